@@ -1,0 +1,52 @@
+"""The pinhole camera that every part of ShellGS shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in the OpenCV frame: x right, y down, z forward; the first pixel's centre is at 0.5.
+
+    Attributes:
+        viewmat: rigid motion from the world to the camera.
+        K: intrinsics in pixels.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    width: int
+    height: int
+
+    def to(self, *args, **kwargs) -> Camera:
+        """The same camera with its tensors on another device or of another dtype, as :meth:`torch.Tensor.to`."""
+        return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        """Centre of projection in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def shrunk(self, max_image_size: int | None) -> Camera:
+        """The camera of the same photograph resized so that its longer side is at most ``max_image_size`` pixels."""
+        longest = max(self.width, self.height)
+        if max_image_size is None or longest <= max_image_size:
+            return self
+        width = max(1, round(self.width * max_image_size / longest))
+        height = max(1, round(self.height * max_image_size / longest))
+        stretch = self.K.new_tensor([width / self.width, height / self.height, 1.0])
+        return Camera(self.viewmat, stretch[:, None] * self.K, width, height)
+
+    def rays(self) -> Float[Tensor, "height width 3"]:
+        """Ray through each pixel's centre in the camera frame, scaled to z = 1, so that ``depth * ray`` is a point."""
+        u = torch.arange(self.width, dtype=self.K.dtype, device=self.K.device) + 0.5
+        v = torch.arange(self.height, dtype=self.K.dtype, device=self.K.device) + 0.5
+        pixels = torch.stack([*torch.meshgrid(u, v, indexing="xy"), torch.ones_like(u).expand(self.height, -1)], dim=-1)
+        return pixels @ torch.linalg.inv(self.K).T

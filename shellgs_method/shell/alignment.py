@@ -1,0 +1,163 @@
+"""The fixed similarity that carries a shell into the frame of the photographs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from dataparsers.cue_maps import atomic_write
+from dataparsers.errors import SceneError
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A similarity from the shell's frame to the scene's, and where it came from.
+
+    Attributes:
+        shell_to_scene: uniform scale, rotation and translation.
+        shell: the shell's file, relative to the scene's folder (or absolute).
+        metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
+        source: how the alignment was found, for people.
+
+    Raises:
+        SceneError: the matrix is no similarity, or mirrors.
+    """
+
+    shell_to_scene: Float64[np.ndarray, "4 4"]
+    shell: str
+    metres_per_shell_unit: float = 1.0
+    source: str = "matrix"
+
+    def __post_init__(self) -> None:
+        """Check the matrix."""
+        matrix = np.array(self.shell_to_scene, dtype=np.float64)
+        matrix.setflags(write=False)
+        object.__setattr__(self, "shell_to_scene", matrix)
+        _check_similarity(matrix)
+        if not 0 < self.metres_per_shell_unit < np.inf:
+            raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
+
+    def __eq__(self, other: object) -> bool:
+        """Equal in every number and word."""
+        return isinstance(other, Alignment) and self._fields() == other._fields()
+
+    @property
+    def scale(self) -> float:
+        """Scene units in one shell unit."""
+        return float(np.cbrt(np.linalg.det(self.shell_to_scene[:3, :3])))
+
+    @property
+    def rotation(self) -> Float64[np.ndarray, "3 3"]:
+        """The rotation from the shell's axes to the scene's, exactly orthonormal."""
+        u, _, vt = np.linalg.svd(self.shell_to_scene[:3, :3])
+        return u @ vt
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Metres in one scene unit."""
+        return self.metres_per_shell_unit / self.scale
+
+    def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Points of the shell in the scene's frame, in double precision."""
+        points = np.asarray(points, dtype=np.float64)
+        return points @ self.shell_to_scene[:3, :3].T + self.shell_to_scene[:3, 3]
+
+    def save(self, path: Path) -> None:
+        """Write the alignment as json."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as file:
+            file.write((json.dumps(self._fields(), indent=1, ensure_ascii=False) + "\n").encode())
+
+    @classmethod
+    def load(cls, path: Path) -> Alignment:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            SceneError: the file is damaged or its matrix no similarity.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist: align the shell with `shellgs align` first")
+        try:
+            fields = json.loads(path.read_bytes())
+            matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
+            unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
+            return cls(matrix, str(fields["shell"]), float(unit), str(source))
+        except KeyError as error:
+            raise SceneError(f"{path}: the entry {error} is missing") from error
+        except (ValueError, TypeError, AttributeError) as error:
+            raise SceneError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_matrix_file(
+        cls,
+        path: Path,
+        shell: str,
+        metres_per_shell_unit: float = 1.0,
+        global_shift: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> Alignment:
+        """The alignment in a file that holds a row-major 4x4 matrix: text as CloudCompare saves it, json or npy.
+
+        Args:
+            path: the file.
+            shell: the shell's file, relative to the scene's folder (or absolute).
+            metres_per_shell_unit: 1 for a shell in metres.
+            global_shift: CloudCompare's "global shift", which it adds to a cloud's coordinates on loading and which
+                its matrices therefore take for granted.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            SceneError: the file holds no 4x4 matrix, or one that is no similarity.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(f"the matrix file {path} does not exist")
+        shift = np.eye(4)
+        shift[:3, 3] = global_shift
+        try:
+            return cls(_read_matrix(path) @ shift, shell, metres_per_shell_unit, source=f"matrix file {path.name}")
+        except ValueError as error:
+            raise SceneError(f"{path}: {error}") from error
+
+    def _fields(self) -> dict:
+        return {**vars(self), "shell_to_scene": self.shell_to_scene.tolist()}
+
+
+def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
+    try:
+        if path.suffix == ".npy":
+            matrix = np.load(path, allow_pickle=False)
+        elif path.suffix == ".json":
+            matrix = json.loads(path.read_bytes())
+        else:
+            matrix = [line.replace(",", " ").split() for line in path.read_text().splitlines() if line.strip()]
+        matrix = np.array(matrix, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise SceneError(f"this is not a 4x4 matrix ({error})") from error
+    if matrix.shape != (4, 4):
+        raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")
+    return matrix
+
+
+def _check_similarity(matrix: np.ndarray) -> None:
+    if matrix.shape != (4, 4):
+        raise SceneError(f"the alignment must be a 4x4 matrix, not {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise SceneError("the alignment's matrix holds NaN or infinite values")
+    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        row = " ".join(f"{value:g}" for value in matrix[3])
+        raise SceneError(f"the alignment's last row is {row} instead of 0 0 0 1: is the matrix column-major?")
+    scales = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if scales[2] <= 1e-12 * scales[0]:
+        raise SceneError("the alignment's matrix is singular: it flattens the shell")
+    if scales[0] - scales[2] > 1e-3 * scales[0]:
+        raise SceneError(
+            f"the alignment scales by {scales[0]:.6g} in one direction and by {scales[2]:.6g} in another: only a "
+            "rotation, a translation and one uniform scale are allowed"
+        )
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        raise SceneError("the alignment mirrors the shell (negative determinant): one axis has the wrong sign")

@@ -1,0 +1,134 @@
+"""Shell maps for all views of a scene."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from dataparsers.camera import Camera
+from dataparsers.cue_maps import CueMaps
+from dataparsers.errors import SceneError
+from shellgs_method.shell.alignment import Alignment
+from shellgs_method.shell.mesh import load_shell
+from shellgs_method.shell.raycast import ShellCaster
+
+log = logging.getLogger(__name__)
+
+ALIGNMENT = Path("shell/alignment.json")  # in the scene's folder
+
+
+@dataclass(frozen=True)
+class CastSummary:
+    """What :func:`cast_views` did.
+
+    Attributes:
+        cast: views whose map was made.
+        skipped: views that had a map for this camera, shell and alignment already.
+        seeing: views with at least one pixel on the shell.
+        supported: share of the pixels of all views that lie on the shell.
+        seconds: wall time.
+    """
+
+    cast: int
+    skipped: int
+    seeing: int
+    supported: float
+    seconds: float
+
+
+def cast_views(
+    scene: Path,
+    views: Sequence[tuple[str, Camera]],
+    alignment: Alignment,
+    *,
+    max_image_size: int | None = None,
+) -> CastSummary:
+    """Cast the scene's shell into views and store the maps in ``scene/cues/shell``.
+
+    Views whose map is sound and made for the same camera, shell and alignment are skipped, so an interrupted run goes
+    on where it stopped. ``scene/shell/alignment.json``, which the maps are bound to, is written if it holds another
+    alignment. Nothing is written before some camera is known to see the shell.
+
+    Args:
+        scene: the scene's folder.
+        views: images' names (their paths relative to the scene) and cameras in the scene's frame.
+        alignment: names the shell and places it.
+        max_image_size: cast for photographs resized to this longer side.
+
+    Raises:
+        FileNotFoundError: the shell is missing.
+        SceneError: the shell cannot be used, or no camera sees it.
+    """
+    start = time.monotonic()
+    shell = scene / alignment.shell
+    caster = ShellCaster(load_shell(shell), alignment.shell_to_scene)
+    _check_placement(caster, [camera for _, camera in views], shell)
+    kept = scene / ALIGNMENT
+    if not kept.is_file() or Alignment.load(kept) != alignment:
+        alignment.save(kept)
+    maps = CueMaps.create(
+        scene,
+        "shell",
+        command="shellgs cast {scene}" + (f" --max-image-size {max_image_size}" if max_image_size else ""),
+        sources=[shell, kept],
+        metres_per_unit=alignment.metres_per_unit,
+        max_image_size=max_image_size,
+    )
+    cast = 0
+    for name, full_camera in track(views, description="casting the shell"):
+        camera = full_camera.shrunk(max_image_size)
+        if not maps.current(name, camera):
+            maps.write(name, caster.cast(camera), camera)
+            cast += 1
+    supported = [record.supported for name, _ in views if (record := maps.record(name))]
+    return CastSummary(
+        cast=cast,
+        skipped=len(views) - cast,
+        seeing=int(np.count_nonzero(supported)),
+        supported=float(np.mean(supported)),
+        seconds=time.monotonic() - start,
+    )
+
+
+def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path) -> None:
+    """Refuse a shell that no camera sees, and warn of one whose size is out of all proportion to the camera path."""
+    if not cameras:
+        raise SceneError("there are no views to cast the shell into")
+    positions = np.stack([camera.position.detach().cpu().double().numpy() for camera in cameras])
+    span = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    depth = _median_depth(caster, cameras)
+    if depth is None:
+        distance = np.linalg.norm(positions - caster.origin, axis=1).min()
+        raise SceneError(
+            f"no camera sees the shell {shell}: it is {caster.extent:.3g} scene units wide and its centre is "
+            f"{distance:.3g} from the nearest camera, while the cameras span {span:.3g}; check the alignment and the "
+            "shell's units"
+        )
+    if span > 0 and (caster.extent < span / 100 or not span / 100 < depth < span * 100):
+        log.warning(
+            "the shell %s is %.3g scene units wide and %.3g away, the cameras span %.3g: check the alignment's scale "
+            "and the shell's units (millimetres taken for metres are 1000 times off)",
+            shell,
+            caster.extent,
+            depth,
+            span,
+        )
+
+
+def _median_depth(caster: ShellCaster, cameras: Sequence[Camera]) -> float | None:
+    """Median depth of the shell in a handful of thumbnails, spread over the views; None if no view at all sees it."""
+    step = -(-len(cameras) // 16)
+    seen: list[np.ndarray] = []
+    for k in sorted(range(len(cameras)), key=lambda k: k % step):
+        if seen and k % step:
+            break
+        cue = caster.cast(cameras[k].shrunk(128))
+        if cue.mask.any():
+            seen.append(cue.depth[cue.mask])
+    return float(np.median(np.concatenate(seen))) if seen else None

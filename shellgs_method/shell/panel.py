@@ -1,0 +1,41 @@
+"""What supervises a view, as a picture: photograph, depth, normals, mask."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.figure import Figure
+
+from dataparsers.cue_maps import CueMap
+from shellgs_method.evaluation.colours import GREY, normal_colours
+
+
+def supervision_panel(
+    image: UInt8[np.ndarray, "H W 3"], cue: CueMap, metres_per_unit: float | None = None, kind: str = "shell"
+) -> Figure:
+    """The paper's supervision figure for one view; save it with ``.savefig(path)``.
+
+    Args:
+        image: the photograph.
+        cue: its maps.
+        metres_per_unit: gives the depth in metres; without it the colour bar counts scene units.
+        kind: what the maps come from, for the titles.
+    """
+    height, width = cue.mask.shape
+    figure = Figure(figsize=(16, 4.2 * height / width + 0.9), dpi=120, layout="constrained")
+    axes = figure.subplots(1, 4)
+    titles = ("RGB", f"{kind} depth", "camera-space normal", f"valid mask ({cue.mask.mean():.0%})")
+    for ax, letter, title in zip(axes, "abcd", titles, strict=True):
+        ax.set_title(f"({letter}) {title}")
+        ax.set_axis_off()
+    axes[0].imshow(image)
+    depth = np.ma.masked_where(~cue.mask, cue.depth * (metres_per_unit or 1.0))
+    low, high = np.percentile(depth.compressed(), [1, 99]) if cue.mask.any() else (0.0, 1.0)
+    colours = matplotlib.colormaps["viridis"].with_extremes(bad=str(GREY / 255))
+    shown = axes[1].imshow(depth, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+    bar = figure.colorbar(shown, cax=axes[1].inset_axes((0.0, -0.09, 1.0, 0.05)), orientation="horizontal")
+    bar.set_label("metres" if metres_per_unit else "scene units")
+    axes[2].imshow(normal_colours(cue.normal, cue.mask), interpolation="nearest")
+    axes[3].imshow(cue.mask, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    return figure

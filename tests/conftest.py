@@ -1,0 +1,28 @@
+"""A tiny synthetic facade that the tests of the nerfstudio side share."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+from shellgs_method.synthetic import FacadeConfig, write_scene
+
+
+@pytest.fixture(scope="session")
+def pristine_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene of 10 views of 48 x 32 pixels with shell and truth maps; not to be changed."""
+    scene = tmp_path_factory.mktemp("facade") / "scene"
+    write_scene(scene, FacadeConfig(width=48, height=32, views=10, points=300, supersampling=1))
+    views = read_views(FacadeDataParserConfig(data=scene))
+    cast_views(scene, [(view.name, view.camera) for view in views], Alignment.load(scene / ALIGNMENT))
+    return scene
+
+
+@pytest.fixture
+def scene(pristine_scene: Path, tmp_path: Path) -> Path:
+    """A copy of the scene that a test may change."""
+    return Path(shutil.copytree(pristine_scene, tmp_path / "scene"))
