@@ -1,0 +1,33 @@
+"""What is measured on held-out views: appearance, and geometry where a reference supports it.
+
+:func:`geometry_errors` says what each figure means. The parts it is made of take plain tensors and can be used alone.
+"""
+
+from shellgs_method.evaluation.colours import colours_to_normals, normal_colours, normals_to_colours
+from shellgs_method.evaluation.geometry import NormalErrors, angular_error, depth_mae, normal_errors
+from shellgs_method.evaluation.image import image_errors, lpips_network
+from shellgs_method.evaluation.normals import normals_from_depth
+from shellgs_method.evaluation.surface import SurfaceComparison, back_project, compare_surfaces, voxel_means
+from shellgs_method.evaluation.view import Reference, Rendering, evaluate_view, geometry_errors, mean_over_views
+
+__all__ = [
+    "NormalErrors",
+    "Reference",
+    "Rendering",
+    "SurfaceComparison",
+    "angular_error",
+    "back_project",
+    "colours_to_normals",
+    "compare_surfaces",
+    "depth_mae",
+    "evaluate_view",
+    "geometry_errors",
+    "image_errors",
+    "lpips_network",
+    "mean_over_views",
+    "normal_colours",
+    "normal_errors",
+    "normals_from_depth",
+    "normals_to_colours",
+    "voxel_means",
+]

@@ -1,0 +1,53 @@
+"""Qualitative strips: methods side by side, their normals and the error of these below."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from shellgs_method.evaluation.colours import GREY, normal_colours
+
+
+class Panel(NamedTuple):
+    """What one method, or the reference, shows of a view."""
+
+    title: str
+    rgb: Float[Tensor, "H W 3"]
+    normal: Float[Tensor, "H W 3"]
+    error: Float[Tensor, "H W 1"]
+    """Unsigned angle to the reference's normals in degrees, as from :func:`angular_error`."""
+    mask: Bool[Tensor, "H W 1"]
+    """True where the reference has a normal; grey elsewhere."""
+
+
+def save_strip(path: Path, panels: Sequence[Panel], max_error: float = 45.0, panel_inches: float = 2.5) -> None:
+    """Write a PNG of one column a panel: picture, normals, angular error with one colour bar for all, up to a limit."""
+    height, width = panels[0].rgb.shape[:2]
+    size = (panel_inches * len(panels) + 0.8, panel_inches * 3 * height / width + 0.3)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(3, len(panels), squeeze=False)
+    scale = ScalarMappable(Normalize(0, max_error), colormaps["inferno"])
+    for column, panel in zip(axes.T, panels, strict=True):
+        mask, normal = panel.mask.cpu().numpy(), panel.normal.detach().cpu().numpy()
+        error = np.where(mask, scale.to_rgba(panel.error.cpu().numpy()[..., 0])[..., :3], GREY / 255)
+        pictures = (panel.rgb.detach().clamp(0, 1).cpu().numpy(), normal_colours(normal, mask[..., 0]), error)
+        for axis, picture in zip(column, pictures, strict=True):
+            axis.imshow(picture)
+            axis.set_axis_off()
+        column[0].set_title(panel.title, fontsize=9)
+    figure.colorbar(scale, ax=axes[2], extend="max", label="normal error (°)")
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    figure.savefig(temporary, format="png", dpi=150)
+    os.replace(temporary, path)

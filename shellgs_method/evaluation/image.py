@@ -1,0 +1,73 @@
+"""Appearance: PSNR, SSIM, LPIPS."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import urllib.request
+from contextlib import suppress
+from functools import cache
+
+import torch
+import torchvision
+from jaxtyping import Float
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+SMALLEST_LPIPS_IMAGE = 31
+"""Side in pixels below which AlexNet's strides leave nothing of an image."""
+
+logger = logging.getLogger(__name__)
+
+
+def image_errors(rgb: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> dict[str, float]:
+    """PSNR in dB (at most 100, so that an exact picture can be averaged), SSIM, and LPIPS where it can be had.
+
+    Colours are in [0, 1]. SSIM has a Gaussian window of 11 pixels and sigma 1.5, LPIPS the AlexNet backbone.
+    """
+    rgb, target = rgb.detach().clamp(0, 1).permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
+    figures = {
+        "psnr": min(peak_signal_noise_ratio(rgb, target, data_range=1.0).item(), 100.0),
+        "ssim": structural_similarity_index_measure(rgb, target, data_range=1.0).item(),  # pyright: ignore
+    }
+    network = lpips_network()
+    if isinstance(network, Metric) and min(rgb.shape[-2:]) >= SMALLEST_LPIPS_IMAGE:
+        with torch.no_grad():
+            figures["lpips"] = network.to(rgb.device)(rgb, target).item()
+    return figures
+
+
+@cache
+def lpips_network() -> Metric | str:
+    """LPIPS' network, or why there is none: its backbone's weights are downloaded unless torch.hub has them cached.
+
+    Tried once a process, so that a machine without network pays for it once and is told once.
+    """
+    url = torchvision.models.AlexNet_Weights.DEFAULT.url
+    cached = os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
+    if not os.path.exists(cached) and not _reachable(url):
+        obstacle = f"the weights of AlexNet are not at {cached}, and {url} cannot be reached"
+    else:
+        try:
+            return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
+        except Exception as error:  # a cut download, a damaged file, a full disk: the run goes on without LPIPS
+            obstacle = f"the weights of AlexNet cannot be loaded from {cached}: {error}"
+    logger.warning("LPIPS is not available: %s.", obstacle)
+    return obstacle
+
+
+def _reachable(url: str, seconds: float = 5.0) -> bool:
+    """Whether a server answers in time. A name server can take minutes, so a thread is asked and not waited for."""
+    answered = threading.Event()
+
+    def ask() -> None:
+        with suppress(OSError), urllib.request.urlopen(urllib.request.Request(url, method="HEAD"), timeout=seconds):
+            answered.set()
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return answered.is_set()

@@ -1,0 +1,88 @@
+"""The visible surface as a point cloud: accuracy, completeness, Chamfer distance, F-score."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from dataparsers.camera import Camera
+
+
+@dataclass(frozen=True)
+class SurfaceComparison:
+    """Distances between a reconstructed point cloud and a reference, from each point to the other's nearest.
+
+    The F-score is that of Tanks and Temples (Knapitsch et al. 2017), the Chamfer distance the paper's: the mean of
+    accuracy and completeness, not squared. Both clouds must have points for the mean distances to exist.
+    """
+
+    to_reference: Float[ndarray, " N"]
+    """From each reconstructed point."""
+    to_reconstruction: Float[ndarray, " M"]
+    """From each point of the reference."""
+
+    @property
+    def accuracy(self) -> float:
+        """Mean distance of the reconstruction from the reference."""
+        return float(self.to_reference.mean())
+
+    @property
+    def completeness(self) -> float:
+        """Mean distance of the reference from the reconstruction."""
+        return float(self.to_reconstruction.mean())
+
+    @property
+    def chamfer(self) -> float:
+        """Mean of accuracy and completeness."""
+        return (self.accuracy + self.completeness) / 2
+
+    def precision(self, threshold: float) -> float:
+        """Share of the reconstruction closer than ``threshold`` to the reference."""
+        return float((self.to_reference < threshold).mean()) if len(self.to_reference) else 0.0
+
+    def recall(self, threshold: float) -> float:
+        """Share of the reference closer than ``threshold`` to the reconstruction."""
+        return float((self.to_reconstruction < threshold).mean()) if len(self.to_reconstruction) else 0.0
+
+    def f_score(self, threshold: float) -> float:
+        """Harmonic mean of precision and recall; zero where both are."""
+        precision, recall = self.precision(threshold), self.recall(threshold)
+        return 2 * precision * recall / max(precision + recall, 1e-12)
+
+
+def compare_surfaces(
+    points: Float[ndarray, "N 3"], reference: Float[ndarray, "M 3"], voxel: float
+) -> SurfaceComparison:
+    """Compare two point clouds after both are thinned to one point a voxel.
+
+    The density of the samples alone moves the Chamfer distance threefold: figures can be compared only at the same
+    voxel, and are stated with it.
+    """
+    points, reference = voxel_means(points, voxel), voxel_means(reference, voxel)
+    return SurfaceComparison(_nearest(points, reference), _nearest(reference, points))
+
+
+def back_project(depth: Float[Tensor, "H W 1"], camera: Camera, mask: Bool[Tensor, "H W 1"]) -> Float[ndarray, "N 3"]:
+    """Points of the masked pixels in the camera frame, in float64."""
+    return (depth.double() * camera.rays().to(depth.device).double())[mask[..., 0]].cpu().numpy()
+
+
+def voxel_means(points: Float[ndarray, "N 3"], voxel: float) -> Float[ndarray, "M 3"]:
+    """Mean of the points in each occupied cell of a grid through the origin."""
+    cell = np.zeros(len(points), dtype=np.int64)
+    for column in np.floor(points / voxel).astype(np.int64).T if len(points) else ():
+        # Renumbered after each axis, so that no product of three extents can overflow.
+        column = column - column.min()
+        cell = np.unique(cell * (column.max() + 1) + column, return_inverse=True)[1]
+    count = np.bincount(cell)
+    return np.stack([np.bincount(cell, weights=axis) / count for axis in points.T], axis=1)
+
+
+def _nearest(points: Float[ndarray, "N 3"], others: Float[ndarray, "M 3"]) -> Float[ndarray, " N"]:
+    """Distance of each point to the nearest of the others, infinite where there are none."""
+    return KDTree(others, balanced_tree=False, compact_nodes=False).query(points, workers=-1)[0]

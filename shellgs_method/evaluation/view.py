@@ -1,0 +1,156 @@
+"""Everything that is measured on one held-out view, and the average over views."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from dataparsers.camera import Camera
+from shellgs_method.evaluation.geometry import depth_mae, normal_errors, share
+from shellgs_method.evaluation.image import image_errors
+from shellgs_method.evaluation.normals import normals_from_depth
+from shellgs_method.evaluation.surface import back_project, compare_surfaces
+
+VOXEL_METRES = 0.02
+"""Voxel of both point clouds; 0.4 of the smallest threshold."""
+THRESHOLDS_METRES = {"5cm": 0.05, "10cm": 0.10, "20cm": 0.20}
+"""Thresholds of the F-score."""
+VOXEL_SHARE = 1 / 500
+"""Voxel as a share of the reference's median depth where metres are unknown: 2 cm for a wall 10 m away."""
+OPAQUE = 0.5
+"""Opacity from which a pixel counts as rendered: a ray that never becomes half opaque has no median depth."""
+
+
+class Rendering(NamedTuple):
+    """Maps that a method rendered for a view."""
+
+    rgb: Float[Tensor, "H W 3"]
+    """Colours in [0, 1]."""
+    depth: Float[Tensor, "H W 1"]
+    """Forward z-depth in scene units, 0 where there is none."""
+    alpha: Float[Tensor, "H W 1"]
+    """Accumulated opacity."""
+    normal: Float[Tensor, "H W 3"] | None = None
+    """Composited normals in the camera frame, of any length; None for a method that has none."""
+
+
+class Reference(NamedTuple):
+    """Maps of the true geometry for a view: the shell's, or another's."""
+
+    depth: Float[Tensor, "H W 1"]
+    """Forward z-depth in scene units, 0 where there is none."""
+    normal: Float[Tensor, "H W 3"]
+    """Normals in the camera frame."""
+    mask: Bool[Tensor, "H W 1"]
+    """True where the geometry counts."""
+
+
+def evaluate_view(
+    rendering: Rendering,
+    image: Float[Tensor, "H W 3"],
+    camera: Camera,
+    reference: Reference | None = None,
+    metres_per_unit: float | None = None,
+) -> dict[str, float]:
+    """All figures of a view by name: those of :func:`image_errors`, and with a reference those of the geometry."""
+    figures = image_errors(rendering.rgb, image)
+    if reference is not None:
+        figures |= geometry_errors(rendering, camera, reference, metres_per_unit)
+    return figures
+
+
+def geometry_errors(
+    rendering: Rendering, camera: Camera, reference: Reference, metres_per_unit: float | None = None
+) -> dict[str, float]:
+    """Geometric figures of a view: shares in [0, 1], angles in degrees, lengths in metres (``_m``).
+
+    Empty where the reference supports no pixel, else:
+
+    * ``supported``: share of the image in the mask; ``rendered``: share of the mask at least half opaque, with depth.
+    * ``depth_mae_m``: after the view's median scale, over rendered pixels.
+    * ``normal_deg``, ``normal_below_10deg``, ``normal_below_20deg``: composited normals, over the whole mask;
+      ``depth_normal_deg`` and so on: normals of the rendered depth, over the mask less the image's border. Where
+      nothing was rendered the angle counts as 90°: a hole is no way to a better figure.
+    * ``accuracy_m``, ``completeness_m``, ``chamfer_m``, ``precision_5cm``, ``recall_5cm``, ``f_score_5cm`` (10cm,
+      20cm): raw depth of rendered pixels against the mask's, both thinned to 2 cm voxels; ``surface_points`` and
+      ``reference_points`` are what is left of the two.
+
+    Where nothing of the mask was rendered, depth error and distances do not exist and are absent, and the F-scores
+    are 0. Where ``metres_per_unit`` is unknown, lengths are in scene units and their names end in ``_units``, the
+    voxel is 1/500 of the reference's median depth, and there is no F-score. No figure is ever NaN.
+    """
+    mask = reference.mask & (reference.depth > 0)
+    if not mask.any():
+        return {}
+    depth = rendering.depth.detach()
+    opaque = (depth > 0) & depth.isfinite() & (rendering.alpha >= OPAQUE)
+    depth = depth.where(opaque, 0.0)
+    figures = {"supported": share(mask).item(), "rendered": share(opaque[mask]).item()}
+
+    if rendering.normal is not None:
+        composited = rendering.normal.detach().where(opaque, 0.0)
+        figures |= _normal_figures("normal", composited, reference.normal, mask)
+    inner = pad(mask[1:-1, 1:-1], (0, 0, 1, 1, 1, 1))
+    figures |= _normal_figures("depth_normal", normals_from_depth(depth, camera), reference.normal, inner)
+    return figures | _length_figures(depth, reference.depth, mask, camera, metres_per_unit)
+
+
+def mean_over_views(figures: Sequence[Mapping[str, float]], deviation: bool = False) -> dict[str, float]:
+    """Mean of each figure over the views that have it.
+
+    A figure that some views lack gets its number of views beside it (``_views``), and with ``deviation`` every figure
+    its standard deviation over the views (``_std``).
+    """
+    means: dict[str, float] = {}
+    for key in dict.fromkeys(key for view in figures for key in view):
+        values = [float(view[key]) for view in figures if key in view]
+        means[key] = float(np.mean(values))
+        if deviation:
+            means[f"{key}_std"] = float(np.std(values))
+        if len(values) < len(figures):
+            means[f"{key}_views"] = float(len(values))
+    return means
+
+
+def _normal_figures(name: str, normal: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
+    if not mask.any():
+        return {}
+    errors = normal_errors(normal, target, mask)
+    return {
+        f"{name}_deg": errors.mean,
+        f"{name}_below_10deg": errors.below_10,
+        f"{name}_below_20deg": errors.below_20,
+    }
+
+
+def _length_figures(
+    depth: Tensor, target: Tensor, mask: Tensor, camera: Camera, metres_per_unit: float | None
+) -> dict[str, float]:
+    """Depth error and point clouds; a rendered depth of zero is none."""
+    if metres_per_unit is None:
+        unit, scale, voxel, thresholds = "units", 1.0, VOXEL_SHARE * target[mask].median().item(), {}
+    else:
+        unit, scale, voxel, thresholds = "m", metres_per_unit, VOXEL_METRES, THRESHOLDS_METRES
+
+    points = back_project(depth * scale, camera, mask & (depth > 0))
+    surface = compare_surfaces(points, back_project(target * scale, camera, mask), voxel)
+    figures = {
+        "surface_points": float(len(surface.to_reference)),
+        "reference_points": float(len(surface.to_reconstruction)),
+    }
+    for name, threshold in thresholds.items():
+        figures[f"precision_{name}"] = surface.precision(threshold)
+        figures[f"recall_{name}"] = surface.recall(threshold)
+        figures[f"f_score_{name}"] = surface.f_score(threshold)
+    error = depth_mae(depth, target, mask)
+    if error is not None:
+        figures[f"depth_mae_{unit}"] = error * scale
+        figures[f"accuracy_{unit}"] = surface.accuracy
+        figures[f"completeness_{unit}"] = surface.completeness
+        figures[f"chamfer_{unit}"] = surface.chamfer
+    return figures

@@ -1,0 +1,20 @@
+"""The terms of the objective: plain differentiable functions of [H, W, C] maps in the camera frame.
+
+L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C consistency. Masks are true where a pixel
+counts; an empty one gives a zero that can be back-propagated.
+"""
+
+from shellgs_method.losses.consistency import consistency_loss
+from shellgs_method.losses.depth import ncc_loss, vid2sim_ncc_loss
+from shellgs_method.losses.normal import normal_loss
+from shellgs_method.losses.photometric import photometric_loss
+from shellgs_method.losses.schedules import ExponentialDecay
+
+__all__ = [
+    "ExponentialDecay",
+    "consistency_loss",
+    "ncc_loss",
+    "normal_loss",
+    "photometric_loss",
+    "vid2sim_ncc_loss",
+]

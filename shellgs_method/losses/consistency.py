@@ -1,0 +1,48 @@
+"""C: rendered normals should be smooth where the cue's depth is."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.filters import spatial_gradient
+from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
+
+from shellgs_method.losses.normal import unit
+from shellgs_method.losses.reduction import weighted_mean
+
+
+def consistency_loss(
+    normal: Float[Tensor, "H W 3"], target_depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]
+) -> Float[Tensor, ""]:
+    """Edge-aware smoothness of the rendered normals, Σ w a / Σ w (Vid2Sim's geometry consistency).
+
+    ``a`` is the mean of 1 - cos between a pixel's normal and those to its left and above; ``w`` falls from 1 at the
+    smoothest supported pixel to 0 at the steepest one.
+
+    Args:
+        normal: rendered normals of any length, as composited.
+        target_depth: the cue's z-depth.
+        mask: true where the target is valid.
+    """
+    normal = unit(normal)
+    left = (normal[1:, 1:] * normal[1:, :-1]).sum(dim=-1, keepdim=True)
+    above = (normal[1:, 1:] * normal[:-1, 1:]).sum(dim=-1, keepdim=True)
+    return weighted_mean(1 - (left + above) / 2, _smoothness(target_depth, mask)[1:, 1:])
+
+
+@torch.no_grad()
+def _smoothness(depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]) -> Float[Tensor, "H W 1"]:
+    """1 - minmax(|∇Z| / Z) where all the 3 x 3 pixels of the Sobel window are supported, else 0.
+
+    Only there is the gradient known, and only there are both neighbours supported too: pairs of normals that straddle
+    the mask's edge drop out by the same rule.
+    """
+    unsupported = pad((~mask).to(depth.dtype)[None, ..., 0], (1, 1, 1, 1), value=1.0)
+    inside = max_pool2d(unsupported, kernel_size=3, stride=1)[0, ..., None] == 0
+    gradient = spatial_gradient(depth[None, None, ..., 0], mode="sobel")[0, 0]  # [2, H, W], per pixel
+    steepness = gradient.norm(dim=0)[..., None] / depth.where(inside, 1.0)
+    low = steepness.where(inside, torch.inf).amin()
+    high = steepness.where(inside, -torch.inf).amax()
+    # Gradients that differ by 1e-5 of the depth per pixel differ by rounding: they are not stretched to [0, 1].
+    return (1 - (steepness - low) / (high - low).clamp_min(1e-5)).where(inside, 0.0)

@@ -1,0 +1,380 @@
+"""The figures against closed forms: planes, known rotations, parallel walls."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+import torchvision
+from PIL import Image
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+from torch.autograd import gradcheck
+
+from dataparsers.camera import Camera
+from shellgs_method.evaluation import (
+    Reference,
+    Rendering,
+    angular_error,
+    back_project,
+    compare_surfaces,
+    depth_mae,
+    evaluate_view,
+    image,
+    image_errors,
+    mean_over_views,
+    normal_errors,
+    normals_from_depth,
+    voxel_means,
+)
+from shellgs_method.evaluation.colours import GREY
+from shellgs_method.evaluation.figures import Panel, save_strip
+from shellgs_method.evaluation.tables import Column, markdown_table, rich_table
+
+WIDTH, HEIGHT = 48, 40
+CAMERA = Camera(torch.eye(4), torch.tensor([[60.0, 0, 24.5], [0, 62, 19], [0, 0, 1]]), WIDTH, HEIGHT)
+EVERYWHERE = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+
+
+@pytest.fixture(autouse=True)
+def no_lpips(monkeypatch):
+    """No test may go to the network for weights."""
+    image.lpips_network.cache_clear()
+    monkeypatch.setattr(image, "_reachable", lambda url: False)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: "nowhere")
+    yield
+    image.lpips_network.cache_clear()
+
+
+def plane(normal: tuple[float, float, float], distance: float = 6.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """z-depth and unit normals of the plane n · x = -distance in front of the camera."""
+    n = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    depth = (-distance / (CAMERA.rays().double() @ n))[..., None]
+    assert (depth > 0).all()
+    return depth, n.expand(HEIGHT, WIDTH, 3)
+
+
+def seen(normal: tuple[float, float, float] = (0.3, -0.2, -1.0)) -> tuple[Rendering, torch.Tensor, Reference]:
+    """A perfect rendering of a slanted wall, its photograph, and its reference."""
+    depth, normals = plane(normal)
+    photograph = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    rendering = Rendering(0.9 * photograph, depth, torch.ones_like(depth), normals)
+    return rendering, photograph, Reference(depth, normals, EVERYWHERE)
+
+
+# normals
+
+
+@pytest.mark.parametrize("normal", [(0, 0, -1), (0.5, 0, -1), (-0.3, 0.6, -1), (0.9, -0.8, -1)])
+def test_normals_of_a_slanted_plane_are_the_planes(normal):
+    depth, expected = plane(normal)
+    normals = normals_from_depth(depth, CAMERA)
+    torch.testing.assert_close(normals[1:-1, 1:-1], expected[1:-1, 1:-1])
+
+
+def test_normals_of_any_depth_face_the_camera():
+    depth = torch.rand(HEIGHT, WIDTH, 1, generator=torch.Generator().manual_seed(0)) * 10 + 0.1
+    towards = (normals_from_depth(depth, CAMERA) * CAMERA.rays()).sum(dim=-1)[1:-1, 1:-1]
+    assert (towards < 0).all()
+
+
+def test_normals_are_zero_on_the_border_and_beside_missing_depth():
+    depth, _ = plane((0.3, 0, -1))
+    depth[10, 20] = 0
+    missing = normals_from_depth(depth, CAMERA).norm(dim=-1) == 0
+    expected = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    expected[1:-1, 1:-1] = False
+    for row, column in [(10, 20), (9, 20), (11, 20), (10, 19), (10, 21)]:
+        expected[row, column] = True
+    assert torch.equal(missing, expected)
+
+
+def test_normals_gradient_is_right_and_finite_beside_missing_depth():
+    K = torch.tensor([[60.0, 0, 3], [0, 62, 3], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(torch.eye(4, dtype=torch.float64), K, 6, 6)
+    depth = torch.rand(6, 6, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 3
+    known = torch.ones_like(depth)
+    known[2, 2] = 0
+    assert gradcheck(lambda d: normals_from_depth(d * known, camera), depth.requires_grad_())
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.001, 9.0, 20.5, 89.0, 90.0])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_angular_error_of_a_known_rotation_is_unsigned(degrees, sign):
+    rng = np.random.default_rng(0)
+    target = rng.normal(size=(3, 4, 3))
+    axis = np.cross(target, rng.normal(size=(3, 4, 3)))
+    axis *= math.radians(degrees) / np.linalg.norm(axis, axis=-1, keepdims=True)
+    turned = Rotation.from_rotvec(axis.reshape(-1, 3)).apply(target.reshape(-1, 3)).reshape(3, 4, 3)
+    error = angular_error(torch.from_numpy(2.5 * sign * turned), torch.from_numpy(target))
+    torch.testing.assert_close(error, torch.full((3, 4, 1), degrees), atol=1e-5, rtol=1e-5)
+
+
+def test_missing_normal_counts_as_ninety_degrees():
+    target = torch.tensor([0.0, 0.0, -1.0]).repeat(1, 4, 1)
+    normal = target.clone()
+    normal[0, 0] = 0
+    errors = normal_errors(normal, target, torch.ones(1, 4, 1, dtype=torch.bool))
+    # (90 + 0 + 0 + 0) / 4
+    assert errors == (22.5, 0.75, 0.75)
+
+
+def test_random_normals_are_at_the_chance_level_of_57_degrees():
+    normal, target = torch.randn(2, 300, 300, 3, generator=torch.Generator().manual_seed(0))
+    errors = normal_errors(normal, target, torch.ones(300, 300, 1, dtype=torch.bool))
+    # Unsigned angles of random directions: mean 180/π, shares 1 - cos 10° and 1 - cos 20°.
+    assert errors.mean == pytest.approx(57.296, abs=0.3)
+    assert errors.below_10 == pytest.approx(0.0152, abs=0.002)
+    assert errors.below_20 == pytest.approx(0.0603, abs=0.003)
+
+
+# depth
+
+
+def test_depth_error_is_what_the_median_ratio_leaves():
+    depth = torch.tensor([1.0, 2.0, 3.0, 0.0, 5.0])[None, :, None]
+    target = torch.tensor([2.0, 4.0, 9.0, 7.0, 0.0])[None, :, None]
+    # Ratios 2, 2, 3; the last two pixels lack a depth, so the error is |2-2|, |4-4|, |6-9|.
+    assert depth_mae(depth, target, torch.ones(1, 5, 1, dtype=torch.bool)) == pytest.approx(1.0)
+
+
+def test_depth_error_ignores_the_scale_of_the_rendering():
+    depth, _ = plane((0.3, 0, -1))
+    assert depth_mae(0.37 * depth, depth, EVERYWHERE) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_depth_error_of_nothing_is_none():
+    depth, _ = plane((0, 0, -1))
+    assert depth_mae(torch.zeros_like(depth), depth, EVERYWHERE) is None
+
+
+# surfaces
+
+
+def test_surface_of_two_parallel_walls_three_centimetres_apart():
+    grid = np.stack(np.meshgrid(np.arange(0.01, 1, 0.02), np.arange(0.01, 1, 0.02)), axis=-1).reshape(-1, 2)
+    wall = np.c_[grid, np.full(len(grid), 2.005)]
+    surface = compare_surfaces(wall + np.array([0, 0, 0.03]), wall, voxel=0.02)
+    assert [surface.accuracy, surface.completeness, surface.chamfer] == pytest.approx([0.03] * 3)
+    assert [surface.f_score(0.02), surface.f_score(0.05)] == [0.0, 1.0]
+
+
+def test_surface_of_half_a_wall_is_accurate_but_not_complete():
+    x = np.arange(100) * 0.1
+    reference = np.c_[x, np.zeros(100), np.ones(100)]
+    surface = compare_surfaces(reference[:50], reference, voxel=0.02)
+    # The missing half lies 0.1, 0.2, ..., 5.0 from the last reconstructed point.
+    assert surface.accuracy == 0
+    assert surface.completeness == pytest.approx(np.arange(1, 51).sum() * 0.1 / 100)
+    assert (surface.precision(0.05), surface.recall(0.05)) == (1.0, 0.5)
+    assert surface.f_score(0.05) == pytest.approx(2 / 3)
+
+
+def test_surface_distances_equal_brute_force():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(200, 3)), rng.normal(size=(150, 3))
+    surface = compare_surfaces(a, b, voxel=0.3)
+    distances = cdist(voxel_means(a, 0.3), voxel_means(b, 0.3))
+    assert surface.accuracy == pytest.approx(distances.min(axis=1).mean())
+    assert surface.completeness == pytest.approx(distances.min(axis=0).mean())
+
+
+def test_voxel_means_are_those_of_a_dictionary_of_cells():
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    cells: dict[tuple, list] = {}
+    for point in points:
+        cells.setdefault(tuple(np.floor(point / 0.5)), []).append(point)
+    expected = np.array(sorted(np.mean(cell, axis=0).tolist() for cell in cells.values()))
+    assert np.allclose(sorted(voxel_means(points, 0.5).tolist()), expected)
+
+
+def test_voxel_means_stand_a_depth_beyond_any_grid():
+    points = np.array([[0, 0, 1], [0.001, 0, 1], [1e9, -1e9, 1e9]])
+    assert len(voxel_means(points, 0.02)) == 2
+
+
+def test_back_projected_points_project_to_their_pixels():
+    depth, _ = plane((0.3, -0.2, -1))
+    points = torch.from_numpy(back_project(depth, CAMERA, EVERYWHERE)).reshape(HEIGHT, WIDTH, 3)
+    pixels = points @ CAMERA.K.double().T / depth
+    assert torch.allclose(pixels[7, 31], torch.tensor([31.5, 7.5, 1.0], dtype=torch.float64), atol=1e-5)
+    assert torch.allclose(points[..., 2:], depth)
+
+
+# images
+
+
+def test_psnr_of_a_constant_error_is_its_closed_form():
+    target = torch.full((HEIGHT, WIDTH, 3), 0.5)
+    # MSE 0.01
+    assert image_errors(target + 0.1, target)["psnr"] == pytest.approx(20.0, abs=1e-3)
+
+
+def test_figures_of_an_exact_picture_are_finite():
+    target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
+    assert image_errors(target, target) == {"psnr": 100.0, "ssim": pytest.approx(1.0)}
+
+
+def test_ssim_equals_the_formula_on_constant_pictures():
+    # No variance, so the luminance term alone: (2·0.5·0.6 + c1) / (0.25 + 0.36 + c1).
+    a, b = torch.full((HEIGHT, WIDTH, 3), 0.5), torch.full((HEIGHT, WIDTH, 3), 0.6)
+    assert image_errors(a, b)["ssim"] == pytest.approx((0.6 + 1e-4) / (0.61 + 1e-4), abs=1e-4)
+
+
+def test_lpips_without_weights_is_left_out_and_said_once(caplog, monkeypatch):
+    asked = []
+    monkeypatch.setattr(image, "_reachable", asked.append)
+    target = torch.rand(HEIGHT, WIDTH, 3)
+    with caplog.at_level(logging.WARNING):
+        figures = [image_errors(target, target) for _ in range(3)]
+    assert all("lpips" not in view for view in figures)
+    assert len(asked) == 1
+    assert [record.message.startswith("LPIPS is not available") for record in caplog.records] == [True]
+
+
+def test_lpips_with_a_damaged_file_of_weights_is_left_out(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"cut short")
+    assert "cannot be loaded" in str(image.lpips_network())
+
+
+def test_lpips_with_weights_is_zero_for_the_same_picture_and_positive_for_another(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    (tmp_path / "checkpoints").mkdir()
+    torch.manual_seed(0)
+    weights = torchvision.models.alexnet(weights=None).state_dict()
+    torch.save(weights, tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth")
+    a, b = torch.rand(2, 64, 64, 3)
+    assert image_errors(a, a)["lpips"] == pytest.approx(0.0, abs=1e-6)
+    assert image_errors(a, b)["lpips"] > 1e-6
+
+
+# a view
+
+
+def test_a_perfect_rendering_has_perfect_geometry():
+    rendering, photograph, reference = seen()
+    figures = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=2.0)
+    for key in ("depth_mae_m", "normal_deg", "depth_normal_deg", "accuracy_m", "completeness_m", "chamfer_m"):
+        assert figures[key] == pytest.approx(0.0, abs=1e-5), key
+    for key in ("supported", "rendered", "normal_below_10deg", "f_score_5cm", "f_score_20cm"):
+        assert figures[key] == 1.0, key
+
+
+def test_lengths_are_in_metres():
+    # A frontal wall at 6 units rendered at 6.1, half a metre a unit: each point lies 5 cm too far in z, along its ray.
+    depth, normals = plane((0, 0, -1))
+    photograph = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64)
+    rendering = Rendering(photograph, depth + 0.1, torch.ones_like(depth), normals)
+    figures = evaluate_view(rendering, photograph, CAMERA, Reference(depth, normals, EVERYWHERE), 0.5)
+    assert figures["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["accuracy_m"] == pytest.approx(0.05 * CAMERA.rays().norm(dim=-1).mean().item(), rel=1e-5)
+    assert (figures["f_score_5cm"], figures["f_score_10cm"]) == (0.0, 1.0)
+
+
+def test_lengths_without_a_known_metre_do_not_pretend_to_be_metres():
+    figures = evaluate_view(*seen()[:2], CAMERA, seen()[2])
+    assert {"depth_mae_units", "accuracy_units", "completeness_units", "chamfer_units"} <= figures.keys()
+    assert not any(key.endswith(("_m", "cm")) for key in figures)
+
+
+def test_a_hole_costs_normals_and_completeness_but_is_no_depth_error():
+    rendering, photograph, reference = seen()
+    alpha = rendering.alpha.clone()
+    alpha[:, : WIDTH // 2] = 0.2
+    figures = evaluate_view(rendering._replace(alpha=alpha), photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert figures["rendered"] == 0.5
+    assert figures["normal_deg"] == pytest.approx(45.0, abs=1e-5)
+    assert figures["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["completeness_m"] > 0.1 > figures["accuracy_m"]
+
+
+def test_a_view_where_nothing_was_rendered_scores_zero_and_has_no_nan():
+    rendering, photograph, reference = seen()
+    empty = Rendering(
+        rendering.rgb, *(torch.zeros_like(t) for t in (rendering.depth, rendering.alpha, reference.normal))
+    )
+    figures = evaluate_view(empty, photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert figures["rendered"] == figures["f_score_20cm"] == figures["surface_points"] == 0.0
+    assert figures["normal_deg"] == figures["depth_normal_deg"] == 90.0
+    assert "depth_mae_m" not in figures
+    assert all(math.isfinite(value) for value in figures.values())
+
+
+def test_what_lies_outside_the_mask_does_not_count():
+    rendering, photograph, reference = seen()
+    mask = EVERYWHERE.clone()
+    mask[:, :10] = False
+    wrong = rendering.depth.clone()
+    wrong[:, :9] *= 3
+    figures = evaluate_view(rendering._replace(depth=wrong), photograph, CAMERA, reference._replace(mask=mask), 1.0)
+    assert figures["depth_normal_deg"] == pytest.approx(0.0, abs=1e-5)
+    assert figures["accuracy_m"] == figures["completeness_m"] == 0.0
+
+
+@pytest.mark.parametrize("supported", [False, True], ids=["empty mask", "with a mask"])
+def test_a_view_without_support_has_image_figures_only(supported):
+    rendering, photograph, reference = seen()
+    reference = reference._replace(mask=EVERYWHERE & supported)
+    figures = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert ("depth_mae_m" in figures) == supported
+    assert evaluate_view(rendering, photograph, CAMERA).keys() == {"psnr", "ssim"}
+
+
+def test_figures_are_plain_floats():
+    rendering, photograph, reference = seen()
+    figures = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+
+
+def test_means_are_over_the_views_that_have_a_figure():
+    views = [{"psnr": 20.0, "chamfer_m": 0.1}, {"psnr": 30.0}, {"psnr": 25.0, "chamfer_m": 0.3}]
+    assert mean_over_views(views) == {"psnr": 25.0, "chamfer_m": pytest.approx(0.2), "chamfer_m_views": 2.0}
+
+
+def test_deviation_is_over_the_views():
+    means = mean_over_views([{"psnr": 20.0}, {"psnr": 30.0}], deviation=True)
+    assert means == {"psnr": 25.0, "psnr_std": 5.0}
+
+
+# tables and figures
+
+COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("chamfer_m", "CD (m)", min, ".3f"))
+ROWS = {"shellgs": {"psnr": 24.96, "chamfer_m": 0.052}, "photo-gs": {"psnr": 25.04}}
+
+
+def test_markdown_table_sets_the_best_in_bold_and_dashes_what_is_missing():
+    # 24.96 and 25.04 both read 25.0 and are equally good.
+    assert markdown_table(ROWS, COLUMNS) == (
+        "| Method | PSNR ↑ | CD (m) ↓ |\n"
+        "| --- | ---: | ---: |\n"
+        "| shellgs | **25.0** | **0.052** |\n"
+        "| photo-gs | **25.0** | – |\n"
+    )
+
+
+def test_terminal_table_has_the_same_cells():
+    table = rich_table(ROWS, COLUMNS)
+    assert [list(column.cells) for column in table.columns] == [
+        ["shellgs", "photo-gs"],
+        ["[bold]25.0[/bold]", "[bold]25.0[/bold]"],
+        ["[bold]0.052[/bold]", "–"],
+    ]
+
+
+def test_strip_is_written_whole_and_grey_outside_the_mask(tmp_path):
+    rendering, _, reference = seen()
+    mask = torch.zeros_like(EVERYWHERE)
+    error = angular_error(reference.normal, reference.normal)
+    panel = Panel("shellgs", rendering.rgb, reference.normal, error, mask)
+    save_strip(tmp_path / "new folder" / "strip.png", [panel, panel._replace(title="photo-gs")])
+    assert [path.name for path in (tmp_path / "new folder").iterdir()] == ["strip.png"]
+    picture = np.asarray(Image.open(tmp_path / "new folder" / "strip.png").convert("RGB"))
+    grey = (picture == GREY).all(axis=-1)
+    # Two of three rows of the panels, which fill most of the picture.
+    assert grey.mean() > 0.2

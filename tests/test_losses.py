@@ -1,0 +1,317 @@
+"""The losses against loops over pixels in float64, and against the laws they are meant to obey."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter, sobel
+from torch.autograd import gradcheck
+
+from dataparsers.camera import Camera
+from shellgs_method.losses import (
+    ExponentialDecay,
+    consistency_loss,
+    ncc_loss,
+    normal_loss,
+    photometric_loss,
+    vid2sim_ncc_loss,
+)
+
+HEIGHT, WIDTH = 14, 17
+
+
+@pytest.fixture
+def random() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def some_mask(random: torch.Generator) -> torch.Tensor:
+    mask = torch.rand(HEIGHT, WIDTH, 1, generator=random) < 0.8
+    mask[:, :4] = False
+    return mask
+
+
+def some_normals(random: torch.Generator) -> torch.Tensor:
+    return torch.randn(HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+
+
+def wall(normal: tuple[float, float, float], distance: float = 8.0) -> torch.Tensor:
+    """z-depth of the plane n · x = -distance, seen at 96 x 64 pixels with a focal length of 100."""
+    K = torch.tensor([[100.0, 0, 48], [0, 100, 32], [0, 0, 1]], dtype=torch.float64)
+    n = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    rays = Camera(torch.eye(4, dtype=torch.float64), K, 96, 64).rays()
+    return (-distance / (rays @ n))[..., None]
+
+
+def yawed(degrees: float) -> torch.Tensor:
+    return wall((math.sin(math.radians(degrees)), 0.0, -math.cos(math.radians(degrees))))
+
+
+def ncc_by_patches(x, y, mask, window=9, min_valid=0.5, eps=1e-4) -> float:
+    """Patch by patch, with NumPy's correlation coefficient."""
+    x, y, mask = (t[..., 0].numpy() for t in (x, y, mask))
+    half, losses = window // 2, []
+    for row, column in np.argwhere(mask):
+        patch = np.s_[max(row - half, 0) : row + half + 1, max(column - half, 0) : column + half + 1]
+        inside = mask[patch]
+        a, b = x[patch][inside].astype(np.float64), y[patch][inside].astype(np.float64)
+        if inside.sum() >= min_valid * window**2 and b.std() > eps * b.mean():
+            losses.append(1 - np.corrcoef(a, b)[0, 1])
+    return float(np.mean(losses))
+
+
+# D
+
+
+@pytest.mark.parametrize("window", [3, 7, 9])
+def test_ncc_equals_correlation_patch_by_patch(random, window):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) * 0.1 + 0.1
+    mask = some_mask(random)
+    torch.testing.assert_close(ncc_loss(x, y, mask, window).item(), ncc_by_patches(x, y, mask, window))
+
+
+def test_ncc_in_float32_equals_float64_where_a_patch_varies_by_a_thousandth(random):
+    # 1/8 with a deviation of 1/8000: E[x²] - E[x]² in float32 would be wrong by a tenth.
+    x, y = 0.125 + 0.000125 * torch.randn(2, HEIGHT, WIDTH, 1, generator=random)
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    expected = ncc_by_patches(x, y, mask)
+    assert ncc_loss(x, y, mask).item() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.1, 0.0), (1.0, 0.05), (3.0, -0.1)])
+def test_ncc_ignores_scale_and_offset_of_the_rendering(random, scale, offset):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) + 0.5
+    mask = some_mask(random)
+    torch.testing.assert_close(ncc_loss(scale * x + offset, y, mask), ncc_loss(x, y, mask))
+
+
+def test_ncc_is_blind_to_how_far_a_plane_tilts_but_not_to_which_way():
+    mask = torch.ones(64, 96, 1, dtype=torch.bool)
+    shell = 1 / yawed(30)
+    assert ncc_loss(1 / yawed(55), shell, mask).item() == pytest.approx(0.0, abs=1e-9)
+    # Tilted the other way, the two slopes are opposite: NCC -1. About the other axis they are orthogonal: NCC 0.
+    assert ncc_loss(1 / yawed(-30), shell, mask).item() == pytest.approx(2.0, abs=1e-9)
+    inner = torch.zeros_like(mask)
+    inner[8:-8, 8:-8] = True
+    pitched = 1 / wall((0.0, 0.5, -0.866))
+    assert ncc_loss(pitched, shell, inner, min_valid=1.0).item() == pytest.approx(1.0, abs=1e-9)
+
+
+def test_ncc_leaves_out_the_patches_of_a_frontal_wall():
+    rendered, shell = (1 / yawed(30)).requires_grad_(), 1 / yawed(0)
+    loss = ncc_loss(rendered, shell, torch.ones(64, 96, 1, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(loss, rendered)
+    assert loss.item() == 0.0
+    assert not gradient.any()
+
+
+def test_ncc_of_a_flat_rendering_is_one_with_a_finite_gradient():
+    rendered = torch.full((64, 96, 1), 0.1, requires_grad=True)
+    loss = ncc_loss(rendered, (1 / yawed(30)).float(), torch.ones(64, 96, 1, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(loss, rendered)
+    assert loss.item() == pytest.approx(1.0, abs=1e-6)
+    assert gradient.isfinite().all()
+    assert gradient.any()
+
+
+def test_ncc_does_not_see_what_the_mask_leaves_out(random):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random) + 0.5
+    mask = some_mask(random)
+    loss = ncc_loss(x, y, mask)
+    assert ncc_loss(x.where(mask, torch.inf), y.where(mask, torch.nan), mask) == loss
+
+
+def test_ncc_gradient(random):
+    x, y = torch.rand(2, 5, 6, 1, generator=random, dtype=torch.float64) + 0.5
+    mask = torch.rand(5, 6, 1, generator=random) < 0.8
+    assert gradcheck(lambda x: ncc_loss(x, y, mask, window=3), x.requires_grad_())
+
+
+def test_vid2sim_ncc_equals_its_formula_pixel_by_pixel(random):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) * 0.01 + 0.1
+    mask = some_mask(random)
+    padded = [np.pad((t * mask)[..., 0].numpy(), 1) for t in (x, y)]
+    patches = [np.array([p[i : i + 3, j : j + 3].ravel() for i in range(HEIGHT) for j in range(WIDTH)]) for p in padded]
+    p, g = (patch - patch.mean() for patch in patches)
+    deviation = np.sqrt((p**2).mean(1)) * np.sqrt((g**2).mean(1))
+    expected = (1 - (p * g).sum(1) / (deviation + 1e-5) / 9).mean()
+    assert vid2sim_ncc_loss(x, y, mask).item() == pytest.approx(expected, abs=1e-12)
+
+
+# N
+
+
+def test_normal_loss_equals_a_loop_over_pixels(random):
+    normal, target, mask = 3 * some_normals(random), some_normals(random), some_mask(random)
+    terms = [
+        1 - a @ b / np.linalg.norm(a) / np.linalg.norm(b)
+        for a, b in zip(normal[mask[..., 0]].numpy(), target[mask[..., 0]].numpy(), strict=True)
+    ]
+    assert normal_loss(normal, target, mask).item() == pytest.approx(np.mean(terms), abs=1e-12)
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(0, 0.0), (60, 0.5), (90, 1.0), (180, 2.0)])
+def test_normal_loss_of_a_known_angle_is_signed(degrees, expected):
+    angle = math.radians(degrees)
+    target = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3, 3)
+    normal = torch.tensor([math.sin(angle), 0.0, -math.cos(angle)]).expand(2, 3, 3)
+    assert normal_loss(normal, target, torch.ones(2, 3, 1, dtype=torch.bool)).item() == pytest.approx(
+        expected, abs=1e-6
+    )
+
+
+def test_normal_loss_of_a_missing_normal_has_a_finite_gradient():
+    normal = torch.zeros(2, 3, 3, requires_grad=True)
+    target = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3, 3)
+    (gradient,) = torch.autograd.grad(normal_loss(normal, target, torch.ones(2, 3, 1, dtype=torch.bool)), normal)
+    assert gradient.isfinite().all()
+
+
+def test_normal_loss_gradient(random):
+    normal, target, mask = some_normals(random), some_normals(random), some_mask(random)
+    assert gradcheck(lambda normal: normal_loss(normal, target, mask), normal.requires_grad_())
+
+
+# C
+
+
+def test_consistency_equals_a_loop_over_pixels(random):
+    normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    mask[3, 5] = mask[9, 9:12] = False
+    depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    n = torch.nn.functional.normalize(normal, dim=-1).numpy()
+    z, m = depth[..., 0].numpy(), mask[..., 0].numpy()
+    steepness = np.hypot(sobel(z, 0), sobel(z, 1)) / 8 / z
+    pixels = [
+        (i, j) for i in range(1, HEIGHT - 1) for j in range(1, WIDTH - 1) if m[i - 1 : i + 2, j - 1 : j + 2].all()
+    ]
+    g = np.array([steepness[p] for p in pixels])
+    w = 1 - (g - g.min()) / (g.max() - g.min())
+    a = np.array([1 - 0.5 * (n[i, j] @ n[i, j - 1] + n[i, j] @ n[i - 1, j]) for i, j in pixels])
+    assert consistency_loss(normal, depth, mask).item() == pytest.approx((w * a).sum() / w.sum(), abs=1e-12)
+
+
+def test_consistency_ignores_pairs_that_straddle_the_mask():
+    # Two walls at a right angle; the column between them is not supported.
+    normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
+    normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    depth = torch.full((HEIGHT, WIDTH, 1), 5.0)
+    assert consistency_loss(normal, depth, mask) > 0
+    mask[:, WIDTH // 2] = False
+    assert consistency_loss(normal, depth, mask) == 0
+
+
+def test_consistency_does_not_take_missing_depth_for_an_edge(random):
+    normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    mask[:, :5] = False
+    depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    missing = consistency_loss(normal, depth.where(mask, 0.0), mask)
+    torch.testing.assert_close(missing, consistency_loss(normal, depth, mask))
+
+
+def test_consistency_costs_nothing_at_the_strongest_edge():
+    # The fold of the normals lies on the only step of the depth, where w = 0.
+    normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
+    normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
+    depth = torch.full((HEIGHT, WIDTH, 1), 5.0)
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    flat = consistency_loss(normal, depth, mask)
+    depth[:, WIDTH // 2 :] = 5.01
+    assert consistency_loss(normal, depth, mask).item() < 0.01 * flat.item()
+
+
+def test_consistency_does_not_depend_on_the_unit_of_length(random):
+    normal, mask = some_normals(random), some_mask(random)
+    mask[4:10, 6:12] = True
+    depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    torch.testing.assert_close(consistency_loss(normal, 100 * depth, mask), consistency_loss(normal, depth, mask))
+
+
+def test_consistency_gradient(random):
+    normal, mask = torch.randn(5, 6, 3, generator=random, dtype=torch.float64), torch.ones(5, 6, 1, dtype=torch.bool)
+    depth = 5 + torch.rand(5, 6, 1, generator=random, dtype=torch.float64)
+    assert gradcheck(lambda normal: consistency_loss(normal, depth, mask), normal.requires_grad_())
+
+
+# R
+
+
+def ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Wang et al. 2004, with SciPy's Gaussian of 11 taps and kornia's reflected border."""
+
+    def blur(image):
+        return gaussian_filter(image, sigma=(1.5, 1.5, 0), radius=5, mode="mirror")
+
+    mean_a, mean_b = blur(a), blur(b)
+    variance_a, variance_b = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2
+    covariance = blur(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
+    return luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
+
+
+def test_photometric_loss_is_l1_and_one_minus_ssim(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    l1, ssim = np.abs(a.numpy() - b.numpy()).mean(), ssim_map(a.numpy(), b.numpy()).mean()
+    assert photometric_loss(a, b).item() == pytest.approx(0.8 * l1 + 0.2 * (1 - ssim), abs=1e-9)
+
+
+def test_photometric_loss_averages_over_kept_pixels_only(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    mask = some_mask(random)
+    kept, shown = mask[..., 0].numpy(), a.where(mask, b).numpy()
+    l1, ssim = np.abs(a.numpy() - b.numpy())[kept].mean(), ssim_map(shown, b.numpy())[kept].mean()
+    assert photometric_loss(a, b, mask).item() == pytest.approx(0.8 * l1 + 0.2 * (1 - ssim), abs=1e-9)
+
+
+def test_photometric_loss_sends_no_gradient_to_pixels_left_out(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random)
+    mask = some_mask(random)
+    (gradient,) = torch.autograd.grad(photometric_loss(a.requires_grad_(), b, mask), a)
+    assert not gradient[~mask[..., 0]].any()
+    assert gradient[mask[..., 0]].any()
+
+
+# all of them
+
+
+@pytest.mark.parametrize(
+    ("loss", "channels"),
+    [
+        (ncc_loss, 1),
+        (vid2sim_ncc_loss, 1),
+        (normal_loss, 3),
+        (lambda n, t, m: consistency_loss(n, t[..., :1], m), 3),
+        (photometric_loss, 3),
+    ],
+    ids=["ncc", "vid2sim ncc", "normal", "consistency", "photometric"],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_empty_mask_gives_a_zero_that_can_be_back_propagated(random, loss, channels, dtype):
+    rendered, target = torch.rand(2, HEIGHT, WIDTH, channels, generator=random, dtype=dtype)
+    value = loss(rendered.requires_grad_(), target, torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(value, rendered)
+    assert value.item() == 0.0
+    assert value.dtype == dtype
+    assert not gradient.any()
+
+
+def test_depth_weight_falls_from_a_half_to_a_tenth():
+    weight = ExponentialDecay(0.5, 0.1)
+    # 0.5 · 0.2^(1/2) = 0.2236
+    assert [weight(t) for t in (0, 0.5, 1, 2)] == pytest.approx([0.5, 0.2236068, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1])
+def test_equal_ends_are_a_constant_weight(value):
+    weight = ExponentialDecay(value, value)
+    assert [weight(t) for t in (0, 0.3, 1)] == pytest.approx([value] * 3)
+
+
+def test_negative_weight_is_refused():
+    with pytest.raises(ValueError, match="cannot be negative"):
+        ExponentialDecay(0.5, -0.1)
