@@ -1,0 +1,42 @@
+"""The three frames of the synthetic scene: the building's (metres), the photographs' (arbitrary) and the shell's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from dataparsers.camera import Camera
+
+
+def _similarity(scale: float, turn: Rotation, shift: list[float]) -> Float64[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * turn.as_matrix()
+    matrix[:3, 3] = shift
+    return matrix
+
+
+UNITS_PER_METRE = 0.37
+
+# SfM finds neither the scale nor the directions of the world; a survey has metres and national coordinates.
+SCENE_FROM_BUILDING = _similarity(
+    UNITS_PER_METRE, Rotation.from_euler("ZYX", [-37, 24, 101], degrees=True), [1.9, -0.6, 2.3]
+)
+SHELL_FROM_BUILDING = _similarity(1.0, Rotation.from_euler("Z", 31, degrees=True), [412_345.678, 5_123_456.789, 212.34])
+
+
+def transformed(
+    points: Float64[np.ndarray, "*N 3"], similarity: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "*N 3"]:
+    """The points after the similarity."""
+    return points @ similarity[:3, :3].T + similarity[:3, 3]
+
+
+def scene_camera(camera: Camera) -> Camera:
+    """A camera of the building's frame in the scene's, where depths are ``UNITS_PER_METRE`` times as long."""
+    rescaled = np.diag([UNITS_PER_METRE] * 3 + [1.0])
+    viewmat = rescaled @ camera.viewmat.numpy() @ np.linalg.inv(SCENE_FROM_BUILDING)
+    return replace(camera, viewmat=torch.from_numpy(viewmat))

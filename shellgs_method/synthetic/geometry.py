@@ -1,0 +1,76 @@
+"""Triangles with a material each, and the few solids that the building and its street are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+
+class Material(IntEnum):
+    """What a triangle is made of; the building's own materials come first, up to ``RAILING``."""
+
+    WALL = 0
+    COLUMN = 1
+    SLAB = 2
+    DOOR = 3
+    GLASS = 4
+    FRAME = 5
+    RAILING = 6
+    GROUND = 7
+    POLE = 8
+    TRUNK = 9
+    LEAF = 10
+    HOUSE = 11
+    CAR = 12
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A triangle soup.
+
+    Attributes:
+        vertices: positions in metres.
+        triangles: three vertex indices each, counter-clockwise seen from outside.
+        material: one :class:`Material` per triangle.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    triangles: Int[np.ndarray, "F 3"]
+    material: Int[np.ndarray, " F"]
+
+
+def merge(meshes: Iterable[Mesh]) -> Mesh:
+    """All the meshes as one."""
+    meshes = list(meshes)
+    first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.triangles + offset for mesh, offset in zip(meshes, first, strict=True)]),
+        np.concatenate([mesh.material for mesh in meshes]),
+    )
+
+
+def parallelogram(corner: Sequence[float], a: Sequence[float], b: Sequence[float], material: Material) -> Mesh:
+    """The parallelogram spanned by ``a`` and ``b`` from ``corner``; its normal points along ``a × b``."""
+    vertices = np.array(corner, dtype=np.float64) + np.stack([np.zeros(3), a, np.add(a, b), b])
+    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, material))
+
+
+def box(low: Sequence[float], high: Sequence[float], material: Material) -> Mesh:
+    """The axis-aligned box between two corners."""
+    return _coated(trimesh.creation.box(bounds=[low, high]), material)
+
+
+def cylinder(foot: Sequence[float], radius: float, height: float, material: Material) -> Mesh:
+    """An upright cylinder on ``foot``."""
+    solid = trimesh.creation.cylinder(radius=radius, height=height, sections=20)
+    return _coated(solid.apply_translation(np.add(foot, (0.0, 0.0, height / 2))), material)
+
+
+def _coated(solid: trimesh.Trimesh, material: Material) -> Mesh:
+    return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces), np.full(len(solid.faces), material))

@@ -1,0 +1,53 @@
+"""A hand-held walk past the building."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from dataparsers.camera import Camera
+
+FIELD_OF_VIEW = 67.0
+"""Horizontal, in degrees: the main camera of a phone."""
+
+# Camera to building for someone who looks straight at the wall: right is x, down is -z, forward is y.
+_FACING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def walk(length: float, views: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
+    """Cameras of a walk along a facade, there at about 7 m and back at about 11 m, in the building's frame (metres).
+
+    Args:
+        length: length of the facade in metres.
+        views: how many photographs.
+        width: image width in pixels.
+        height: image height in pixels.
+        rng: source of the hand's tremor.
+    """
+    there = (views + 1) // 2
+    near = np.arange(views) < there
+    s = np.concatenate([np.linspace(0, 1, there), np.linspace(1, 0, views - there)])
+    x = np.where(near, -1.0 + s * (length + 2.0), 1.0 + s * (length - 2.0))
+    y = np.where(near, -7.0, -11.0) + 0.5 * np.sin(7.0 * s)
+    centres = np.stack([x, y, np.full(views, 1.6)], axis=-1) + rng.normal(0.0, [0.1, 0.08, 0.04], (views, 3))
+    # Glancing to and fro and up and down, but towards the building at its ends: roof, ends and slanted walls are seen.
+    yaw = 15.0 * np.sin(13.0 * s + np.where(near, 0.0, 1.5)) + 16.0 * (1.0 - 2.0 * s)
+    pitch = np.where(near, 15.0, 17.0) + 8.0 * np.sin(29.0 * s)
+    angles = np.stack([yaw, pitch, np.zeros(views)], axis=-1) + rng.normal(0.0, [2.0, 1.5, 1.0], (views, 3))
+    rotations = _FACING @ Rotation.from_euler("YXZ", angles, degrees=True).as_matrix()
+
+    focal = 0.5 * width / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return [
+        Camera(torch.from_numpy(_viewmat(rotation, centre)), K, width, height)
+        for rotation, centre in zip(rotations, centres, strict=True)
+    ]
+
+
+def _viewmat(rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """World to camera from the camera's axes (columns) and its centre in the world."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ centre
+    return viewmat

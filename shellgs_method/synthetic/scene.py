@@ -1,0 +1,172 @@
+"""The synthetic facade as a scene folder: photographs, cameras, SfM points, shell, alignment and true maps."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from rich.progress import track
+
+from dataparsers.camera import Camera
+from dataparsers.cue_maps import CueMap, CueMaps
+from shellgs_method.shell import Alignment
+from shellgs_method.shell.raycast import import_open3d
+from shellgs_method.synthetic.appearance import Daylight, photograph, rays
+from shellgs_method.synthetic.building import Layout, building, shell
+from shellgs_method.synthetic.frames import (
+    SCENE_FROM_BUILDING,
+    SHELL_FROM_BUILDING,
+    UNITS_PER_METRE,
+    scene_camera,
+    transformed,
+)
+from shellgs_method.synthetic.geometry import Material, Mesh, merge
+from shellgs_method.synthetic.path import walk
+from shellgs_method.synthetic.sfm import Points, features, triangulate
+from shellgs_method.synthetic.street import street
+from shellgs_method.synthetic.world import World
+
+SHELL = "shell/facade.ply"
+
+
+@dataclass(frozen=True)
+class FacadeConfig:
+    """A procedural facade and a walk past it."""
+
+    width: int = 320
+    """Image width in pixels."""
+    height: int = 180
+    """Image height in pixels."""
+    views: int = 40
+    """Number of photographs."""
+    seed: int = 0
+    """Seed of the tree, the textures, the walk and the noise; the same seed gives the same files."""
+    bays: int = 6
+    """Windows side by side, 3 m apart."""
+    storeys: int = 3
+    """Windows above each other, 3.3 m apart."""
+    points: int = 4000
+    """Number of SfM points at most."""
+    supersampling: int = 3
+    """Rays per pixel along each image axis."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no scene can be made of."""
+        least = {"width": 16, "height": 16, "views": 3, "seed": 0, "bays": 1, "storeys": 1, "points": 1}
+        for name, minimum in {**least, "supersampling": 1}.items():
+            if getattr(self, name) < minimum:
+                raise ValueError(f"a synthetic facade's {name} must be at least {minimum}, not {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Facade:
+    """The synthetic facade in memory, in the building's frame (metres).
+
+    Attributes:
+        layout: the building's numbers.
+        daylight: building and street, lit.
+        cameras: one for each photograph, in the order of the walk.
+    """
+
+    layout: Layout
+    daylight: Daylight
+    cameras: list[Camera]
+
+    @classmethod
+    def build(cls, config: FacadeConfig) -> Facade:
+        """The facade a configuration describes."""
+        layout = Layout(config.bays, config.storeys)
+        tree, texture, hand = _generators(config.seed, 3)
+        world = World(merge([building(layout), street(layout, tree)]))
+        daylight = Daylight(world, texture.uniform(-1.0, 1.0, (256, 256)).astype(np.float32))
+        return cls(layout, daylight, walk(layout.length, config.views, config.width, config.height, hand))
+
+    def truth(self, camera: Camera) -> CueMap:
+        """True maps in scene units: depth and normal of everything but the sky, masked to the building."""
+        origin, directions = rays(camera)
+        hits = self.daylight.world.cast(origin, directions)
+        depth = np.where(np.isfinite(hits.t), UNITS_PER_METRE * hits.t, 0.0).astype(np.float32)
+        normal = hits.normal @ camera.viewmat[:3, :3].numpy().T
+        return CueMap(depth, normal.astype(np.float16), hits.material <= Material.RAILING)
+
+
+def write_scene(scene: Path, config: FacadeConfig) -> None:
+    """Write the scene folder of a synthetic facade; it appears whole or not at all.
+
+    Raises:
+        ValueError: there is something at ``scene`` already.
+    """
+    scene = Path(scene)
+    if scene.exists() and not (scene.is_dir() and not any(scene.iterdir())):
+        raise ValueError(f"{scene} exists and is not an empty folder: give another one, or remove it first")
+    unfinished = scene.with_name(f".{scene.name}.{os.getpid()}.tmp")
+    unfinished.mkdir(parents=True)
+    try:
+        _write(unfinished, config)
+        os.replace(unfinished, scene)
+    except BaseException:
+        shutil.rmtree(unfinished)
+        raise
+
+
+def _write(scene: Path, config: FacadeConfig) -> None:
+    facade = Facade.build(config)
+    _write_shell(scene, shell(facade.layout))
+    truth = CueMaps.create(scene, "truth", command="shellgs demo", metres_per_unit=1 / UNITS_PER_METRE)
+    names = [f"images/frame_{i + 1:05d}.png" for i in range(config.views)]
+    (scene / "images").mkdir()
+
+    # Half as many again as wanted: not every feature is seen in three views.
+    found, per_view = [], -(-3 * config.points // (2 * config.views))
+    sensor, sfm = _generators(config.seed + 1, 2)
+    for name, camera in track(list(zip(names, facade.cameras, strict=True)), "synthetic facade", transient=True):
+        image = photograph(facade.daylight, camera, config.supersampling, sensor)
+        Image.fromarray(image).save(scene / name)
+        found.append(features(facade.daylight.world, camera, image, per_view, sfm))
+        truth.write(name, facade.truth(camera), scene_camera(camera))
+    points = triangulate(facade.daylight.world, facade.cameras, found, config.points, sfm)
+    _write_points(scene / "sparse_pc.ply", points)
+    (scene / "transforms.json").write_text(json.dumps(_transforms(names, facade.cameras), indent=1) + "\n")
+
+
+def _generators(seed: int, count: int) -> list[np.random.Generator]:
+    """Independent sources of chance, so that one more view leaves the tree as it was."""
+    return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)]
+
+
+def _transforms(names: list[str], cameras: list[Camera]) -> dict:
+    """The cameras in nerfstudio's form: camera to world, OpenGL axes."""
+    frames = []
+    for name, camera in zip(names, map(scene_camera, cameras), strict=True):
+        pose = np.linalg.inv(camera.viewmat.numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    K = cameras[0].K
+    lens = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    size = {"w": cameras[0].width, "h": cameras[0].height}
+    return {"camera_model": "OPENCV", **lens, **size, "ply_file_path": "sparse_pc.ply", "frames": frames}
+
+
+def _write_points(path: Path, points: Points) -> None:
+    o3d = import_open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(transformed(points.positions, SCENE_FROM_BUILDING)))
+    cloud.colors = o3d.utility.Vector3dVector(points.colours / 255)
+    o3d.io.write_point_cloud(str(path), cloud)
+
+
+def _write_shell(scene: Path, mesh: Mesh) -> None:
+    """The shell in its own georeferenced frame, which only a file in double precision can hold."""
+    o3d = import_open3d()
+    path = scene / SHELL
+    path.parent.mkdir(parents=True)
+    vertices = transformed(mesh.vertices, SHELL_FROM_BUILDING)
+    solid = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(mesh.triangles.astype(np.int32))
+    )
+    o3d.io.write_triangle_mesh(str(path), solid)
+    matrix = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
+    Alignment(matrix, SHELL, 1.0, source="the synthetic facade's own frames").save(scene / "shell" / "alignment.json")
