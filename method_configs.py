@@ -1,0 +1,59 @@
+"""The registry: every method is a point of primitive x cues, as a config."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from dataparsers.facade import FacadeDataParserConfig
+from shellgs_method.datamanager import FacadeDataManagerConfig
+from shellgs_method.model import FacadeModelConfig
+from shellgs_method.pipeline import FacadePipelineConfig
+from shellgs_method.trainer import FacadeTrainerConfig, RunLengthDecayConfig
+
+
+def _adam(lr: float, lr_final: float | None = None) -> dict:
+    decay = None if lr_final is None else RunLengthDecayConfig(lr_final=lr_final)
+    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
+
+
+def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpecification:
+    config = FacadeTrainerConfig(
+        method_name=name,
+        max_num_iterations=30_000,
+        steps_per_save=2000,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=500,
+        steps_per_eval_all_images=0,
+        mixed_precision=False,
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        pipeline=FacadePipelineConfig(
+            datamanager=FacadeDataManagerConfig(dataparser=FacadeDataParserConfig(), cache_images_type="uint8"),
+            model=model,
+        ),
+        optimizers={
+            "means": _adam(1.6e-4, lr_final=1.6e-6),
+            "features_dc": _adam(0.0025),
+            "features_rest": _adam(0.0025 / 20),
+            "opacities": _adam(0.05),
+            "scales": _adam(0.005),
+            "quats": _adam(0.001),
+        },
+        viewer=ViewerConfig(quit_on_train_completion=True),
+        vis="viewer",
+    )
+    return MethodSpecification(config=config, description=description)
+
+
+shellgs = _method(
+    "shellgs",
+    "3D Gaussians supervised by an aligned exterior facade shell",
+    FacadeModelConfig(cues="shell"),
+)
+photo_gs = _method(
+    "photo-gs",
+    "3D Gaussians from the photographs alone, the baseline of shellgs",
+    FacadeModelConfig(cues="none"),
+)

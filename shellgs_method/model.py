@@ -1,0 +1,322 @@
+"""One model for every method: Gaussians, and the cues that supervise their geometry."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from gsplat.strategy import DefaultStrategy
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.splatfacto import (
+    RGB2SH,
+    SplatfactoModel,
+    SplatfactoModelConfig,
+    num_sh_bases,
+    random_quat_tensor,
+)
+from nerfstudio.utils.colors import get_color
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from dataparsers.camera import Camera
+from dataparsers.errors import SceneError
+from shellgs_method.evaluation import (
+    Reference,
+    Rendering,
+    colours_to_normals,
+    geometry_errors,
+    image_errors,
+    normals_to_colours,
+)
+from shellgs_method.losses import (
+    ExponentialDecay,
+    consistency_loss,
+    ncc_loss,
+    normal_loss,
+    photometric_loss,
+    vid2sim_ncc_loss,
+)
+from shellgs_method.rasterizer import quats_to_rotations, rasterize, spherical_harmonics
+
+PAPER_ITERATIONS = 30_000
+"""The run for which the iteration numbers of the config are stated; a shorter run shrinks them in proportion."""
+
+MIN_REFINE_EVERY = 20
+"""Fewest iterations between two densifications: the gradients of fewer views are noise."""
+
+MIN_RESET_EVERY = 300
+"""Fewest iterations between two resets of the opacities, which take half of that to come back at any length of run."""
+
+
+@dataclass
+class GeometryLossConfig:
+    """Weights of D, N and C from the first iteration to the last (paper, section 3.4); 0 0 leaves a term out."""
+
+    depth: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.5, 0.1))
+    """Weight α(t) of the inverse-depth NCC."""
+    normal: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
+    """Weight β(t) of the normal loss."""
+    consistency: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
+    """Weight γ(t) of the consistency of neighbouring normals."""
+    ncc: Literal["local", "vid2sim"] = "local"
+    """local: the paper's equation; vid2sim: the form of the released baseline."""
+    ncc_window: int = 9
+    """Side of the patches of the local NCC in pixels."""
+
+
+@dataclass
+class FacadeModelConfig(SplatfactoModelConfig):
+    """Gaussians of a facade. Numbers of iterations are those of a run of 30 000 and shrink with a shorter run."""
+
+    _target: type = field(default_factory=lambda: FacadeModel)
+    cues: Literal["none", "shell"] = "none"
+    """Maps that supervise the geometry."""
+    geometry: GeometryLossConfig = field(default_factory=GeometryLossConfig)
+    """Losses against the cues."""
+
+    background_color: Literal["random", "black", "white"] = "black"
+    cull_alpha_thresh: float = 0.005
+    cull_scale_thresh: float = 0.1
+    densify_grad_thresh: float = 0.0002
+    use_absgrad: tyro.conf.Suppress[bool] = False
+    stop_screen_size_at: int = 0
+    num_downscales: tyro.conf.Suppress[int] = 0
+    resolution_schedule: tyro.conf.Suppress[int] = 3000
+    output_depth_during_training: tyro.conf.Suppress[bool] = True
+    use_scale_regularization: tyro.conf.Suppress[bool] = False
+    max_gauss_ratio: tyro.conf.Suppress[float] = 10.0
+    rasterize_mode: tyro.conf.Suppress[Literal["classic", "antialiased"]] = "classic"
+    use_bilateral_grid: tyro.conf.Suppress[bool] = False
+    color_corrected_metrics: tyro.conf.Suppress[bool] = False
+
+
+class FacadeModel(SplatfactoModel):
+    """Splatfacto with geometry channels, on any device.
+
+    Outputs: ``rgb``, ``depth`` (forward z in nerfstudio's rescaled units), ``normal`` (camera frame, as the picture
+    of :func:`normals_to_colours`), ``accumulation``, ``background``; all [H, W, C].
+
+    Splatfacto itself calls CUDA and downloads LPIPS' network when it is built
+    (https://github.com/nerfstudio-project/nerfstudio/issues/3290), and its resume leaves the optimizers with the old
+    parameters; the overrides below mend these.
+    """
+
+    config: FacadeModelConfig
+
+    def populate_modules(self) -> None:
+        """Gaussians at the SfM points."""
+        self._refuse_missing_cues()
+        points, colours = self._seed_points()
+        spacing = cKDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))[0][:, 1:].mean(axis=1)
+        scales = torch.from_numpy(np.log(spacing.clip(min=1e-6))).float()[:, None].repeat(1, 3)
+        self.gauss_params = nn.ParameterDict(
+            {
+                "means": nn.Parameter(points),
+                "scales": nn.Parameter(scales),
+                "quats": nn.Parameter(random_quat_tensor(len(points))),
+                "features_dc": nn.Parameter(RGB2SH(colours)),
+                "features_rest": nn.Parameter(torch.zeros(len(points), num_sh_bases(self.config.sh_degree) - 1, 3)),
+                "opacities": nn.Parameter(torch.full((len(points), 1), math.log(0.1 / 0.9))),
+            }
+        )
+        self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        self.background_color = get_color(
+            "black" if self.config.background_color == "random" else self.config.background_color
+        )
+        self.crop_box = None
+        self.metres_per_unit: float | None = self.kwargs["metadata"].get("metres_per_unit")
+        self.step = 0
+        self.plan(PAPER_ITERATIONS)
+
+    def _refuse_missing_cues(self) -> None:
+        cues = self.config.cues
+        if cues != "none" and cues not in self.kwargs["metadata"]["cues"]:
+            raise SceneError(
+                f"shellgs needs the {cues} maps of the scene, and there are none: run `shellgs cast SCENE` first, "
+                "or train photo-gs"
+            )
+
+    def _seed_points(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+        if self.seed_points is None or len(self.seed_points[0]) < 4:
+            raise SceneError("The scene has no SfM points to start from: its COLMAP model or ply_file_path is empty.")
+        return self.seed_points[0].float(), self.seed_points[1].float() / 255
+
+    def plan(self, num_iterations: int) -> None:
+        """Fit every schedule to a run of ``num_iterations``."""
+        self.num_iterations = num_iterations
+        config, shrink = self.config, num_iterations / PAPER_ITERATIONS
+        reset_every = config.reset_alpha_every * config.refine_every
+        self.strategy = DefaultStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=round(config.stop_screen_size_at * shrink),
+            refine_start_iter=round(config.warmup_length * shrink),
+            refine_stop_iter=round(config.stop_split_at * shrink),
+            reset_every=max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every)),
+            refine_every=max(round(config.refine_every * shrink), min(MIN_REFINE_EVERY, config.refine_every)),
+            absgrad=config.use_absgrad,
+        )
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+
+    def get_training_callbacks(self, training_callback_attributes):
+        """Splatfacto's callbacks; the trainer tells how long the run is."""
+        self.plan(training_callback_attributes.trainer.config.max_num_iterations)
+        return super().get_training_callbacks(training_callback_attributes)
+
+    def step_post_backward(self, step: int) -> None:
+        """Densify and prune. gsplat 1.4 would reset the opacities at step 0 already."""
+        if step > 0:
+            super().step_post_backward(step)
+
+    def load_state_dict(self, dict, **kwargs):
+        """Load in place: the optimizers, built before, must go on holding the same parameters."""
+        for name, parameter in self.gauss_params.items():
+            stored = dict[f"gauss_params.{name}"]
+            parameter.data = parameter.data.new_zeros(stored.shape)
+        self.step = self.num_iterations
+        return nn.Module.load_state_dict(self, dict, **kwargs)
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        """Render one camera; the geometry is left out where neither a loss nor a viewer asks for it."""
+        pinhole = pinhole_camera(camera)
+        background = self._get_background_color()
+        gaussians = self._inside_crop()
+        if len(gaussians["means"]) == 0:
+            return self.get_empty_outputs(pinhole.width, pinhole.height, background)
+        with_geometry = self.config.cues != "none" or not self.training
+        features = [self._colours(gaussians, pinhole)]
+        if with_geometry:
+            features += [*facing_normals_and_depths(gaussians, pinhole)]
+        composited, alpha, self.info = rasterize(
+            gaussians["means"],
+            gaussians["quats"],
+            gaussians["scales"].exp(),
+            gaussians["opacities"].sigmoid().squeeze(-1),
+            torch.cat(features, dim=-1),
+            pinhole,
+        )
+        if self.training:
+            self.strategy.step_pre_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
+            )
+        outputs = {
+            "rgb": (composited[..., :3] + (1 - alpha) * background).clamp(0, 1),
+            "accumulation": alpha,
+            "background": background if self.training else background.expand(pinhole.height, pinhole.width, 3),
+        }
+        if with_geometry:
+            depth = composited[..., 6:7] / alpha.clamp_min(1e-6)
+            outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
+            outputs["normal"] = normals_to_colours(nn.functional.normalize(composited[..., 3:6], dim=-1))
+        return outputs
+
+    def _inside_crop(self) -> dict[str, Tensor]:
+        """The Gaussians, or in the viewer those inside its crop box."""
+        if self.crop_box is None or self.training:
+            return dict(self.gauss_params)
+        inside = self.crop_box.within(self.means).squeeze(-1)
+        return {name: parameter[inside] for name, parameter in self.gauss_params.items()}
+
+    def _colours(self, gaussians: dict[str, Tensor], camera: Camera) -> Float[Tensor, "N 3"]:
+        """View-dependent colours; one more degree of harmonics every ``sh_degree_interval`` iterations."""
+        interval = self.config.sh_degree_interval * self.num_iterations / PAPER_ITERATIONS
+        degree = min(int(self.step / interval), self.config.sh_degree)
+        directions = nn.functional.normalize(gaussians["means"] - camera.position, dim=-1)
+        coefficients = torch.cat([gaussians["features_dc"][:, None], gaussians["features_rest"]], dim=1)
+        return (spherical_harmonics(degree, directions, coefficients) + 0.5).clamp_min(0)
+
+    def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
+        """Figures of a training view."""
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        psnr = -10 * (outputs["rgb"].detach() - target).square().mean().log10()
+        return {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
+
+    def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
+        """R, and D, N and C where the view has a map of the cue (paper, equation of section 3.4)."""
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        kept = batch["mask"].to(self.device) if "mask" in batch else None
+        losses = {"photometric": photometric_loss(outputs["rgb"], target, kept, self.config.ssim_lambda)}
+        if f"{self.config.cues}_depth" in batch:
+            losses |= self._geometry_losses(outputs, _reference(batch, self.config.cues, self.device))
+        return losses
+
+    def _geometry_losses(self, outputs: dict[str, Tensor], cue: Reference) -> dict[str, Tensor]:
+        weights, progress = self.config.geometry, self.step / self.num_iterations
+        mask = cue.mask
+        inverse_depth = 1 / outputs["depth"].clamp_min(1e-6)
+        normal = colours_to_normals(outputs["normal"])
+        ncc = {"local": partial(ncc_loss, window=weights.ncc_window), "vid2sim": vid2sim_ncc_loss}[weights.ncc]
+        terms = {
+            "depth": lambda: ncc(inverse_depth, torch.where(mask, 1 / cue.depth, 0.0), mask),
+            "normal": lambda: normal_loss(normal, cue.normal, mask),
+            "consistency": lambda: consistency_loss(normal, cue.depth, mask),
+        }
+        scheduled = {name: getattr(weights, name)(progress) for name in terms}
+        return {name: scheduled[name] * term() for name, term in terms.items() if scheduled[name] > 0}
+
+    @torch.no_grad()
+    def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """All figures of a held-out view, against the shell and, as ``truth_…``, the true geometry; and its pictures.
+
+        Both are there for every method: the shell is a reference even where it is no cue.
+        """
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        normal = colours_to_normals(outputs["normal"])
+        height, width = target.shape[:2]
+        camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
+        figures = image_errors(outputs["rgb"], target)
+        images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}
+        for kind, prefix in (("shell", ""), ("truth", "truth_")):
+            if f"{kind}_depth" not in batch:
+                continue
+            reference = _reference(batch, kind, self.device)
+            rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
+            errors = geometry_errors(rendering, camera, reference, self.metres_per_unit)
+            figures |= {prefix + name: value for name, value in errors.items()}
+            images[f"{prefix}normal"] = torch.cat([normals_to_colours(reference.normal), outputs["normal"]], 1)
+        return figures, images
+
+
+def _reference(batch: dict, kind: str, device: torch.device) -> Reference:
+    """The maps of one kind in a batch; what the user masked out is not supported."""
+    depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
+    if "mask" in batch:
+        mask = mask & batch["mask"].to(device)
+    return Reference(depth, normal.float(), mask)
+
+
+def pinhole_camera(camera: Cameras) -> Camera:
+    """The one camera of a nerfstudio ``Cameras``, which is OpenGL and has its centres at 0.5 as ours."""
+    pose = camera.camera_to_worlds[0]
+    rotation = (pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])).T
+    viewmat = torch.eye(4, dtype=pose.dtype, device=pose.device)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ pose[:, 3]
+    K = camera.get_intrinsics_matrices()[0].to(pose.device)
+    return Camera(viewmat, K, int(camera.width[0]), int(camera.height[0]))
+
+
+def facing_normals_and_depths(
+    gaussians: dict[str, Tensor], camera: Camera
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"]]:
+    """Normal of each Gaussian in the camera frame, facing the camera, and forward depth of its centre.
+
+    The normal of a Gaussian is its shortest axis.
+    """
+    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    centres = gaussians["means"] @ rotation.T + translation
+    shortest = gaussians["scales"].argmin(dim=-1)
+    axes = quats_to_rotations(gaussians["quats"])
+    normals = axes[torch.arange(len(axes), device=axes.device), :, shortest] @ rotation.T
+    away = (normals * centres).sum(dim=-1, keepdim=True) > 0
+    return torch.where(away, -normals, normals), centres[:, 2:]

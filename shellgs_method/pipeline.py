@@ -1,0 +1,57 @@
+"""Nerfstudio's pipeline, with averages over the views that have a figure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+
+import torchvision
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from rich.progress import track
+
+from dataparsers.errors import refusals_end_the_program
+from shellgs_method.evaluation import mean_over_views
+
+
+@dataclass
+class FacadePipelineConfig(VanillaPipelineConfig):
+    """Pipeline of the facade methods."""
+
+    _target: type = field(default_factory=lambda: FacadePipeline)
+
+
+class FacadePipeline(VanillaPipeline):
+    """Evaluation of every held-out view, where some views may have no shell map.
+
+    Nerfstudio's own averages the keys of the first view over all views, and fails where they differ.
+    """
+
+    config: FacadePipelineConfig
+
+    def __init__(self, config: FacadePipelineConfig, *args, **kwargs):
+        with refusals_end_the_program():
+            super().__init__(config, *args, **kwargs)
+
+    def get_average_image_metrics(
+        self, data_loader, image_prefix: str, step: int | None = None, output_path: Path | None = None, get_std=False
+    ) -> dict[str, float]:
+        """Mean (and standard deviation) of each figure over the views that have it."""
+        del step
+        self.eval()
+        if output_path is not None:
+            output_path.mkdir(parents=True, exist_ok=True)
+        figures = []
+        for index, (camera, batch) in enumerate(track(data_loader, "Evaluating all images", transient=True)):
+            start = perf_counter()
+            outputs = self.model.get_outputs_for_camera(camera)
+            seconds = perf_counter() - start
+            metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
+            rays = int(camera.height) * int(camera.width)
+            figures.append(metrics | {"num_rays_per_sec": rays / seconds, "fps": 1 / seconds})
+            if output_path is not None:
+                for key, image in images.items():
+                    path = output_path / f"{image_prefix}_{key}_{index:04d}.png"
+                    torchvision.utils.save_image(image.permute(2, 0, 1).cpu(), path)
+        self.train()
+        return mean_over_views(figures, deviation=get_std)

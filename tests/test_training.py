@@ -1,0 +1,267 @@
+"""The methods inside nerfstudio: outputs, losses, schedules, checkpoints, figures."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+import method_configs
+from dataparsers.camera import Camera
+from shellgs_method.evaluation import colours_to_normals
+from shellgs_method.model import FacadeModel, facing_normals_and_depths, pinhole_camera
+from shellgs_method.trainer import FacadeTrainer
+
+Method = Literal["shellgs", "photo_gs"]
+
+
+def trainer_of(
+    scene: Path, folder: Path, method: Method = "shellgs", iterations: int = 6, load_dir: Path | None = None
+) -> FacadeTrainer:
+    """A trainer as ns-train sets it up."""
+    config = copy.deepcopy(getattr(method_configs, method).config)
+    config.pipeline.datamanager.data = scene
+    config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
+    config.max_num_iterations, config.load_dir = iterations, load_dir
+    config.steps_per_eval_image = 0
+    config.logging.local_writer.enable = False
+    torch.manual_seed(0)
+    trainer = config.setup()
+    trainer.setup()
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def trained(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> FacadeTrainer:
+    """A shellgs run of 60 iterations."""
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), iterations=60)
+    trainer.train()
+    trainer.pipeline.eval()
+    return trainer
+
+
+def model_of(trainer: FacadeTrainer) -> FacadeModel:
+    model = trainer.pipeline.model
+    assert isinstance(model, FacadeModel)
+    return model
+
+
+def held_out(trainer: FacadeTrainer) -> tuple[Cameras, dict]:
+    return trainer.pipeline.datamanager.fixed_indices_eval_dataloader[0]  # pyright: ignore
+
+
+def render(trainer: FacadeTrainer) -> dict[str, Tensor]:
+    return model_of(trainer).get_outputs_for_camera(held_out(trainer)[0])
+
+
+def test_every_output_of_a_held_out_view_is_an_image(trained):
+    outputs = render(trained)
+    assert {name: tuple(image.shape) for name, image in outputs.items()} == {
+        "rgb": (32, 48, 3),
+        "accumulation": (32, 48, 1),
+        "background": (32, 48, 3),
+        "depth": (32, 48, 1),
+        "normal": (32, 48, 3),
+    }
+    assert all(image.isfinite().all() for image in outputs.values())
+
+
+def test_rendered_normals_are_unit_and_face_the_camera(trained):
+    outputs = render(trained)
+    seen = outputs["accumulation"][..., 0] > 0.5
+    normal = colours_to_normals(outputs["normal"])[seen]
+    rays = pinhole_camera(held_out(trained)[0]).rays()[seen]
+    assert seen.sum() > 200
+    torch.testing.assert_close(normal.norm(dim=-1), torch.ones(len(normal)))
+    # The composite of facing normals faces the pixel's own ray but for grazing ones.
+    assert ((normal * rays).sum(dim=-1) < 0).float().mean() > 0.98
+
+
+def test_training_makes_the_picture_and_the_normals_better(trained, pristine_scene, tmp_path):
+    untrained = trainer_of(pristine_scene, tmp_path)
+    untrained.pipeline.eval()
+    before, after = (
+        model_of(trainer).get_image_metrics_and_images(render(trainer), held_out(trainer)[1])[0]
+        for trainer in (untrained, trained)
+    )
+    assert after["psnr"] > before["psnr"] + 1
+    assert after["normal_deg"] < before["normal_deg"] - 1
+
+
+def test_the_normal_of_a_gaussian_is_its_shortest_axis_turned_to_the_camera():
+    rotation = Rotation.random(20, random_state=0)
+    quats = torch.from_numpy(rotation.as_quat()[:, [3, 0, 1, 2]]).float()
+    scales = torch.tensor([0.0, -3.0, 1.0]).expand(20, 3)
+    means = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (20, 3))).float() + torch.tensor([0, 0, 5.0])
+    camera = Camera(torch.eye(4), torch.eye(3), 4, 4)
+    normals, depths = facing_normals_and_depths({"means": means, "quats": quats, "scales": scales}, camera)
+    axis = torch.from_numpy(rotation.as_matrix()[:, :, 1]).float()
+    torch.testing.assert_close((normals * axis).sum(dim=-1).abs(), torch.ones(20))
+    assert ((normals * means).sum(dim=-1) < 0).all()
+    torch.testing.assert_close(depths[:, 0], means[:, 2])
+
+
+def test_a_nerfstudio_camera_looks_along_minus_z_and_ours_along_plus_z():
+    pose = torch.tensor([[[1.0, 0, 0, 2], [0, 1, 0, 3], [0, 0, 1, 4]]])
+    camera = pinhole_camera(Cameras(pose, fx=5.0, fy=6.0, cx=2.0, cy=1.0, width=4, height=2))
+    ahead_right_up = torch.tensor([2.5, 3.25, 3.0, 1.0])  # 0.5 to the right, 0.25 up, 1 ahead
+    torch.testing.assert_close(camera.viewmat @ ahead_right_up, torch.tensor([0.5, -0.25, 1.0, 1.0]))
+
+
+def test_schedules_shrink_with_the_run(pristine_scene, tmp_path):
+    trainer = trainer_of(pristine_scene, tmp_path, iterations=3000)
+    strategy = model_of(trainer).strategy
+    assert (strategy.refine_start_iter, strategy.refine_stop_iter) == (50, 1500)
+    assert strategy.reset_every == 300
+    scheduler = trainer.optimizers.schedulers["means"]
+    assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
+    factor = scheduler.lr_lambdas[0]
+    assert [factor(0), factor(1500), factor(3000)] == pytest.approx([1.0, 0.1, 0.01])
+
+
+def test_geometry_weights_follow_the_run(trained):
+    """With the same rendering and batch, D's share falls from 0.5 to 0.1 over the run, N's and C's stay."""
+    model = model_of(trained)
+    outputs, (_, batch) = render(trained), held_out(trained)
+    losses = []
+    for model.step in (0, 30, 60):
+        losses.append(model.get_loss_dict(outputs, batch))
+    start, half, end = ({name: float(value) for name, value in loss.items()} for loss in losses)
+    assert half["depth"] / start["depth"] == pytest.approx(0.2**0.5, rel=1e-4)
+    assert end["depth"] / start["depth"] == pytest.approx(0.2, rel=1e-4)
+    assert start["normal"] == end["normal"]
+    assert start["consistency"] == end["consistency"]
+
+
+def test_a_view_without_a_map_trains_with_its_photograph_alone(trained):
+    model = model_of(trained)
+    outputs, (_, batch) = render(trained), held_out(trained)
+    bare = {key: value for key, value in batch.items() if not key.startswith("shell")}
+    assert model.get_loss_dict(outputs, bare).keys() == {"photometric"}
+    assert model.get_loss_dict(outputs, batch).keys() == {"photometric", "depth", "normal", "consistency"}
+
+
+def test_what_the_user_masked_out_supervises_nothing(trained):
+    model = model_of(trained)
+    outputs, (_, batch) = render(trained), held_out(trained)
+    losses = model.get_loss_dict(outputs, batch | {"mask": torch.zeros(32, 48, 1, dtype=torch.bool)})
+    assert all(float(value) == 0 for value in losses.values())
+
+
+def test_photo_gs_renders_no_geometry_while_it_trains(pristine_scene, tmp_path):
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs")
+    trainer.train()
+    trainer.pipeline.train()
+    camera, _ = trainer.pipeline.datamanager.next_train(0)
+    assert "normal" not in trainer.pipeline.model(camera)
+
+
+def test_a_checkpoint_loads_as_weights_only(trained):
+    (checkpoint,) = trained.checkpoint_dir.glob("*.ckpt")
+    loaded = torch.load(checkpoint, weights_only=True)
+    assert loaded["step"] == 59
+    assert not any("lpips" in key for key in loaded["pipeline"])
+
+
+def test_a_resumed_run_moves_the_restored_parameters_and_ends_where_it_was_planned_to(pristine_scene, tmp_path):
+    first = trainer_of(pristine_scene, tmp_path / "first", iterations=4)
+    first.train()
+    saved = {name: parameter.detach().clone() for name, parameter in model_of(first).gauss_params.items()}
+
+    second = trainer_of(pristine_scene, tmp_path / "second", iterations=7, load_dir=first.checkpoint_dir)
+    model = model_of(second)
+    for name, parameter in model.gauss_params.items():
+        torch.testing.assert_close(parameter.detach(), saved[name], msg=name)
+        assert second.optimizers.optimizers[name].param_groups[0]["params"][0] is parameter
+        assert second.optimizers.optimizers[name].state[parameter]["step"] == 4
+    second.train()
+    assert second.step == 6
+    assert (model.opacities.detach() - saved["opacities"]).abs().max() > 0.05
+
+
+def test_a_resumed_run_loads_another_number_of_gaussians(pristine_scene, tmp_path):
+    first = trainer_of(pristine_scene, tmp_path / "first", iterations=1)
+    state = first.pipeline.state_dict()
+    fewer = {key: value[:50] if "gauss_params" in key else value for key, value in state.items()}
+    first.pipeline.load_pipeline(fewer, 0)
+    assert model_of(first).num_points == 50
+    first.train()
+
+
+def test_a_finished_run_is_left_as_it_is(trained, pristine_scene, tmp_path):
+    again = trainer_of(pristine_scene, tmp_path, iterations=60, load_dir=trained.checkpoint_dir)
+    again.train()
+    assert not again.checkpoint_dir.exists()
+
+
+def test_a_failed_save_leaves_the_last_checkpoint(trained, monkeypatch):
+    before = sorted(trained.checkpoint_dir.iterdir())
+
+    def full_disk(_, path):
+        Path(path).write_bytes(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        trained.save_checkpoint(77)
+    assert sorted(trained.checkpoint_dir.iterdir()) == before
+    assert not list(trained.base_dir.glob("checkpoint-*"))
+
+
+@pytest.mark.parametrize("method", ["shellgs", "photo_gs"])
+def test_every_method_is_measured_against_shell_and_truth(pristine_scene, tmp_path, method):
+    trainer = trainer_of(pristine_scene, tmp_path, method, iterations=10)
+    trainer.train()
+    figures = trainer.pipeline.get_average_eval_image_metrics(get_std=True)
+    geometric = {
+        "depth_mae_m",
+        "normal_deg",
+        "depth_normal_deg",
+        "accuracy_m",
+        "chamfer_m",
+        "f_score_10cm",
+        "supported",
+    }
+    assert {"psnr", "ssim", *geometric, *(f"truth_{name}" for name in geometric)} <= figures.keys()
+    assert np.isfinite(list(figures.values())).all()
+
+
+def test_a_held_out_view_without_a_map_counts_for_the_pictures_only(scene, tmp_path):
+    (scene / "cues" / "shell" / "images" / "frame_00001.png.npz").unlink()
+    trainer = trainer_of(scene, tmp_path, iterations=5)
+    trainer.train()
+    figures = trainer.pipeline.get_average_eval_image_metrics()
+    assert figures["normal_deg_views"] == 1
+    assert "psnr_views" not in figures
+
+
+def test_a_shell_method_on_a_scene_without_shell_maps_ends_with_one_sentence(scene, tmp_path):
+    shutil.rmtree(scene / "cues" / "shell")
+    with pytest.raises(SystemExit, match=r"shellgs needs the shell maps .* run `shellgs cast"):
+        trainer_of(scene, tmp_path)
+
+
+def test_photo_gs_needs_no_shell(scene, tmp_path):
+    shutil.rmtree(scene / "cues")
+    trainer_of(scene, tmp_path, "photo_gs", iterations=2).train()
+
+
+def test_a_map_of_another_camera_ends_training_with_one_sentence(scene, tmp_path):
+    maps = scene / "cues" / "shell" / "images"
+    shutil.copy(maps / "frame_00004.png.npz", maps / "frame_00002.png.npz")
+    trainer = trainer_of(scene, tmp_path)
+    with pytest.raises(SystemExit, match=r"^shellgs: .*frame_00002.png.*shellgs cast"):
+        trainer.train()
+
+
+def test_a_load_dir_without_a_checkpoint_ends_with_one_sentence(pristine_scene, tmp_path):
+    with pytest.raises(SystemExit, match="holds no checkpoint"):
+        trainer_of(pristine_scene, tmp_path, load_dir=tmp_path)
