@@ -1,0 +1,9 @@
+"""Features composited over 3D Gaussians, in pure PyTorch."""
+
+from __future__ import annotations
+
+from shellgs_method.rasterizer.projection import quats_to_rotations
+from shellgs_method.rasterizer.rasterization import rasterize
+from shellgs_method.rasterizer.spherical_harmonics import spherical_harmonics
+
+__all__ = ["quats_to_rotations", "rasterize", "spherical_harmonics"]

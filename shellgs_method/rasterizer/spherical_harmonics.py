@@ -1,0 +1,54 @@
+"""View-dependent colour: a sum of real spherical harmonics, in the order and with the signs of 3DGS and gsplat."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+
+def spherical_harmonics(
+    degree: int, directions: Float[Tensor, "N 3"], coefficients: Float[Tensor, "N K 3"]
+) -> Float[Tensor, "N 3"]:
+    """Sum of the harmonics up to ``degree``, as it is: 3DGS adds 0.5 to it and clamps at 0 to get a colour.
+
+    Args:
+        degree: highest degree that counts; coefficients of higher degrees are left out.
+        directions: from the camera to the splats, of any length.
+        coefficients: of Y(l, m) at index l² + l + m.
+
+    Raises:
+        ValueError: if there are fewer coefficients than the degree needs.
+    """
+    n_harmonics = (degree + 1) ** 2
+    if coefficients.shape[1] < n_harmonics:
+        raise ValueError(f"SH degree {degree} needs {n_harmonics} coefficients, not {coefficients.shape[1]}.")
+    harmonics = _harmonics(degree, F.normalize(directions, dim=-1))
+    return torch.einsum("nk,nkc->nc", harmonics, coefficients[:, :n_harmonics])
+
+
+def _harmonics(degree: int, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
+    """Real harmonics of unit directions, Condon-Shortley phase included.
+
+    The recurrences are those of Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013: of the associated Legendre
+    functions without their factor sin(theta)^m, and of sin(theta)^m times the sine and cosine of m phi.
+    """
+    x, y, z = directions.unbind(-1)
+    harmonics = [torch.empty(0)] * (degree + 1) ** 2
+    cosine, sine, sectoral = torch.ones_like(x), torch.zeros_like(x), 1.0
+    for m in range(degree + 1):
+        below, legendre = torch.zeros_like(z), torch.full_like(z, sectoral)
+        for l in range(m, degree + 1):  # noqa: E741
+            norm = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - m) / math.factorial(l + m))
+            if m == 0:
+                harmonics[l * l + l] = norm * legendre
+            else:
+                harmonics[l * l + l + m] = math.sqrt(2) * norm * legendre * cosine
+                harmonics[l * l + l - m] = math.sqrt(2) * norm * legendre * sine
+            below, legendre = legendre, ((2 * l + 1) * z * legendre - (l + m) * below) / (l + 1 - m)
+        cosine, sine = x * cosine - y * sine, x * sine + y * cosine
+        sectoral *= -(2 * m + 1)
+    return torch.stack(harmonics, dim=-1)

@@ -1,0 +1,315 @@
+"""The rasterizer against the formulas, the laws of a picture, and gsplat's densification."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+from dense_reference import dense_rasterize
+from gsplat import DefaultStrategy
+from torch import Tensor
+from torch._inductor.cpp_builder import get_cpp_compiler
+from torch._inductor.exc import InvalidCxxCompiler
+
+from dataparsers.camera import Camera
+from shellgs_method.rasterizer import fusion, rasterize
+
+NAMES = ("means", "quats", "scales", "opacities", "features")
+
+
+def make_camera(width: int, height: int, dtype: torch.dtype = torch.float64) -> Camera:
+    """A camera that looks along z, a little askew, from near the origin."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.linalg.qr(torch.eye(3).double() + 0.1 * torch.arange(9.0).double().view(3, 3).sin())[0]
+    viewmat[:3, :3] *= viewmat[:3, :3].diagonal().sign()
+    viewmat[:3, 3] = torch.tensor([0.05, -0.03, 0.1])
+    K = torch.tensor([[0.8 * width, 0, 0.47 * width], [0, 0.83 * width, 0.53 * height], [0, 0, 1]])
+    return Camera(viewmat.to(dtype), K.to(dtype), width, height)
+
+
+def make_splats(n: int, n_features: int, seed: int) -> list[Tensor]:
+    """Splats of every sort: in front and behind, off screen, sub-pixel to screen-filling, faint and opaque."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    means = normal(n, 3) * torch.tensor([2.0, 1.5, 2.0]) + torch.tensor([0.0, 0.0, 3.0])
+    scales = (normal(n, 3) - 2.5).exp()
+    scales[: n // 10] *= 30
+    scales[n // 10 : n // 5] *= 0.01
+    opacities = torch.sigmoid(3 * normal(n))
+    opacities[::7], opacities[1::7] = 0.9999, 0.003
+    return [means, 3 * normal(n, 4), scales, opacities, normal(n, n_features)]
+
+
+def differentiate(splats: list[Tensor], composited: Tensor, alpha: Tensor, counted: Tensor, means2d: Tensor) -> dict:
+    """Gradients of a random linear function of the counted pixels."""
+    generator = torch.Generator().manual_seed(5)
+    shape = composited.shape[0], composited.shape[1], composited.shape[2] + 1
+    slope = torch.randn(shape, generator=generator, dtype=torch.float64).to(composited) * counted[..., None]
+    (torch.cat([alpha, composited], dim=-1) * slope).sum().backward()
+    gradients = {name: splat.grad for name, splat in zip(NAMES, splats, strict=True)}
+    assert means2d.grad is not None
+    return {**gradients, "means2d": means2d.grad.reshape(-1, 2)}
+
+
+def compare(dtype: torch.dtype, n: int, width: int, height: int, n_features: int, seed: int, margin: float) -> tuple:
+    """Largest error of the values, relative error of each gradient, and the share of pixels left out.
+
+    Left out is where a decision (alpha below 1/255, transmittance below 1e-4) is closer to its threshold than rounding.
+    """
+    splats = [splat.requires_grad_() for splat in make_splats(n, n_features, seed)]
+    camera = make_camera(width, height)
+    reference = dense_rasterize(*splats, viewmat=camera.viewmat, K=camera.K, width=width, height=height)
+    counted = reference.margin > margin
+    expected = differentiate(splats, reference.composited, reference.alpha, counted, reference.means2d)
+
+    own = [splat.detach().to(dtype).requires_grad_() for splat in splats]
+    composited, alpha, info = rasterize(*own, camera=camera)
+    info["means2d"].retain_grad()
+    assert composited.shape == (height, width, n_features)
+    assert alpha.shape == (height, width, 1)
+    assert composited.dtype == alpha.dtype == dtype
+    actual = differentiate(own, composited, alpha, counted, info["means2d"])
+
+    errors = torch.cat([composited - reference.composited, alpha - reference.alpha], dim=-1)[counted].abs()
+    relative = {k: ((actual[k] - expected[k]).norm() / expected[k].norm()).item() for k in expected}
+    return errors.max().item(), relative, 1 - float(counted.double().mean())
+
+
+def render(n: int, width: int, height: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    splats = [splat.to(dtype).requires_grad_() for splat in make_splats(n, 3, seed=12)]
+    return rasterize(*splats, camera=make_camera(width, height))[0]
+
+
+@pytest.fixture
+def compiler(monkeypatch) -> None:
+    """Lets kernels be compiled from scratch, where that is possible."""
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler as error:
+        pytest.skip(f"no C++ compiler: {error}")
+    monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
+    monkeypatch.setattr(fusion, "_failed", False)
+
+
+@pytest.fixture(autouse=True)
+def _eager(monkeypatch) -> None:
+    """Tests pay for compilation only where it matters."""
+    monkeypatch.setenv("SHELLGS_COMPILE", "0")
+
+
+@pytest.mark.parametrize(
+    ("n", "width", "height", "n_features", "seed"),
+    [(90, 37, 29, 3, 0), (60, 8, 8, 1, 1), (120, 61, 45, 8, 2), (40, 3, 50, 3, 3), (1, 20, 20, 3, 13)],
+)
+def test_values_and_gradients_are_those_of_the_formulas_in_float64(n, width, height, n_features, seed):
+    error, relative, left_out = compare(torch.float64, n, width, height, n_features, seed, margin=1e-10)
+    assert error < 1e-9
+    assert max(relative.values()) < 1e-8, relative
+    assert left_out == 0
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_values_and_gradients_are_those_of_the_formulas_in_float32(compiled, request):
+    fusion._compiled.cache_clear()
+    if compiled:
+        request.getfixturevalue("compiler")
+    error, relative, left_out = compare(torch.float32, 100, 53, 38, 3, seed=1, margin=1e-4)
+    assert error < 1e-4
+    assert max(relative.values()) < 1e-3, relative
+    assert left_out < 0.02
+    assert fusion._compiled.cache_info().currsize == (2 if compiled else 0)
+    assert not fusion._failed
+
+
+def test_compiled_kernels_serve_every_number_of_splats_and_size_of_image(compiler):
+    render(20, 40, 30).sum().backward()  # compiles
+    with torch._dynamo.config.patch(error_on_recompile=True), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for n, width, height in [(300, 40, 30), (5, 100, 8), (1, 5, 5), (150, 129, 70), (1000, 64, 64)]:
+            render(n, width, height).sum().backward()
+    assert not fusion._failed
+
+
+def test_a_failure_to_compile_is_said_once_and_the_picture_is_made_all_the_same(monkeypatch, caplog):
+    def fail(*_) -> None:
+        raise RuntimeError("no C++ compiler\nmuch detail")
+
+    expected = render(50, 33, 21, torch.float64).float()
+    monkeypatch.setattr(fusion, "_compiled", fail)
+    monkeypatch.setattr(fusion, "_failed", False)
+    monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
+    for _ in range(2):
+        torch.testing.assert_close(render(50, 33, 21), expected, atol=1e-4, rtol=0)
+    assert [record.getMessage() for record in caplog.records] == [
+        "The rasterizer runs without torch.compile, slower: RuntimeError: no C++ compiler"
+    ]
+
+
+def test_a_stack_of_splats_stops_before_the_transmittance_reaches_the_minimum():
+    # One pixel, four splats on it, each of alpha 0.9: transmittance 1, 0.1, 0.01, 0.001; the fourth would bring 1e-4.
+    n = 4
+    means = torch.tensor([[0.0, 0.0, 1.0 + i] for i in range(n)], dtype=torch.float64)
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(n, 4)
+    features = torch.eye(n, dtype=torch.float64)
+    K = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    camera = Camera(torch.eye(4, dtype=torch.float64), K, 1, 1)
+    opacities = torch.full((n,), 0.9, dtype=torch.float64) + 1e-9
+    weights, alpha, _ = rasterize(means, quats, torch.ones(n, 3).double(), opacities, features, camera)
+    assert weights[0, 0].tolist() == pytest.approx([0.9, 0.09, 0.009, 0.0], abs=1e-8)
+    assert alpha.item() == pytest.approx(0.999, abs=1e-8)
+
+
+def test_an_opaque_splat_leaves_a_thousandth_of_the_light():
+    camera = make_camera(9, 9)
+    centre = torch.linalg.inv(camera.viewmat)[:3] @ torch.tensor([0.0, 0.0, 2.0, 1.0]).double()
+    splat = [centre[None], torch.ones(1, 4).double(), 50 * torch.ones(1, 3).double(), torch.ones(1).double() - 1e-9]
+    _, alpha, _ = rasterize(*splat, features=torch.ones(1, 1).double(), camera=camera)
+    torch.testing.assert_close(alpha, torch.full((9, 9, 1), 0.999, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("n", [0, 1, 5])
+def test_nothing_visible_gives_an_empty_picture_and_gradients_of_zero(n):
+    camera = make_camera(20, 13)
+    splats = make_splats(n, 3, seed=0)
+    splats[0][:, 2] = -5.0
+    splats = [splat.requires_grad_() for splat in splats]
+    composited, alpha, info = rasterize(*splats, camera=camera)
+    info["means2d"].retain_grad()
+    (composited.sum() + alpha.sum()).backward()
+    assert not composited.any()
+    assert not alpha.any()
+    assert not info["radii"].any()
+    assert info["means2d"].grad.shape == (1, n, 2)
+    for splat in [*splats, info["means2d"]]:
+        assert splat.grad is not None
+        assert not splat.grad.any()
+
+
+def test_a_splat_at_the_cameras_centre_or_fainter_than_a_grey_level_leaves_finite_gradients():
+    camera = make_camera(20, 13)
+    splats = make_splats(40, 3, seed=4)
+    splats[0][0] = camera.position
+    splats[3][1:4] = torch.tensor([0.0, 1e-30, 1 / 256])
+    splats = [splat.requires_grad_() for splat in splats]
+    composited, alpha, _ = rasterize(*splats, camera=camera)
+    (composited.sum() + alpha.sum()).backward()
+    assert all(splat.grad.isfinite().all() for splat in splats)
+    assert not splats[3].grad[1:4].any()
+
+
+def test_alpha_is_what_a_feature_of_one_composites_to():
+    *splats, features = make_splats(100, 1, seed=5)
+    composited, alpha, _ = rasterize(*splats, features=torch.ones_like(features), camera=make_camera(33, 21))
+    torch.testing.assert_close(composited, alpha)
+
+
+def test_the_order_of_the_splats_does_not_matter():
+    splats, camera = make_splats(100, 3, seed=6), make_camera(33, 21)
+    order = torch.randperm(100, generator=torch.Generator().manual_seed(0))
+    expected, *_ = rasterize(*splats, camera=camera)
+    actual, *_ = rasterize(*(splat[order] for splat in splats), camera=camera)
+    torch.testing.assert_close(actual, expected)
+
+
+def test_cropping_is_shifting_the_principal_point():
+    *splats, features = make_splats(100, 3, seed=7)
+    splats[0] *= 0.2  # all within the field of view, or the clamped slopes of the projection would follow the crop
+    splats[0][:, 2] += 3
+    camera = make_camera(50, 40)
+    shift = torch.tensor([[0.0, 0.0, 11.0], [0.0, 0.0, 6.0], [0.0, 0.0, 0.0]])
+    crop = replace(camera, K=camera.K - shift, width=30, height=27)
+    whole, *_ = rasterize(*splats, features=features, camera=camera)
+    part, *_ = rasterize(*splats, features=features, camera=crop)
+    torch.testing.assert_close(part, whole[6 : 6 + 27, 11 : 11 + 30])
+
+
+def test_a_rigid_motion_of_world_and_camera_changes_nothing():
+    (means, quats, *rest), camera = make_splats(100, 3, seed=8), make_camera(33, 21)
+    angle = torch.tensor(0.7).double()
+    rotation = torch.eye(3).double()
+    rotation[:2, :2] = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
+    motion = torch.eye(4).double()
+    motion[:3, :3], motion[:3, 3] = rotation, torch.tensor([3.0, -2.0, 1.0])
+    w, x, y, z = quats.unbind(1)
+    c, s = (angle / 2).cos(), (angle / 2).sin()
+    turned = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], dim=1)
+    moved = replace(camera, viewmat=camera.viewmat @ torch.linalg.inv(motion))
+    expected, *_ = rasterize(means, quats, *rest, camera=camera)
+    actual, *_ = rasterize(means @ rotation.T + motion[:3, 3], turned, *rest, camera=moved)
+    torch.testing.assert_close(actual, expected)
+
+
+def test_radii_are_positive_exactly_where_a_splat_shows():
+    *splats, features = make_splats(60, 1, seed=9)
+    camera = make_camera(33, 21)
+    *_, info = rasterize(*splats, features=features, camera=camera)
+    alone = [[splat[i : i + 1] for splat in [*splats, features]] for i in range(60)]
+    shows = torch.tensor([bool(rasterize(*splat, camera=camera)[1].any()) for splat in alone])
+    seen = info["radii"][0] > 0
+    assert seen[shows].all()
+    assert int((seen & ~shows).sum()) <= 3  # the ellipse's box touches the picture, the ellipse no pixel's centre
+
+
+def test_the_pictures_gradient_by_the_camera_is_that_of_the_formulas():
+    splats, camera = make_splats(60, 3, seed=10), make_camera(24, 17)
+
+    def sparse(pose: Tensor) -> Tensor:
+        return rasterize(*splats, camera=replace(camera, viewmat=pose))[0]
+
+    def dense(pose: Tensor) -> Tensor:
+        return dense_rasterize(*splats, viewmat=pose, K=camera.K, width=camera.width, height=camera.height).composited
+
+    gradients = []
+    for picture in (sparse, dense):
+        pose = camera.viewmat.clone().requires_grad_()
+        (picture(pose) * torch.linspace(-1, 1, 24, dtype=torch.float64)[:, None]).sum().backward()
+        assert pose.grad is not None
+        gradients.append(pose.grad[:3])
+    torch.testing.assert_close(*gradients)
+
+
+def test_gsplats_default_strategy_densifies_unchanged():
+    means, quats, scales, opacities, features = (splat.float() for splat in make_splats(80, 3, seed=11))
+    params = torch.nn.ParameterDict(
+        {"means": means, "quats": quats, "scales": scales.log(), "opacities": opacities.logit(), "features": features}
+    )
+    optimizers: dict[str, torch.optim.Optimizer] = {
+        name: torch.optim.Adam([param], lr=1e-3) for name, param in params.items()
+    }
+    strategy = DefaultStrategy(
+        refine_start_iter=2,
+        refine_every=4,
+        reset_every=9,
+        grow_grad2d=1e-4,
+        refine_scale2d_stop_iter=10,
+        prune_opa=0.005,
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state(scene_scale=1.0)
+    camera = make_camera(33, 21, torch.float32)
+    target = torch.rand(21, 33, 3, generator=torch.Generator().manual_seed(1))
+    sizes, losses = [], []
+    for step in range(20):
+        if step == 10:
+            strategy.grow_grad2d = float("inf")  # from here it can only prune
+        opacities = params["opacities"].sigmoid()
+        composited, _, info = rasterize(
+            params["means"], params["quats"], params["scales"].exp(), opacities, params["features"], camera
+        )
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss = (composited - target).abs().mean()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        strategy.step_post_backward(params, optimizers, state, step, info)
+        sizes.append(len(params["means"]))
+        losses.append(loss.item())
+    assert sizes[9] > sizes[0]
+    assert sizes[-1] < sizes[9]
+    assert all(torch.tensor(losses).isfinite())
