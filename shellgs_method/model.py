@@ -47,9 +47,6 @@ from shellgs_method.rasterizer import quats_to_rotations, rasterize, spherical_h
 PAPER_ITERATIONS = 30_000
 """The run for which the iteration numbers of the config are stated; a shorter run shrinks them in proportion."""
 
-MIN_REFINE_EVERY = 20
-"""Fewest iterations between two densifications: the gradients of fewer views are noise."""
-
 MIN_RESET_EVERY = 300
 """Fewest iterations between two resets of the opacities, which take half of that to come back at any length of run."""
 
@@ -163,7 +160,8 @@ class FacadeModel(SplatfactoModel):
             refine_start_iter=round(config.warmup_length * shrink),
             refine_stop_iter=round(config.stop_split_at * shrink),
             reset_every=max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every)),
-            refine_every=max(round(config.refine_every * shrink), min(MIN_REFINE_EVERY, config.refine_every)),
+            # As it is: a Gaussian that was just split needs its time to settle in a short run too, or all split again.
+            refine_every=config.refine_every,
             absgrad=config.use_absgrad,
         )
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)

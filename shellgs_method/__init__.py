@@ -1,0 +1,1 @@
+"""ShellGS: Gaussian splatting of building facades, supervised by an aligned exterior shell."""

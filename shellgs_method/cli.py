@@ -1,0 +1,109 @@
+"""The `shellgs` command: everything around the training."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Optional
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from dataparsers.cue_maps import relative_path
+from dataparsers.errors import SceneError, refusals_end_the_program
+from shellgs_method.synthetic import FacadeConfig
+
+console = Console()
+
+Scene = Annotated[Path, tyro.conf.Positional]
+
+
+def demo(
+    folder: Annotated[Path, tyro.conf.Positional] = Path("demo"),
+    facade: Annotated[FacadeConfig, tyro.conf.arg(name="")] = FacadeConfig(),  # noqa: B008
+    iterations: int = 1500,
+) -> None:
+    """Make a synthetic facade, run the whole pipeline on it, and end with a table and pictures.
+
+    What an interrupted demo finished is kept: run it again to go on.
+
+    Args:
+        folder: Where everything is written.
+        facade: The facade and the walk past it.
+        iterations: Length of each training run.
+    """
+    from shellgs_method.demo import run_demo
+
+    run_demo(folder, facade, iterations, console)
+
+
+def cast(
+    scene: Scene,
+    shell: Optional[Path] = None,
+    matrix: Optional[Path] = None,
+    metres_per_shell_unit: float = 1.0,
+    max_image_size: Optional[int] = None,
+) -> None:
+    """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
+
+    An interrupted cast goes on where it stopped.
+
+    Args:
+        scene: Scene folder.
+        shell: The shell's mesh, with --matrix; else what scene/shell/alignment.json names.
+        matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
+        metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
+        max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
+    """
+    from dataparsers.cue_maps import CueMaps
+    from dataparsers.facade import FacadeDataParserConfig, read_views
+    from dataparsers.photograph import load_photograph
+    from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, supervision_panel
+
+    if (shell is None) != (matrix is None):
+        raise SceneError("--shell and --matrix go together: which mesh, and where it stands in the scene")
+    if shell is not None and matrix is not None:
+        alignment = Alignment.from_matrix_file(matrix, relative_path(shell, scene), metres_per_shell_unit)
+    else:
+        alignment = Alignment.load(scene / ALIGNMENT)
+    views = [replace(v, camera=v.camera.shrunk(max_image_size)) for v in read_views(FacadeDataParserConfig(data=scene))]
+    summary = cast_views(scene, [(v.name, v.camera) for v in views], alignment, max_image_size=max_image_size)
+    console.print(
+        f"{summary.cast} views cast, {summary.skipped} there already, in {summary.seconds:.1f} s; the shell is in "
+        f"{summary.seeing} of {len(views)} views and in {summary.supported:.0%} of their pixels."
+    )
+    maps = CueMaps.open(scene, "shell")
+    view = max(views, key=lambda view: maps.record(view.name).supported)
+    cue, panel = maps.read(view.name, view.camera), maps.folder / "panel.png"
+    supervision_panel(load_photograph(view)[..., :3], cue, alignment.metres_per_unit).savefig(panel)
+    console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
+
+
+def doctor(install_libraries: bool = False) -> None:
+    """What this machine can run, each with its remedy.
+
+    Args:
+        install_libraries: Install the system libraries that are missing, where apt-get is there and may be used.
+    """
+    from shellgs_method.environment import examine, install_system_libraries
+
+    if install_libraries:
+        install_system_libraries()
+    table = Table(title="shellgs doctor")
+    for heading in ("", "part", "finding"):
+        table.add_column(heading)
+    findings = list(examine())
+    for finding in findings:
+        mark = "[green]✓" if finding.works else "[red]✗" if finding.needed else "[yellow]–"
+        table.add_row(mark, finding.subject, finding.detail)
+    console.print(table)
+    sys.exit(any(finding.needed and not finding.works for finding in findings))
+
+
+def main() -> None:
+    """Entry point."""
+    commands = {"demo": demo, "cast": cast, "doctor": doctor}
+    with refusals_end_the_program():
+        tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)
