@@ -1,5 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
+# OpenMP's threads spin while they wait, which slows shared and virtual machines down many times.
+export OMP_WAIT_POLICY ?= passive
 
 .PHONY: demo test install
 

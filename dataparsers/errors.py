@@ -12,7 +12,7 @@ class SceneError(ValueError):
 
 @contextmanager
 def refusals_end_the_program() -> Iterator[None]:
-    """Turn a refusal into its sentence on stderr and exit status 1, as a command line does; bugs keep their traceback."""
+    """Turn a refusal into its sentence on stderr and exit status 1; a bug keeps its traceback."""
     try:
         yield
     except (SceneError, FileNotFoundError) as error:

@@ -159,7 +159,8 @@ def _views(outputs: DataparserOutputs, scene: Path) -> list[View]:
                 pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K).double(), image.shape[1], image.shape[0])
             camera = replace(pinholes[key], viewmat=camera.viewmat)
         mask = outputs.mask_filenames[i] if outputs.mask_filenames else None
-        views.append(View(path.relative_to(scene).as_posix(), path, camera, lens, mask))
+        name = path.relative_to(scene).as_posix() if path.is_relative_to(scene) else path.name
+        views.append(View(name, path, camera, lens, mask))
     return views
 
 

@@ -11,9 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from dataparsers.cue_maps import relative_path
 from dataparsers.errors import SceneError, refusals_end_the_program
-from shellgs_method.synthetic import FacadeConfig
 
 console = Console()
 
@@ -22,8 +20,11 @@ Scene = Annotated[Path, tyro.conf.Positional]
 
 def demo(
     folder: Annotated[Path, tyro.conf.Positional] = Path("demo"),
-    facade: Annotated[FacadeConfig, tyro.conf.arg(name="")] = FacadeConfig(),  # noqa: B008
     iterations: int = 1500,
+    width: int = 320,
+    height: int = 180,
+    views: int = 40,
+    seed: int = 0,
 ) -> None:
     """Make a synthetic facade, run the whole pipeline on it, and end with a table and pictures.
 
@@ -31,12 +32,16 @@ def demo(
 
     Args:
         folder: Where everything is written.
-        facade: The facade and the walk past it.
         iterations: Length of each training run.
+        width: Width of the photographs in pixels.
+        height: Height of the photographs in pixels.
+        views: Number of photographs.
+        seed: Seed of the facade and of the walk past it.
     """
     from shellgs_method.demo import run_demo
+    from shellgs_method.synthetic import FacadeConfig
 
-    run_demo(folder, facade, iterations, console)
+    run_demo(folder, FacadeConfig(width, height, views, seed), iterations, console)
 
 
 def cast(
@@ -57,7 +62,7 @@ def cast(
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
     """
-    from dataparsers.cue_maps import CueMaps
+    from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, read_views
     from dataparsers.photograph import load_photograph
     from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, supervision_panel
@@ -75,8 +80,9 @@ def cast(
         f"{summary.seeing} of {len(views)} views and in {summary.supported:.0%} of their pixels."
     )
     maps = CueMaps.open(scene, "shell")
-    view = max(views, key=lambda view: maps.record(view.name).supported)
-    cue, panel = maps.read(view.name, view.camera), maps.folder / "panel.png"
+    cues = ((view, maps.read(view.name, view.camera)) for view in views[:: max(len(views) // 8, 1)])
+    view, cue = max(((v, cue) for v, cue in cues if cue is not None), key=lambda pair: pair[1].mask.mean())
+    panel = maps.folder / "panel.png"
     supervision_panel(load_photograph(view)[..., :3], cue, alignment.metres_per_unit).savefig(panel)
     console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
 
@@ -106,4 +112,6 @@ def main() -> None:
     """Entry point."""
     commands = {"demo": demo, "cast": cast, "doctor": doctor}
     with refusals_end_the_program():
-        tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)
+        tyro.extras.subcommand_cli_from_dict(
+            commands, description="Everything around the training of the methods; these are trained by `ns-train`."
+        )

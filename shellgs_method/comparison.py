@@ -9,8 +9,10 @@ from pathlib import Path
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
+from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import angular_error, colours_to_normals
 from shellgs_method.evaluation.figures import Panel, save_strip
+from shellgs_method.model import FacadeModel
 
 
 def read_figures(evaluations: Mapping[str, Path]) -> dict[str, dict[str, float]]:
@@ -31,11 +33,14 @@ def save_comparison(configs: Mapping[str, Path], path: Path, view: int = 0, refe
     panels: list[Panel] = []
     for method, config in configs.items():
         _, pipeline, _, _ = eval_setup(config, test_mode="test")
-        camera, batch = pipeline.datamanager.fixed_indices_eval_dataloader[view]
-        outputs = pipeline.model.get_outputs_for_camera(camera)
+        datamanager, model = pipeline.datamanager, pipeline.model
+        assert isinstance(datamanager, FacadeDataManager)
+        assert isinstance(model, FacadeModel)
+        camera, batch = datamanager.fixed_indices_eval_dataloader[view]
+        outputs = model.get_outputs_for_camera(camera)
         target, mask = batch[f"{reference}_normal"].float(), batch[f"{reference}_mask"]
         if not panels:
-            photograph = pipeline.model.get_gt_img(batch["image"])[..., :3].cpu()
+            photograph = model.get_gt_img(batch["image"])[..., :3].cpu()
             panels.append(
                 Panel(f"photograph, {reference}", photograph, target, torch.zeros_like(target[..., :1]), mask)
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -16,6 +17,8 @@ from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, mark
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 METHODS = ("photo-gs", "shellgs")
+# OpenMP's threads spin while they wait, which slows shared and virtual machines down many times.
+ENVIRONMENT = {"OMP_WAIT_POLICY": "passive"} | os.environ
 STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
@@ -68,7 +71,9 @@ def _run(console: Console, *command: object, steps: int | None = None) -> None:
     program = Path(sys.executable).with_name(words[0])
     output: list[str] = []
     with (
-        subprocess.Popen([program, *words[1:]], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process,
+        subprocess.Popen(
+            [program, *words[1:]], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as process,
         Progress(console=console, transient=True) as progress,
     ):
         task = progress.add_task(words[0], total=steps)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Literal, Optional, cast
 
 import numpy as np
 import torch
-import tyro
 from gsplat.strategy import DefaultStrategy
 from jaxtyping import Float
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.splatfacto import (
     RGB2SH,
@@ -21,8 +21,9 @@ from nerfstudio.models.splatfacto import (
     random_quat_tensor,
 )
 from nerfstudio.utils.colors import get_color
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
+from tyro.conf import Suppress
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
@@ -65,6 +66,11 @@ class GeometryLossConfig:
     """local: the paper's equation; vid2sim: the form of the released baseline."""
     ncc_window: int = 9
     """Side of the patches of the local NCC in pixels."""
+    ncc_eps: float = 1e-3
+    """Contrast of a patch, relative to its depth, below which the local NCC takes it for flat."""
+    occlusion_gate: Optional[float] = None
+    """Leave out pixels whose rendered depth is this share of the shell's in front of it: a tree, a car, a lamp post.
+    The paper has no such gate; 0.1 is a good value where something stands before the facade."""
 
 
 @dataclass
@@ -81,16 +87,29 @@ class FacadeModelConfig(SplatfactoModelConfig):
     cull_alpha_thresh: float = 0.005
     cull_scale_thresh: float = 0.1
     densify_grad_thresh: float = 0.0002
-    use_absgrad: tyro.conf.Suppress[bool] = False
     stop_screen_size_at: int = 0
-    num_downscales: tyro.conf.Suppress[int] = 0
-    resolution_schedule: tyro.conf.Suppress[int] = 3000
-    output_depth_during_training: tyro.conf.Suppress[bool] = True
-    use_scale_regularization: tyro.conf.Suppress[bool] = False
-    max_gauss_ratio: tyro.conf.Suppress[float] = 10.0
-    rasterize_mode: tyro.conf.Suppress[Literal["classic", "antialiased"]] = "classic"
-    use_bilateral_grid: tyro.conf.Suppress[bool] = False
-    color_corrected_metrics: tyro.conf.Suppress[bool] = False
+
+    # What splatfacto and nerfstudio's base model have and these methods have no use for.
+    use_absgrad: Suppress[bool] = False
+    num_downscales: Suppress[int] = 0
+    resolution_schedule: Suppress[int] = 3000
+    random_init: Suppress[bool] = False
+    num_random: Suppress[int] = 50_000
+    random_scale: Suppress[float] = 10.0
+    n_split_samples: Suppress[int] = 2
+    output_depth_during_training: Suppress[bool] = True
+    use_scale_regularization: Suppress[bool] = False
+    max_gauss_ratio: Suppress[float] = 10.0
+    rasterize_mode: Suppress[Literal["classic", "antialiased"]] = "classic"
+    camera_optimizer: Suppress[CameraOptimizerConfig] = field(default_factory=lambda: CameraOptimizerConfig(mode="off"))
+    use_bilateral_grid: Suppress[bool] = False
+    grid_shape: Suppress[tuple[int, int, int]] = (16, 16, 8)
+    color_corrected_metrics: Suppress[bool] = False
+    enable_collider: Suppress[bool] = False
+    collider_params: Suppress[Optional[dict[str, float]]] = None
+    loss_coefficients: Suppress[dict[str, float]] = field(default_factory=dict)
+    eval_num_rays_per_chunk: Suppress[int] = 4096
+    prompt: Suppress[Optional[str]] = None
 
 
 class FacadeModel(SplatfactoModel):
@@ -110,7 +129,7 @@ class FacadeModel(SplatfactoModel):
         """Gaussians at the SfM points."""
         self._refuse_missing_cues()
         points, colours = self._seed_points()
-        spacing = cKDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))[0][:, 1:].mean(axis=1)
+        spacing = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))[0][:, 1:].mean(axis=1)
         scales = torch.from_numpy(np.log(spacing.clip(min=1e-6))).float()[:, None].repeat(1, 3)
         self.gauss_params = nn.ParameterDict(
             {
@@ -168,7 +187,9 @@ class FacadeModel(SplatfactoModel):
 
     def get_training_callbacks(self, training_callback_attributes):
         """Splatfacto's callbacks; the trainer tells how long the run is."""
-        self.plan(training_callback_attributes.trainer.config.max_num_iterations)
+        trainer = training_callback_attributes.trainer
+        assert trainer is not None
+        self.plan(trainer.config.max_num_iterations)
         return super().get_training_callbacks(training_callback_attributes)
 
     def step_post_backward(self, step: int) -> None:
@@ -190,7 +211,7 @@ class FacadeModel(SplatfactoModel):
         background = self._get_background_color()
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:
-            return self.get_empty_outputs(pinhole.width, pinhole.height, background)
+            return cast(dict[str, Tensor], self.get_empty_outputs(pinhole.width, pinhole.height, background))
         with_geometry = self.config.cues != "none" or not self.training
         features = [self._colours(gaussians, pinhole)]
         if with_geometry:
@@ -251,9 +272,13 @@ class FacadeModel(SplatfactoModel):
     def _geometry_losses(self, outputs: dict[str, Tensor], cue: Reference) -> dict[str, Tensor]:
         weights, progress = self.config.geometry, self.step / self.num_iterations
         mask = cue.mask
+        if weights.occlusion_gate is not None:
+            mask = mask & (outputs["depth"].detach() > (1 - weights.occlusion_gate) * cue.depth)
         inverse_depth = 1 / outputs["depth"].clamp_min(1e-6)
         normal = colours_to_normals(outputs["normal"])
-        ncc = {"local": partial(ncc_loss, window=weights.ncc_window), "vid2sim": vid2sim_ncc_loss}[weights.ncc]
+        ncc = {"local": partial(ncc_loss, window=weights.ncc_window, eps=weights.ncc_eps), "vid2sim": vid2sim_ncc_loss}[
+            weights.ncc
+        ]
         terms = {
             "depth": lambda: ncc(inverse_depth, torch.where(mask, 1 / cue.depth, 0.0), mask),
             "normal": lambda: normal_loss(normal, cue.normal, mask),

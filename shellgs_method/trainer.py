@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,8 @@ from dataparsers.errors import SceneError, refusals_end_the_program
 
 # Nerfstudio's own scheduler puts np.float64 into checkpoints, which torch >= 2.6 refuses to load
 # (https://github.com/nerfstudio-project/nerfstudio/issues/3683). Ours writes float; this lets older files load.
-torch.serialization.add_safe_globals([np.float64(0).__reduce__()[0], np.dtype, type(np.dtype(np.float64))])
+_REBUILD_SCALAR: Any = np.float64(0).__reduce__()[0]
+torch.serialization.add_safe_globals([_REBUILD_SCALAR, np.dtype, type(np.dtype(np.float64))])
 
 
 @dataclass

@@ -27,7 +27,7 @@ def walk(length: float, views: int, width: int, height: int, rng: np.random.Gene
     """
     there = (views + 1) // 2
     near = np.arange(views) < there
-    s = np.concatenate([np.linspace(0, 1, there), np.linspace(1, 0, views - there)])
+    s = np.concatenate([_stroll(there), _stroll(views - there)[::-1]])
     x = np.where(near, -1.0 + s * (length + 2.0), 1.0 + s * (length - 2.0))
     y = np.where(near, -7.0, -11.0) + 0.5 * np.sin(7.0 * s)
     centres = np.stack([x, y, np.full(views, 1.6)], axis=-1) + rng.normal(0.0, [0.1, 0.08, 0.04], (views, 3))
@@ -43,6 +43,11 @@ def walk(length: float, views: int, width: int, height: int, rng: np.random.Gene
         Camera(torch.from_numpy(_viewmat(rotation, centre)), K, width, height)
         for rotation, centre in zip(rotations, centres, strict=True)
     ]
+
+
+def _stroll(views: int) -> np.ndarray:
+    """From 0 to 1, slow at the ends, so that the outermost views have neighbours that see almost the same."""
+    return (1 - np.cos(np.pi * np.linspace(0, 1, views))) / 2
 
 
 def _viewmat(rotation: np.ndarray, centre: np.ndarray) -> np.ndarray:

@@ -27,8 +27,8 @@ def _street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
     yield parallelogram((middle - 80, -60, 0), (160, 0, 0), (0, 140, 0), Material.GROUND)
     yield cylinder((0.3 * layout.length, -2.4, 0), 0.075, 7.0, Material.POLE)
     yield box((0.3 * layout.length - 0.05, -3.6, 6.9), (0.3 * layout.length + 0.05, -2.4, 7.0), Material.POLE)
-    yield cylinder((0.76 * layout.length, -3.3, 0), 0.12, 3.0, Material.TRUNK)
-    yield _crown(np.array([0.76 * layout.length, -3.3, 3.9]), rng)
+    yield cylinder((0.76 * layout.length, -2.2, 0), 0.07, 2.6, Material.TRUNK)
+    yield _crown(np.array([0.76 * layout.length, -2.2, 3.0]), rng)
     for y, heights in ((-24.0, (8.0, 15.0)), (30.0, (6.0, 11.0))):
         for x in np.arange(middle - 46, middle + 46, HOUSE):
             x = np.floor(x / HOUSE) * HOUSE
@@ -39,10 +39,10 @@ def _street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
         yield box((x + 0.9, y - 1.65, 0.9), (x + 3.5, y - 0.15, 1.5), Material.CAR)
 
 
-def _crown(centre: np.ndarray, rng: np.random.Generator, leaves: int = 1600, size: float = 0.15) -> Mesh:
+def _crown(centre: np.ndarray, rng: np.random.Generator, leaves: int = 700, size: float = 0.12) -> Mesh:
     """Loose leaves, one triangle each, thicker towards the outside of an ellipsoid."""
     outwards = rng.normal(size=(leaves, 1, 3))
     outwards /= np.linalg.norm(outwards, axis=-1, keepdims=True)
-    place = centre + outwards * [1.25, 1.1, 1.5] * rng.uniform(0.25, 1.0, (leaves, 1, 1)) ** 0.5
+    place = centre + outwards * [0.7, 0.65, 0.9] * rng.uniform(0.25, 1.0, (leaves, 1, 1)) ** 0.5
     vertices = (place + rng.uniform(-size, size, (leaves, 3, 3))).reshape(-1, 3)
     return Mesh(vertices, np.arange(3 * leaves).reshape(-1, 3), np.full(leaves, Material.LEAF))

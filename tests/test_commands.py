@@ -1,0 +1,136 @@
+"""The commands as a user types them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+BIN = Path(sys.executable).parent
+
+
+def run(*words: object, cwd: Path, status: int = 0) -> str:
+    """Output of a command of this environment, without the terminal's line breaks."""
+    # Runs this short would spend their time compiling.
+    environment = os.environ | {"SHELLGS_COMPILE": "0", "OMP_WAIT_POLICY": "passive", "COLUMNS": "200"}
+    command = [BIN / str(words[0]), *map(str, words[1:])]
+    done = subprocess.run(command, cwd=cwd, env=environment, text=True, capture_output=True)
+    output = done.stdout + done.stderr
+    assert done.returncode == status, output
+    return output
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a small `shellgs demo` leaves behind."""
+    folder = tmp_path_factory.mktemp("demo")
+    run("shellgs", "demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20, cwd=folder)
+    return folder / "demo"
+
+
+def config(demo: Path) -> Path:
+    return demo / "runs" / "scene" / "shellgs" / "demo" / "config.yml"
+
+
+def test_the_demo_ends_with_a_table_and_pictures(demo):
+    table = (demo / "results.md").read_text()
+    assert all(word in table for word in ("photo-gs", "shellgs", "PSNR", "Normal (°)", "CD (m)"))
+    for picture in (demo / "strip.png", demo / "scene" / "cues" / "shell" / "panel.png"):
+        with Image.open(picture) as image:
+            assert np.asarray(image).std() > 10
+
+
+def test_a_second_demo_keeps_what_the_first_finished(demo):
+    checkpoint = next(config(demo).parent.glob("nerfstudio_models/*.ckpt"))
+    before = checkpoint.stat().st_mtime_ns
+    output = run("shellgs", "demo", demo, "--iterations", 20, cwd=demo.parent)
+    assert "ns-train" not in output
+    assert "0 views cast, 10 there already" in output
+    assert checkpoint.stat().st_mtime_ns == before
+
+
+def test_ns_eval_writes_all_figures(demo):
+    figures = json.loads((config(demo).parent / "eval.json").read_text())["results"]
+    assert {
+        "psnr",
+        "ssim",
+        "normal_deg",
+        "depth_mae_m",
+        "chamfer_m",
+        "f_score_10cm",
+        "truth_normal_deg",
+    } <= figures.keys()
+
+
+def test_ns_export_writes_the_gaussians(demo, tmp_path):
+    run("ns-export", "gaussian-splat", "--load-config", config(demo), "--output-dir", tmp_path, cwd=demo.parent)
+    cloud = trimesh.load(tmp_path / "splat.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert len(cloud.vertices) > 100
+
+
+def test_ns_render_writes_pictures_of_every_output(demo, tmp_path):
+    outputs = ("rgb", "depth", "normal", "accumulation")
+    command = ("ns-render", "dataset", "--load-config", config(demo), "--output-path", tmp_path, "--split", "test")
+    run(*command, "--rendered-output-names", *outputs, cwd=demo.parent)
+    for output in outputs:
+        assert len(list((tmp_path / "test" / output).iterdir())) == 2
+
+
+def test_ns_train_lists_the_methods_and_describes_their_settings(tmp_path):
+    assert {"shellgs", "photo-gs"} <= set(run("ns-train", "--help", cwd=tmp_path).split())
+    described = run("ns-train", "shellgs", "--help", cwd=tmp_path)
+    assert "--pipeline.model.geometry.depth.initial" in described
+    assert "facade-data" in described
+
+
+def test_a_missing_shell_ends_ns_train_with_one_sentence(demo, tmp_path):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    for name in ("images", "transforms.json", "sparse_pc.ply"):
+        (scene / name).symlink_to(demo / "scene" / name)
+    output = run("ns-train", "shellgs", "--data", scene, "--vis", "tensorboard", cwd=tmp_path, status=1)
+    assert "shellgs needs the shell maps" in output
+    assert "Traceback" not in output
+
+
+def test_shellgs_cast_takes_a_shell_and_its_matrix(demo, tmp_path):
+    scene = tmp_path / "eine Szene – 場面"
+    scene.mkdir()
+    for name in ("images", "transforms.json", "sparse_pc.ply"):
+        (scene / name).symlink_to(demo / "scene" / name)
+    alignment = json.loads((demo / "scene" / "shell" / "alignment.json").read_text())
+    (tmp_path / "matrix.txt").write_text("\n".join(" ".join(map(repr, row)) for row in alignment["shell_to_scene"]))
+    shell = demo / "scene" / "shell" / "facade.ply"
+    output = run("shellgs", "cast", scene, "--shell", shell, "--matrix", tmp_path / "matrix.txt", cwd=tmp_path)
+    assert "10 views cast" in output
+    again = run("shellgs", "cast", scene, "--max-image-size", 32, cwd=tmp_path)
+    assert "10 views cast" in again
+    full_size_once_more = run("shellgs", "cast", scene, cwd=tmp_path)
+    assert "10 views cast" in full_size_once_more
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["cast", "nowhere"], "nowhere"),
+        (["cast", ".", "--shell", "scan.ply"], "--shell and --matrix go together"),
+    ],
+)
+def test_a_users_mistake_is_answered_with_one_sentence(tmp_path, words, sentence):
+    output = run("shellgs", *words, cwd=tmp_path, status=1)
+    assert output.startswith("shellgs: ")
+    assert sentence in output
+    assert "Traceback" not in output
+
+
+def test_the_doctor_finds_this_machine_fit(tmp_path):
+    output = run("shellgs", "doctor", cwd=tmp_path)
+    assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
