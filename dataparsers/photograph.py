@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from nerfstudio.cameras.cameras import Cameras
 from PIL import Image, ImageOps
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
 
 
 @dataclass(frozen=True)

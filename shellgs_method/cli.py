@@ -53,7 +53,8 @@ def cast(
 ) -> None:
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
-    An interrupted cast goes on where it stopped.
+    An interrupted cast goes on where it stopped. What stands before the shell can be painted black in masks,
+    scene/shell/masks/<image path>.png: there the shell does not count.
 
     Args:
         scene: Scene folder.
@@ -73,14 +74,15 @@ def cast(
         alignment = Alignment.from_matrix_file(matrix, relative_path(shell, scene), metres_per_shell_unit)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
-    views = [replace(v, camera=v.camera.shrunk(max_image_size)) for v in read_views(FacadeDataParserConfig(data=scene))]
-    summary = cast_views(scene, [(v.name, v.camera) for v in views], alignment, max_image_size=max_image_size)
+    views = read_views(FacadeDataParserConfig(data=scene))
+    summary = cast_views(scene, views, alignment, max_image_size=max_image_size)
     console.print(
         f"{summary.cast} views cast, {summary.skipped} there already, in {summary.seconds:.1f} s; the shell is in "
         f"{summary.seeing} of {len(views)} views and in {summary.supported:.0%} of their pixels."
     )
     maps = CueMaps.open(scene, "shell")
-    cues = ((view, maps.read(view.name, view.camera)) for view in views[:: max(len(views) // 8, 1)])
+    views = [replace(view, camera=view.camera.shrunk(max_image_size)) for view in views[:: max(len(views) // 8, 1)]]
+    cues = ((view, maps.read(view.name, view.camera)) for view in views)
     view, cue = max(((v, cue) for v, cue in cues if cue is not None), key=lambda pair: pair[1].mask.mean())
     panel = maps.folder / "panel.png"
     supervision_panel(load_photograph(view)[..., :3], cue, alignment.metres_per_unit).savefig(panel)

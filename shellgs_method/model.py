@@ -68,9 +68,6 @@ class GeometryLossConfig:
     """Side of the patches of the local NCC in pixels."""
     ncc_eps: float = 1e-3
     """Contrast of a patch, relative to its depth, below which the local NCC takes it for flat."""
-    occlusion_gate: Optional[float] = None
-    """Leave out pixels whose rendered depth is this share of the shell's in front of it: a tree, a car, a lamp post.
-    The paper has no such gate; 0.1 is a good value where something stands before the facade."""
 
 
 @dataclass
@@ -272,8 +269,6 @@ class FacadeModel(SplatfactoModel):
     def _geometry_losses(self, outputs: dict[str, Tensor], cue: Reference) -> dict[str, Tensor]:
         weights, progress = self.config.geometry, self.step / self.num_iterations
         mask = cue.mask
-        if weights.occlusion_gate is not None:
-            mask = mask & (outputs["depth"].detach() > (1 - weights.occlusion_gate) * cue.depth)
         inverse_depth = 1 / outputs["depth"].clamp_min(1e-6)
         normal = colours_to_normals(outputs["normal"])
         ncc = {"local": partial(ncc_loss, window=weights.ncc_window, eps=weights.ncc_eps), "vid2sim": vid2sim_ncc_loss}[

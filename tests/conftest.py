@@ -18,7 +18,7 @@ def pristine_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = tmp_path_factory.mktemp("facade") / "scene"
     write_scene(scene, FacadeConfig(width=48, height=32, views=10, points=300, supersampling=1))
     views = read_views(FacadeDataParserConfig(data=scene))
-    cast_views(scene, [(view.name, view.camera) for view in views], Alignment.load(scene / ALIGNMENT))
+    cast_views(scene, views, Alignment.load(scene / ALIGNMENT))
     return scene
 
 

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
+from dataparsers.photograph import View
 from shellgs_method.evaluation import normal_colours
 from shellgs_method.shell import (
     ALIGNMENT,
@@ -340,14 +342,18 @@ def alignment(tmp_path: Path) -> Alignment:
     return Alignment(np.eye(4), "shell/box.ply")
 
 
-VIEWS = [(f"images/{k}.jpg", camera_at([k - 2.0, 0, 0])) for k in range(5)]
+def view(name: str, camera: Camera) -> View:
+    return View(name, Path(name), camera)
+
+
+VIEWS = [view(f"images/{k}.jpg", camera_at([k - 2.0, 0, 0])) for k in range(5)]
 
 
 def test_every_view_gets_the_map_that_its_camera_sees(tmp_path: Path, alignment: Alignment):
     summary = cast_views(tmp_path, VIEWS, alignment)
     maps, caster = CueMaps.open(tmp_path, "shell"), ShellCaster(box(), np.eye(4))
-    expected = [caster.cast(camera) for _, camera in VIEWS]
-    for (name, camera), cue in zip(VIEWS, expected, strict=True):
+    expected = [caster.cast(view.camera) for view in VIEWS]
+    for (name, camera), cue in zip(((view.name, view.camera) for view in VIEWS), expected, strict=True):
         stored = maps.read(name, camera)
         assert stored is not None
         assert_same_maps(stored, cue)
@@ -359,15 +365,15 @@ def test_maps_are_cast_at_the_size_asked_for(tmp_path: Path, alignment: Alignmen
     cast_views(tmp_path, VIEWS, alignment, max_image_size=32)
     maps = CueMaps.open(tmp_path, "shell")
     assert maps.manifest.max_image_size == 32
-    assert maps.read(VIEWS[0][0], VIEWS[0][1].shrunk(32)) is not None
+    assert maps.read(VIEWS[0].name, VIEWS[0].camera.shrunk(32)) is not None
     with pytest.raises(SceneError, match=r"shellgs cast .* --max-image-size 32"):
-        maps.read(*VIEWS[0])
+        maps.read(VIEWS[0].name, VIEWS[0].camera)
 
 
 def test_the_scale_in_metres_is_kept_with_the_maps(tmp_path: Path):
     save(tmp_path / "shell" / "box.ply", ShellMesh(1000 * box().vertices, box().faces))
     millimetres = Alignment(similarity(0.0005, np.eye(3), np.zeros(3)), "shell/box.ply", metres_per_shell_unit=0.001)
-    cast_views(tmp_path, [("images/x.jpg", camera_at([0, 0, -5]))], millimetres)
+    cast_views(tmp_path, [view("images/x.jpg", camera_at([0, 0, -5]))], millimetres)
     assert CueMaps.open(tmp_path, "shell").manifest.metres_per_unit == pytest.approx(2)
 
 
@@ -398,7 +404,7 @@ def test_a_damaged_map_is_made_again(tmp_path: Path, alignment: Alignment):
     path = tmp_path / "cues/shell/images/1.jpg.npz"
     path.write_bytes(path.read_bytes()[:-40])
     assert cast_views(tmp_path, VIEWS, alignment).cast == 1
-    assert CueMaps.open(tmp_path, "shell").read(*VIEWS[1]) is not None
+    assert CueMaps.open(tmp_path, "shell").read(VIEWS[1].name, VIEWS[1].camera) is not None
 
 
 def test_another_alignment_makes_all_maps_again(tmp_path: Path, alignment: Alignment):
@@ -425,8 +431,8 @@ def test_a_shell_that_no_camera_sees_is_refused_before_anything_is_written(tmp_p
 
 
 def test_one_camera_that_sees_the_shell_is_enough(tmp_path: Path, alignment: Alignment):
-    views = [(f"images/{k}.jpg", camera_at([0, 0, 20.0 + k])) for k in range(40)]
-    views[37] = ("images/37.jpg", camera_at([0, 0, 0]))
+    views = [view(f"images/{k}.jpg", camera_at([0, 0, 20.0 + k])) for k in range(40)]
+    views[37] = view("images/37.jpg", camera_at([0, 0, 0]))
     summary = cast_views(tmp_path, views, alignment)
     assert (summary.cast, summary.seeing) == (40, 1)
 
@@ -434,7 +440,7 @@ def test_one_camera_that_sees_the_shell_is_enough(tmp_path: Path, alignment: Ali
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_units_a_thousand_times_off_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: float):
     save(tmp_path / "shell" / "wall.ply", wall())
-    views = [(f"images/{k}.jpg", camera_at([k * 5.0, 0, 0])) for k in range(3)]
+    views = [view(f"images/{k}.jpg", camera_at([k * 5.0, 0, 0])) for k in range(3)]
     cast_views(tmp_path, views, Alignment(np.diag([1.0, 1, 1, 1]), "shell/wall.ply"))
     assert "units" not in caplog.text
     cast_views(tmp_path, views, Alignment(np.diag([scale, scale, scale, 1]), "shell/wall.ply"))
@@ -477,3 +483,20 @@ def test_a_view_that_sees_nothing_has_a_panel(tmp_path: Path):
     cue = ShellCaster(box(), np.eye(4)).cast(camera_at([0, 0, 20]))
     supervision_panel(np.zeros((48, 64, 3), np.uint8), cue).savefig(tmp_path / "panel.png")
     assert (tmp_path / "panel.png").stat().st_size > 0
+
+
+def test_what_a_mask_paints_black_is_no_shell(tmp_path: Path, alignment: Alignment):
+    cast_views(tmp_path, VIEWS, alignment)
+    before = CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)
+    height, width = VIEWS[2].camera.height, VIEWS[2].camera.width
+    painted = np.full((height, width), 255, np.uint8)
+    painted[:, : width // 2] = 0
+    path = tmp_path / "shell" / "masks" / "images" / "2.jpg.png"
+    path.parent.mkdir(parents=True)
+    Image.fromarray(painted).save(path)
+    cast_views(tmp_path, VIEWS, alignment)
+    after = CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(after.mask, before.mask & (painted > 0))
+    np.testing.assert_array_equal(after.depth, before.depth)

@@ -4,13 +4,14 @@
 """
 
 from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.cast import ALIGNMENT, CastSummary, cast_views
+from shellgs_method.shell.cast import ALIGNMENT, MASKS, CastSummary, cast_views
 from shellgs_method.shell.mesh import ShellMesh, load_shell
 from shellgs_method.shell.panel import supervision_panel
 from shellgs_method.shell.raycast import ShellCaster
 
 __all__ = [
     "ALIGNMENT",
+    "MASKS",
     "Alignment",
     "CastSummary",
     "ShellCaster",

@@ -5,22 +5,25 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from rich.progress import track
 
 from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMaps
+from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
+from dataparsers.photograph import View, load_mask
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.mesh import load_shell
 from shellgs_method.shell.raycast import ShellCaster
 
 log = logging.getLogger(__name__)
 
-ALIGNMENT = Path("shell/alignment.json")  # in the scene's folder
+# In the scene's folder:
+ALIGNMENT = Path("shell/alignment.json")
+MASKS = Path("shell/masks")
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class CastSummary:
 
 def cast_views(
     scene: Path,
-    views: Sequence[tuple[str, Camera]],
+    views: Sequence[View],
     alignment: Alignment,
     *,
     max_image_size: int | None = None,
@@ -55,9 +58,12 @@ def cast_views(
     on where it stopped. ``scene/shell/alignment.json``, which the maps are bound to, is written if it holds another
     alignment. Nothing is written before some camera is known to see the shell.
 
+    The shell knows nothing of what stands before it, a tree or a car: what is black in
+    ``scene/shell/masks/<image's name>.png``, if there is such a picture, is taken out of the view's mask.
+
     Args:
         scene: the scene's folder.
-        views: images' names (their paths relative to the scene) and cameras in the scene's frame.
+        views: the photographs, with full-size cameras.
         alignment: names the shell and places it.
         max_image_size: cast for photographs resized to this longer side.
 
@@ -68,7 +74,7 @@ def cast_views(
     start = time.monotonic()
     shell = scene / alignment.shell
     caster = ShellCaster(load_shell(shell), alignment.shell_to_scene)
-    _check_placement(caster, [camera for _, camera in views], shell)
+    _check_placement(caster, [view.camera for view in views], shell)
     kept = scene / ALIGNMENT
     if not kept.is_file() or Alignment.load(kept) != alignment:
         alignment.save(kept)
@@ -76,17 +82,17 @@ def cast_views(
         scene,
         "shell",
         command="shellgs cast {scene}" + (f" --max-image-size {max_image_size}" if max_image_size else ""),
-        sources=[shell, kept],
+        sources=[shell, kept, *sorted((scene / MASKS).rglob("*.png"))],
         metres_per_unit=alignment.metres_per_unit,
         max_image_size=max_image_size,
     )
     cast = 0
-    for name, full_camera in track(views, description="casting the shell"):
-        camera = full_camera.shrunk(max_image_size)
-        if not maps.current(name, camera):
-            maps.write(name, caster.cast(camera), camera)
+    for full_size in track(views, description="casting the shell"):
+        view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
+        if not maps.current(view.name, view.camera):
+            maps.write(view.name, _unoccluded(caster.cast(view.camera), view, scene), view.camera)
             cast += 1
-    supported = [record.supported for name, _ in views if (record := maps.record(name))]
+    supported = [record.supported for view in views if (record := maps.record(view.name))]
     return CastSummary(
         cast=cast,
         skipped=len(views) - cast,
@@ -94,6 +100,12 @@ def cast_views(
         supported=float(np.mean(supported)),
         seconds=time.monotonic() - start,
     )
+
+
+def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
+    path = scene / MASKS / f"{view.name}.png"
+    kept = load_mask(replace(view, mask=path)) if path.is_file() else None
+    return cue if kept is None else replace(cue, mask=cue.mask & kept)
 
 
 def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path) -> None:

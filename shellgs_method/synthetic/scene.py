@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 from PIL import Image
 from rich.progress import track
+from scipy.ndimage import binary_dilation
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
-from shellgs_method.shell import Alignment
+from shellgs_method.shell import ALIGNMENT, MASKS, Alignment
 from shellgs_method.shell.raycast import import_open3d
 from shellgs_method.synthetic.appearance import Daylight, photograph, rays
 from shellgs_method.synthetic.building import Layout, building, shell
@@ -94,6 +96,11 @@ class Facade:
         normal = hits.normal @ camera.viewmat[:3, :3].numpy().T
         return CueMap(depth, normal.astype(np.float16), hits.material <= Material.RAILING)
 
+    def unoccluded(self, camera: Camera) -> Bool[np.ndarray, "H W"]:
+        """Where neither pole nor tree stands before the building, with the margin that a brush leaves."""
+        material = self.daylight.world.cast(*rays(camera)).material
+        return ~binary_dilation(np.isin(material, (Material.POLE, Material.TRUNK, Material.LEAF)), iterations=2)
+
 
 def write_scene(scene: Path, config: FacadeConfig) -> None:
     """Write the scene folder of a synthetic facade; it appears whole or not at all.
@@ -129,6 +136,9 @@ def _write(scene: Path, config: FacadeConfig) -> None:
         Image.fromarray(image).save(scene / name)
         found.append(features(facade.daylight.world, camera, image, per_view, sfm))
         truth.write(name, facade.truth(camera), scene_camera(camera))
+        mask = scene / MASKS / f"{name}.png"
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(facade.unoccluded(camera)).save(mask)
     points = triangulate(facade.daylight.world, facade.cameras, found, config.points, sfm)
     _write_points(scene / "sparse_pc.ply", points)
     (scene / "transforms.json").write_text(json.dumps(_transforms(names, facade.cameras), indent=1) + "\n")
@@ -169,4 +179,4 @@ def _write_shell(scene: Path, mesh: Mesh) -> None:
     )
     o3d.io.write_triangle_mesh(str(path), solid)
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
-    Alignment(matrix, SHELL, 1.0, source="the synthetic facade's own frames").save(scene / "shell" / "alignment.json")
+    Alignment(matrix, SHELL, 1.0, source="the synthetic facade's own frames").save(scene / ALIGNMENT)
