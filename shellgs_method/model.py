@@ -48,8 +48,8 @@ from shellgs_method.rasterizer import quats_to_rotations, rasterize, spherical_h
 PAPER_ITERATIONS = 30_000
 """The run for which the iteration numbers of the config are stated; a shorter run shrinks them in proportion."""
 
-MIN_RESET_EVERY = 300
-"""Fewest iterations between two resets of the opacities, which take half of that to come back at any length of run."""
+MIN_RESET_EVERY = 1000
+"""Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in a long."""
 
 
 @dataclass

@@ -120,7 +120,7 @@ def test_schedules_shrink_with_the_run(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, iterations=3000)
     strategy = model_of(trainer).strategy
     assert (strategy.refine_start_iter, strategy.refine_stop_iter) == (50, 1500)
-    assert strategy.reset_every == 300
+    assert strategy.reset_every == 1000
     scheduler = trainer.optimizers.schedulers["means"]
     assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
     factor = scheduler.lr_lambdas[0]

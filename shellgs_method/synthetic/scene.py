@@ -99,7 +99,8 @@ class Facade:
     def unoccluded(self, camera: Camera) -> Bool[np.ndarray, "H W"]:
         """Where neither pole nor tree stands before the building, with the margin that a brush leaves."""
         material = self.daylight.world.cast(*rays(camera)).material
-        return ~binary_dilation(np.isin(material, (Material.POLE, Material.TRUNK, Material.LEAF)), iterations=2)
+        before = np.isin(material, (Material.POLE, Material.TRUNK, Material.LEAF))
+        return np.logical_not(binary_dilation(before, iterations=2))
 
 
 def write_scene(scene: Path, config: FacadeConfig) -> None:
