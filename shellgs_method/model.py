@@ -49,7 +49,7 @@ PAPER_ITERATIONS = 30_000
 """The run for which the iteration numbers of the config are stated; a shorter run shrinks them in proportion."""
 
 MIN_RESET_EVERY = 1000
-"""Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in a long."""
+"""Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in any."""
 
 
 @dataclass
