@@ -1,0 +1,48 @@
+"""The shell pipeline on photographs of a real facade; the data are not part of the project."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nerfstudio.data.utils.colmap_parsing_utils import read_points3D_binary
+
+from dataparsers.cue_maps import CueMaps
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.shell import Alignment, cast_views
+
+DATA = Path(os.environ.get("SHELLGS_DATA", Path(__file__).parents[2] / "shared" / "data"))
+SCENES = {"herz-jesu-p25": "herz_jesu_survey.ply", "south-building-26": "south_building_survey.ply"}
+
+pytestmark = pytest.mark.skipif(
+    not DATA.is_dir(), reason=f"no real scenes in {DATA}; SHELLGS_DATA tells where they are"
+)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_cast_shell_lies_where_sfm_saw_the_building(tmp_path: Path, name: str):
+    scene = tmp_path / name
+    shutil.copytree(DATA / name, scene, copy_function=os.symlink)
+    shell = f"shell/{SCENES[name]}"
+    alignment = Alignment.from_matrix_file(scene / "shell" / "shell_to_scene.txt", shell)
+    views = read_views(FacadeDataParserConfig(data=scene))[::8]
+    cast_views(scene, views, alignment, max_image_size=384)
+    maps = CueMaps.open(scene, "shell")
+    cloud = read_points3D_binary(scene / "colmap" / "sparse" / "0" / "points3D.bin")
+    points = np.array([point.xyz for point in cloud.values()])
+    errors = []
+    for view in views:
+        camera = view.camera.shrunk(384)
+        cue = maps.read(view.name, camera)
+        assert cue is not None
+        seen = points @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
+        seen = seen[seen[:, 2] > 0]
+        column, row, _ = np.floor(seen @ camera.K.numpy().T / seen[:, 2:]).astype(int).T
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        depth = cue.depth[row[inside], column[inside]]
+        errors.append(np.abs(seen[inside, 2] / depth - 1)[depth > 0])
+    # Points on the far side of a relief are in it too: the median stands for those that the camera sees.
+    assert np.median(np.concatenate(errors)) < 0.005
