@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Optional
@@ -112,6 +113,7 @@ def doctor(install_libraries: bool = False) -> None:
 
 def main() -> None:
     """Entry point."""
+    warnings.filterwarnings("ignore", category=FutureWarning)  # of the libraries below, and nothing to a user
     commands = {"demo": demo, "cast": cast, "doctor": doctor}
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(

@@ -82,7 +82,9 @@ class Alignment:
             SceneError: the file is damaged or its matrix no similarity.
         """
         if not path.is_file():
-            raise FileNotFoundError(f"{path} does not exist: align the shell with `shellgs align` first")
+            raise FileNotFoundError(
+                f"{path} does not exist: name the shell and its place with `shellgs cast --shell … --matrix …`"
+            )
         try:
             fields = json.loads(path.read_bytes())
             matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
