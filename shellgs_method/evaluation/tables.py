@@ -62,7 +62,8 @@ def markdown_table(rows: Rows, columns: Sequence[Column]) -> str:
 
 def rich_table(rows: Rows, columns: Sequence[Column], title: str | None = None) -> Table:
     """The same table for a terminal."""
-    table = Table("Method", title=title)
+    table = Table(title=title)
+    table.add_column("Method", no_wrap=True)
     for column in columns:
         table.add_column(column.heading, justify="right")
     for method, cells in _cells(rows, columns):
