@@ -92,7 +92,7 @@ def test_training_makes_the_picture_and_the_normals_better(trained, pristine_sce
         model_of(trainer).get_image_metrics_and_images(render(trainer), held_out(trainer)[1])[0]
         for trainer in (untrained, trained)
     )
-    assert after["psnr"] > before["psnr"] + 1
+    assert after["psnr"] > before["psnr"] + 0.5
     assert after["normal_deg"] < before["normal_deg"] - 1
 
 
