@@ -9,40 +9,13 @@ import pytest
 import torch
 from dense_reference import dense_rasterize
 from gsplat import DefaultStrategy
+from random_splats import NAMES, make_camera, make_splats, orbit
 from torch import Tensor
 from torch._inductor.cpp_builder import get_cpp_compiler
 from torch._inductor.exc import InvalidCxxCompiler
 
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer import fusion, rasterize
-
-NAMES = ("means", "quats", "scales", "opacities", "features")
-
-
-def make_camera(width: int, height: int, dtype: torch.dtype = torch.float64) -> Camera:
-    """A camera that looks along z, a little askew, from near the origin."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.linalg.qr(torch.eye(3).double() + 0.1 * torch.arange(9.0).double().view(3, 3).sin())[0]
-    viewmat[:3, :3] *= viewmat[:3, :3].diagonal().sign()
-    viewmat[:3, 3] = torch.tensor([0.05, -0.03, 0.1])
-    K = torch.tensor([[0.8 * width, 0, 0.47 * width], [0, 0.83 * width, 0.53 * height], [0, 0, 1]])
-    return Camera(viewmat.to(dtype), K.to(dtype), width, height)
-
-
-def make_splats(n: int, n_features: int, seed: int) -> list[Tensor]:
-    """Splats of every sort: in front and behind, off screen, sub-pixel to screen-filling, faint and opaque."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    means = normal(n, 3) * torch.tensor([2.0, 1.5, 2.0]) + torch.tensor([0.0, 0.0, 3.0])
-    scales = (normal(n, 3) - 2.5).exp()
-    scales[: n // 10] *= 30
-    scales[n // 10 : n // 5] *= 0.01
-    opacities = torch.sigmoid(3 * normal(n))
-    opacities[::7], opacities[1::7] = 0.9999, 0.003
-    return [means, 3 * normal(n, 4), scales, opacities, normal(n, n_features)]
 
 
 def differentiate(splats: list[Tensor], composited: Tensor, alpha: Tensor, counted: Tensor, means2d: Tensor) -> dict:
@@ -214,6 +187,30 @@ def test_the_order_of_the_splats_does_not_matter():
     expected, *_ = rasterize(*splats, camera=camera)
     actual, *_ = rasterize(*(splat[order] for splat in splats), camera=camera)
     torch.testing.assert_close(actual, expected)
+
+
+def test_a_batch_of_cameras_gives_the_pictures_of_each():
+    splats = [splat.requires_grad_() for splat in make_splats(80, 3, seed=14)]
+    cameras = orbit(make_camera(29, 22), 3)
+    composited, alpha, info = rasterize(*splats, camera=cameras)
+    assert info["n_cameras"] == 3
+    assert info["means2d"].shape == (3, 80, 2)
+    singles = [rasterize(*splats, camera=camera) for camera in cameras]
+    slope = torch.linspace(-1, 1, 29 * 3, dtype=torch.float64).view(29, 3)
+    batched = torch.autograd.grad((slope * composited).sum() + alpha.sum(), [*splats, info["means2d"]])
+    by_one = [torch.autograd.grad((slope * c).sum() + a.sum(), [*splats, i["means2d"]]) for c, a, i in singles]
+    torch.testing.assert_close(composited, torch.stack([single[0] for single in singles]))
+    torch.testing.assert_close(alpha, torch.stack([single[1] for single in singles]))
+    for actual, *expected in zip(batched[:-1], *(each[:-1] for each in by_one), strict=True):
+        torch.testing.assert_close(actual, torch.stack(expected).sum(0))
+    torch.testing.assert_close(batched[-1], torch.cat([each[-1] for each in by_one]))
+    assert torch.equal(info["radii"], torch.cat([single[2]["radii"] for single in singles]))
+
+
+@pytest.mark.parametrize("widths", [[], [20, 21]])
+def test_a_batch_needs_cameras_of_one_size(widths):
+    with pytest.raises(ValueError, match="one size in common"):
+        rasterize(*make_splats(5, 3, seed=0), camera=[make_camera(width, 20) for width in widths])
 
 
 def test_cropping_is_shifting_the_principal_point():

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 TILE = 8  # pixels along the side of a tile
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """Ellipses on the screen, in pixels.
+
+    Attributes:
+        centres: (x, y).
+        conics: A, B, C of A x² + 2 B x y + C y² <= 1 about the centre.
+        reach: half the width and height.
+    """
+
+    centres: Float[Tensor, "*batch 2"]
+    conics: Float[Tensor, "*batch 3"]
+    reach: Float[Tensor, "*batch 2"]
+
+    def __getitem__(self, index: Int[Tensor, "..."] | int) -> Ellipses:
+        return Ellipses(self.centres[index], self.conics[index], self.reach[index])
+
+    def touch(self, width: int, height: int) -> Bool[Tensor, "*batch"]:
+        """Whether the ellipses' boxes touch the image."""
+        size = self.centres.new_tensor([width, height])
+        return ((self.centres + self.reach > 0) & (self.centres - self.reach < size)).all(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -38,25 +62,22 @@ class Bins:
 
 
 @torch.no_grad()
-def bin_splats(
-    means2d: Float[Tensor, "splats 2"],
-    conics: Float[Tensor, "splats 3"],
-    cutoff: Float[Tensor, "splats"],
-    reach: Float[Tensor, "splats 2"],
-    width: int,
-    height: int,
-) -> Bins:
-    """Assign splats, ordered front to back, to exactly the tiles whose pixels' centres span their ellipses."""
-    rows, columns = -(-height // TILE), -(-width // TILE)
-    splats = torch.arange(len(means2d), device=means2d.device)
+def bin_splats(outlines: Sequence[Ellipses], width: int, height: int) -> Bins:
+    """Assign splats, ordered front to back, to the tiles whose pixels' centres their outlines span.
 
-    v, reach_y = means2d[:, 1], reach[:, 1]
-    first_row, n_rows = _tiles_between(v - reach_y, v + reach_y, height)
+    Of a splat with several outlines, it is the tiles between the leftmost and rightmost of them in each row.
+    """
+    rows, columns = -(-height // TILE), -(-width // TILE)
+    splats = torch.arange(len(outlines[0].centres), device=outlines[0].centres.device)
+
+    tops = [outline.centres[:, 1] - outline.reach[:, 1] for outline in outlines]
+    bottoms = [outline.centres[:, 1] + outline.reach[:, 1] for outline in outlines]
+    first_row, n_rows = _tiles_between(torch.stack(tops).amin(0), torch.stack(bottoms).amax(0), height)
     strip_splat, rank = _repeat(splats, n_rows)
     strip_row = first_row[strip_splat] + rank
 
-    left, right = _span_in_strip(means2d, conics, cutoff, reach, strip_splat, strip_row)
-    first_column, n_columns = _tiles_between(left, right, width)
+    lefts, rights = zip(*(_span_in_strip(outline[strip_splat], strip_row) for outline in outlines), strict=True)
+    first_column, n_columns = _tiles_between(torch.stack(lefts).amin(0), torch.stack(rights).amax(0), width)
     strip, rank = _repeat(torch.arange(len(strip_splat), device=splats.device), n_columns)
     tile = strip_row[strip] * columns + first_column[strip] + rank
     splat = strip_splat[strip]
@@ -76,31 +97,29 @@ def bin_splats(
 
 
 def _span_in_strip(
-    means2d: Float[Tensor, "splats 2"],
-    conics: Float[Tensor, "splats 3"],
-    cutoff: Float[Tensor, "splats"],
-    reach: Float[Tensor, "splats 2"],
-    splat: Int[Tensor, "strips"],
-    row: Int[Tensor, "strips"],
+    ellipses: Ellipses, row: Int[Tensor, "strips"]
 ) -> tuple[Float[Tensor, "strips"], Float[Tensor, "strips"]]:
-    """Leftmost and rightmost x of a splat's ellipse among the lines of pixel centres of a row of tiles.
+    """Leftmost and rightmost x of an ellipse among the lines of pixel centres of a row of tiles; none, inf and -inf.
 
-    At height y above its centre, the ellipse A x² + 2 B x y + C y² = cutoff spans
-    x = -B/A y ± sqrt(cutoff / A (1 - y² / reach_y²)), and it is widest where y = ∓B/C reach_x.
+    At height y above its centre, the ellipse A x² + 2 B x y + C y² = 1 spans
+    x = -B/A y ± sqrt((1 - y² / reach_y²) / A), and it is widest where y = ∓B/C reach_x.
     """
-    u, v = means2d[splat].unbind(-1)
-    A, B, C = conics[splat].unbind(-1)
-    reach_x, reach_y = reach[splat].unbind(-1)
+    u, v = ellipses.centres.unbind(-1)
+    A, B, C = ellipses.conics.unbind(-1)
+    reach_x, reach_y = ellipses.reach.unbind(-1)
     above = torch.maximum(row * TILE + 0.5 - v, -reach_y)
     below = torch.minimum(row * TILE + (TILE - 0.5) - v, reach_y)
     widest = -B / C * reach_x
 
     def half_width(y: Tensor) -> Tensor:
-        return (cutoff[splat] / A * (1 - (y / reach_y).square()).clamp_min(0)).sqrt()
+        return ((1 - (y / reach_y).square()).clamp_min(0) / A).sqrt()
 
     y_right = torch.minimum(torch.maximum(widest, above), below)
     y_left = torch.minimum(torch.maximum(-widest, above), below)
-    return u - B / A * y_left - half_width(y_left), u - B / A * y_right + half_width(y_right)
+    left = u - B / A * y_left - half_width(y_left)
+    right = u - B / A * y_right + half_width(y_right)
+    meets = above <= below
+    return torch.where(meets, left, torch.inf), torch.where(meets, right, -torch.inf)
 
 
 def _tiles_between(

@@ -20,25 +20,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from shellgs_method.rasterizer.projection import ALPHA_MIN
+from shellgs_method.rasterizer.projection import ALPHA_MAX, ALPHA_MIN
 
-ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would bring it there
 N_SHAPE = 6  # parameters of a splat before its features
 NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, math.inf)  # of a splat whose alpha is 0 everywhere
 Z_MAX = math.log2(ALPHA_MAX / ALPHA_MIN)
-
-
-def pack(
-    means2d: Float[Tensor, "N 2"],
-    conics: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    features: Float[Tensor, "N C"],
-) -> Float[Tensor, "N K"]:
-    """The parameters of the kernels, one row a splat."""
-    halvings = conics * conics.new_tensor([0.5, 1.0, 0.5]) / math.log(2)
-    n = (ALPHA_MAX / opacities).log2()
-    return torch.cat([means2d, halvings, n[:, None], features, torch.ones_like(n)[:, None]], dim=1)
 
 
 def forward_chunk(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -10,76 +12,104 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from shellgs_method.rasterizer.binning import Ellipses
 
 NEAR_PLANE = 0.01
 LOW_PASS = 0.3  # variance in px² added to every splat
 ALPHA_MIN = 1 / 255  # less does not count
+ALPHA_MAX = 0.999
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Gaussians on the screen.
+    """Splats on the screens of B cameras.
 
     Attributes:
         means2d: centres in pixels.
-        conics: inverse covariances (xx, xy, yy).
-        covars2d: covariances (xx, xy, yy) in px².
+        shapes: what the kernels of the primitive know of a splat besides its centre and features.
         depths: z of the centres in the camera frame.
-        cutoff: squared Mahalanobis distance up to which alpha may reach 1/255.
-        visible: in front of the near plane, and the ellipse of the cut-off touches the image.
+        outlines: ellipses that together cover the pixels where alpha reaches 1/255.
+        covars2d: covariances (xx, xy, yy) in px², low-pass included.
+        visible: in front of the near plane, and an outline touches the image.
     """
 
-    means2d: Float[Tensor, "N 2"]
-    conics: Float[Tensor, "N 3"]
-    covars2d: Float[Tensor, "N 3"]
-    depths: Float[Tensor, "N"]
-    cutoff: Float[Tensor, "N"]
-    visible: Bool[Tensor, "N"]
-
-    @property
-    def reach(self) -> Float[Tensor, "N 2"]:
-        """Half the width and height of the ellipse of the cut-off."""
-        return (self.cutoff[:, None] * self.covars2d[:, ::2]).sqrt()
+    means2d: Float[Tensor, "B N 2"]
+    shapes: Float[Tensor, "B N K"]
+    depths: Float[Tensor, "B N"]
+    outlines: Sequence[Ellipses]
+    covars2d: Float[Tensor, "B N 3"]
+    visible: Bool[Tensor, "B N"]
 
 
-def project(
+def project_gaussians(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
     scales: Float[Tensor, "N 3"],
     opacities: Float[Tensor, "N"],
-    camera: Camera,
+    cameras: Sequence[Camera],
 ) -> Projection:
-    """Project Gaussians (EWA splatting, Zwicker et al. 2001); differentiable in the means2d and conics."""
-    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    x, y, z = (means @ rotation.T + translation).unbind(-1)
+    """Project Gaussians (EWA splatting, Zwicker et al. 2001); differentiable in the means2d and shapes.
+
+    Their shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`.
+    """
+    viewmats, fx, fy, cx, cy = stack_cameras(cameras)
+    width, height = cameras[0].width, cameras[0].height
+    x, y, z = to_camera(means, viewmats).unbind(-1)
     depths = z.detach()
     in_front = depths >= NEAR_PLANE
     z = torch.where(in_front, z, 1.0)  # a culled splat must not put a division by 0 into the gradients
     x, y = x / z, y / z
-
-    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     means2d = torch.stack([fx * x + cx, fy * y + cy], dim=-1)
 
     # Off screen the linearised projection runs wild: its slope is held within 15 % of the image beyond the borders.
-    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
-    x = x.clamp(-cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
-    y = y.clamp(-cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
-    axes = rotation @ (quats_to_rotations(quats) * scales[:, None, :])  # columns: the Gaussian's half-axes
-    across = (fx / z)[:, None] * (axes[:, 0] - x[:, None] * axes[:, 2])
-    down = (fy / z)[:, None] * (axes[:, 1] - y[:, None] * axes[:, 2])
+    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
+    x = x.clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
+    y = y.clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
+    # columns: the Gaussian's half-axes
+    axes = viewmats[:, None, :3, :3] @ (quats_to_rotations(quats) * scales[:, None, :])
+    across = (fx / z)[..., None] * (axes[..., 0, :] - x[..., None] * axes[..., 2, :])
+    down = (fy / z)[..., None] * (axes[..., 1, :] - y[..., None] * axes[..., 2, :])
 
     xx, xy, yy = (across * across).sum(-1), (across * down).sum(-1), (down * down).sum(-1)
     # xx yy - xy², by Lagrange's identity: no cancellation for a long and thin splat
     determinant = torch.linalg.cross(across, down).square().sum(-1) + LOW_PASS * (xx + yy) + LOW_PASS**2
-    conics = torch.stack([yy + LOW_PASS, -xy, xx + LOW_PASS], dim=-1) / determinant[:, None]
+    conics = torch.stack([yy + LOW_PASS, -xy, xx + LOW_PASS], dim=-1) / determinant[..., None]
+    n = halvings(opacities).expand_as(depths)
+    shapes = torch.cat([conics * conics.new_tensor([0.5, 1.0, 0.5]) / math.log(2), n[..., None]], dim=-1)
 
     covars2d = torch.stack([xx + LOW_PASS, xy, yy + LOW_PASS], dim=-1).detach()
+    cutoff = cutoffs(opacities)[:, None]
+    outline = Ellipses(means2d.detach(), conics.detach() / cutoff, (cutoff * covars2d[..., ::2]).sqrt())
+    visible = in_front & (cutoff[:, 0] > 0) & outline.touch(width, height)
+    return Projection(means2d, shapes, depths, [outline], covars2d, visible)
+
+
+def stack_cameras(
+    cameras: Sequence[Camera],
+) -> tuple[
+    Float[Tensor, "B 4 4"], Float[Tensor, "B 1"], Float[Tensor, "B 1"], Float[Tensor, "B 1"], Float[Tensor, "B 1"]
+]:
+    """Views and fx, fy, cx, cy of cameras, for splats along the second dimension."""
+    Ks = torch.stack([camera.K for camera in cameras])
+    viewmats = torch.stack([camera.viewmat for camera in cameras])
+    return viewmats, Ks[:, 0, 0, None], Ks[:, 1, 1, None], Ks[:, 0, 2, None], Ks[:, 1, 2, None]
+
+
+def to_camera(points: Float[Tensor, "N 3"], viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B N 3"]:
+    """Points of the world in the frames of cameras."""
+    return points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
+
+
+def halvings(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """How many times alpha has halved below its limit at a splat's centre."""
+    # What is so faint is culled; it must not put a division by 0 into the gradients.
+    return (ALPHA_MAX / opacities.clamp_min(ALPHA_MIN / 2)).log2()
+
+
+def cutoffs(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    """Squared Mahalanobis distance up to which alpha may reach 1/255; 0 for a splat too faint to count."""
     # The slack outweighs rounding, so that binning never loses a pixel that the kernel would count.
-    cutoff = (2 * (opacities.detach() / ALPHA_MIN).log() + 1e-3).clamp_min(0)
-    projection = Projection(means2d, conics, covars2d, depths, cutoff, in_front & (cutoff > 0))
-    size = means2d.new_tensor([camera.width, camera.height])
-    touches = (means2d + projection.reach > 0) & (means2d - projection.reach < size)
-    return replace(projection, visible=projection.visible & touches.all(dim=-1))
+    return (2 * (opacities.detach() / ALPHA_MIN).log() + 1e-3).clamp_min(0)
 
 
 def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:

@@ -1,7 +1,8 @@
-"""Rasterization of 3D Gaussians with any features, differentiable, with the semantics of gsplat's classic mode."""
+"""Rasterization of splats with any features, differentiable, with the semantics of gsplat's classic mode."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -12,8 +13,7 @@ from torch import Tensor
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer.binning import bin_splats
 from shellgs_method.rasterizer.compositing import composite
-from shellgs_method.rasterizer.kernels import pack
-from shellgs_method.rasterizer.projection import Projection, project
+from shellgs_method.rasterizer.projection import Projection, project_gaussians
 
 
 def rasterize(
@@ -22,8 +22,8 @@ def rasterize(
     scales: Float[Tensor, "N 3"],
     opacities: Float[Tensor, "N"],
     features: Float[Tensor, "N C"],
-    camera: Camera,
-) -> tuple[Float[Tensor, "height width C"], Float[Tensor, "height width 1"], dict[str, Any]]:
+    camera: Camera | Sequence[Camera],
+) -> tuple[Float[Tensor, "*B height width C"], Float[Tensor, "*B height width 1"], dict[str, Any]]:
     """Composite the features of 3D Gaussians front to back, by the depth of their centres.
 
     A splat's alpha is at most 0.999, and does not count below 1/255; a pixel stops before the splat that would bring
@@ -35,41 +35,55 @@ def rasterize(
         scales: standard deviations along the rotated axes, in scene units, positive.
         opacities: in (0, 1).
         features: any channels, all composited in one pass.
-        camera: its tensors are brought to the dtype and device of the means.
+        camera: one, or B of one size; its tensors are brought to the dtype and device of the means.
 
     Returns:
         The sums of weight times feature (not divided by alpha, no background), the sums of the weights, and what
-        gsplat's densification strategies need: ``means2d`` [1, N, 2] in pixels, whose gradient can be retained,
-        ``radii``, ….
+        gsplat's densification strategies need: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained,
+        ``radii``, …. The pictures of a sequence of cameras are stacked.
+
+    Raises:
+        ValueError: if the cameras differ in size, or there are none.
     """
-    projection = project(means, quats, scales, opacities, camera.to(means))
-    means2d = projection.means2d[None]
+    cameras = [camera] if isinstance(camera, Camera) else list(camera)
+    sizes = {(each.width, each.height) for each in cameras}
+    if len(sizes) != 1:
+        raise ValueError(f"The cameras of a batch need one size in common, not {sorted(sizes)}.")
+    ((width, height),) = sizes
+    projection = project_gaussians(means, quats, scales, opacities, [each.to(means) for each in cameras])
     info = {
-        "means2d": means2d,
-        "radii": _radii(projection)[None],
+        "means2d": projection.means2d,
+        "radii": _radii(projection),
         "gaussian_ids": None,
-        "width": camera.width,
-        "height": camera.height,
-        "n_cameras": 1,
+        "width": width,
+        "height": height,
+        "n_cameras": len(cameras),
     }
-
-    visible = projection.visible.nonzero().squeeze(1)
-    order = visible[projection.depths[visible].argsort(stable=True)]
-    centres, conics, opacities, features = (
-        splats.index_select(0, order) for splats in (means2d[0], projection.conics, opacities, features)
-    )
-    bins = bin_splats(centres, conics, projection.cutoff[order], projection.reach[order], camera.width, camera.height)
-    composited = composite(pack(centres, conics, opacities, features), bins)[: camera.height, : camera.width]
-    return composited[..., :-1], composited[..., -1:], info
+    pictures = torch.stack([_render(projection, i, features, width, height) for i in range(len(cameras))])
+    if isinstance(camera, Camera):
+        pictures = pictures[0]
+    return pictures[..., :-1], pictures[..., -1:], info
 
 
-def _radii(projection: Projection) -> Int[Tensor, "N ..."]:
+def _render(
+    projection: Projection, i: int, features: Float[Tensor, "N C"], width: int, height: int
+) -> Float[Tensor, "height width C+1"]:
+    """Features and alpha as camera ``i`` sees them."""
+    visible = projection.visible[i].nonzero().squeeze(1)
+    order = visible[projection.depths[i, visible].argsort(stable=True)]
+    bins = bin_splats([outline[i][order] for outline in projection.outlines], width, height)
+    params = [projection.means2d[i], projection.shapes[i], features, torch.ones_like(features[:, :1])]
+    return composite(torch.cat([splats.index_select(0, order) for splats in params], dim=1), bins)[:height, :width]
+
+
+def _radii(projection: Projection) -> Int[Tensor, "B N ..."]:
     """Radii in pixels as the installed gsplat has them, 0 where a splat is invisible.
 
     One of three standard deviations in gsplat 1.4; from 1.5 one each along x and y, up to where alpha counts.
     """
     if tuple(map(int, version("gsplat").split(".")[:2])) >= (1, 5):
-        return torch.where(projection.visible[:, None], projection.reach.ceil(), 0).int()
+        reach = torch.stack([outline.reach for outline in projection.outlines]).amax(0)
+        return torch.where(projection.visible[..., None], reach.ceil(), 0).int()
     xx, xy, yy = projection.covars2d.unbind(-1)
     variance = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
     return torch.where(projection.visible, (3 * variance.sqrt()).ceil(), 0).int()

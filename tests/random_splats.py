@@ -1,0 +1,51 @@
+"""Splats and cameras at random, the same every time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dataparsers.camera import Camera
+
+NAMES = ("means", "quats", "scales", "opacities", "features")
+
+
+def make_camera(width: int, height: int, dtype: torch.dtype = torch.float64) -> Camera:
+    """A camera that looks along z, a little askew, from near the origin."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.linalg.qr(torch.eye(3).double() + 0.1 * torch.arange(9.0).double().view(3, 3).sin())[0]
+    viewmat[:3, :3] *= viewmat[:3, :3].diagonal().sign()
+    viewmat[:3, 3] = torch.tensor([0.05, -0.03, 0.1])
+    K = torch.tensor([[0.8 * width, 0, 0.47 * width], [0, 0.83 * width, 0.53 * height], [0, 0, 1]])
+    return Camera(viewmat.to(dtype), K.to(dtype), width, height)
+
+
+def make_splats(n: int, n_features: int, seed: int) -> list[Tensor]:
+    """Splats of every sort: in front and behind, off screen, sub-pixel to screen-filling, faint and opaque."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    means = normal(n, 3) * torch.tensor([2.0, 1.5, 2.0]) + torch.tensor([0.0, 0.0, 3.0])
+    scales = (normal(n, 3) - 2.5).exp()
+    scales[: n // 10] *= 30
+    scales[n // 10 : n // 5] *= 0.01
+    opacities = torch.sigmoid(3 * normal(n))
+    opacities[::7], opacities[1::7] = 0.9999, 0.003
+    return [means, 3 * normal(n, 4), scales, opacities, normal(n, n_features)]
+
+
+def orbit(camera: Camera, n: int) -> list[Camera]:
+    """Cameras one beside the other, each turned a little further about its y axis, with ever longer lenses."""
+    cameras = []
+    for i in range(n):
+        angle = torch.tensor(0.15 * i, dtype=camera.viewmat.dtype)
+        turn = torch.eye(4, dtype=camera.viewmat.dtype)
+        turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
+        turn[0, 3] = 0.1 * i
+        zoom = camera.K.new_tensor([1 + 0.2 * i, 1 + 0.1 * i, 1.0])
+        cameras.append(replace(camera, viewmat=turn @ camera.viewmat, K=zoom[:, None] * camera.K))
+    return cameras
