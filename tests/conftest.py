@@ -1,4 +1,4 @@
-"""A tiny synthetic facade that the tests of the nerfstudio side share."""
+"""What tests share: a tiny synthetic facade, and the rasterizer with and without a compiler."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from torch._inductor.cpp_builder import get_cpp_compiler
+from torch._inductor.exc import InvalidCxxCompiler
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.rasterizer import fusion
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
@@ -26,3 +29,20 @@ def pristine_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(pristine_scene: Path, tmp_path: Path) -> Path:
     """A copy of the scene that a test may change."""
     return Path(shutil.copytree(pristine_scene, tmp_path / "scene"))
+
+
+@pytest.fixture
+def compiler(monkeypatch) -> None:
+    """Lets kernels be compiled from scratch, where that is possible."""
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler as error:
+        pytest.skip(f"no C++ compiler: {error}")
+    monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
+    monkeypatch.setattr(fusion, "_failed", False)
+
+
+@pytest.fixture
+def eager(monkeypatch) -> None:
+    """Tests pay for compilation only where it matters."""
+    monkeypatch.setenv("SHELLGS_COMPILE", "0")

@@ -11,11 +11,11 @@ from dense_reference import dense_rasterize
 from gsplat import DefaultStrategy
 from random_splats import NAMES, make_camera, make_splats, orbit
 from torch import Tensor
-from torch._inductor.cpp_builder import get_cpp_compiler
-from torch._inductor.exc import InvalidCxxCompiler
 
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer import fusion, rasterize
+
+pytestmark = pytest.mark.usefixtures("eager")
 
 
 def differentiate(splats: list[Tensor], composited: Tensor, alpha: Tensor, counted: Tensor, means2d: Tensor) -> dict:
@@ -56,23 +56,6 @@ def compare(dtype: torch.dtype, n: int, width: int, height: int, n_features: int
 def render(n: int, width: int, height: int, dtype: torch.dtype = torch.float32) -> Tensor:
     splats = [splat.to(dtype).requires_grad_() for splat in make_splats(n, 3, seed=12)]
     return rasterize(*splats, camera=make_camera(width, height))[0]
-
-
-@pytest.fixture
-def compiler(monkeypatch) -> None:
-    """Lets kernels be compiled from scratch, where that is possible."""
-    try:
-        get_cpp_compiler()
-    except InvalidCxxCompiler as error:
-        pytest.skip(f"no C++ compiler: {error}")
-    monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
-    monkeypatch.setattr(fusion, "_failed", False)
-
-
-@pytest.fixture(autouse=True)
-def _eager(monkeypatch) -> None:
-    """Tests pay for compilation only where it matters."""
-    monkeypatch.setenv("SHELLGS_COMPILE", "0")
 
 
 @pytest.mark.parametrize(
@@ -181,11 +164,12 @@ def test_alpha_is_what_a_feature_of_one_composites_to():
     torch.testing.assert_close(composited, alpha)
 
 
-def test_the_order_of_the_splats_does_not_matter():
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_the_order_of_the_splats_does_not_matter(primitive):
     splats, camera = make_splats(100, 3, seed=6), make_camera(33, 21)
     order = torch.randperm(100, generator=torch.Generator().manual_seed(0))
-    expected, *_ = rasterize(*splats, camera=camera)
-    actual, *_ = rasterize(*(splat[order] for splat in splats), camera=camera)
+    expected, *_ = rasterize(*splats, camera=camera, primitive=primitive)
+    actual, *_ = rasterize(*(splat[order] for splat in splats), camera=camera, primitive=primitive)
     torch.testing.assert_close(actual, expected)
 
 
@@ -225,7 +209,8 @@ def test_cropping_is_shifting_the_principal_point():
     torch.testing.assert_close(part, whole[6 : 6 + 27, 11 : 11 + 30])
 
 
-def test_a_rigid_motion_of_world_and_camera_changes_nothing():
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_a_rigid_motion_of_world_and_camera_changes_nothing(primitive):
     (means, quats, *rest), camera = make_splats(100, 3, seed=8), make_camera(33, 21)
     angle = torch.tensor(0.7).double()
     rotation = torch.eye(3).double()
@@ -236,8 +221,8 @@ def test_a_rigid_motion_of_world_and_camera_changes_nothing():
     c, s = (angle / 2).cos(), (angle / 2).sin()
     turned = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], dim=1)
     moved = replace(camera, viewmat=camera.viewmat @ torch.linalg.inv(motion))
-    expected, *_ = rasterize(means, quats, *rest, camera=camera)
-    actual, *_ = rasterize(means @ rotation.T + motion[:3, 3], turned, *rest, camera=moved)
+    expected, *_ = rasterize(means, quats, *rest, camera=camera, primitive=primitive)
+    actual, *_ = rasterize(means @ rotation.T + motion[:3, 3], turned, *rest, camera=moved, primitive=primitive)
     torch.testing.assert_close(actual, expected)
 
 

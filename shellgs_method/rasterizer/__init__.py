@@ -1,4 +1,4 @@
-"""Features composited over 3D Gaussians, in pure PyTorch."""
+"""Features composited over 3D Gaussians or 2D discs, in pure PyTorch."""
 
 from __future__ import annotations
 

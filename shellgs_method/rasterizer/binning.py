@@ -30,6 +30,11 @@ class Ellipses:
     def __getitem__(self, index: Int[Tensor, "..."] | int) -> Ellipses:
         return Ellipses(self.centres[index], self.conics[index], self.reach[index])
 
+    def where(self, condition: Bool[Tensor, "*batch"], other: Ellipses) -> Ellipses:
+        """These where the condition holds, the others where it does not."""
+        pairs = ((self.centres, other.centres), (self.conics, other.conics), (self.reach, other.reach))
+        return Ellipses(*(torch.where(condition[..., None], own, others) for own, others in pairs))
+
     def touch(self, width: int, height: int) -> Bool[Tensor, "*batch"]:
         """Whether the ellipses' boxes touch the image."""
         size = self.centres.new_tensor([width, height])

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from shellgs_method.rasterizer.binning import TILE, Bins
 from shellgs_method.rasterizer.fusion import run_fused
-from shellgs_method.rasterizer.kernels import N_SHAPE, NULL_SHAPE, TRANSMITTANCE_MIN, backward_chunk, forward_chunk
+from shellgs_method.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 
 CHUNK = 8  # splats a kernel takes at once
 LANES = 16  # tiles side by side in the innermost dimension
@@ -20,9 +20,9 @@ TILES_PER_BATCH = 1024  # so that a batch's state stays in the cache
 REPACK_BELOW = 0.75  # share of tiles still at work
 
 
-def composite(params: Float[Tensor, "N K"], bins: Bins) -> Float[Tensor, "height width C"]:
-    """Composite splats, ordered front to back, over the whole tiles of ``bins``: the sums of weight times feature."""
-    return _Composite.apply(params, bins)
+def composite(params: Float[Tensor, "N K"], bins: Bins, kernels: Kernels) -> Float[Tensor, "height width C"]:
+    """Composite splats, ordered front to back, over the whole tiles of ``bins``: sums of weight times feature, maps."""
+    return _Composite.apply(params, bins, kernels)
 
 
 @dataclass(frozen=True)
@@ -36,25 +36,28 @@ class _Run:
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, params, bins):
+    def forward(ctx, params, bins, kernels):
         columns = F.pad(params, (0, 0, 0, 1)).T.contiguous()
-        columns[:N_SHAPE, -1] = columns.new_tensor(NULL_SHAPE)  # fills up a tile's last chunk
-        canvas = params.new_zeros(len(bins.counts), 1 + len(columns) - N_SHAPE, TILE * TILE)
+        columns[: kernels.n_shape, -1] = columns.new_tensor(kernels.null_shape)  # fills up a tile's last chunk
+        n_totals = len(columns) - kernels.n_shape + kernels.n_maps
+        canvas = params.new_zeros(len(bins.counts), 1 + n_totals, TILE * TILE)
         canvas[:, 0] = 1
-        runs = _paint(canvas, columns, bins)
+        runs = _paint(canvas, columns, bins, kernels)
         ctx.save_for_backward(columns)
-        ctx.bins, ctx.runs = bins, runs
+        ctx.bins, ctx.runs, ctx.kernels = bins, runs, kernels
         return _untile(canvas[:-1, 1:], bins)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradients):
         (columns,) = ctx.saved_tensors
-        return _gradients(_tile(gradients, ctx.bins), columns, ctx.bins, ctx.runs), None
+        return _gradients(_tile(gradients, ctx.bins), columns, ctx.bins, ctx.runs, ctx.kernels), None, None
 
 
-def _paint(canvas: Float[Tensor, "tiles+1 1+C P"], columns: Float[Tensor, "K N+1"], bins: Bins) -> list[_Run]:
-    """Composite all tiles into the canvas, which holds the transmittance and the features."""
+def _paint(
+    canvas: Float[Tensor, "tiles+1 1+C P"], columns: Float[Tensor, "K N+1"], bins: Bins, kernels: Kernels
+) -> list[_Run]:
+    """Composite all tiles into the canvas, which holds the transmittance and the totals."""
     runs = []
     # Tiles with a like number of splats finish together.
     busiest_first = bins.counts.argsort(descending=True)[: int((bins.counts > 0).sum())]
@@ -69,7 +72,7 @@ def _paint(canvas: Float[Tensor, "tiles+1 1+C P"], columns: Float[Tensor, "K N+1
             while int(at_work.sum()) >= REPACK_BELOW * len(tiles):
                 params, _ = _chunk_params(columns, bins, run.tiles, chunk)
                 run.transmittances.append(transmittance)
-                transmittance, totals = run_fused(forward_chunk, transmittance, totals, params, *pixels)
+                transmittance, totals = run_fused(kernels.forward, transmittance, totals, params, *pixels)
                 chunk += 1
                 at_work = (transmittance.amax(1) > 0) & (bins.counts[run.tiles] > chunk * CHUNK)
             canvas[run.tiles] = torch.stack([transmittance, *totals], -1).permute(0, 2, 3, 1)
@@ -78,9 +81,13 @@ def _paint(canvas: Float[Tensor, "tiles+1 1+C P"], columns: Float[Tensor, "K N+1
 
 
 def _gradients(
-    gradients: Float[Tensor, "tiles+1 C P"], columns: Float[Tensor, "K N+1"], bins: Bins, runs: list[_Run]
+    gradients: Float[Tensor, "tiles+1 C P"],
+    columns: Float[Tensor, "K N+1"],
+    bins: Bins,
+    runs: list[_Run],
+    kernels: Kernels,
 ) -> Float[Tensor, "N K"]:
-    """Gradients of the splats' parameters from those of the composited features."""
+    """Gradients of the splats' parameters from those of the composited totals."""
     behind = torch.zeros_like(gradients[:, :1])
     by_entry = columns.new_zeros(len(bins.entries), len(columns))
     for run in reversed(runs):
@@ -90,7 +97,7 @@ def _gradients(
         for i in reversed(range(len(run.transmittances))):
             params, entries = _chunk_params(columns, bins, run.tiles, run.first_chunk + i)
             behind_run, rows = run_fused(
-                backward_chunk, run.transmittances[i], behind_run, gradients_run, params, *pixels
+                kernels.backward, run.transmittances[i], behind_run, gradients_run, params, *pixels
             )
             by_entry.index_copy_(0, entries, rows.flatten(1).T)
         behind[run.tiles, 0] = behind_run.transpose(1, 2)

@@ -1,11 +1,10 @@
-"""The arithmetic of compositing: one chunk of splats over many tiles at once.
+"""The arithmetic of compositing that all primitives share: one chunk of splats over many tiles at once.
 
 Shapes: G groups of V tiles side by side in the innermost dimension, so that a vector unit works on V tiles and every
 pixel of a tile meets the same splat; P pixels of a tile; L splats of a chunk, front to back.
 
-A splat's parameters are u, v, a, b, c, n and its features, the last of which is 1 and composites to alpha. Of a pixel
-at (x, y), with dx = x - u and dy = y - v, z = a dx² + b dx dy + c dy² + n is how many times alpha has halved below its
-limit: alpha = ALPHA_MAX 2^-max(z, 0).
+A splat's parameters are u, v, those of its shape, and its features, the last of which is 1 and composites to alpha. The
+exponent z of a splat at a pixel is how many times alpha has halved below its limit: alpha = ALPHA_MAX 2^-max(z, 0).
 
 What the kernels need besides splats and state: x and y of a tile's pixels from its centre, and ``stop``, which is
 TRANSMITTANCE_MIN in a tensor whose dimensions are groups and lanes, but not pixels. As a number it would let inductor
@@ -15,6 +14,8 @@ merge the loops over pixels and lanes wherever nothing else tells them apart, an
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -23,84 +24,64 @@ from torch import Tensor
 from shellgs_method.rasterizer.projection import ALPHA_MAX, ALPHA_MIN
 
 TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would bring it there
-N_SHAPE = 6  # parameters of a splat before its features
-NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, math.inf)  # of a splat whose alpha is 0 everywhere
 Z_MAX = math.log2(ALPHA_MAX / ALPHA_MIN)
 
 
-def forward_chunk(
-    transmittance: Float[Tensor, "G P V"],  # 0 once the pixel has stopped
-    totals: list[Float[Tensor, "G P V"]],  # composited so far, of each feature
-    params: Float[Tensor, "G K L V"],
-    x: Float[Tensor, "1 P 1"],
-    y: Float[Tensor, "1 P 1"],
-    stop: Float[Tensor, "G 1 V"],
-) -> tuple[Float[Tensor, "G P V"], list[Float[Tensor, "G P V"]]]:
-    """Transmittance and totals behind a chunk from those before it."""
-    for splat in params.unbind(2):
-        _, _, weight, transmittance = _meet(splat, transmittance, x, y, stop)
-        totals = [total + weight * splat[:, N_SHAPE + c, None] for c, total in enumerate(totals)]
-    return transmittance, totals
+@dataclass(frozen=True)
+class Kernels:
+    """What compositing needs to know of a primitive.
 
-
-def backward_chunk(
-    transmittance: Float[Tensor, "G P V"],  # before the chunk
-    behind: Float[Tensor, "G P V"],
-    gradients: list[Float[Tensor, "G P V"]],  # of the composited features
-    params: Float[Tensor, "G K L V"],
-    x: Float[Tensor, "1 P 1"],
-    y: Float[Tensor, "1 P 1"],
-    stop: Float[Tensor, "G 1 V"],
-) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "K L G V"]]:
-    """Walk a chunk back to front: the new ``behind``, and the gradients of the parameters, summed over a tile's pixels.
-
-    With g_i = the gradient of the loss by the weight w_i = alpha_i T_i, ``behind`` is the sum of g_j w_j of the splats
-    behind a chunk, over their transmittance. It needs no division: behind += alpha_i (g_i - behind), and the loss has
-    the gradient T_i (g_i - behind) by alpha_i.
+    Attributes:
+        null_shape: parameters before the features of a splat whose alpha is 0 everywhere.
+        n_maps: totals behind those of the features, of what the primitive itself has at a pixel.
+        forward: transmittance (0 once the pixel has stopped) [G P V] and a list of totals [G P V] behind a chunk, from
+            those before it, the chunk's parameters [G K L V], x, y [1 P 1] and ``stop`` [G 1 V].
+        backward: walks a chunk back to front. From the transmittance before it, ``behind`` (see :func:`walk_back`), a
+            list of the totals' gradients, and the rest as above: the new ``behind``, and the gradients of the
+            parameters [K L G V], summed over a tile's pixels.
     """
-    splats = params.unbind(2)
-    met = []
-    for splat in splats:
-        z, alpha, weight, transmittance = _meet(splat, transmittance, x, y, stop)
-        met.append((z, alpha, weight))
 
-    grad_z, weights = [], []
-    for splat, (z, alpha, weight) in zip(reversed(splats), reversed(met), strict=True):
-        excess = -behind
-        for c, grad in enumerate(gradients):
-            excess = excess + grad * splat[:, N_SHAPE + c, None]
-        behind = behind + alpha * excess
-        # d alpha / dz = -ln 2 alpha, and 0 where alpha is at its limit
-        grad_z.append(torch.where(z > 0, (-math.log(2)) * weight * excess, 0.0))
-        weights.append(weight)
+    null_shape: tuple[float, ...]
+    n_maps: int
+    forward: Callable[..., tuple[Tensor, list[Tensor]]]
+    backward: Callable[..., tuple[Tensor, Tensor]]
 
-    # u, v, a, b, c and n take the moments of grad_z about the splat's centre, shifted there from the tile's.
-    q, w = torch.stack(grad_z[::-1]), torch.stack(weights[::-1])  # [L, G, P, V]
-    qx, qy = q * x, q * y
-    q, sx, sy, sxx, sxy, syy = (moment.sum(2) for moment in (q, qx, qy, qx * x, qx * y, qy * y))
-    u, v, a, b, c = params[:, :5].permute(1, 2, 0, 3)
-    mx, my = sx - u * q, sy - v * q
-    mxx, mxy, myy = sxx - u * (sx + mx), sxy - u * sy - v * mx, syy - v * (sy + my)
-    shape = [-2 * a * mx - b * my, -b * mx - 2 * c * my, mxx, mxy, myy, q]
-    return behind, torch.stack([*shape, *((w * grad).sum(2) for grad in gradients)])
+    @property
+    def n_shape(self) -> int:
+        """Number of parameters before the features."""
+        return len(self.null_shape)
 
 
-def _meet(
-    splat: Float[Tensor, "G K V"],
-    transmittance: Float[Tensor, "G P V"],
-    x: Float[Tensor, "1 P 1"],
-    y: Float[Tensor, "1 P 1"],
-    stop: Float[Tensor, "G 1 V"],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The exponent z, alpha (0 where it does not count), the weight, and the transmittance behind a splat."""
-    u, v, a, b, c, n = (splat[:, k, None] for k in range(N_SHAPE))
-    dx, dy = x - u, y - v
-    z = (a * dx + b * dy) * dx + c * dy * dy + n
+def attenuate(
+    z: Float[Tensor, "G P V"], transmittance: Float[Tensor, "G P V"], stop: Float[Tensor, "G 1 V"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Alpha (0 where it does not count), the weight, and the transmittance behind a splat."""
     alpha = torch.where(z <= Z_MAX, ALPHA_MAX * _halve(torch.relu(z)), 0.0)
     after = transmittance - alpha * transmittance
     counts = after > stop
     alpha = torch.where(counts, alpha, 0.0)
-    return z, alpha, alpha * transmittance, torch.where(counts, after, 0.0)
+    return alpha, alpha * transmittance, torch.where(counts, after, 0.0)
+
+
+def walk_back(
+    behind: Float[Tensor, "G P V"],
+    z: Float[Tensor, "G P V"],
+    alpha: Float[Tensor, "G P V"],
+    weight: Float[Tensor, "G P V"],
+    gradients: Sequence[Tensor],
+    values: Sequence[Tensor],
+) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G P V"]]:
+    """Step to before a splat: the new ``behind``, and the gradient of the loss by z.
+
+    With g_i = the gradient of the loss by the weight w_i = alpha_i T_i, the sum over the channels of the total's
+    gradient times the splat's value, ``behind`` is the sum of g_j w_j of the splats behind, over their transmittance.
+    It needs no division: behind += alpha_i (g_i - behind), and the loss has the gradient T_i (g_i - behind) by alpha_i.
+    """
+    excess = -behind
+    for gradient, value in zip(gradients, values, strict=True):
+        excess = excess + gradient * value
+    # d alpha / dz = -ln 2 alpha, and 0 where alpha is at its limit
+    return behind + alpha * excess, torch.where(z > 0, (-math.log(2)) * weight * excess, 0.0)
 
 
 def _halve(z: Tensor) -> Tensor:

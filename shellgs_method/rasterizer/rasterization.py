@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -13,6 +13,10 @@ from torch import Tensor
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer.binning import bin_splats
 from shellgs_method.rasterizer.compositing import composite
+from shellgs_method.rasterizer.disc_kernels import DISCS
+from shellgs_method.rasterizer.discs import disc_maps, project_discs
+from shellgs_method.rasterizer.gaussian_kernels import GAUSSIANS
+from shellgs_method.rasterizer.kernels import Kernels
 from shellgs_method.rasterizer.projection import Projection, project_gaussians
 
 
@@ -23,8 +27,12 @@ def rasterize(
     opacities: Float[Tensor, "N"],
     features: Float[Tensor, "N C"],
     camera: Camera | Sequence[Camera],
+    primitive: Literal["3d", "2d"] = "3d",
 ) -> tuple[Float[Tensor, "*B height width C"], Float[Tensor, "*B height width 1"], dict[str, Any]]:
-    """Composite the features of 3D Gaussians front to back, by the depth of their centres.
+    """Composite the features of 3D Gaussians or 2D discs front to back, by the depth of their centres.
+
+    Gaussians go through the EWA approximation. Discs, spanned by the first two axes of a splat, are met by each
+    pixel's ray where it goes through their planes, and are at least as wide as a pixel by the low-pass of 2DGS.
 
     A splat's alpha is at most 0.999, and does not count below 1/255; a pixel stops before the splat that would bring
     its transmittance to 1e-4 or less.
@@ -36,11 +44,18 @@ def rasterize(
         opacities: in (0, 1).
         features: any channels, all composited in one pass.
         camera: one, or B of one size; its tensors are brought to the dtype and device of the means.
+        primitive: "3d" for Gaussians, "2d" for discs.
 
     Returns:
         The sums of weight times feature (not divided by alpha, no background), the sums of the weights, and what
         gsplat's densification strategies need: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained,
         ``radii``, …. The pictures of a sequence of cameras are stacked.
+
+        Of discs there are also, differentiable, [*B, height, width, 1]: ``depth``, the sum of weight times z of the
+        ray's intersection; ``median_depth``, the z of the splat at which the transmittance falls to 1/2 or less, 0
+        where it does not, with a gradient to that splat alone; ``distortion``, see :func:`~.discs.disc_maps`. Their
+        ``gradient_2dgs`` is ``means2d``: gsplat's is the gradient by the screen position of a centre at fixed depth
+        and axes, as it acts through the intersection; this one has what acts through the low-pass added.
 
     Raises:
         ValueError: if the cameras differ in size, or there are none.
@@ -50,7 +65,12 @@ def rasterize(
     if len(sizes) != 1:
         raise ValueError(f"The cameras of a batch need one size in common, not {sorted(sizes)}.")
     ((width, height),) = sizes
-    projection = project_gaussians(means, quats, scales, opacities, [each.to(means) for each in cameras])
+    project, kernels = _PRIMITIVES[primitive]
+    projection = project(means, quats, scales, opacities, [each.to(means) for each in cameras])
+    pictures = torch.stack([_render(projection, kernels, i, features, width, height) for i in range(len(cameras))])
+    if isinstance(camera, Camera):
+        pictures = pictures[0]
+    composited, alpha, maps = pictures.split([features.shape[1], 1, kernels.n_maps], dim=-1)
     info = {
         "means2d": projection.means2d,
         "radii": _radii(projection),
@@ -59,21 +79,24 @@ def rasterize(
         "height": height,
         "n_cameras": len(cameras),
     }
-    pictures = torch.stack([_render(projection, i, features, width, height) for i in range(len(cameras))])
-    if isinstance(camera, Camera):
-        pictures = pictures[0]
-    return pictures[..., :-1], pictures[..., -1:], info
+    if primitive == "2d":
+        info |= {"gradient_2dgs": projection.means2d, **disc_maps(alpha, maps)}
+    return composited, alpha, info
+
+
+_PRIMITIVES = {"3d": (project_gaussians, GAUSSIANS), "2d": (project_discs, DISCS)}
 
 
 def _render(
-    projection: Projection, i: int, features: Float[Tensor, "N C"], width: int, height: int
-) -> Float[Tensor, "height width C+1"]:
-    """Features and alpha as camera ``i`` sees them."""
+    projection: Projection, kernels: Kernels, i: int, features: Float[Tensor, "N C"], width: int, height: int
+) -> Float[Tensor, "height width C+1+maps"]:
+    """Features, alpha and the primitive's maps as camera ``i`` sees them."""
     visible = projection.visible[i].nonzero().squeeze(1)
     order = visible[projection.depths[i, visible].argsort(stable=True)]
     bins = bin_splats([outline[i][order] for outline in projection.outlines], width, height)
-    params = [projection.means2d[i], projection.shapes[i], features, torch.ones_like(features[:, :1])]
-    return composite(torch.cat([splats.index_select(0, order) for splats in params], dim=1), bins)[:height, :width]
+    columns = [projection.means2d[i], projection.shapes[i], features, torch.ones_like(features[:, :1])]
+    params = torch.cat([column.index_select(0, order) for column in columns], dim=1)
+    return composite(params, bins, kernels)[:height, :width]
 
 
 def _radii(projection: Projection) -> Int[Tensor, "B N ..."]:

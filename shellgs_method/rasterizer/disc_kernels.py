@@ -1,0 +1,120 @@
+"""Compositing of discs, met by each pixel's ray where it goes through their planes.
+
+At a pixel (dx, dy) from the projected centre, what is linear along a plane is affine over its depth. The shape of a
+disc is a, b, c, d, p, q, r, n: its local coordinates, in units that make the exponent s² + t², and inverse depth are
+
+    s = (a dx + b dy) / i,  t = (c dx + d dy) / i,  i = p + q dx + r dy,
+
+and the exponent with the low-pass of 2DGS, which keeps a disc seen edge-on or from afar as wide as a pixel, is
+z = min(s² + t², (dx² + dy²) / ln 2) + n.
+
+Its maps are the weighted sums of depth, inverse depth, and inverse depth squared; and the median depth, that of the
+splat at which the transmittance falls to 1/2 or less, whose gradient goes to that splat's depth alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from shellgs_method.rasterizer.kernels import Kernels, attenuate, walk_back
+from shellgs_method.rasterizer.projection import NEAR_PLANE
+
+_LOW_PASS = 1 / math.log(2)  # exponent over squared distance in pixels: rho = 2 |x - c|², alpha ~ exp(-rho / 2)
+_NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, math.inf)
+_N_SHAPE, _N_MAPS = len(_NULL_SHAPE), 4
+
+
+def _forward(
+    transmittance: Float[Tensor, "G P V"],
+    totals: list[Float[Tensor, "G P V"]],
+    params: Float[Tensor, "G K L V"],
+    x: Float[Tensor, "1 P 1"],
+    y: Float[Tensor, "1 P 1"],
+    stop: Float[Tensor, "G 1 V"],
+) -> tuple[Float[Tensor, "G P V"], list[Float[Tensor, "G P V"]]]:
+    *totals, median = totals
+    for splat in params[:, :, None].unbind(3):
+        z, _, _, _, depth, inverse_depth = _intersect(splat, x, y)
+        before = transmittance
+        _, weight, transmittance = attenuate(z, before, stop)
+        values = [*splat[:, _N_SHAPE:].unbind(1), depth, inverse_depth, inverse_depth * inverse_depth]
+        totals = [total + weight * value for total, value in zip(totals, values, strict=True)]
+        median = torch.where(_halves(before, transmittance), depth, median)
+    return transmittance, [*totals, median]
+
+
+def _backward(
+    transmittance: Float[Tensor, "G P V"],
+    behind: Float[Tensor, "G P V"],
+    gradients: list[Float[Tensor, "G P V"]],
+    params: Float[Tensor, "G K L V"],
+    x: Float[Tensor, "1 P 1"],
+    y: Float[Tensor, "1 P 1"],
+    stop: Float[Tensor, "G 1 V"],
+) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "K L G V"]]:
+    splats = params[:, :, None].unbind(3)
+    *gradients, by_median = gradients
+    by_depth, by_inverse, by_square = gradients[-3:]
+    met = []
+    for splat in splats:
+        intersection = _intersect(splat, x, y)
+        before = transmittance
+        alpha, weight, transmittance = attenuate(intersection[0], before, stop)
+        met.append((intersection, alpha, weight, _halves(before, transmittance)))
+
+    sums = []
+    for splat, (intersection, alpha, weight, halves) in zip(reversed(splats), reversed(met), strict=True):
+        z, on_plane, s, t, depth, inverse_depth = intersection
+        values = [*splat[:, _N_SHAPE:].unbind(1), depth, inverse_depth, inverse_depth * inverse_depth]
+        behind, by_z = walk_back(behind, z, alpha, weight, gradients, values)
+        # by the numerators of s and t, by inverse depth, and by the exponent where the low-pass decides
+        by_radius = torch.where(on_plane, 2 * by_z * depth, 0.0)
+        by_s, by_t = by_radius * s, by_radius * t
+        through_depth = weight * by_depth + torch.where(halves, by_median, 0.0)
+        by_i = weight * (by_inverse + 2 * inverse_depth * by_square) - depth * depth * through_depth
+        by_i = by_i - (by_s * s + by_t * t)
+        by_screen = torch.where(on_plane, 0.0, by_z)
+        sums.append((by_z, by_s, by_t, by_i, by_screen, weight))
+
+    by_z, by_s, by_t, by_i, by_screen, w = (torch.stack(each[::-1]) for each in zip(*sums, strict=True))  # [L, G, P, V]
+    u, v, a, b, c, d, _, q, r = params[:, : _N_SHAPE - 1].permute(1, 2, 0, 3)
+
+    def moments(gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Sum, and first moments about the splat's centre, shifted there from the tile's."""
+        total = gradient.sum(2)
+        return total, (gradient * x).sum(2) - u * total, (gradient * y).sum(2) - v * total
+
+    (s, sx, sy), (t, tx, ty), (i, ix, iy), (_, nx, ny) = (moments(each) for each in (by_s, by_t, by_i, by_screen))
+    by_u = -(a * s + c * t + q * i + 2 * _LOW_PASS * nx)
+    by_v = -(b * s + d * t + r * i + 2 * _LOW_PASS * ny)
+    shape = [by_u, by_v, sx, sy, tx, ty, i, ix, iy, by_z.sum(2)]
+    return behind, torch.stack([*shape, *((w * gradient).sum(2) for gradient in gradients[:-3])])
+
+
+def _intersect(
+    splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The exponent, whether it is that of the plane's point and not the low-pass, s, t, depth, and inverse depth."""
+    u, v, a, b, c, d, p, q, r, n, *_ = splat.unbind(1)
+    dx, dy = x - u, y - v
+    inverse_depth = p + q * dx + r * dy
+    in_front = (inverse_depth > 0) & (inverse_depth <= 1 / NEAR_PLANE)
+    inverse_depth = torch.where(in_front, inverse_depth, 1.0)
+    depth = 1 / inverse_depth
+    s, t = (a * dx + b * dy) * depth, (c * dx + d * dy) * depth
+    plane, screen = s * s + t * t, (dx * dx + dy * dy) * _LOW_PASS
+    on_plane = plane < screen
+    z = torch.where(in_front, torch.where(on_plane, plane, screen) + n, math.inf)
+    return z, on_plane, s, t, depth, inverse_depth
+
+
+def _halves(before: Tensor, behind: Tensor) -> Tensor:
+    """Whether the transmittance crosses 1/2."""
+    return (before > 0.5) & (behind <= 0.5)
+
+
+DISCS = Kernels(_NULL_SHAPE, _N_MAPS, _forward, _backward)

@@ -1,0 +1,146 @@
+"""Discs of 2D Gaussian Splatting (Huang et al. 2024) to the screen: exactly, in perspective."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dataparsers.camera import Camera
+from shellgs_method.rasterizer.binning import Ellipses
+from shellgs_method.rasterizer.projection import (
+    NEAR_PLANE,
+    Projection,
+    cutoffs,
+    halvings,
+    quats_to_rotations,
+    stack_cameras,
+    to_camera,
+)
+
+EDGE_ON = 1e-6  # cosine of normal and ray below which rounding decides which side of a disc shows: none does
+MAPPING_NEAR, MAPPING_FAR = 0.2, 100.0  # of the depths in the distortion, as in 2DGS
+
+
+def project_discs(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    cameras: Sequence[Camera],
+) -> Projection:
+    """Project discs with the half-axes s_u t_u and s_v t_v, the first two; differentiable in the means2d and shapes.
+
+    A ray z r (r_z = 1) meets the plane through m with the normal n = t_u × t_v at the depth z = n·m / n·r, where
+    u = t_v·(m × r) / (s_u n·r) and v = -t_u·(m × r) / (s_v n·r). With r = m / m_z + e at a pixel whose distance from
+    the projected centre is e, the constant terms of the cross products vanish, and what is left are the shapes of
+    :mod:`~shellgs_method.rasterizer.disc_kernels`.
+
+    The centres in the camera are taken from ``means2d`` and their depths, so that the gradient by ``means2d`` is all
+    that a shift of the disc parallel to the screen does.
+    """
+    viewmats, fx, fy, cx, cy = stack_cameras(cameras)
+    x, y, z = to_camera(means, viewmats).unbind(-1)
+    depths = z.detach()
+    in_front = depths >= NEAR_PLANE
+    z = torch.where(in_front, z, 1.0)  # a culled splat must not put a division by 0 into the gradients
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    rays = torch.stack([(means2d[..., 0] - cx) / fx, (means2d[..., 1] - cy) / fy, torch.ones_like(z)], dim=-1)
+    tangents_u, tangents_v, normals = (viewmats[:, None, :3, :3] @ quats_to_rotations(quats)).unbind(-1)
+
+    facing = (normals * rays).sum(-1)
+    shows = facing.detach().abs() > EDGE_ON * rays.detach().norm(dim=-1)
+    facing = torch.where(shows, facing, 1.0)
+    pixel = torch.stack([1 / fx, 1 / fy], dim=-1)
+    u = torch.linalg.cross(tangents_v, rays)[..., :2] * pixel / (scales[:, 0] * facing)[..., None]
+    v = torch.linalg.cross(rays, tangents_u)[..., :2] * pixel / (scales[:, 1] * facing)[..., None]
+    inverse_depth = torch.stack([facing, normals[..., 0] / fx, normals[..., 1] / fy], dim=-1) / (z * facing)[..., None]
+    halves = math.sqrt(0.5 / math.log(2))  # exp(-u²/2) = 2^-(halves u)²
+    shapes = torch.cat([halves * u, halves * v, inverse_depth, halvings(opacities).expand_as(z)[..., None]], dim=-1)
+
+    with torch.no_grad():
+        half_axes = torch.stack([tangents_u * scales[:, :1], tangents_v * scales[:, 1:2]], dim=-1)
+        cutoff = cutoffs(opacities)
+        outline, covars2d = _outlines(torch.stack([x, y, z], dim=-1), half_axes, cutoff.sqrt(), cameras)
+        round_conics = (2 / cutoff)[:, None] * cutoff.new_tensor([1.0, 0.0, 1.0])
+        low_pass = Ellipses(means2d, round_conics.expand(*z.shape, 3), (cutoff / 2).sqrt()[:, None].expand_as(means2d))
+    width, height = cameras[0].width, cameras[0].height
+    touches = outline.touch(width, height) | low_pass.touch(width, height)
+    visible = in_front & shows & (cutoff > 0) & touches
+    return Projection(means2d, shapes, depths, [outline, low_pass], covars2d, visible)
+
+
+def disc_maps(
+    alpha: Float[Tensor, "*batch 1"], maps: Float[Tensor, "*batch 4"]
+) -> dict[str, Float[Tensor, "*batch 1"]]:
+    """What a disc picture tells of geometry, from the maps that the kernels composite.
+
+    Distortion is the L2 form of 2DGS, sum over i and j < i of w_i w_j (m_i - m_j)², with depths mapped to
+    m = far / (far - near) (1 - near / z). It is the variance A Σ w m² - (Σ w m)², A = Σ w, in which the constant of
+    the mapping drops out: left out, it does not drown the rest in rounding.
+    """
+    depth, inverse_depth, square, median = maps.split(1, dim=-1)
+    mapping = MAPPING_FAR * MAPPING_NEAR / (MAPPING_FAR - MAPPING_NEAR)
+    distortion = mapping**2 * (alpha * square - inverse_depth.square())
+    return {"depth": depth, "median_depth": median, "distortion": distortion}
+
+
+def _outlines(
+    centres: Float[Tensor, "B N 3"],
+    half_axes: Float[Tensor, "B N 3 2"],
+    radius: Float[Tensor, "N"],
+    cameras: Sequence[Camera],
+) -> tuple[Ellipses, Float[Tensor, "B N 3"]]:
+    """Ellipses around discs of so many half-axes, and the covariances of the discs as if seen from afar.
+
+    The ellipse is exact, but for a tenth of a pixel in quadrature, where the whole disc is well in front of the camera.
+    Of another, it is the one around its box in the camera, cut off at the near plane and at the image's borders.
+    """
+    _, fx, fy, cx, cy = stack_cameras(cameras)
+    x, y, z = centres.unbind(-1)
+    # A disc's point (u, v) is at (across, down)·(u, v) / (z + along·(u, v)) from the projected centre.
+    along = half_axes[..., 2, :]
+    across = fx[..., None] * (half_axes[..., 0, :] - (x / z)[..., None] * along)
+    down = fy[..., None] * (half_axes[..., 1, :] - (y / z)[..., None] * along)
+    xx, xy, yy = (across * across).sum(-1), (across * down).sum(-1), (down * down).sum(-1)
+    x_along, y_along, along_squared = (across * along).sum(-1), (down * along).sum(-1), (along * along).sum(-1)
+    area = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
+
+    in_front = radius * along_squared.sqrt() < 0.95 * z
+    # The dual conic of the circle |(u, v)| = radius.
+    scale = radius.square() / torch.where(in_front, z.square() - radius.square() * along_squared, 1.0)
+    centre_x, centre_y = fx * x / z + cx - scale * x_along, fy * y / z + cy - scale * y_along
+    slack = 0.01
+    covar_xx = scale * xx + (scale * x_along).square() + slack
+    covar_xy = scale * xy + scale.square() * x_along * y_along
+    covar_yy = scale * yy + (scale * y_along).square() + slack
+    determinant = (scale * area).square() * (1 + scale * along_squared) + slack * (covar_xx + covar_yy - slack)
+
+    reach = radius[:, None] * half_axes.norm(dim=-1)
+    nearest, farthest = (z - reach[..., 2]).clamp_min(NEAR_PLANE), z + reach[..., 2]
+
+    def box(centre: Tensor, reach: Tensor, focal: Tensor, principal: Tensor, size: int) -> tuple[Tensor, Tensor]:
+        low, high = centre - reach, centre + reach
+        low = (focal * torch.minimum(low / nearest, low / farthest) + principal).clamp(0, size)
+        high = (focal * torch.maximum(high / nearest, high / farthest) + principal).clamp(0, size)
+        return (low + high) / 2, ((high - low) / 2).clamp_min(slack) * math.sqrt(2)
+
+    box_x, box_reach_x = box(x, reach[..., 0], fx, cx, cameras[0].width)
+    box_y, box_reach_y = box(y, reach[..., 1], fy, cy, cameras[0].height)
+    zero = torch.zeros_like(z)
+    exact = Ellipses(
+        torch.stack([centre_x, centre_y], dim=-1),
+        torch.stack([covar_yy, -covar_xy, covar_xx], dim=-1) / determinant[..., None],
+        torch.stack([covar_xx, covar_yy], dim=-1).sqrt(),
+    )
+    around_box = Ellipses(
+        torch.stack([box_x, box_y], dim=-1),
+        torch.stack([1 / box_reach_x.square(), zero, 1 / box_reach_y.square()], dim=-1),
+        torch.stack([box_reach_x, box_reach_y], dim=-1),
+    )
+    low_pass = 0.5
+    covars2d = torch.stack([xx / z.square() + low_pass, xy / z.square(), yy / z.square() + low_pass], dim=-1)
+    return exact.where(in_front, around_box), covars2d

@@ -1,0 +1,73 @@
+"""Compositing of screen-space Gaussians.
+
+Their shape is a, b, c, n: at a pixel (dx, dy) from the centre, z = a dx² + b dx dy + c dy² + n.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from shellgs_method.rasterizer.kernels import Kernels, attenuate, walk_back
+
+_NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, math.inf)
+_FEATURES = slice(len(_NULL_SHAPE), None)
+
+
+def _forward(
+    transmittance: Float[Tensor, "G P V"],
+    totals: list[Float[Tensor, "G P V"]],
+    params: Float[Tensor, "G K L V"],
+    x: Float[Tensor, "1 P 1"],
+    y: Float[Tensor, "1 P 1"],
+    stop: Float[Tensor, "G 1 V"],
+) -> tuple[Float[Tensor, "G P V"], list[Float[Tensor, "G P V"]]]:
+    for splat in params[:, :, None].unbind(3):
+        _, weight, transmittance = attenuate(_exponent(splat, x, y), transmittance, stop)
+        values = splat[:, _FEATURES].unbind(1)
+        totals = [total + weight * value for total, value in zip(totals, values, strict=True)]
+    return transmittance, totals
+
+
+def _backward(
+    transmittance: Float[Tensor, "G P V"],
+    behind: Float[Tensor, "G P V"],
+    gradients: list[Float[Tensor, "G P V"]],
+    params: Float[Tensor, "G K L V"],
+    x: Float[Tensor, "1 P 1"],
+    y: Float[Tensor, "1 P 1"],
+    stop: Float[Tensor, "G 1 V"],
+) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "K L G V"]]:
+    splats = params[:, :, None].unbind(3)
+    met = []
+    for splat in splats:
+        z = _exponent(splat, x, y)
+        alpha, weight, transmittance = attenuate(z, transmittance, stop)
+        met.append((z, alpha, weight))
+
+    grad_z = []
+    for splat, (z, alpha, weight) in zip(reversed(splats), reversed(met), strict=True):
+        behind, gradient = walk_back(behind, z, alpha, weight, gradients, splat[:, _FEATURES].unbind(1))
+        grad_z.append(gradient)
+
+    # u, v, a, b, c and n take the moments of grad_z about the splat's centre, shifted there from the tile's.
+    q, w = torch.stack(grad_z[::-1]), torch.stack([weight for _, _, weight in met])  # [L, G, P, V]
+    qx, qy = q * x, q * y
+    q, sx, sy, sxx, sxy, syy = (moment.sum(2) for moment in (q, qx, qy, qx * x, qx * y, qy * y))
+    u, v, a, b, c = params[:, :5].permute(1, 2, 0, 3)
+    mx, my = sx - u * q, sy - v * q
+    mxx, mxy, myy = sxx - u * (sx + mx), sxy - u * sy - v * mx, syy - v * (sy + my)
+    shape = [-2 * a * mx - b * my, -b * mx - 2 * c * my, mxx, mxy, myy, q]
+    return behind, torch.stack([*shape, *((w * gradient).sum(2) for gradient in gradients)])
+
+
+def _exponent(splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]) -> Tensor:
+    u, v, a, b, c, n, *_ = splat.unbind(1)
+    dx, dy = x - u, y - v
+    return (a * dx + b * dy) * dx + c * dy * dy + n
+
+
+GAUSSIANS = Kernels(_NULL_SHAPE, 0, _forward, _backward)
