@@ -16,7 +16,7 @@ from shellgs_method.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 
 CHUNK = 8  # splats a kernel takes at once
 LANES = 16  # tiles side by side in the innermost dimension
-TILES_PER_BATCH = 1024  # so that a batch's state stays in the cache
+TILES_PER_BATCH = 512  # so that a batch's state, and what a backward kernel sums, stay in the cache
 REPACK_BELOW = 0.75  # share of tiles still at work
 
 

@@ -64,23 +64,24 @@ def _backward(
         intersection = _intersect(splat, x, y)
         before = transmittance
         alpha, weight, transmittance = attenuate(intersection[0], before, stop)
-        met.append((intersection, alpha, weight, _halves(before, transmittance)))
+        met.append((intersection, alpha, weight, torch.where(_halves(before, transmittance), by_median, 0.0)))
 
-    sums = []
-    for splat, (intersection, alpha, weight, halves) in zip(reversed(splats), reversed(met), strict=True):
-        z, on_plane, s, t, depth, inverse_depth = intersection
+    by_z = []
+    for splat, (intersection, alpha, weight, _) in zip(reversed(splats), reversed(met), strict=True):
+        z, *_, depth, inverse_depth = intersection
         values = [*splat[:, _N_SHAPE:].unbind(1), depth, inverse_depth, inverse_depth * inverse_depth]
-        behind, by_z = walk_back(behind, z, alpha, weight, gradients, values)
-        # by the numerators of s and t, by inverse depth, and by the exponent where the low-pass decides
-        by_radius = torch.where(on_plane, 2 * by_z * depth, 0.0)
-        by_s, by_t = by_radius * s, by_radius * t
-        through_depth = weight * by_depth + torch.where(halves, by_median, 0.0)
-        by_i = weight * (by_inverse + 2 * inverse_depth * by_square) - depth * depth * through_depth
-        by_i = by_i - (by_s * s + by_t * t)
-        by_screen = torch.where(on_plane, 0.0, by_z)
-        sums.append((by_z, by_s, by_t, by_i, by_screen, weight))
+        behind, gradient = walk_back(behind, z, alpha, weight, gradients, values)
+        by_z.append(gradient)
 
-    by_z, by_s, by_t, by_i, by_screen, w = (torch.stack(each[::-1]) for each in zip(*sums, strict=True))  # [L, G, P, V]
+    # All splats at once, [L, G, P, V]. Meeting them again is cheaper than storing what was met.
+    by_z, w = torch.stack(by_z[::-1]), torch.stack([weight for _, _, weight, _ in met])
+    by_median = torch.stack([each for *_, each in met])
+    _, ahead, s, t, depth, inverse_depth = _intersect(params.permute(2, 0, 1, 3)[:, :, :, None], x, y)
+    # by the numerators of s and t, by inverse depth, and by the exponent where the low-pass decides
+    by_radius = torch.where(ahead > 0, 2 * by_z * depth, 0.0)
+    by_s, by_t, by_screen = by_radius * s, by_radius * t, torch.where(ahead > 0, 0.0, by_z)
+    by_i = w * (by_inverse + 2 * inverse_depth * by_square) - depth * depth * (w * by_depth + by_median)
+    by_i = by_i - (by_s * s + by_t * t)
     u, v, a, b, c, d, _, q, r = params[:, : _N_SHAPE - 1].permute(1, 2, 0, 3)
 
     def moments(gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -96,10 +97,13 @@ def _backward(
 
 
 def _intersect(
-    splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]
+    splat: Float[Tensor, "*L G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The exponent, whether it is that of the plane's point and not the low-pass, s, t, depth, and inverse depth."""
-    u, v, a, b, c, d, p, q, r, n, *_ = splat.unbind(1)
+    """The exponent, how far the low-pass is behind the plane's point, s, t, depth, and inverse depth.
+
+    The point decides where that is positive. It is a number since stored truth values do not vectorise.
+    """
+    u, v, a, b, c, d, p, q, r, n, *_ = splat.unbind(-3)
     dx, dy = x - u, y - v
     inverse_depth = p + q * dx + r * dy
     in_front = (inverse_depth > 0) & (inverse_depth <= 1 / NEAR_PLANE)
@@ -107,9 +111,9 @@ def _intersect(
     depth = 1 / inverse_depth
     s, t = (a * dx + b * dy) * depth, (c * dx + d * dy) * depth
     plane, screen = s * s + t * t, (dx * dx + dy * dy) * _LOW_PASS
-    on_plane = plane < screen
-    z = torch.where(in_front, torch.where(on_plane, plane, screen) + n, math.inf)
-    return z, on_plane, s, t, depth, inverse_depth
+    ahead = screen - plane
+    z = torch.where(in_front, torch.where(ahead > 0, plane, screen) + n, math.inf)
+    return z, ahead, s, t, depth, inverse_depth
 
 
 def _halves(before: Tensor, behind: Tensor) -> Tensor:
