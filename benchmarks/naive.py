@@ -72,7 +72,7 @@ def _tile(
     channels = [weights @ values[splats]]
     if primitive == "2d":
         median = torch.where((before > 0.5) & (behind <= 0.5), 1 / inverse_depth, 0.0)
-        maps = [weights / inverse_depth, weights * inverse_depth, weights * inverse_depth.square(), median]
+        maps = [weights * inverse_depth, weights * inverse_depth.square(), median]
         channels += [each.sum(dim=1, keepdim=True) for each in maps]
     return torch.cat(channels, dim=1).view(height, width, -1)
 
@@ -107,7 +107,7 @@ def _meet(
     a, b, c, d, p, q, r, n = projection.shapes[0, splats].unbind(-1)
     inverse_depth = p + q * dx + r * dy
     in_front = (inverse_depth > 0) & (inverse_depth <= 1 / NEAR_PLANE)
-    inverse_depth = torch.where(in_front, inverse_depth, 1.0)
+    inverse_depth = torch.where(in_front, inverse_depth, p)
     plane = ((a * dx + b * dy) / inverse_depth).square() + ((c * dx + d * dy) / inverse_depth).square()
-    z = torch.minimum(plane, (dx * dx + dy * dy) / math.log(2)) + n
-    return torch.where(in_front, z, torch.inf), inverse_depth
+    screen = (dx * dx + dy * dy) / math.log(2)
+    return torch.where(in_front, torch.minimum(plane, screen), screen) + n, inverse_depth

@@ -130,7 +130,7 @@ def prepare(case: Case, renderer: Callable[..., tuple[Tensor, Tensor, dict]]) ->
         forward = time.perf_counter() - start
         if not case.backward:
             return forward, float("nan")
-        maps = [info[name].mean() for name in ("depth", "median_depth", "distortion") if name in info]
+        maps = [info[name].mean() for name in ("inverse_depth", "median_depth", "distortion") if name in info]
         (torch.cat([composited, alpha], dim=-1) * slope).sum().add(sum(maps)).backward()
         return forward, time.perf_counter() - start
 

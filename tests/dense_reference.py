@@ -85,7 +85,7 @@ def dense_rasterize(means, quats, scales, opacities, features, viewmat, K, width
 class DenseDiscs(DenseImage):
     """The picture of discs, and its maps [H, W, 1]."""
 
-    depth: Tensor
+    inverse_depth: Tensor
     median_depth: Tensor
     distortion: Tensor
 
@@ -105,7 +105,7 @@ def dense_rasterize_discs(means, quats, scales, opacities, features, viewmat, K,
     x, y = x.to(means), y.to(means)
     composited = torch.zeros(height, width, features.shape[1], dtype=means.dtype)
     zeros = torch.zeros(height, width, dtype=means.dtype)
-    alpha_sum, depth, median, distortion, transmittance = zeros, zeros, zeros, zeros, zeros + 1
+    alpha_sum, inverse_depth, median, distortion, transmittance = zeros, zeros, zeros, zeros, zeros + 1
     met: list[tuple[Tensor, Tensor]] = []
     stopped = torch.zeros(height, width, dtype=torch.bool)
     margin = torch.full((height, width), torch.inf, dtype=means.dtype)
@@ -123,29 +123,28 @@ def dense_rasterize_discs(means, quats, scales, opacities, features, viewmat, K,
         parallel = q[..., 2] == 0
         u, v = (q[..., :2] / torch.where(parallel, 1.0, q[..., 2])[..., None]).unbind(-1)
         z_hit = u * T[2, 0] + v * T[2, 1] + T[2, 2]
-        rho_plane = u * u + v * v
+        hits = ~parallel & (z_hit >= near)
+        z_hit = torch.where(hits, z_hit, z[i].detach())
+        rho_plane = torch.where(hits, u * u + v * v, torch.inf)
         rho_screen = 2 * ((x - means2d[i, 0]) ** 2 + (y - means2d[i, 1]) ** 2)
         alpha = (opacities[i] * torch.exp(-0.5 * torch.minimum(rho_plane, rho_screen))).clamp(max=0.999)
-        in_front = ~parallel & (z_hit >= near)
-        counted = (alpha >= 1 / 255) & in_front & ~stopped
+        counted = (alpha >= 1 / 255) & ~stopped
         behind = transmittance * (1 - alpha)
         with torch.no_grad():
-            may_count = in_front & ~stopped
-            margin = torch.where(may_count, torch.minimum(margin, (alpha * 255 - 1).abs()), margin)
+            margin = torch.where(~stopped, torch.minimum(margin, (alpha * 255 - 1).abs()), margin)
             for distance in (z_hit / near - 1, behind / 1e-4 - 1, behind / 0.5 - 1, rho_plane / rho_screen - 1):
                 margin = torch.where(counted, torch.minimum(margin, distance.abs()), margin)
         stopped = stopped | (counted & (behind <= 1e-4))
         counted = counted & ~stopped
         weight = torch.where(counted, alpha * transmittance, 0.0)
-        z_hit = torch.where(counted, z_hit, 1.0)
         composited = composited + weight[..., None] * features[i]
         alpha_sum = alpha_sum + weight
-        depth = depth + weight * z_hit
+        inverse_depth = inverse_depth + weight / z_hit
         median = torch.where(counted & (transmittance > 0.5) & (behind <= 0.5), z_hit, median)
         mapped = 100 / (100 - 0.2) * (1 - 0.2 / z_hit)
         for weight_before, mapped_before in met:
             distortion = distortion + weight * weight_before * (mapped - mapped_before) ** 2
         met.append((weight, mapped))
         transmittance = torch.where(counted, behind, transmittance)
-    maps = (each[..., None] for each in (depth, median, distortion))
+    maps = (each[..., None] for each in (inverse_depth, median, distortion))
     return DenseDiscs(composited, alpha_sum[..., None], means2d, margin, *maps)

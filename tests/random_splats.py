@@ -49,3 +49,12 @@ def orbit(camera: Camera, n: int) -> list[Camera]:
         zoom = camera.K.new_tensor([1 + 0.2 * i, 1 + 0.1 * i, 1.0])
         cameras.append(replace(camera, viewmat=turn @ camera.viewmat, K=zoom[:, None] * camera.K))
     return cameras
+
+
+def make_discs(n: int, n_features: int, seed: int) -> list[Tensor]:
+    """Discs turned to z by up to 37 degrees, none of which reaches from before the camera to behind it."""
+    means, quats, scales, opacities, features = make_splats(n, n_features, seed)
+    means[:, 2] = 3 + means[:, 2].abs()
+    means[: n // 8, 2] *= -1
+    quats[:, 0] = 3 * quats[:, 1:].norm(dim=1)
+    return [means, quats, scales.clamp(1e-3, 0.4), opacities, features]

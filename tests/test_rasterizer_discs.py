@@ -16,7 +16,7 @@ from shellgs_method.rasterizer import fusion, quats_to_rotations, rasterize
 
 pytestmark = pytest.mark.usefixtures("eager")
 
-MAPS = ("depth", "median_depth", "distortion")
+MAPS = ("inverse_depth", "median_depth", "distortion")
 FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
@@ -117,7 +117,7 @@ def test_the_depth_of_a_slanted_disc_is_that_of_its_plane(scale):
     plane = (normal @ in_camera / (camera.rays() @ normal))[..., None]
     shows = alpha > 0
     assert shows.any()
-    torch.testing.assert_close((info["depth"] / alpha)[shows], plane[shows])
+    torch.testing.assert_close((alpha / info["inverse_depth"])[shows], plane[shows])
     halves = alpha >= 0.5
     torch.testing.assert_close(info["median_depth"][halves], plane[halves])
     assert not info["median_depth"][~halves].any()
@@ -133,7 +133,7 @@ def test_the_distortion_of_two_surfaces_is_the_product_of_their_weights_and_squa
     _, alpha, info = rasterize(*splats, camera=pinhole(1, 1, 1.0), primitive="2d")
     near, far = (100 / 99.8 * (1 - 0.2 / z) for z in (1, 4))
     assert alpha.item() == pytest.approx(0.8)
-    assert info["depth"].item() == pytest.approx(0.6 * 1 + 0.2 * 4)
+    assert info["inverse_depth"].item() == pytest.approx(0.6 / 1 + 0.2 / 4)
     assert info["median_depth"].item() == pytest.approx(1.0)
     assert info["distortion"].item() == pytest.approx(0.6 * 0.2 * (near - far) ** 2)
 

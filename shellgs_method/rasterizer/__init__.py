@@ -1,4 +1,4 @@
-"""Features composited over 3D Gaussians or 2D discs, in pure PyTorch."""
+"""Features composited over 3D Gaussians or 2D discs, in pure PyTorch or on gsplat's CUDA kernels."""
 
 from __future__ import annotations
 

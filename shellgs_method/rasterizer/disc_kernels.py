@@ -6,10 +6,11 @@ disc is a, b, c, d, p, q, r, n: its local coordinates, in units that make the ex
     s = (a dx + b dy) / i,  t = (c dx + d dy) / i,  i = p + q dx + r dy,
 
 and the exponent with the low-pass of 2DGS, which keeps a disc seen edge-on or from afar as wide as a pixel, is
-z = min(s² + t², (dx² + dy²) / ln 2) + n.
+z = min(s² + t², (dx² + dy²) / ln 2) + n. Where the ray meets the plane behind the near plane, if at all, only the
+low-pass counts, at the depth of the centre, which is a constant there.
 
-Its maps are the weighted sums of depth, inverse depth, and inverse depth squared; and the median depth, that of the
-splat at which the transmittance falls to 1/2 or less, whose gradient goes to that splat's depth alone.
+Its maps are the weighted sums of inverse depth and of its square; and the median depth, that of the splat at which the
+transmittance falls to 1/2 or less, whose gradient goes to that splat's depth alone.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from shellgs_method.rasterizer.projection import NEAR_PLANE
 
 _LOW_PASS = 1 / math.log(2)  # exponent over squared distance in pixels: rho = 2 |x - c|², alpha ~ exp(-rho / 2)
 _NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, math.inf)
-_N_SHAPE, _N_MAPS = len(_NULL_SHAPE), 4
+_N_SHAPE, _N_MAPS = len(_NULL_SHAPE), 3
 
 
 def _forward(
@@ -38,10 +39,10 @@ def _forward(
 ) -> tuple[Float[Tensor, "G P V"], list[Float[Tensor, "G P V"]]]:
     *totals, median = totals
     for splat in params[:, :, None].unbind(3):
-        z, _, _, _, depth, inverse_depth = _intersect(splat, x, y)
+        z, _, _, _, depth, inverse_depth, _ = _intersect(splat, x, y)
         before = transmittance
         _, weight, transmittance = attenuate(z, before, stop)
-        values = [*splat[:, _N_SHAPE:].unbind(1), depth, inverse_depth, inverse_depth * inverse_depth]
+        values = [*splat[:, _N_SHAPE:].unbind(1), inverse_depth, inverse_depth * inverse_depth]
         totals = [total + weight * value for total, value in zip(totals, values, strict=True)]
         median = torch.where(_halves(before, transmittance), depth, median)
     return transmittance, [*totals, median]
@@ -58,7 +59,7 @@ def _backward(
 ) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "K L G V"]]:
     splats = params[:, :, None].unbind(3)
     *gradients, by_median = gradients
-    by_depth, by_inverse, by_square = gradients[-3:]
+    by_inverse, by_square = gradients[-2:]
     met = []
     for splat in splats:
         intersection = _intersect(splat, x, y)
@@ -68,19 +69,19 @@ def _backward(
 
     by_z = []
     for splat, (intersection, alpha, weight, _) in zip(reversed(splats), reversed(met), strict=True):
-        z, *_, depth, inverse_depth = intersection
-        values = [*splat[:, _N_SHAPE:].unbind(1), depth, inverse_depth, inverse_depth * inverse_depth]
+        z, *_, inverse_depth, _ = intersection
+        values = [*splat[:, _N_SHAPE:].unbind(1), inverse_depth, inverse_depth * inverse_depth]
         behind, gradient = walk_back(behind, z, alpha, weight, gradients, values)
         by_z.append(gradient)
 
     # All splats at once, [L, G, P, V]. Meeting them again is cheaper than storing what was met.
     by_z, w = torch.stack(by_z[::-1]), torch.stack([weight for _, _, weight, _ in met])
     by_median = torch.stack([each for *_, each in met])
-    _, ahead, s, t, depth, inverse_depth = _intersect(params.permute(2, 0, 1, 3)[:, :, :, None], x, y)
+    _, ahead, s, t, depth, inverse_depth, hits = _intersect(params.permute(2, 0, 1, 3)[:, :, :, None], x, y)
     # by the numerators of s and t, by inverse depth, and by the exponent where the low-pass decides
     by_radius = torch.where(ahead > 0, 2 * by_z * depth, 0.0)
     by_s, by_t, by_screen = by_radius * s, by_radius * t, torch.where(ahead > 0, 0.0, by_z)
-    by_i = w * (by_inverse + 2 * inverse_depth * by_square) - depth * depth * (w * by_depth + by_median)
+    by_i = hits * (w * (by_inverse + 2 * inverse_depth * by_square) - depth * depth * by_median)
     by_i = by_i - (by_s * s + by_t * t)
     u, v, a, b, c, d, _, q, r = params[:, : _N_SHAPE - 1].permute(1, 2, 0, 3)
 
@@ -93,27 +94,28 @@ def _backward(
     by_u = -(a * s + c * t + q * i + 2 * _LOW_PASS * nx)
     by_v = -(b * s + d * t + r * i + 2 * _LOW_PASS * ny)
     shape = [by_u, by_v, sx, sy, tx, ty, i, ix, iy, by_z.sum(2)]
-    return behind, torch.stack([*shape, *((w * gradient).sum(2) for gradient in gradients[:-3])])
+    return behind, torch.stack([*shape, *((w * gradient).sum(2) for gradient in gradients[:-2])])
 
 
 def _intersect(
     splat: Float[Tensor, "*L G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The exponent, how far the low-pass is behind the plane's point, s, t, depth, and inverse depth.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The exponent, how far the low-pass is behind the plane's point, s, t, depth, inverse depth, and if the ray hits.
 
-    The point decides where that is positive. It is a number since stored truth values do not vectorise.
+    The point decides where the second is positive. That the ray hits is a number, 1 or 0, since stored truth values do
+    not vectorise.
     """
     u, v, a, b, c, d, p, q, r, n, *_ = splat.unbind(-3)
     dx, dy = x - u, y - v
     inverse_depth = p + q * dx + r * dy
     in_front = (inverse_depth > 0) & (inverse_depth <= 1 / NEAR_PLANE)
-    inverse_depth = torch.where(in_front, inverse_depth, 1.0)
+    inverse_depth = torch.where(in_front, inverse_depth, p)
     depth = 1 / inverse_depth
     s, t = (a * dx + b * dy) * depth, (c * dx + d * dy) * depth
     plane, screen = s * s + t * t, (dx * dx + dy * dy) * _LOW_PASS
-    ahead = screen - plane
-    z = torch.where(in_front, torch.where(ahead > 0, plane, screen) + n, math.inf)
-    return z, ahead, s, t, depth, inverse_depth
+    ahead = torch.where(in_front, screen - plane, -1.0)
+    z = torch.where(ahead > 0, plane, screen) + n
+    return z, ahead, s, t, depth, inverse_depth, torch.where(in_front, 1.0, 0.0)
 
 
 def _halves(before: Tensor, behind: Tensor) -> Tensor:

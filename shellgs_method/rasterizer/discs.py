@@ -74,18 +74,18 @@ def project_discs(
 
 
 def disc_maps(
-    alpha: Float[Tensor, "*batch 1"], maps: Float[Tensor, "*batch 4"]
+    alpha: Float[Tensor, "*batch 1"], maps: Float[Tensor, "*batch 3"]
 ) -> dict[str, Float[Tensor, "*batch 1"]]:
-    """What a disc picture tells of geometry, from the maps that the kernels composite.
+    """What a disc picture tells of geometry, from what is composited of each disc: 1/z, 1/z², and the median's z.
 
     Distortion is the L2 form of 2DGS, sum over i and j < i of w_i w_j (m_i - m_j)², with depths mapped to
     m = far / (far - near) (1 - near / z). It is the variance A Σ w m² - (Σ w m)², A = Σ w, in which the constant of
     the mapping drops out: left out, it does not drown the rest in rounding.
     """
-    depth, inverse_depth, square, median = maps.split(1, dim=-1)
+    inverse_depth, square, median_depth = maps.split(1, dim=-1)
     mapping = MAPPING_FAR * MAPPING_NEAR / (MAPPING_FAR - MAPPING_NEAR)
     distortion = mapping**2 * (alpha * square - inverse_depth.square())
-    return {"depth": depth, "median_depth": median, "distortion": distortion}
+    return {"inverse_depth": inverse_depth, "median_depth": median_depth, "distortion": distortion}
 
 
 def _outlines(

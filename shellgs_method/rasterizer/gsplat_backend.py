@@ -1,0 +1,262 @@
+"""Rasterization on the CUDA kernels of the installed gsplat, 1.4 or 1.5, for 3D Gaussians and for the discs of 2DGS.
+
+gsplat imports everywhere; whether its kernels load shows when they are first asked for, which may compile them.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from gsplat import (
+    fully_fused_projection,
+    fully_fused_projection_2dgs,
+    isect_offset_encode,
+    isect_tiles,
+    rasterize_to_pixels,
+    rasterize_to_pixels_2dgs,
+)
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dataparsers.camera import Camera
+from shellgs_method.rasterizer.discs import EDGE_ON
+from shellgs_method.rasterizer.picture import Picture
+from shellgs_method.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs
+
+logger = logging.getLogger(__name__)
+
+Backend = Literal["auto", "torch", "gsplat"]
+
+TILE = 16  # pixels along the side of a tile; gsplat tests no other
+
+
+def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
+    """Whether to rasterize on gsplat's kernels; where a CUDA device has to do without, a log line says why, once.
+
+    Raises:
+        ValueError: gsplat is asked for by name and cannot run.
+    """
+    if backend == "torch":
+        return False
+    on_cuda = means.device.type == "cuda"
+    if not on_cuda or means.dtype != torch.float32:
+        fault = f"its kernels take float32 tensors on a CUDA device, and these are {means.dtype} on {means.device}"
+    else:
+        fault = _kernels_fault()
+    if backend == "gsplat" and fault:
+        raise ValueError(f'backend="gsplat" cannot run here; use "auto" or "torch": {fault}.')
+    if on_cuda and fault:
+        _warn_once(f"The rasterizer runs on {means.device} in plain torch, slower than gsplat: {fault}.")
+    return fault is None
+
+
+def rasterize_3d(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    features: Float[Tensor, "N C"],
+    cameras: Sequence[Camera],
+) -> Picture:
+    """Rasterize Gaussians on cameras of one size; float32 on a CUDA device, like all tensors here.
+
+    The picture is that of the torch backend, except that gsplat culls a splat beside the image that reaches into it
+    with no more than its alpha beyond three standard deviations, which is below 0.012.
+    """
+    viewmats, Ks, width, height = _stack(cameras)
+    radii, means2d, depths, conics, _ = fully_fused_projection(
+        means, None, quats, scales, viewmats, Ks, width, height, eps2d=LOW_PASS, near_plane=NEAR_PLANE, packed=False
+    )
+    # gsplat's radii are of three standard deviations. A splat goes into the tiles where its alpha counts: farther out,
+    # or the picture would break off at their borders; or, of a faint splat, not so far, which saves time.
+    reach = (cutoffs(opacities).sqrt() / 3).view(-1, *[1] * (radii.dim() - 2))
+    bins = _bin(means2d, radii * reach, depths, width, height)
+    composited, alpha = rasterize_to_pixels(
+        *(means2d, conics, features.expand(len(cameras), -1, -1), opacities.expand(len(cameras), -1)),
+        *(width, height, TILE, *bins),
+    )
+    return Picture(composited, alpha, composited[..., :0], means2d, radii)
+
+
+def rasterize_2d(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    features: Float[Tensor, "N C"],
+    cameras: Sequence[Camera],
+) -> Picture:
+    """Rasterize the discs of 2DGS (Huang et al. 2024).
+
+    gsplat blends the depths of the centres, not of the intersections (its issues #477 and #863). Of an intersection,
+    though, 1/z = q · ray with a constant q of the disc, see :class:`_Discs`: composited, the vectors q give the sum of
+    weight over z exactly, and their products q qᵀ that of weight over z².
+
+    The picture is that of the torch backend, except that gsplat culls by the boxes of three standard deviations, and
+    that its maps have the depth of the centre for all of a disc that is as good as edge-on.
+    """
+    discs = _project_discs(means, quats, scales, opacities, cameras)
+    # One camera at a time: gsplat 1.4 writes the normals of a batch over those of its first (its issue #425).
+    views = [_composite_discs(discs, i, opacities, features, camera) for i, camera in enumerate(cameras)]
+    composited, alpha, maps = (torch.cat(view) for view in zip(*views, strict=True))
+    return Picture(composited, alpha, maps, discs.means2d, discs.radii)
+
+
+RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
+
+
+@dataclass(frozen=True)
+class _Discs:
+    """Discs on the screens of B cameras.
+
+    Attributes:
+        means2d: projected centres in pixels.
+        ray_transforms: K [s_u t_u | s_v t_v | centre] in the camera frame; equation 8 of 2DGS.
+        inverse_planes: q = normal / (normal · centre), which has q · ray = 1/z where a ray meets the plane;
+            of a steep disc as if it faced the camera.
+        radii: as gsplat has them, 0 of a culled disc.
+        tile_radii: of the squares around the means2d outside of which alpha does not count.
+    """
+
+    means2d: Float[Tensor, "B N 2"]
+    ray_transforms: Float[Tensor, "B N 3 3"]
+    inverse_planes: Float[Tensor, "B N 3"]
+    radii: Int[Tensor, "B N ..."]
+    tile_radii: Float[Tensor, "B N ..."]
+
+
+def _project_discs(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    cameras: Sequence[Camera],
+) -> _Discs:
+    viewmats, Ks, width, height = _stack(cameras)
+    splats = fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane=NEAR_PLANE)
+    radii, _, _, ray_transforms, normals = splats  # pyright: ignore[reportAssignmentType]
+    # Of a culled disc gsplat leaves memory as it was; none of it may reach a gradient, as 0 times NaN.
+    visible = radii.view(*normals.shape[:2], -1).amin(-1) > 0
+    normals = torch.where(visible[..., None], normals, normals.new_tensor([0.0, 0.0, -1.0]))
+    ray_transforms = torch.where(visible[..., None, None], ray_transforms, torch.eye(3).to(means))
+
+    # The centres go through means2d, which so have the whole gradient by a shift on the screen. gsplat has centres of
+    # boxes there, unlike the torch backend, and in 1.4 their gradient lacks the mixed terms of a tilted disc.
+    depths = ray_transforms[..., 2:, 2]
+    means2d = ray_transforms[..., :2, 2] / depths
+    centres = torch.cat([means2d * depths, depths], dim=-1)
+    ray_transforms = torch.cat([ray_transforms[..., :2], centres[..., None]], dim=-1)
+
+    centres = centres @ torch.linalg.inv(Ks).mT
+    planes = (normals * centres).sum(-1, keepdim=True)
+    shows = visible & (planes[..., 0].detach().abs() > EDGE_ON * centres.detach().norm(dim=-1))
+    # The low-pass shows a steep disc even where the ray meets its plane behind the camera; the depth of the centre is
+    # right there, and for want of another has to do where a ray meets the plane in front.
+    cutoff = cutoffs(opacities)
+    slopes = (normals[..., :2] / torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], dim=-1)[:, None]).norm(dim=-1)
+    steep = planes[..., 0].abs() <= slopes * (cutoff / 2).sqrt() * depths[..., 0]
+    facing = torch.cat([torch.zeros_like(means2d), 1 / depths], dim=-1)
+    inverse_planes = torch.where(steep[..., None], facing, normals / torch.where(steep[..., None], 1.0, planes))
+
+    reach = _reach_of_discs(means2d, ray_transforms, cutoff, max(width, height))
+    tile_radii = reach.amax(-1) * shows if radii.dim() == 2 else reach * shows[..., None]
+    return _Discs(means2d, ray_transforms, inverse_planes, radii, tile_radii)
+
+
+@torch.no_grad()
+def _reach_of_discs(
+    means2d: Float[Tensor, "B N 2"],
+    ray_transforms: Float[Tensor, "B N 3 3"],
+    cutoff: Float[Tensor, "N"],
+    image_size: int,
+) -> Float[Tensor, "B N 2"]:
+    """Half the sides of boxes around the means2d in which a disc, and its low-pass, lie up to a cutoff.
+
+    The points (u, v) of a disc with u² + v² = cutoff lie on the screen on an ellipse, and its box follows from the dual
+    conic T diag(cutoff, cutoff, -1) Tᵀ (2DGS, section 4.2), here with the origin of the pixels in the projected centre.
+    """
+    w = ray_transforms[..., 2:, :]
+    rows = ray_transforms[..., :2, :] - means2d[..., None] * w
+    signs = torch.stack([cutoff, cutoff, -torch.ones_like(cutoff)], dim=-1)[:, None]
+    against = (signs * w * w).sum(-1)
+    middle = (signs * rows * w).sum(-1) / against
+    half = (middle.square() - (signs * rows * rows).sum(-1) / against).clamp_min(0).sqrt()
+    # A disc that reaches behind the camera has no ellipse: it may be anywhere in the image.
+    on_plane = torch.where(against < 0, middle.abs() + half, means2d.abs() + image_size)
+    return torch.maximum(on_plane, (cutoff / 2).sqrt()[:, None])
+
+
+def _composite_discs(
+    discs: _Discs, i: int, opacities: Float[Tensor, "N"], features: Float[Tensor, "N C"], camera: Camera
+) -> tuple[Float[Tensor, "1 height width C"], Float[Tensor, "1 height width 1"], Float[Tensor, "1 height width 3"]]:
+    """Features, alpha, and the maps of a picture, as camera ``i`` sees them."""
+    one = slice(i, i + 1)
+    means2d, inverse_planes = discs.means2d[one], discs.inverse_planes[one]
+    bins = _bin(means2d, discs.tile_radii[one], discs.ray_transforms[one, :, 2, 2], camera.width, camera.height)
+    rows, columns = torch.triu_indices(3, 3, device=means2d.device)
+    # Filled up with zeros to a power of two; gsplat would fill up with memory as it is. The kernel takes the last
+    # feature of the disc at the median for its depth: numbered, the discs tell which one it is.
+    n_features = features.shape[-1]
+    size = 1 << (n_features + len(rows)).bit_length()
+    products = inverse_planes[..., rows] * inverse_planes[..., columns]
+    numbers = torch.arange(len(features), dtype=features.dtype, device=features.device)
+    filling = features.new_zeros(1, len(features), size - n_features - len(rows) - 1)
+    channels = torch.cat([features[None], products, filling, numbers[None, :, None]], dim=-1)
+    pictures = rasterize_to_pixels_2dgs(
+        *(means2d, discs.ray_transforms[one], channels, opacities[None], inverse_planes),
+        *(torch.zeros_like(means2d), camera.width, camera.height, TILE, *bins),
+    )
+    composited, alpha, inverse_plane, _, median = pictures  # pyright: ignore[reportAssignmentType]
+    composited, products, _ = composited.split([n_features, len(rows), size - n_features - len(rows)], dim=-1)
+    rays = camera.rays()
+    pairs_of_rays = torch.where(rows == columns, 1, 2) * rays[..., rows] * rays[..., columns]
+    inverse_depth = (inverse_plane * rays).sum(-1, keepdim=True)
+    square = (products * pairs_of_rays).sum(-1, keepdim=True)
+    at_median = (inverse_planes[:, median[0, ..., 0].long()] * rays).sum(-1, keepdim=True)
+    halves = alpha >= 0.5
+    median_depth = torch.where(halves, 1 / torch.where(halves, at_median, 1.0), 0.0)
+    return composited, alpha, torch.cat([inverse_depth, square, median_depth], dim=-1)
+
+
+@torch.no_grad()
+def _bin(
+    means2d: Float[Tensor, "B N 2"],
+    radii: Float[Tensor, "B N ..."],
+    depths: Float[Tensor, "B N"],
+    width: int,
+    height: int,
+) -> tuple[Int[Tensor, "B rows columns"], Int[Tensor, "entries"]]:
+    """Which splats touch which tiles, front to back: where each tile begins in the list, and the list."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    _, tiles, splats = isect_tiles(means2d, radii.ceil().int(), depths, TILE, columns, rows)
+    return isect_offset_encode(tiles, len(means2d), columns, rows), splats
+
+
+def _stack(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"], int, int]:
+    """The viewmats and Ks, and the width and height that all share."""
+    viewmats = torch.stack([camera.viewmat for camera in cameras])
+    return viewmats, torch.stack([camera.K for camera in cameras]), cameras[0].width, cameras[0].height
+
+
+@functools.cache
+def _kernels_fault() -> str | None:
+    """Why gsplat's kernels do not load, None if they do; asked for the first time it may compile them, in minutes."""
+    try:
+        kernels = importlib.import_module("gsplat.cuda._backend")._C
+    except Exception as error:  # of nvcc, of the C++ compiler, of a library for another CUDA or torch, …
+        reason = next(iter(str(error).strip().splitlines()), "")
+        return f"its kernels neither load nor compile ({type(error).__name__}: {reason})"
+    return (
+        None if kernels is not None else "it came without compiled kernels, and there is no nvcc to compile them with"
+    )
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    logger.warning(message)
