@@ -73,7 +73,7 @@ def test_gsplat_gives_the_picture_and_gradients_of_the_torch_backend(primitive, 
 
 @pytest.mark.usefixtures("_twins")
 def test_a_splat_beside_the_image_is_lost_beyond_three_standard_deviations():
-    # A standard deviation is 10 pixels, the centre 31.5 from that of the pixel: 0.999 exp(-31.5² / 200.6) = 0.0071.
+    # A standard deviation is 10 pixels, the centre 31.5 from the pixel: alpha is 0.999 exp(-31.5² / 200.6) = 0.0071.
     K = torch.tensor([[1000.0, 0.0, -31.0], [0.0, 1000.0, 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
     camera = Camera(torch.eye(4).double(), K, 1, 1)
     mean, quat = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])

@@ -13,7 +13,7 @@ from random_splats import NAMES, make_camera, make_splats, orbit
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.rasterizer import fusion, rasterize
+from shellgs_method.rasterizer import compositing, fusion, rasterize
 
 pytestmark = pytest.mark.usefixtures("eager")
 
@@ -195,6 +195,18 @@ def test_a_batch_of_cameras_gives_the_pictures_of_each():
 def test_a_batch_needs_cameras_of_one_size(widths):
     with pytest.raises(ValueError, match="one size in common"):
         rasterize(*make_splats(5, 3, seed=0), camera=[make_camera(width, 20) for width in widths])
+
+
+@pytest.mark.parametrize("batches", [(1, 1), (7, 3), compositing.GPU_BATCHES])
+def test_how_tiles_are_batched_changes_neither_picture_nor_gradients(batches, monkeypatch):
+    def differentiated() -> list[Tensor]:
+        splats = [splat.requires_grad_() for splat in make_splats(200, 3, seed=14)]
+        composited, alpha, _ = rasterize(*splats, camera=make_camera(53, 38))
+        return [composited, alpha, *torch.autograd.grad((composited.square().sum() + alpha.sum()), splats)]
+
+    expected = differentiated()
+    monkeypatch.setattr(compositing, "CPU_BATCHES", batches)
+    torch.testing.assert_close(differentiated(), expected)
 
 
 def test_cropping_is_shifting_the_principal_point():

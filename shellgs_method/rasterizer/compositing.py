@@ -16,7 +16,10 @@ from shellgs_method.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 
 CHUNK = 8  # splats a kernel takes at once
 LANES = 16  # tiles side by side in the innermost dimension
-TILES_PER_BATCH = 512  # so that a batch's state, and what a backward kernel sums, stay in the cache
+# Tiles in a batch, and chunks before a look at which tiles are still at work. A batch's state, and what a backward
+# kernel sums, stay in a CPU's cache; a GPU wants much to do at once, and a look makes the host wait for it.
+CPU_BATCHES = (512, 1)
+GPU_BATCHES = (1 << 14, 4)
 REPACK_BELOW = 0.75  # share of tiles still at work
 
 
@@ -61,7 +64,8 @@ def _paint(
     runs = []
     # Tiles with a like number of splats finish together.
     busiest_first = bins.counts.argsort(descending=True)[: int((bins.counts > 0).sum())]
-    for tiles in busiest_first.split(TILES_PER_BATCH):
+    tiles_per_batch, chunks_per_look = CPU_BATCHES if canvas.device.type == "cpu" else GPU_BATCHES
+    for tiles in busiest_first.split(tiles_per_batch):
         chunk = 0
         while len(tiles):
             run = _Run(_fill_lanes(tiles, bins), chunk)
@@ -70,10 +74,11 @@ def _paint(
             transmittance, *totals = _gather(canvas, run.tiles)
             at_work = torch.ones_like(run.tiles, dtype=torch.bool)
             while int(at_work.sum()) >= REPACK_BELOW * len(tiles):
-                params, _ = _chunk_params(columns, bins, run.tiles, chunk)
-                run.transmittances.append(transmittance)
-                transmittance, totals = run_fused(kernels.forward, transmittance, totals, params, *pixels)
-                chunk += 1
+                for _ in range(chunks_per_look):
+                    params, _ = _chunk_params(columns, bins, run.tiles, chunk)
+                    run.transmittances.append(transmittance)
+                    transmittance, totals = run_fused(kernels.forward, transmittance, totals, params, *pixels)
+                    chunk += 1
                 at_work = (transmittance.amax(1) > 0) & (bins.counts[run.tiles] > chunk * CHUNK)
             canvas[run.tiles] = torch.stack([transmittance, *totals], -1).permute(0, 2, 3, 1)
             tiles = run.tiles[at_work]
