@@ -27,7 +27,7 @@ FOV = math.radians(70)
 
 
 def facade(n: int, camera: Camera) -> dict[str, Tensor]:
-    """A relief of thin splats before the camera, and three tenths of the splats anywhere between; held as splatfacto holds them."""
+    """Parameters as splatfacto holds them: a relief of thin splats, and three tenths of them anywhere before it."""
     generator = torch.Generator().manual_seed(n)
     uniform, normal = partial(torch.rand, generator=generator), partial(torch.randn, generator=generator)
     n_relief = n * 7 // 10
