@@ -6,7 +6,7 @@ import math
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
@@ -81,11 +81,10 @@ def _touching(projection: Projection, left: int, top: int, width: int, height: i
     """Splats with an outline whose box touches a tile."""
     low, high = torch.tensor([left, top]), torch.tensor([left + width, top + height])
 
-    def overlap(centres: Tensor, reach: Tensor) -> Bool[Tensor, "N"]:
-        return ((centres + reach > low) & (centres - reach < high)).all(dim=-1)
-
-    touch = torch.stack([overlap(outline.centres[0], outline.reach[0]) for outline in projection.outlines])
-    return (touch.any(dim=0) & projection.visible[0]).nonzero().squeeze(1)
+    outlines = projection.outlines[0]
+    centres, reach = outlines[..., :2], outlines[..., 5:]
+    touch = ((centres + reach > low) & (centres - reach < high)).all(dim=-1)
+    return (touch.any(dim=1) & projection.visible[0]).nonzero().squeeze(1)
 
 
 def _meet(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -18,130 +19,231 @@ CHUNK = 8  # splats a kernel takes at once
 LANES = 16  # tiles side by side in the innermost dimension
 # Tiles in a batch, and chunks before a look at which tiles are still at work. A batch's state, and what a backward
 # kernel sums, stay in a CPU's cache; a GPU wants much to do at once, and a look makes the host wait for it.
-CPU_BATCHES = (512, 1)
+CPU_BATCHES = (2048, 1)
 GPU_BATCHES = (1 << 14, 4)
+MAX_SUMMED = 24 << 20  # bytes of gradients summed at once; from 32 MB, memory is new and slow each time it is allocated
 REPACK_BELOW = 0.75  # share of tiles still at work
 
 
-def composite(params: Float[Tensor, "N K"], bins: Bins, kernels: Kernels) -> Float[Tensor, "height width C"]:
-    """Composite splats, ordered front to back, over the whole tiles of ``bins``: sums of weight times feature, maps."""
-    return _Composite.apply(params, bins, kernels)
+def composite(
+    means2d: Float[Tensor, "N 2"],
+    shapes: Float[Tensor, "N S"],
+    features: Float[Tensor, "N C"],
+    order: Int[Tensor, "n"],
+    bins: Bins,
+    kernels: Kernels,
+) -> Float[Tensor, "height width C+1+maps"]:
+    """Composite splats over the whole tiles of ``bins``: features, alpha, and the primitive's maps.
+
+    Args:
+        means2d: centres in pixels.
+        shapes: what the primitive's kernels know of them.
+        features: any channels.
+        order: the splats in the bins, front to back.
+        bins: of the splats in this order.
+        kernels: of the primitive.
+    """
+    return _Composite.apply(means2d, shapes, features, order, bins, kernels)
 
 
 @dataclass(frozen=True)
-class _Run:
-    """Consecutive chunks over the same tiles, and the transmittance before each."""
+class _Plan:
+    """Tiles side by side, the busiest first, and the chunks of splats they meet.
+
+    A group of tiles is through once the busiest of its tiles has no more splats; those that are not come first.
+
+    Attributes:
+        tiles: in their lanes.
+        centres: of the tiles in pixels.
+        first_chunk: that these tiles have not met yet.
+        splats: rows of the table, chunk after chunk, those of the groups that are not through.
+        ends: of each chunk among these rows.
+        transmittances: before each chunk that was met.
+    """
 
     tiles: Int[Tensor, "G V"]
+    centres: Float[Tensor, "G 2 V"]
     first_chunk: int
-    transmittances: list[Float[Tensor, "G P V"]] = field(default_factory=list)
+    splats: Int[Tensor, "rows L V"]
+    ends: list[int]
+    transmittances: list[Float[Tensor, "g P V"]] = field(default_factory=list)
+
+    def chunk(self, i: int) -> slice:
+        """Rows of ``splats`` that the i-th chunk takes, one for each group that is not through."""
+        return slice(self.ends[i - 1] if i else 0, self.ends[i])
+
+    @property
+    def n_met(self) -> int:
+        """Rows of ``splats`` that were met."""
+        return self.ends[len(self.transmittances) - 1]
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, params, bins, kernels):
-        columns = F.pad(params, (0, 0, 0, 1)).T.contiguous()
-        columns[: kernels.n_shape, -1] = columns.new_tensor(kernels.null_shape)  # fills up a tile's last chunk
-        n_totals = len(columns) - kernels.n_shape + kernels.n_maps
-        canvas = params.new_zeros(len(bins.counts), 1 + n_totals, TILE * TILE)
-        canvas[:, 0] = 1
-        runs = _paint(canvas, columns, bins, kernels)
-        ctx.save_for_backward(columns)
-        ctx.bins, ctx.runs, ctx.kernels = bins, runs, kernels
-        return _untile(canvas[:-1, 1:], bins)
+    def forward(ctx, means2d, shapes, features, order, bins, kernels):
+        columns = [each.index_select(0, order) for each in (means2d, shapes, features)]
+        table = F.pad(torch.cat([*columns, features.new_ones(len(order), 1)], dim=1), (0, 0, 0, 1))
+        table[-1, : kernels.n_shape] = table.new_tensor(kernels.null_shape)  # fills up a tile's last chunk
+        canvas, plans = _paint(table, bins, kernels)
+        ctx.save_for_backward(table, order)
+        ctx.n, ctx.bins, ctx.plans, ctx.kernels = len(means2d), bins, plans, kernels
+        return _untile(canvas[:-1], bins)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradients):
-        (columns,) = ctx.saved_tensors
-        return _gradients(_tile(gradients, ctx.bins), columns, ctx.bins, ctx.runs, ctx.kernels), None, None
+        table, order = ctx.saved_tensors
+        by_row = _gradients(_tile(gradients, ctx.bins), table, ctx.plans, ctx.kernels)
+        widths = [2, ctx.kernels.n_shape - 2, table.shape[1] - ctx.kernels.n_shape - 1]
+        by_input = (
+            table.new_zeros(ctx.n, each.shape[1]).index_copy_(0, order, each)
+            for each in by_row[:-1, :-1].split(widths, dim=1)
+        )
+        return *by_input, None, None, None
 
 
 def _paint(
-    canvas: Float[Tensor, "tiles+1 1+C P"], columns: Float[Tensor, "K N+1"], bins: Bins, kernels: Kernels
-) -> list[_Run]:
-    """Composite all tiles into the canvas, which holds the transmittance and the totals."""
-    runs = []
+    table: Float[Tensor, "N+1 K"], bins: Bins, kernels: Kernels
+) -> tuple[Float[Tensor, "tiles+1 C P"], list[_Plan]]:
+    """Totals of all tiles, and how they came about."""
+    n_totals = table.shape[1] - kernels.n_shape + kernels.n_maps
+    canvas = table.new_zeros(len(bins.counts), n_totals, TILE * TILE)
+    plans = []
     # Tiles with a like number of splats finish together.
     busiest_first = bins.counts.argsort(descending=True)[: int((bins.counts > 0).sum())]
-    tiles_per_batch, chunks_per_look = CPU_BATCHES if canvas.device.type == "cpu" else GPU_BATCHES
+    tiles_per_batch, chunks_per_look = CPU_BATCHES if table.device.type == "cpu" else GPU_BATCHES
     for tiles in busiest_first.split(tiles_per_batch):
-        chunk = 0
+        transmittance, first_chunk = table.new_ones(len(tiles), TILE * TILE), 0
         while len(tiles):
-            run = _Run(_fill_lanes(tiles, bins), chunk)
-            runs.append(run)
-            pixels = _pixels(columns, run)
-            transmittance, *totals = _gather(canvas, run.tiles)
-            at_work = torch.ones_like(run.tiles, dtype=torch.bool)
-            while int(at_work.sum()) >= REPACK_BELOW * len(tiles):
-                for _ in range(chunks_per_look):
-                    params, _ = _chunk_params(columns, bins, run.tiles, chunk)
-                    run.transmittances.append(transmittance)
-                    transmittance, totals = run_fused(kernels.forward, transmittance, totals, params, *pixels)
-                    chunk += 1
-                at_work = (transmittance.amax(1) > 0) & (bins.counts[run.tiles] > chunk * CHUNK)
-            canvas[run.tiles] = torch.stack([transmittance, *totals], -1).permute(0, 2, 3, 1)
-            tiles = run.tiles[at_work]
-    return runs
+            plan = _plan(tiles, first_chunk, bins, table)
+            tiles, transmittance = _follow(plan, transmittance, canvas, table, bins, kernels, chunks_per_look)
+            first_chunk += len(plan.transmittances)
+            plans.append(plan)
+    return canvas, plans
+
+
+def _follow(
+    plan: _Plan,
+    transmittance: Float[Tensor, "tiles P"],
+    canvas: Float[Tensor, "all_tiles C P"],
+    table: Float[Tensor, "N+1 K"],
+    bins: Bins,
+    kernels: Kernels,
+    chunks_per_look: int,
+) -> tuple[Int[Tensor, "left"], Float[Tensor, "left P"]]:
+    """Composite chunks until too few of the tiles are still at work: these tiles, and their transmittance."""
+    pixels, stop = _pixels(table), _stop(plan, table)
+    counts = bins.counts[plan.tiles]
+    totals = _gather(canvas, plan.tiles)
+    transmittance = F.pad(transmittance, (0, 0, 0, plan.tiles.numel() - len(transmittance)))
+    (transmittance,) = _side_by_side(transmittance[:, None], len(plan.tiles))
+    at_work = counts > plan.first_chunk * CHUNK
+    for i in range(len(plan.ends)):
+        rows = plan.splats[plan.chunk(i)]
+        n = len(rows)
+        plan.transmittances.append(transmittance[:n])
+        transmittance, brightest = run_fused(
+            kernels.forward,
+            *(transmittance[:n], [total[:n] for total in totals], table, rows, plan.centres[:n], *pixels, stop[:n]),
+        )
+        if (i + 1) % chunks_per_look == 0 or i + 1 == len(plan.ends):
+            at_work = (brightest > 0) & (counts[:n] > (plan.first_chunk + i + 1) * CHUNK)
+            if int(at_work.sum()) < REPACK_BELOW * len(brightest) * LANES:
+                break
+    canvas[plan.tiles] = torch.stack(totals, -1).permute(0, 2, 3, 1)
+    n = len(at_work)
+    return plan.tiles[:n][at_work], transmittance[:n].transpose(1, 2)[at_work]
 
 
 def _gradients(
+    gradients: Float[Tensor, "tiles+1 C P"], table: Float[Tensor, "N+1 K"], plans: list[_Plan], kernels: Kernels
+) -> Float[Tensor, "N+1 K"]:
+    """Gradients of the table's rows from those of the composited totals."""
+    by_params = torch.zeros_like(table)
+    behind = table.new_zeros(len(gradients), 1, TILE * TILE)
+    for group in _in_groups(plans[::-1], MAX_SUMMED // (CHUNK * LANES * table[0].nbytes)):
+        splats = torch.cat([plan.splats[: plan.n_met] for plan in group])
+        by_row = table.new_empty(*splats.shape, table.shape[1])
+        for plan, by_row_of_plan in zip(group, by_row.split([plan.n_met for plan in group]), strict=True):
+            _walk_back(plan, by_row_of_plan, gradients, behind, table, kernels)
+        by_params += _sum_by_splat(by_row.flatten(0, 2), splats.flatten(), len(table))
+    return by_params
+
+
+def _walk_back(
+    plan: _Plan,
+    by_row: Float[Tensor, "rows L V K"],
     gradients: Float[Tensor, "tiles+1 C P"],
-    columns: Float[Tensor, "K N+1"],
-    bins: Bins,
-    runs: list[_Run],
+    behind: Float[Tensor, "tiles+1 1 P"],
+    table: Float[Tensor, "N+1 K"],
     kernels: Kernels,
-) -> Float[Tensor, "N K"]:
-    """Gradients of the splats' parameters from those of the composited totals."""
-    behind = torch.zeros_like(gradients[:, :1])
-    by_entry = columns.new_zeros(len(bins.entries), len(columns))
-    for run in reversed(runs):
-        pixels = _pixels(columns, run)
-        (behind_run,) = _gather(behind, run.tiles)
-        gradients_run = _gather(gradients, run.tiles)
-        for i in reversed(range(len(run.transmittances))):
-            params, entries = _chunk_params(columns, bins, run.tiles, run.first_chunk + i)
-            behind_run, rows = run_fused(
-                kernels.backward, run.transmittances[i], behind_run, gradients_run, params, *pixels
-            )
-            by_entry.index_copy_(0, entries, rows.flatten(1).T)
-        behind[run.tiles, 0] = behind_run.transpose(1, 2)
-    # The segment sum of each splat's entries, faster than a scatter.
-    positions = torch.arange(len(bins.entries) - 1, device=columns.device)
-    return F.embedding_bag(positions, by_entry, bins.first_entry, mode="sum")
+) -> None:
+    """Fill in the gradients of the splats a plan has met, and bring ``behind`` to before them."""
+    pixels, stop = _pixels(table), _stop(plan, table)
+    gradients_here, (behind_here,) = _gather(gradients, plan.tiles), _gather(behind, plan.tiles)
+    for i, transmittance in reversed([*enumerate(plan.transmittances)]):
+        rows, n = plan.chunk(i), len(transmittance)
+        run_fused(
+            kernels.backward,
+            *(transmittance, behind_here[:n], [gradient[:n] for gradient in gradients_here]),
+            *(by_row[rows], table, plan.splats[rows], plan.centres[:n], *pixels, stop[:n]),
+        )
+    behind[plan.tiles, 0] = behind_here.transpose(1, 2)
 
 
-def _chunk_params(
-    columns: Float[Tensor, "K N+1"], bins: Bins, tiles: Int[Tensor, "G V"], chunk: int
-) -> tuple[Float[Tensor, "G K L V"], Int[Tensor, "L*G*V"]]:
-    """Parameters of each tile's splats in a chunk, their positions from the tile's centre; and their entries."""
-    within = chunk * CHUNK + torch.arange(CHUNK, device=tiles.device)[:, None, None]
-    position = torch.where(within < bins.counts[tiles], bins.starts[tiles] + within, len(bins.entries) - 1)
-    entries = bins.entries.index_select(0, position.flatten())
-    params = columns.index_select(1, bins.splats.index_select(0, entries)).view(-1, *position.shape)
-    params[0] -= (tiles % bins.columns + 0.5) * TILE
-    params[1] -= (tiles // bins.columns + 0.5) * TILE
-    return params.permute(2, 0, 1, 3), entries
+def _sum_by_splat(rows: Float[Tensor, "n K"], splats: Int[Tensor, "n"], n_splats: int) -> Float[Tensor, "n_splats K"]:
+    """Sums of the rows of each splat; several times as fast as a scatter."""
+    ends = torch.bincount(splats, minlength=n_splats).cumsum(0)
+    return F.embedding_bag(splats.sort().indices, rows, F.pad(ends[:-1], (1, 0)), mode="sum")
 
 
-def _pixels(
-    columns: Tensor, run: _Run
-) -> tuple[Float[Tensor, "1 P 1"], Float[Tensor, "1 P 1"], Float[Tensor, "G 1 V"]]:
-    """Coordinates of a tile's pixels from its centre, and the transmittance at which they stop."""
-    side = torch.arange(TILE, dtype=columns.dtype, device=columns.device) + 0.5 - TILE / 2
-    stop = columns.new_full((len(run.tiles), 1, LANES), TRANSMITTANCE_MIN)
-    return side.repeat(TILE)[None, :, None], side.repeat_interleave(TILE)[None, :, None], stop
+def _in_groups(plans: list[_Plan], max_rows: int) -> Iterator[list[_Plan]]:
+    """Consecutive plans that have met at most so many rows together, or one."""
+    group: list[_Plan] = []
+    for plan in plans:
+        if group and sum(each.n_met for each in group) + plan.n_met > max_rows:
+            yield group
+            group = []
+        group.append(plan)
+    if group:
+        yield group
 
 
-def _fill_lanes(tiles: Int[Tensor, "n"], bins: Bins) -> Int[Tensor, "G V"]:
-    """Tiles in groups, two at least, filled up with the tile that does not exist."""
-    n_groups = max(2, -(-len(tiles) // LANES))
-    return F.pad(tiles, (0, n_groups * LANES - len(tiles)), value=len(bins.counts) - 1).view(-1, LANES)
+def _plan(tiles: Int[Tensor, "n"], first_chunk: int, bins: Bins, table: Float[Tensor, "N+1 K"]) -> _Plan:
+    """Put tiles into lanes, filled up with the tile that does not exist, and look up their splats."""
+    n_groups = max(2, -(-len(tiles) // LANES))  # a kernel compiled for one would not do for more
+    tiles = F.pad(tiles, (0, n_groups * LANES - len(tiles)), value=len(bins.counts) - 1).view(-1, LANES)
+    centres = torch.stack([tiles % bins.columns, tiles // bins.columns], dim=1) * TILE + TILE / 2
+    starts, counts = bins.starts[tiles], bins.counts[tiles]
+    n_chunks = -(-counts.amax(1) // CHUNK)
+    n_chunks[1] = n_chunks[0]
+    to_do = torch.arange(first_chunk, int(n_chunks[0]), device=tiles.device)[:, None] < n_chunks
+    chunk, group = to_do.nonzero(as_tuple=True)
+    rank = ((chunk + first_chunk)[:, None] * CHUNK + torch.arange(CHUNK, device=tiles.device))[..., None]
+    position = torch.where(rank < counts[group][:, None], starts[group][:, None] + rank, len(bins.splats) - 1)
+    splats = bins.splats.index_select(0, position.flatten()).view_as(position)
+    return _Plan(tiles, centres.to(table), first_chunk, splats, to_do.sum(1).cumsum(0).tolist())
+
+
+def _pixels(table: Tensor) -> tuple[Float[Tensor, "1 P 1"], Float[Tensor, "1 P 1"]]:
+    """Coordinates of a tile's pixels from its centre."""
+    side = torch.arange(TILE, dtype=table.dtype, device=table.device) + 0.5 - TILE / 2
+    return side.repeat(TILE)[None, :, None], side.repeat_interleave(TILE)[None, :, None]
+
+
+def _stop(plan: _Plan, table: Tensor) -> Float[Tensor, "G 1 V"]:
+    """The transmittance at which pixels stop."""
+    return table.new_full((len(plan.tiles), 1, LANES), TRANSMITTANCE_MIN)
 
 
 def _gather(canvas: Float[Tensor, "tiles+1 C P"], tiles: Int[Tensor, "G V"]) -> list[Float[Tensor, "G P V"]]:
     """The tiles' channels, each as the kernels take it."""
-    return [channel.transpose(1, 2).contiguous() for channel in canvas[tiles].unbind(2)]
+    return _side_by_side(canvas.index_select(0, tiles.flatten()), len(tiles))
+
+
+def _side_by_side(tiles: Float[Tensor, "G*V C P"], n_groups: int) -> list[Float[Tensor, "G P V"]]:
+    """Channels of tiles with the tiles in the innermost dimension."""
+    return [channel.transpose(1, 2).contiguous() for channel in tiles.unflatten(0, (n_groups, LANES)).unbind(2)]
 
 
 def _untile(canvas: Float[Tensor, "tiles C P"], bins: Bins) -> Float[Tensor, "height width C"]:

@@ -18,10 +18,10 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from shellgs_method.rasterizer.kernels import Kernels, attenuate, walk_back
+from shellgs_method.rasterizer.kernels import Kernels, attenuate, look_up, walk_back
 from shellgs_method.rasterizer.projection import NEAR_PLANE
 
 _LOW_PASS = 1 / math.log(2)  # exponent over squared distance in pixels: rho = 2 |x - c|², alpha ~ exp(-rho / 2)
@@ -32,47 +32,57 @@ _N_SHAPE, _N_MAPS = len(_NULL_SHAPE), 3
 def _forward(
     transmittance: Float[Tensor, "G P V"],
     totals: list[Float[Tensor, "G P V"]],
-    params: Float[Tensor, "G K L V"],
+    table: Float[Tensor, "N K"],
+    splats: Int[Tensor, "G L V"],
+    centres: Float[Tensor, "G 2 V"],
     x: Float[Tensor, "1 P 1"],
     y: Float[Tensor, "1 P 1"],
     stop: Float[Tensor, "G 1 V"],
-) -> tuple[Float[Tensor, "G P V"], list[Float[Tensor, "G P V"]]]:
-    *totals, median = totals
+) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G V"]]:
+    params = look_up(table, splats, centres)
+    *sums, median = totals
     for splat in params[:, :, None].unbind(3):
         z, _, _, _, depth, inverse_depth, _ = _intersect(splat, x, y)
         before = transmittance
         _, weight, transmittance = attenuate(z, before, stop)
         values = [*splat[:, _N_SHAPE:].unbind(1), inverse_depth, inverse_depth * inverse_depth]
-        totals = [total + weight * value for total, value in zip(totals, values, strict=True)]
+        sums = [total + weight * value for total, value in zip(sums, values, strict=True)]
         median = torch.where(_halves(before, transmittance), depth, median)
-    return transmittance, [*totals, median]
+    for total, new in zip(totals, [*sums, median], strict=True):
+        total.copy_(new)
+    return transmittance, transmittance.amax(1)
 
 
 def _backward(
     transmittance: Float[Tensor, "G P V"],
     behind: Float[Tensor, "G P V"],
     gradients: list[Float[Tensor, "G P V"]],
-    params: Float[Tensor, "G K L V"],
+    by_params: Float[Tensor, "G L V K"],
+    table: Float[Tensor, "N K"],
+    splats: Int[Tensor, "G L V"],
+    centres: Float[Tensor, "G 2 V"],
     x: Float[Tensor, "1 P 1"],
     y: Float[Tensor, "1 P 1"],
     stop: Float[Tensor, "G 1 V"],
-) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "K L G V"]]:
-    splats = params[:, :, None].unbind(3)
+) -> None:
+    params = look_up(table, splats, centres)
+    chunk = params[:, :, None].unbind(3)
     *gradients, by_median = gradients
     by_inverse, by_square = gradients[-2:]
     met = []
-    for splat in splats:
+    for splat in chunk:
         intersection = _intersect(splat, x, y)
         before = transmittance
         alpha, weight, transmittance = attenuate(intersection[0], before, stop)
         met.append((intersection, alpha, weight, torch.where(_halves(before, transmittance), by_median, 0.0)))
 
-    by_z = []
-    for splat, (intersection, alpha, weight, _) in zip(reversed(splats), reversed(met), strict=True):
+    before_chunk, by_z = behind, []
+    for splat, (intersection, alpha, weight, _) in zip(reversed(chunk), reversed(met), strict=True):
         z, *_, inverse_depth, _ = intersection
         values = [*splat[:, _N_SHAPE:].unbind(1), inverse_depth, inverse_depth * inverse_depth]
-        behind, gradient = walk_back(behind, z, alpha, weight, gradients, values)
+        before_chunk, gradient = walk_back(before_chunk, z, alpha, weight, gradients, values)
         by_z.append(gradient)
+    behind.copy_(before_chunk)
 
     # All splats at once, [L, G, P, V]. Meeting them again is cheaper than storing what was met.
     by_z, w = torch.stack(by_z[::-1]), torch.stack([weight for _, _, weight, _ in met])
@@ -94,7 +104,8 @@ def _backward(
     by_u = -(a * s + c * t + q * i + 2 * _LOW_PASS * nx)
     by_v = -(b * s + d * t + r * i + 2 * _LOW_PASS * ny)
     shape = [by_u, by_v, sx, sy, tx, ty, i, ix, iy, by_z.sum(2)]
-    return behind, torch.stack([*shape, *((w * gradient).sum(2) for gradient in gradients[:-2])])
+    by_features = [(w * gradient).sum(2) for gradient in gradients[:-2]]
+    by_params.copy_(torch.stack([*shape, *by_features]).permute(2, 1, 3, 0))
 
 
 def _intersect(

@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.rasterizer.binning import Ellipses
+from shellgs_method.rasterizer.binning import touches
+from shellgs_method.rasterizer.fusion import run_fused
 from shellgs_method.rasterizer.projection import (
     NEAR_PLANE,
     Projection,
@@ -19,6 +20,7 @@ from shellgs_method.rasterizer.projection import (
     quats_to_rotations,
     stack_cameras,
     to_camera,
+    turn,
 )
 
 EDGE_ON = 1e-6  # cosine of normal and ray below which rounding decides which side of a disc shows: none does
@@ -40,16 +42,43 @@ def project_discs(
     :mod:`~shellgs_method.rasterizer.disc_kernels`.
 
     The centres in the camera are taken from ``means2d`` and their depths, so that the gradient by ``means2d`` is all
-    that a shift of the disc parallel to the screen does.
+    that a shift of the disc parallel to the screen does: hence two kernels, with ``means2d`` between them.
     """
-    viewmats, fx, fy, cx, cy = stack_cameras(cameras)
-    x, y, z = to_camera(means, viewmats).unbind(-1)
-    depths = z.detach()
-    in_front = depths >= NEAR_PLANE
+    views = stack_cameras(cameras)
+    means2d, depths, in_front = run_fused(_project_centres, means, *views)
+    shapes, outlines, covars2d, visible = run_fused(_project, means2d, depths, quats, scales, opacities, *views)
+    return Projection(means2d, shapes, depths.detach(), outlines, covars2d, visible & in_front)
+
+
+def _project_centres(
+    means: Float[Tensor, "N 3"],
+    viewmats: Float[Tensor, "B 4 4"],
+    intrinsics: Float[Tensor, "B 4 1"],
+    size: Float[Tensor, "1 2"],
+) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
+    """The means2d, their depths, and whether they are in front of the near plane; if not, the depth is 1."""
+    del size
+    fx, fy, cx, cy = intrinsics.unbind(1)
+    x, y, z = to_camera(means, viewmats)
+    in_front = z.detach() >= NEAR_PLANE
     z = torch.where(in_front, z, 1.0)  # a culled splat must not put a division by 0 into the gradients
-    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1), z, in_front
+
+
+def _project(
+    means2d: Float[Tensor, "B N 2"],
+    z: Float[Tensor, "B N"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    viewmats: Float[Tensor, "B 4 4"],
+    intrinsics: Float[Tensor, "B 4 1"],
+    size: Float[Tensor, "1 2"],
+) -> tuple[Tensor, ...]:
+    fx, fy, cx, cy = intrinsics.unbind(1)
     rays = torch.stack([(means2d[..., 0] - cx) / fx, (means2d[..., 1] - cy) / fy, torch.ones_like(z)], dim=-1)
-    tangents_u, tangents_v, normals = (viewmats[:, None, :3, :3] @ quats_to_rotations(quats)).unbind(-1)
+    axes = torch.stack(turn(quats_to_rotations(quats), viewmats), dim=-2)
+    tangents_u, tangents_v, normals = axes.unbind(-1)
 
     facing = (normals * rays).sum(-1)
     shows = facing.detach().abs() > EDGE_ON * rays.detach().norm(dim=-1)
@@ -61,16 +90,16 @@ def project_discs(
     halves = math.sqrt(0.5 / math.log(2))  # exp(-u²/2) = 2^-(halves u)²
     shapes = torch.cat([halves * u, halves * v, inverse_depth, halvings(opacities).expand_as(z)[..., None]], dim=-1)
 
-    with torch.no_grad():
-        half_axes = torch.stack([tangents_u * scales[:, :1], tangents_v * scales[:, 1:2]], dim=-1)
-        cutoff = cutoffs(opacities)
-        outline, covars2d = _outlines(torch.stack([x, y, z], dim=-1), half_axes, cutoff.sqrt(), cameras)
-        round_conics = (2 / cutoff)[:, None] * cutoff.new_tensor([1.0, 0.0, 1.0])
-        low_pass = Ellipses(means2d, round_conics.expand(*z.shape, 3), (cutoff / 2).sqrt()[:, None].expand_as(means2d))
-    width, height = cameras[0].width, cameras[0].height
-    touches = outline.touch(width, height) | low_pass.touch(width, height)
-    visible = in_front & shows & (cutoff > 0) & touches
-    return Projection(means2d, shapes, depths, [outline, low_pass], covars2d, visible)
+    half_axes = (axes[..., :2] * scales[:, None, :2]).detach()
+    cutoff = cutoffs(opacities)
+    x, y, _ = (rays * z[..., None]).detach().unbind(-1)
+    outline, covars2d = _outlines(x, y, z.detach(), half_axes, cutoff.sqrt(), intrinsics, size)
+    radius = (cutoff / 2).sqrt().expand_as(z)
+    conic = [1 / radius.square(), torch.zeros_like(z), 1 / radius.square()]
+    low_pass = torch.stack([*means2d.detach().unbind(-1), *conic, radius, radius], dim=-1)
+    outlines = torch.stack([outline, low_pass], dim=-2)
+    visible = shows & (cutoff > 0) & touches(outlines, size).any(dim=-1)
+    return shapes, outlines, covars2d, visible
 
 
 def disc_maps(
@@ -89,18 +118,20 @@ def disc_maps(
 
 
 def _outlines(
-    centres: Float[Tensor, "B N 3"],
+    x: Float[Tensor, "B N"],
+    y: Float[Tensor, "B N"],
+    z: Float[Tensor, "B N"],
     half_axes: Float[Tensor, "B N 3 2"],
     radius: Float[Tensor, "N"],
-    cameras: Sequence[Camera],
-) -> tuple[Ellipses, Float[Tensor, "B N 3"]]:
+    intrinsics: Float[Tensor, "B 4 1"],
+    size: Float[Tensor, "1 2"],
+) -> tuple[Float[Tensor, "B N 7"], Float[Tensor, "B N 3"]]:
     """Ellipses around discs of so many half-axes, and the covariances of the discs as if seen from afar.
 
     The ellipse is exact, but for a tenth of a pixel in quadrature, where the whole disc is well in front of the camera.
     Of another, it is the one around its box in the camera, cut off at the near plane and at the image's borders.
     """
-    _, fx, fy, cx, cy = stack_cameras(cameras)
-    x, y, z = centres.unbind(-1)
+    fx, fy, cx, cy = intrinsics.unbind(1)
     # A disc's point (u, v) is at (across, down)·(u, v) / (z + along·(u, v)) from the projected centre.
     along = half_axes[..., 2, :]
     across = fx[..., None] * (half_axes[..., 0, :] - (x / z)[..., None] * along)
@@ -122,25 +153,19 @@ def _outlines(
     reach = radius[:, None] * half_axes.norm(dim=-1)
     nearest, farthest = (z - reach[..., 2]).clamp_min(NEAR_PLANE), z + reach[..., 2]
 
-    def box(centre: Tensor, reach: Tensor, focal: Tensor, principal: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    def box(centre: Tensor, reach: Tensor, focal: Tensor, principal: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
         low, high = centre - reach, centre + reach
-        low = (focal * torch.minimum(low / nearest, low / farthest) + principal).clamp(0, size)
-        high = (focal * torch.maximum(high / nearest, high / farthest) + principal).clamp(0, size)
+        low = focal * torch.minimum(low / nearest, low / farthest) + principal
+        high = focal * torch.maximum(high / nearest, high / farthest) + principal
+        low, high = (torch.minimum(each.clamp_min(0), size) for each in (low, high))
         return (low + high) / 2, ((high - low) / 2).clamp_min(slack) * math.sqrt(2)
 
-    box_x, box_reach_x = box(x, reach[..., 0], fx, cx, cameras[0].width)
-    box_y, box_reach_y = box(y, reach[..., 1], fy, cy, cameras[0].height)
-    zero = torch.zeros_like(z)
-    exact = Ellipses(
-        torch.stack([centre_x, centre_y], dim=-1),
-        torch.stack([covar_yy, -covar_xy, covar_xx], dim=-1) / determinant[..., None],
-        torch.stack([covar_xx, covar_yy], dim=-1).sqrt(),
-    )
-    around_box = Ellipses(
-        torch.stack([box_x, box_y], dim=-1),
-        torch.stack([1 / box_reach_x.square(), zero, 1 / box_reach_y.square()], dim=-1),
-        torch.stack([box_reach_x, box_reach_y], dim=-1),
-    )
+    box_x, box_reach_x = box(x, reach[..., 0], fx, cx, size[:, :1])
+    box_y, box_reach_y = box(y, reach[..., 1], fy, cy, size[:, 1:])
+    conic = [covar_yy / determinant, -covar_xy / determinant, covar_xx / determinant]
+    exact = torch.stack([centre_x, centre_y, *conic, covar_xx.sqrt(), covar_yy.sqrt()], dim=-1)
+    conic = [1 / box_reach_x.square(), torch.zeros_like(z), 1 / box_reach_y.square()]
+    around_box = torch.stack([box_x, box_y, *conic, box_reach_x, box_reach_y], dim=-1)
     low_pass = 0.5
     covars2d = torch.stack([xx / z.square() + low_pass, xy / z.square(), yy / z.square() + low_pass], dim=-1)
-    return exact.where(in_front, around_box), covars2d
+    return torch.where(in_front[..., None], exact, around_box), covars2d

@@ -10,7 +10,8 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from types import FunctionType
 from typing import Any
 
@@ -25,25 +26,25 @@ _OPTIONS = {
     "max_fusion_size": 4096,
     "cpp.max_horizontal_fusion_size": 4096,
     "fx_graph_cache": True,
+    "assert_indirect_indexing": False,
 }
 _failed = False  # one failure to compile is enough for a process
 
 
 def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor]) -> Any:
-    """Call a kernel, fused if that is possible: in float32 on a CPU.
+    """Call a kernel, differentiable or not, fused if that is possible: in float32 on a CPU.
 
-    The first dimension of each tensor is 1, or any number from 2 which all of them share.
+    The first dimension of each tensor varies from call to call, unless it is 1; the others do not.
     """
     global _failed
-    tensors = [tensor for arg in args for tensor in (arg if isinstance(arg, list) else [arg])]
-    fusible = tensors[0].dtype == torch.float32 and tensors[0].device.type == "cpu"
+    tensors = _flatten(args)
+    fusible = tensors[0].dtype == torch.float32 and tensors[0].device.type == "cpu" and all(map(len, tensors))
     if _failed or not fusible or os.environ.get("SHELLGS_COMPILE") == "0":
         return kernel(*args)
+    with_grad = torch.is_grad_enabled()
+    key = tuple((len(tensor) > 1, with_grad and tensor.requires_grad) for tensor in tensors)
     try:
-        for tensor in tensors:
-            if len(tensor) > 1:
-                torch._dynamo.mark_dynamic(tensor, 0)
-        return _compiled(kernel, len(tensors))(*args)
+        return _compiled(kernel, key)(*args)
     except (
         Exception
     ) as error:  # of a missing compiler, missing headers, a full disk, a torch that compiles differently, …
@@ -54,10 +55,30 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor]) -> Any:
 
 
 @functools.cache
-def _compiled(kernel: Callable[..., Any], n_tensors: int) -> Callable[..., Any]:
-    """A kernel compiled for a number of tensors, that is, of features."""
-    logger.info("Compiling %s for %d tensors; this takes a while the first time.", kernel.__name__, n_tensors)
+def _compiled(kernel: Callable[..., Any], key: tuple[tuple[bool, bool], ...]) -> Callable[..., Any]:
+    """A kernel compiled for tensors that vary in length or do not, and need gradients or do not."""
     assert isinstance(kernel, FunctionType)
-    # Dynamo limits the compilations per code object: each number of tensors gets one of its own.
+    # Dynamo limits the compilations per code object: each key gets one of its own.
     own = FunctionType(kernel.__code__.replace(), kernel.__globals__, kernel.__name__)
-    return torch.compile(own, fullgraph=True, options=_OPTIONS)
+    compiled = torch.compile(own, fullgraph=True, options=_OPTIONS)
+    varies = [varies for varies, _ in key]
+    first = True
+
+    def call(*args: Tensor | list[Tensor]) -> Any:
+        nonlocal first
+        if not first:
+            return compiled(*args)
+        for tensor, dynamic in zip(_flatten(args), varies, strict=True):
+            if dynamic:
+                torch._dynamo.mark_dynamic(tensor, 0)
+        start = time.perf_counter()
+        result = compiled(*args)
+        first = False
+        logger.info("%s took %.1f s to compile or load.", kernel.__qualname__, time.perf_counter() - start)
+        return result
+
+    return call
+
+
+def _flatten(args: Sequence[Tensor | list[Tensor]]) -> list[Tensor]:
+    return [tensor for arg in args for tensor in (arg if isinstance(arg, list) else [arg])]

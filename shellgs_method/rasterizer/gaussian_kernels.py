@@ -8,10 +8,10 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from shellgs_method.rasterizer.kernels import Kernels, attenuate, walk_back
+from shellgs_method.rasterizer.kernels import Kernels, attenuate, look_up, walk_back
 
 _NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, math.inf)
 _FEATURES = slice(len(_NULL_SHAPE), None)
@@ -20,38 +20,49 @@ _FEATURES = slice(len(_NULL_SHAPE), None)
 def _forward(
     transmittance: Float[Tensor, "G P V"],
     totals: list[Float[Tensor, "G P V"]],
-    params: Float[Tensor, "G K L V"],
+    table: Float[Tensor, "N K"],
+    splats: Int[Tensor, "G L V"],
+    centres: Float[Tensor, "G 2 V"],
     x: Float[Tensor, "1 P 1"],
     y: Float[Tensor, "1 P 1"],
     stop: Float[Tensor, "G 1 V"],
-) -> tuple[Float[Tensor, "G P V"], list[Float[Tensor, "G P V"]]]:
+) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G V"]]:
+    params = look_up(table, splats, centres)
+    sums = list(totals)
     for splat in params[:, :, None].unbind(3):
         _, weight, transmittance = attenuate(_exponent(splat, x, y), transmittance, stop)
         values = splat[:, _FEATURES].unbind(1)
-        totals = [total + weight * value for total, value in zip(totals, values, strict=True)]
-    return transmittance, totals
+        sums = [total + weight * value for total, value in zip(sums, values, strict=True)]
+    for total, new in zip(totals, sums, strict=True):
+        total.copy_(new)
+    return transmittance, transmittance.amax(1)
 
 
 def _backward(
     transmittance: Float[Tensor, "G P V"],
     behind: Float[Tensor, "G P V"],
     gradients: list[Float[Tensor, "G P V"]],
-    params: Float[Tensor, "G K L V"],
+    by_params: Float[Tensor, "G L V K"],
+    table: Float[Tensor, "N K"],
+    splats: Int[Tensor, "G L V"],
+    centres: Float[Tensor, "G 2 V"],
     x: Float[Tensor, "1 P 1"],
     y: Float[Tensor, "1 P 1"],
     stop: Float[Tensor, "G 1 V"],
-) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "K L G V"]]:
-    splats = params[:, :, None].unbind(3)
+) -> None:
+    params = look_up(table, splats, centres)
+    chunk = params[:, :, None].unbind(3)
     met = []
-    for splat in splats:
+    for splat in chunk:
         z = _exponent(splat, x, y)
         alpha, weight, transmittance = attenuate(z, transmittance, stop)
         met.append((z, alpha, weight))
 
-    grad_z = []
-    for splat, (z, alpha, weight) in zip(reversed(splats), reversed(met), strict=True):
-        behind, gradient = walk_back(behind, z, alpha, weight, gradients, splat[:, _FEATURES].unbind(1))
+    before, grad_z = behind, []
+    for splat, (z, alpha, weight) in zip(reversed(chunk), reversed(met), strict=True):
+        before, gradient = walk_back(before, z, alpha, weight, gradients, splat[:, _FEATURES].unbind(1))
         grad_z.append(gradient)
+    behind.copy_(before)
 
     # u, v, a, b, c and n take the moments of grad_z about the splat's centre, shifted there from the tile's.
     q, w = torch.stack(grad_z[::-1]), torch.stack([weight for _, _, weight in met])  # [L, G, P, V]
@@ -61,7 +72,8 @@ def _backward(
     mx, my = sx - u * q, sy - v * q
     mxx, mxy, myy = sxx - u * (sx + mx), sxy - u * sy - v * mx, syy - v * (sy + my)
     shape = [-2 * a * mx - b * my, -b * mx - 2 * c * my, mxx, mxy, myy, q]
-    return behind, torch.stack([*shape, *((w * gradient).sum(2) for gradient in gradients)])
+    by_features = [(w * gradient).sum(2) for gradient in gradients]
+    by_params.copy_(torch.stack([*shape, *by_features]).permute(2, 1, 3, 0))
 
 
 def _exponent(splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]) -> Tensor:

@@ -3,10 +3,12 @@
 Shapes: G groups of V tiles side by side in the innermost dimension, so that a vector unit works on V tiles and every
 pixel of a tile meets the same splat; P pixels of a tile; L splats of a chunk, front to back.
 
-A splat's parameters are u, v, those of its shape, and its features, the last of which is 1 and composites to alpha. The
-exponent z of a splat at a pixel is how many times alpha has halved below its limit: alpha = ALPHA_MAX 2^-max(z, 0).
+A splat's parameters, a row of K in the table of all splats, are u, v, those of its shape, and its features, the last of
+which is 1 and composites to alpha. The exponent z of a splat at a pixel is how many times alpha has halved below its
+limit: alpha = ALPHA_MAX 2^-max(z, 0).
 
-What the kernels need besides splats and state: x and y of a tile's pixels from its centre, and ``stop``, which is
+What the kernels need besides: the splats of the chunk as rows of the table [G L V], the tiles' centres [G 2 V], x and y
+of a tile's pixels from its centre [1 P 1], and ``stop`` [G 1 V], which is
 TRANSMITTANCE_MIN in a tensor whose dimensions are groups and lanes, but not pixels. As a number it would let inductor
 merge the loops over pixels and lanes wherever nothing else tells them apart, and not fuse these statements with others.
 """
@@ -18,7 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from shellgs_method.rasterizer.projection import ALPHA_MAX, ALPHA_MIN
@@ -34,22 +36,31 @@ class Kernels:
     Attributes:
         null_shape: parameters before the features of a splat whose alpha is 0 everywhere.
         n_maps: totals behind those of the features, of what the primitive itself has at a pixel.
-        forward: transmittance (0 once the pixel has stopped) [G P V] and a list of totals [G P V] behind a chunk, from
-            those before it, the chunk's parameters [G K L V], x, y [1 P 1] and ``stop`` [G 1 V].
-        backward: walks a chunk back to front. From the transmittance before it, ``behind`` (see :func:`walk_back`), a
-            list of the totals' gradients, and the rest as above: the new ``behind``, and the gradients of the
-            parameters [K L G V], summed over a tile's pixels.
+        forward: from the transmittance before a chunk (0 once the pixel has stopped) [G P V], a list of totals [G P V],
+            to which it adds those of the chunk, and the rest as above: the transmittance behind the chunk, and its
+            maximum over each tile's pixels [G V].
+        backward: walks a chunk back to front. From the transmittance before it, ``behind`` [G P V] (see
+            :func:`walk_back`), which it brings to before the chunk, the list of the totals' gradients, the gradients of
+            the parameters [G L V K], which it fills, summed over a tile's pixels, and the rest as above.
     """
 
     null_shape: tuple[float, ...]
     n_maps: int
-    forward: Callable[..., tuple[Tensor, list[Tensor]]]
-    backward: Callable[..., tuple[Tensor, Tensor]]
+    forward: Callable[..., tuple[Tensor, Tensor]]
+    backward: Callable[..., None]
 
     @property
     def n_shape(self) -> int:
         """Number of parameters before the features."""
         return len(self.null_shape)
+
+
+def look_up(
+    table: Float[Tensor, "N K"], splats: Int[Tensor, "G L V"], centres: Float[Tensor, "G 2 V"]
+) -> Float[Tensor, "G K L V"]:
+    """Parameters of splats, with u and v from the tiles' centres."""
+    u, v, *rest = (table[splats, i] for i in range(table.shape[1]))
+    return torch.stack([u - centres[:, :1], v - centres[:, 1:], *rest], dim=1)
 
 
 def attenuate(

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.rasterizer.binning import Ellipses
+from shellgs_method.rasterizer.binning import touches
+from shellgs_method.rasterizer.fusion import run_fused
 
 NEAR_PLANE = 0.01
 LOW_PASS = 0.3  # variance in px² added to every splat
@@ -28,7 +29,7 @@ class Projection:
         means2d: centres in pixels.
         shapes: what the kernels of the primitive know of a splat besides its centre and features.
         depths: z of the centres in the camera frame.
-        outlines: ellipses that together cover the pixels where alpha reaches 1/255.
+        outlines: O ellipses (see :mod:`~.binning`) that together cover the pixels where alpha reaches 1/255.
         covars2d: covariances (xx, xy, yy) in px², low-pass included.
         visible: in front of the near plane, and an outline touches the image.
     """
@@ -36,7 +37,7 @@ class Projection:
     means2d: Float[Tensor, "B N 2"]
     shapes: Float[Tensor, "B N K"]
     depths: Float[Tensor, "B N"]
-    outlines: Sequence[Ellipses]
+    outlines: Float[Tensor, "B N O 7"]
     covars2d: Float[Tensor, "B N 3"]
     visible: Bool[Tensor, "B N"]
 
@@ -52,9 +53,20 @@ def project_gaussians(
 
     Their shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`.
     """
-    viewmats, fx, fy, cx, cy = stack_cameras(cameras)
-    width, height = cameras[0].width, cameras[0].height
-    x, y, z = to_camera(means, viewmats).unbind(-1)
+    return Projection(*run_fused(_project, means, quats, scales, opacities, *stack_cameras(cameras)))
+
+
+def _project(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, "N"],
+    viewmats: Float[Tensor, "B 4 4"],
+    intrinsics: Float[Tensor, "B 4 1"],
+    size: Float[Tensor, "1 2"],
+) -> tuple[Tensor, ...]:
+    fx, fy, cx, cy = intrinsics.unbind(1)
+    x, y, z = to_camera(means, viewmats)
     depths = z.detach()
     in_front = depths >= NEAR_PLANE
     z = torch.where(in_front, z, 1.0)  # a culled splat must not put a division by 0 into the gradients
@@ -62,42 +74,52 @@ def project_gaussians(
     means2d = torch.stack([fx * x + cx, fy * y + cy], dim=-1)
 
     # Off screen the linearised projection runs wild: its slope is held within 15 % of the image beyond the borders.
-    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
-    x = x.clamp(-cx / fx - margin_x, (width - cx) / fx + margin_x)
-    y = y.clamp(-cy / fy - margin_y, (height - cy) / fy + margin_y)
-    # columns: the Gaussian's half-axes
-    axes = viewmats[:, None, :3, :3] @ (quats_to_rotations(quats) * scales[:, None, :])
-    across = (fx / z)[..., None] * (axes[..., 0, :] - x[..., None] * axes[..., 2, :])
-    down = (fy / z)[..., None] * (axes[..., 1, :] - y[..., None] * axes[..., 2, :])
+    width, height = size.unbind(-1)
+    x = torch.minimum(torch.maximum(x, -(cx + 0.15 * width) / fx), (1.15 * width - cx) / fx)
+    y = torch.minimum(torch.maximum(y, -(cy + 0.15 * height) / fy), (1.15 * height - cy) / fy)
+    axes = turn(quats_to_rotations(quats) * scales[:, None, :], viewmats)  # columns: the Gaussian's half-axes
+    across = (fx / z)[..., None] * (axes[0] - x[..., None] * axes[2])
+    down = (fy / z)[..., None] * (axes[1] - y[..., None] * axes[2])
 
     xx, xy, yy = (across * across).sum(-1), (across * down).sum(-1), (down * down).sum(-1)
     # xx yy - xy², by Lagrange's identity: no cancellation for a long and thin splat
     determinant = torch.linalg.cross(across, down).square().sum(-1) + LOW_PASS * (xx + yy) + LOW_PASS**2
-    conics = torch.stack([yy + LOW_PASS, -xy, xx + LOW_PASS], dim=-1) / determinant[..., None]
+    xx, yy = xx + LOW_PASS, yy + LOW_PASS
     n = halvings(opacities).expand_as(depths)
-    shapes = torch.cat([conics * conics.new_tensor([0.5, 1.0, 0.5]) / math.log(2), n[..., None]], dim=-1)
+    halving = math.log(2) * determinant
+    shapes = torch.stack([0.5 * yy / halving, -xy / halving, 0.5 * xx / halving, n], dim=-1)
 
-    covars2d = torch.stack([xx + LOW_PASS, xy, yy + LOW_PASS], dim=-1).detach()
-    cutoff = cutoffs(opacities)[:, None]
-    outline = Ellipses(means2d.detach(), conics.detach() / cutoff, (cutoff * covars2d[..., ::2]).sqrt())
-    visible = in_front & (cutoff[:, 0] > 0) & outline.touch(width, height)
-    return Projection(means2d, shapes, depths, [outline], covars2d, visible)
+    xx, xy, yy, determinant = xx.detach(), xy.detach(), yy.detach(), determinant.detach()
+    cutoff = cutoffs(opacities)
+    area, reach = cutoff * determinant, [(cutoff * xx).sqrt(), (cutoff * yy).sqrt()]
+    outline = torch.stack([*means2d.detach().unbind(-1), yy / area, -xy / area, xx / area, *reach], dim=-1)
+    visible = in_front & (cutoff > 0) & touches(outline, size)
+    return means2d, shapes, depths, outline[..., None, :], torch.stack([xx, xy, yy], dim=-1), visible
 
 
 def stack_cameras(
     cameras: Sequence[Camera],
-) -> tuple[
-    Float[Tensor, "B 4 4"], Float[Tensor, "B 1"], Float[Tensor, "B 1"], Float[Tensor, "B 1"], Float[Tensor, "B 1"]
-]:
-    """Views and fx, fy, cx, cy of cameras, for splats along the second dimension."""
+) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 4 1"], Float[Tensor, "1 2"]]:
+    """Viewmats, fx, fy, cx, cy, and the width and height that all share; as tensors, or each size would be compiled."""
     Ks = torch.stack([camera.K for camera in cameras])
-    viewmats = torch.stack([camera.viewmat for camera in cameras])
-    return viewmats, Ks[:, 0, 0, None], Ks[:, 1, 1, None], Ks[:, 0, 2, None], Ks[:, 1, 2, None]
+    intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], dim=1)[..., None]
+    size = Ks.new_tensor([[cameras[0].width, cameras[0].height]])
+    return torch.stack([camera.viewmat for camera in cameras]), intrinsics, size
 
 
-def to_camera(points: Float[Tensor, "N 3"], viewmats: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B N 3"]:
-    """Points of the world in the frames of cameras."""
-    return points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
+def to_camera(points: Float[Tensor, "N 3"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N"]]:
+    """Coordinates of points of the world in the frames of cameras."""
+    return [row + viewmats[:, i, 3, None] for i, row in enumerate(turn(points, viewmats))]
+
+
+def turn(vectors: Float[Tensor, "N 3 *each"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N *each"]]:
+    """Coordinates of vectors (or rows of matrices) of the world in the frames of cameras.
+
+    A sum of three products, unlike a matrix product, fuses with what is before and behind.
+    """
+    shape = (-1, *[1] * (vectors.dim() - 1))
+    R = [[viewmats[:, i, j].view(shape) for j in range(3)] for i in range(3)]
+    return [sum((R[i][j] * vectors[:, j] for j in range(3)), start=torch.zeros(())) for i in range(3)]
 
 
 def halvings(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
