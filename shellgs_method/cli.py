@@ -120,7 +120,8 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
     views, points, predictor = read_views(config), read_sparse_points(config), source.load()
     if max_image_size is None and "shell" in find_cues(scene):
         max_image_size = CueMaps.open(scene, "shell").manifest.max_image_size
-    console.print(f"{predictor.name}, licence {predictor.licence or 'not stated'}, revision {predictor.revision[:12]}.")
+    licence = f", licence {predictor.licence}" if predictor.licence else ""
+    console.print(f"{predictor.name}, revision {predictor.revision[:12]}{licence}.", highlight=False)
     if predictor.non_commercial:
         console.print("[yellow]The licence of these weights forbids commercial use.")
     if points.observed is None:

@@ -377,7 +377,7 @@ def test_other_weights_are_another_revision(depth_anything: Path, tmp_path: Path
         ("license: cc-by-nc-4.0", "cc-by-nc-4.0", True),
         ("license: apache-2.0", "apache-2.0", False),
         ("license: other\nlicense_name: Acme-Non-Commercial", "acme-non-commercial", True),
-        ("tags: []", None, False),
+        ("tags: []", "not stated", False),
     ],
 )
 def test_the_model_card_tells_the_licence(depth_anything: Path, header: str, licence: str, non_commercial: bool):

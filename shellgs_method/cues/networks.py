@@ -128,7 +128,7 @@ class Weights:
 
     folder: Path
     revision: str
-    licence: str | None
+    licence: str
 
 
 def fetch_weights(name: str, patterns: list[str]) -> Weights:
@@ -152,27 +152,27 @@ def fetch_weights(name: str, patterns: list[str]) -> Weights:
         # In the hub's cache, a snapshot's folder is named by its commit.
         folder = Path(snapshot_download(name, allow_patterns=[*patterns, "README.md"]))
     except (OSError, HFValidationError) as error:
-        reason = " ".join(str(error).split())
         raise SceneError(
-            f"the weights {name} cannot be had ({reason.split('. ')[0].rstrip('.')}): check the name and the network, "
-            f"name a local folder with --weights, {ELSEWHERE}"
+            f"the weights {name} cannot be had ({_first_sentence(error)}): check the name and the network, name a "
+            f"local folder with --weights, {ELSEWHERE}"
         ) from error
     return Weights(folder, folder.name, _licence(folder))
 
 
-def _licence(folder: Path) -> str | None:
-    """The licence in a model card's header."""
+def _licence(folder: Path) -> str:
+    """The licence that a model card's header states."""
     from huggingface_hub import ModelCard
 
+    unknown = "not stated"
     if not (folder / "README.md").is_file():
-        return None
+        return unknown
     try:
         data = ModelCard.load(folder / "README.md").data
     except ValueError as error:
         logging.getLogger(__name__).warning("the model card in %s cannot be read: %s", folder, error)
-        return None
+        return unknown
     name = data.get("license_name") if data.get("license") == "other" else data.get("license")
-    return str(name).lower() if name else None
+    return str(name or unknown).lower()
 
 
 def _device() -> torch.device:
@@ -182,5 +182,10 @@ def _device() -> torch.device:
 
 
 def _unusable(weights: str, network: str, error: Exception) -> SceneError:
-    reason = " ".join(str(error).split())[:200]
-    return SceneError(f"{weights} cannot be loaded as weights of {network} ({type(error).__name__}: {reason})")
+    return SceneError(f"{weights} cannot be loaded as weights of {network} ({_first_sentence(error)})")
+
+
+def _first_sentence(error: Exception) -> str:
+    """What an error of a library says, less its advice."""
+    lines = str(error).strip().splitlines()
+    return lines[0].split(". ")[0].rstrip(".") if lines else type(error).__name__

@@ -69,7 +69,7 @@ def disagreement(cue: CueMap, camera: Camera, convention: Convention) -> str | N
         return None
     problem = f"read as {convention} they are {declared:.0f}° from the normals of the depth"
     axes = np.multiply(_SIGNS[convention], flip)
-    names = [name for name, signs in _SIGNS.items() if abs(np.dot(axes, signs)) == 3]
-    if names and better < min(declared - CLEARLY, MAX_DISAGREEMENT):
-        problem += f", as {' or '.join(names)} {better:.0f}°"
+    right = next((name for name, signs in _SIGNS.items() if abs(np.dot(axes, signs)) == 3), None)
+    if right and better < min(declared - CLEARLY, MAX_DISAGREEMENT):
+        problem += f", as {right} {better:.0f}°"
     return problem

@@ -43,9 +43,9 @@ class Precomputed:
     @property
     def command(self) -> str:
         """The words of the command line that choose it."""
-        words = ["from", str(self.folder), "--values", self.values]
+        words = ["from", str(self.folder.absolute()), "--values", self.values]
         if self.normals is not None:
-            words += ["--normals", str(self.normals), "--convention", self.convention]
+            words += ["--normals", str(self.normals.absolute()), "--convention", self.convention]
         return shlex.join(words)
 
     def load(self) -> Predictor:
@@ -74,7 +74,9 @@ class Precomputed:
 
         files = [*maps.files, *(normals.files if normals else ())]
         revision = hash_of(files, self.values, self.convention)
-        return Predictor(str(self.folder), revision, predict, convention=self.convention if normals else None)
+        return Predictor(
+            str(self.folder.absolute()), revision, predict, convention=self.convention if normals else None
+        )
 
 
 class MapFolder:

@@ -38,7 +38,7 @@ class Predictor:
         name: of the network's weights or the folder of maps.
         revision: commit of the weights on their hub, or a hash of what is on disk.
         predict: what is claimed of a view; None where there is nothing.
-        licence: of the weights, where their model card tells.
+        licence: of the weights, as their model card states it; None for maps that were made elsewhere.
         convention: the axes that the normals were declared to have, if they might have others.
     """
 
