@@ -13,7 +13,7 @@ import os
 import shlex
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -61,15 +61,18 @@ class Manifest:
 
     Attributes:
         command: the command that makes the set, with ``{scene}`` for the scene's folder.
-        sources: sha256 of each file the maps were made from, by its path relative to the scene.
+        sources: sha256 of each file the maps were made from, by its path relative to the scene; what is no file (a
+            network's weights) is here by its name and revision.
         metres_per_unit: metres in one scene unit, None where unknown.
         max_image_size: longer side the photographs are resized to for these maps, None for full size.
+        licence: of the network's weights, for maps that a network made.
     """
 
     command: str
     sources: dict[str, str] = field(default_factory=dict)
     metres_per_unit: float | None = None
     max_image_size: int | None = None
+    licence: str | None = None
     shellgs: str = field(default_factory=lambda: _version())
     format: int = FORMAT
 
@@ -105,12 +108,17 @@ class CueMaps:
         *,
         command: str,
         sources: Sequence[Path] = (),
+        revisions: Mapping[str, str] | None = None,
         metres_per_unit: float | None = None,
         max_image_size: int | None = None,
+        licence: str | None = None,
     ) -> CueMaps:
-        """Write the manifest of a set made from ``sources``; maps already there stay, and count while they match it."""
-        hashes = {relative_path(path, scene): content_hash(path) for path in sources}
-        manifest = Manifest(command, hashes, metres_per_unit, max_image_size)
+        """Write the manifest of a set made from the files ``sources`` and from what ``revisions`` names.
+
+        Maps already there stay, and count while they match it.
+        """
+        hashes = {relative_path(path, scene): content_hash(path) for path in sources} | dict(revisions or {})
+        manifest = Manifest(command, hashes, metres_per_unit, max_image_size, licence)
         maps = cls(scene, kind, manifest)
         maps.folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(maps.folder / "manifest.json") as file:
@@ -201,6 +209,11 @@ class CueMaps:
         claims = self._files.setdefault(name, [path])
         if path not in claims:
             claims.append(path)
+
+    def remove(self, name: str) -> None:
+        """Leave a view without a map, so that it is not refused as one of an earlier set."""
+        for path in self._files.pop(name, []):
+            path.unlink(missing_ok=True)
 
     def _path(self, name: str) -> Path:
         parts = PurePosixPath(name)

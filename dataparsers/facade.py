@@ -23,7 +23,7 @@ COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "colmap/sparse", "sparse")
 
 @dataclass
 class FacadeDataParserConfig(DataParserConfig):
-    """A facade: photographs with COLMAP or transforms.json cameras, and the cue maps of `shellgs cast`."""
+    """A facade: photographs with COLMAP or transforms.json cameras, and its shell's and monocular cue maps."""
 
     _target: type = field(default_factory=lambda: FacadeDataParser)
     data: Path = Path()
@@ -35,7 +35,8 @@ class FacadeDataParserConfig(DataParserConfig):
     masks_path: Optional[Path] = None
     """Folder of masks in a COLMAP scene (white is kept, black is ignored), relative to the scene folder."""
     max_image_size: Optional[int] = None
-    """Longer side of the images in pixels. If not set: the size that the shell maps were cast at, else full size."""
+    """Longer side of the images in pixels. If not set: the size that the cue maps were made at, the shell's
+    first, else full size."""
     eval_interval: int = 8
     """Every n-th image by sorted name is held out for evaluation, starting with the first."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
@@ -58,7 +59,8 @@ class FacadeDataParser(DataParser):
         outputs, views = self.read(split)
         cues = {kind: CueMaps.open(self.config.data, kind) for kind in find_cues(self.config.data)}
         shell = cues["shell"].manifest if "shell" in cues else None
-        max_image_size = self.config.max_image_size or (shell.max_image_size if shell else None)
+        sized = shell or (cues["mono"].manifest if "mono" in cues else None)
+        max_image_size = self.config.max_image_size or (sized.max_image_size if sized else None)
         views = [replace(view, camera=view.camera.shrunk(max_image_size)) for view in views]
         metres_per_unit = shell.metres_per_unit if shell else None
         outputs.cameras = _pinhole_cameras(outputs.cameras, views)
@@ -88,19 +90,31 @@ class FacadeDataParser(DataParser):
             "center_method": self.config.center_method,
             "load_3D_points": True,
         }
-        if (scene / "transforms.json").exists() and self.config.colmap_path is None:
+        folder = self.colmap_folder()
+        if folder is None:
             return NerfstudioDataParserConfig(eval_mode="interval", **common).setup()
+        return _SortedColmapDataParser(
+            ColmapDataParserConfig(
+                images_path=self.config.images_path,
+                masks_path=self.config.masks_path,
+                colmap_path=folder,
+                **common,
+            )
+        )
+
+    def colmap_folder(self) -> Path | None:
+        """Where the COLMAP model lies, relative to the scene folder; None where transforms.json holds the cameras.
+
+        Raises:
+            FileNotFoundError: the scene has neither.
+        """
+        scene = self.config.data
+        if (scene / "transforms.json").exists() and self.config.colmap_path is None:
+            return None
         candidates = [self.config.colmap_path] if self.config.colmap_path else map(Path, COLMAP_FOLDERS)
         for folder in candidates:
             if any((scene / folder / f"cameras.{suffix}").exists() for suffix in ("bin", "txt")):
-                return _SortedColmapDataParser(
-                    ColmapDataParserConfig(
-                        images_path=self.config.images_path,
-                        masks_path=self.config.masks_path,
-                        colmap_path=folder,
-                        **common,
-                    )
-                )
+                return folder
         raise FileNotFoundError(
             f"{scene} holds no cameras: neither transforms.json nor a COLMAP model in {', '.join(COLMAP_FOLDERS)}."
         )

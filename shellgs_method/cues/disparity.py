@@ -1,0 +1,123 @@
+"""Affine-invariant disparity, and the scale and shift that make it depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from scipy.ndimage import map_coordinates
+from scipy.stats import siegelslopes
+
+Values = Literal["disparity", "inverse-depth", "depth"]
+"""What the numbers of a map mean, each up to scale; disparity and inverse depth also up to a shift."""
+
+# A view is trusted with at least this many points in it, most of which the aligned map meets, at depths that differ.
+MIN_POINTS = 20
+INLIER = 0.1  # relative error of the depth at a point
+MIN_INLIERS = 0.6  # share of the points
+MAX_RESIDUAL = 0.05  # median relative error of the depth
+MIN_SPREAD = 0.02  # of the points' disparity, relative to its median: below, scale and shift cannot be told apart
+# Beyond this many times the depth of the farthest inlier the fit is extrapolation: sky, and what is near it.
+REACH = 2.0
+
+
+@dataclass(frozen=True)
+class DisparityFit:
+    """How ``scale * disparity + shift`` meets the inverse depth of the SfM points of one view.
+
+    Attributes:
+        points: number of points at which the map has a value.
+        scale: in inverse scene units; 0 where nothing could be fitted.
+        shift: in inverse scene units.
+        inliers: share of the points whose depth is met within :data:`INLIER`.
+        residual: median of |Δz| / z over the points.
+        spread: range of the points' disparities (5th to 95th percentile), relative to their median.
+        farthest: depth of the farthest inlier but one in a hundred, in scene units.
+    """
+
+    points: int
+    scale: float = 0.0
+    shift: float = 0.0
+    inliers: float = 0.0
+    residual: float = 1.0
+    spread: float = 0.0
+    farthest: float = 0.0
+
+    @property
+    def problem(self) -> str | None:
+        """Why the view's map cannot be trusted, in words; None if it can."""
+        if self.points < MIN_POINTS:
+            return f"{self.points} SfM points, {MIN_POINTS} are needed"
+        if self.spread < MIN_SPREAD:
+            return f"the points' disparities spread over {self.spread:.1%} only, {MIN_SPREAD:.0%} are needed"
+        if not self.scale > 0:
+            return "its disparity does not grow towards the camera"
+        if self.inliers < MIN_INLIERS:
+            return f"the depth of {self.inliers:.0%} of the points is met within {INLIER:.0%}, not {MIN_INLIERS:.0%}"
+        if self.residual > MAX_RESIDUAL:
+            return f"a median depth error of {self.residual:.1%}, {MAX_RESIDUAL:.0%} are allowed"
+        return None
+
+
+def as_disparity(values: Float[np.ndarray, "H W"], meaning: Values) -> Float32[np.ndarray, "H W"]:
+    """Disparity, larger where nearer, NaN where ``values`` are zero (none, or infinitely far) or not finite.
+
+    Negative values are valid disparities, but neither depths nor inverse depths.
+    """
+    valid = np.isfinite(values) & (values != 0 if meaning == "disparity" else values > 0)
+    values = np.where(valid, values, 1).astype(np.float64)
+    return np.where(valid, 1 / values if meaning == "depth" else values, np.nan).astype(np.float32)
+
+
+def fit_disparity(
+    disparity: Float32[np.ndarray, "H W"], pixels: Float64[np.ndarray, "N 2"], depth: Float64[np.ndarray, " N"]
+) -> DisparityFit:
+    """Scale and shift that carry a view's disparity to inverse scene units.
+
+    In disparity, because there the error of a triangulated point does not depend on its distance, and networks are
+    affine-invariant there.
+
+    Args:
+        disparity: of the view; NaN where unknown.
+        pixels: positions of the SfM points; the first pixel's centre is at 0.5.
+        depth: their z-depths in scene units.
+    """
+    found = map_coordinates(disparity.astype(np.float64), pixels.T[::-1] - 0.5, order=1, mode="nearest")
+    known = np.isfinite(found)
+    x, y = found[known], 1 / depth[known]
+    if len(x) < MIN_POINTS:
+        return DisparityFit(len(x))
+    low, median, high = np.percentile(y, [5, 50, 95])
+    spread = float((high - low) / median)
+    if spread < MIN_SPREAD or np.ptp(x) < 1e-6 * np.abs(x).max():  # float32 tells no more
+        return DisparityFit(len(x), spread=spread)
+    scale, shift = _robust_line(x, y)
+    error = np.abs(1 / np.maximum(scale * x + shift, 1e-12) - 1 / y) * y
+    met = error < INLIER
+    farthest = float(1 / np.percentile(y[met], 1)) if met.any() else 0.0
+    return DisparityFit(len(x), scale, shift, float(met.mean()), float(np.median(error)), spread, farthest)
+
+
+def aligned_depth(disparity: Float32[np.ndarray, "H W"], fit: DisparityFit) -> Float32[np.ndarray, "H W"]:
+    """Depth in scene units; 0 where the disparity is unknown, not positive or beyond the fit's reach."""
+    inverse = fit.scale * np.nan_to_num(disparity.astype(np.float64)) + fit.shift
+    valid = np.isfinite(disparity) & (inverse > 1 / (REACH * fit.farthest))
+    return np.where(valid, 1 / np.where(valid, inverse, 1), 0).astype(np.float32)
+
+
+def _robust_line(x: Float64[np.ndarray, " N"], y: Float64[np.ndarray, " N"]) -> tuple[float, float]:
+    """Slope and intercept of a line through points of which up to half may be wrong."""
+    # Repeated medians (Siegel 1982) withstand 50 % of outliers, where Theil-Sen withstands 29 %, and need neither
+    # chance nor a threshold; quadratic, hence the subset. Least squares over the points within 2.5 sigma of that line
+    # (sigma from the median absolute deviation) then averages the noise of all of them.
+    step = -(-len(x) // 1000)
+    slope, intercept = np.asarray(siegelslopes(y[::step], x[::step]), dtype=np.float64)
+    for _ in range(20):
+        residual = np.abs(y - (slope * x + intercept))
+        near = residual <= 2.5 * 1.4826 * np.median(residual) + 1e-9 * np.median(y)
+        if np.ptp(x[near]) == 0:
+            break
+        slope, intercept = np.polyfit(x[near], y[near], 1)
+    return float(slope), float(intercept)

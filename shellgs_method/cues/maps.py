@@ -1,0 +1,175 @@
+"""Monocular cue maps for all views of a scene."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from dataparsers.cue_maps import CueMap, CueMaps, atomic_write
+from dataparsers.errors import SceneError
+from dataparsers.photograph import View
+from dataparsers.sparse_points import SparsePoints
+from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_disparity
+from shellgs_method.cues.normals import disagreement, facing, gradient_normals
+from shellgs_method.cues.source import Predictor
+
+NO_PREDICTION = "there is no map of it"
+
+
+@dataclass(frozen=True)
+class MonoSummary:
+    """What :func:`make_maps` did.
+
+    Attributes:
+        made: views whose map was made.
+        skipped: views that had been decided already, with or without a map.
+        problems: why a view has no map, by its name.
+        residual: median over the views with a map of their fit's residual.
+        seconds: wall time.
+    """
+
+    made: int
+    skipped: int
+    problems: dict[str, str]
+    residual: float
+    seconds: float
+
+
+def make_maps(
+    scene: Path,
+    views: Sequence[View],
+    points: SparsePoints,
+    predictor: Predictor,
+    *,
+    command: str,
+    max_image_size: int | None = None,
+) -> MonoSummary:
+    """Predict depth and normals of the views, align them to the SfM points, and store them in ``scene/cues/mono``.
+
+    Each view's disparity is aligned on its own (:func:`fit_disparity`). A view whose fit cannot be trusted gets no
+    map and is trained by its photograph alone. ``cues/mono/fits.json`` holds the numbers behind every verdict; what
+    is there for the same predictor and points is not made again.
+
+    Args:
+        scene: the scene's folder.
+        views: the photographs, with full-size cameras.
+        points: the scene's SfM points.
+        predictor: makes the predictions.
+        command: makes these maps again, with ``{scene}`` for the scene's folder.
+        max_image_size: make maps for photographs resized to this longer side.
+
+    Raises:
+        SceneError: imported normals have other axes than declared, or no view has a map that can be trusted.
+    """
+    start = time.monotonic()
+    views = [replace(view, camera=view.camera.shrunk(max_image_size)) for view in views]
+    _check_one_view(views, points, predictor)
+    maps = CueMaps.create(
+        scene,
+        "mono",
+        command=command,
+        revisions={predictor.name: predictor.revision, "SfM points": _hash_of(points)},
+        max_image_size=max_image_size,
+        licence=predictor.licence,
+    )
+    fits = Fits.open(maps)
+    made = skipped = 0
+    for view in track(views, description="monocular cues"):
+        if fits.problem(view.name) or (view.name in fits.views and maps.current(view.name, view.camera)):
+            skipped += 1
+            continue
+        fit, cue = align_view(view, points, predictor)
+        if cue is None:
+            maps.remove(view.name)
+        else:
+            maps.write(view.name, cue, view.camera)
+            made += 1
+        fits.add(view.name, fit)
+    problems = {view.name: problem for view in views if (problem := fits.problem(view.name))}
+    residuals = [fit["residual"] for name, fit in fits.views.items() if fit and name not in problems]
+    return MonoSummary(made, skipped, problems, float(np.median(residuals)), time.monotonic() - start)
+
+
+def align_view(view: View, points: SparsePoints, predictor: Predictor) -> tuple[DisparityFit | None, CueMap | None]:
+    """The fit of a view's prediction, if there is one, and its cue map, if the fit can be trusted.
+
+    Raises:
+        SceneError: the normals have other axes than they were declared to have.
+    """
+    prediction = predictor.predict(view)
+    if prediction is None:
+        return None, None
+    fit = fit_disparity(prediction.disparity, *points.seen_in(view))
+    if fit.problem:
+        return fit, None
+    depth = aligned_depth(prediction.disparity, fit)
+    normal = gradient_normals(depth, view.camera) if prediction.normal is None else prediction.normal
+    normal = facing(normal, view.camera).astype(np.float16)
+    mask = (depth > 0) & normal.any(axis=-1)
+    cue = CueMap(np.where(mask, depth, np.float32(0)), np.where(mask[..., None], normal, np.float16(0)), mask)
+    if predictor.convention and (problem := disagreement(cue, view.camera, predictor.convention)):
+        raise SceneError(f"the normals of view {view.name!r} in {predictor.name} have other axes: {problem}")
+    return fit, cue
+
+
+def _check_one_view(views: Sequence[View], points: SparsePoints, predictor: Predictor) -> None:
+    """Find one view that gets a map, so that a mistake is told before maps that are there already count as stale."""
+    problem = "there are no views"
+    for view in views:
+        fit, cue = align_view(view, points, predictor)
+        if cue is not None:
+            return
+        problem = f"{view.name}, for one: {fit.problem if fit else NO_PREDICTION}"
+    raise SceneError(f"no view has a monocular map that can be trusted; {problem}")
+
+
+@dataclass(frozen=True)
+class Fits:
+    """The fits of one set of maps, kept on disk as they are made.
+
+    Attributes:
+        path: the file.
+        sources: what the fits were made from, as in the maps' manifest; fits of other sources do not count.
+        views: the numbers and the problem of each view's fit, by name; None for a view without prediction.
+    """
+
+    path: Path
+    sources: dict
+    views: dict[str, dict | None]
+
+    @classmethod
+    def open(cls, maps: CueMaps) -> Fits:
+        """The fits there are for a set of maps."""
+        path = maps.folder / "fits.json"
+        sources = {"max_image_size": maps.manifest.max_image_size, **maps.manifest.sources}
+        try:
+            kept = json.loads(path.read_bytes())
+            views = dict(kept["views"]) if kept["sources"] == sources else {}
+        except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: all are made again
+            views = {}
+        return cls(path, sources, views)
+
+    def add(self, name: str, fit: DisparityFit | None) -> None:
+        """Keep the fit of a view."""
+        self.views[name] = None if fit is None else {**asdict(fit), "problem": fit.problem}
+        with atomic_write(self.path) as file:
+            file.write((json.dumps({"sources": self.sources, "views": self.views}, indent=1) + "\n").encode())
+
+    def problem(self, name: str) -> str | None:
+        """Why a view has no map, or None if it has one or was not tried yet."""
+        fit = self.views.get(name, {})
+        return NO_PREDICTION if fit is None else fit.get("problem")
+
+
+def _hash_of(points: SparsePoints) -> str:
+    digest = hashlib.sha256(np.ascontiguousarray(points.positions).tobytes())
+    for name, indices in sorted((points.observed or {}).items()):
+        digest.update(name.encode() + np.ascontiguousarray(indices, dtype=np.int64).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,191 @@
+"""Monocular networks, loaded by their own packages."""
+
+from __future__ import annotations
+
+import logging
+import math
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dataparsers.errors import SceneError
+
+if TYPE_CHECKING:
+    import torch
+
+    from dataparsers.photograph import View
+    from shellgs_method.cues.source import Prediction, Predictor
+
+ELSEWHERE = "or import maps made elsewhere with `shellgs mono SCENE from FOLDER`"
+
+
+@dataclass(frozen=True)
+class MoGe2:
+    """MoGe-2 (MIT): depth and normals of one network, in one pass."""
+
+    weights: str = "Ruicheng/moge-2-vits-normal"
+    """Repository on the Hugging Face hub, or a folder that holds its model.pt."""
+
+    @property
+    def command(self) -> str:
+        """The words of the command line that choose it."""
+        return f"moge --weights {shlex.quote(self.weights)}"
+
+    def load(self) -> Predictor:
+        """The network on the GPU, if there is one.
+
+        Raises:
+            SceneError: the package or the weights are missing.
+        """
+        import numpy as np
+        import torch
+
+        from dataparsers.photograph import load_photograph
+        from shellgs_method.cues.disparity import as_disparity
+        from shellgs_method.cues.source import Prediction, Predictor
+
+        try:
+            from moge.model.v2 import MoGeModel  # pyright: ignore[reportMissingImports]  # on no package index
+        except ImportError as error:
+            raise SceneError(
+                f"MoGe-2 needs the package moge ({error}): pip install git+https://github.com/microsoft/MoGe.git, "
+                f"or run Depth Anything with `shellgs mono SCENE depth-anything`, {ELSEWHERE}"
+            ) from error
+        weights = fetch_weights(self.weights, ["model.pt"])
+        try:
+            model = MoGeModel.from_pretrained(weights.folder / "model.pt").to(_device()).eval()
+        except Exception as error:  # whatever unpickling and building from a foreign file may raise
+            raise _unusable(self.weights, "MoGe-2", error) from error
+
+        def predict(view: View) -> Prediction:
+            image = torch.from_numpy(load_photograph(view)[..., :3].astype(np.float32) / 255).permute(2, 0, 1)
+            # The focal length is known: only the shift of the point map is left to be found.
+            fov_x = math.degrees(2 * math.atan(view.camera.width / (2 * float(view.camera.K[0, 0]))))
+            maps = model.infer(image.to(_device()), fov_x=fov_x, use_fp16=_device().type == "cuda")
+            depth = maps["depth"].cpu().numpy()  # infinite outside the network's own mask
+            normal = maps["normal"].cpu().numpy() if "normal" in maps else None
+            return Prediction(as_disparity(depth, "depth"), normal)
+
+        return Predictor(self.weights, weights.revision, predict, weights.licence)
+
+
+@dataclass(frozen=True)
+class DepthAnything:
+    """Depth Anything V2: disparity; the normals are those of the aligned depth.
+
+    The weights of Small are Apache-2.0, those of Base and Large are for non-commercial use (CC-BY-NC-4.0).
+    """
+
+    weights: str = "depth-anything/Depth-Anything-V2-Small-hf"
+    """Repository on the Hugging Face hub, or a folder in the form of transformers."""
+
+    @property
+    def command(self) -> str:
+        """The words of the command line that choose it."""
+        return f"depth-anything --weights {shlex.quote(self.weights)}"
+
+    def load(self) -> Predictor:
+        """The network on the GPU, if there is one.
+
+        Raises:
+            SceneError: the package or the weights are missing.
+        """
+        import torch
+
+        from dataparsers.photograph import load_photograph
+        from shellgs_method.cues.disparity import as_disparity
+        from shellgs_method.cues.source import Prediction, Predictor
+
+        try:
+            from transformers import AutoImageProcessor, DepthAnythingForDepthEstimation
+        except ImportError as error:
+            raise SceneError(
+                f"Depth Anything needs the package transformers ({error}): pip install 'shellgs[mono]', {ELSEWHERE}"
+            ) from error
+        weights = fetch_weights(self.weights, ["*.json", "*.safetensors"])
+        try:
+            processor = AutoImageProcessor.from_pretrained(weights.folder)
+            model = DepthAnythingForDepthEstimation.from_pretrained(weights.folder).eval()
+        except Exception as error:  # whatever reading a foreign configuration may raise
+            raise _unusable(self.weights, "Depth Anything", error) from error
+        torch.nn.Module.to(model, _device())
+        meaning = "depth" if model.config.depth_estimation_type == "metric" else "disparity"
+
+        @torch.inference_mode()
+        def predict(view: View) -> Prediction:
+            inputs = processor(images=load_photograph(view)[..., :3], return_tensors="pt").to(_device())
+            size = (view.camera.height, view.camera.width)
+            (maps,) = processor.post_process_depth_estimation(model(**inputs), target_sizes=[size])
+            return Prediction(as_disparity(maps["predicted_depth"].float().cpu().numpy(), meaning))
+
+        return Predictor(self.weights, weights.revision, predict, weights.licence)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A network's files on this machine."""
+
+    folder: Path
+    revision: str
+    licence: str
+
+
+def fetch_weights(name: str, patterns: list[str]) -> Weights:
+    """A local folder of weights, or the files of a hub repository, downloaded once and kept in the hub's cache.
+
+    Raises:
+        SceneError: there is no such folder, and the repository cannot be had.
+    """
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HFValidationError
+
+    from shellgs_method.cues.source import hash_of
+
+    folder = Path(name)
+    if folder.is_dir():
+        files = sorted(path for pattern in patterns for path in folder.glob(pattern))
+        if not files:
+            raise SceneError(f"{folder} holds no weights: none of {', '.join(patterns)} is in it")
+        return Weights(folder, hash_of(files), _licence(folder))
+    try:
+        # In the hub's cache, a snapshot's folder is named by its commit.
+        folder = Path(snapshot_download(name, allow_patterns=[*patterns, "README.md"]))
+    except (OSError, HFValidationError) as error:
+        raise SceneError(
+            f"the weights {name} cannot be had ({_first_sentence(error)}): check the name and the network, name a "
+            f"local folder with --weights, {ELSEWHERE}"
+        ) from error
+    return Weights(folder, folder.name, _licence(folder))
+
+
+def _licence(folder: Path) -> str:
+    """The licence that a model card's header states."""
+    from huggingface_hub import ModelCard
+
+    unknown = "not stated"
+    if not (folder / "README.md").is_file():
+        return unknown
+    try:
+        data = ModelCard.load(folder / "README.md").data
+    except ValueError as error:
+        logging.getLogger(__name__).warning("the model card in %s cannot be read: %s", folder, error)
+        return unknown
+    name = data.get("license_name") if data.get("license") == "other" else data.get("license")
+    return str(name or unknown).lower()
+
+
+def _device() -> torch.device:
+    import torch
+
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _unusable(weights: str, network: str, error: Exception) -> SceneError:
+    return SceneError(f"{weights} cannot be loaded as weights of {network} ({_first_sentence(error)})")
+
+
+def _first_sentence(error: Exception) -> str:
+    """What an error of a library says, less its advice."""
+    lines = str(error).strip().splitlines()
+    return lines[0].split(". ")[0].rstrip(".") if lines else type(error).__name__

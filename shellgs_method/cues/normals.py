@@ -1,0 +1,75 @@
+"""Axis conventions of normal maps, and how a wrong one is found out."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dataparsers.camera import Camera
+from dataparsers.cue_maps import CueMap
+from shellgs_method.evaluation.geometry import angular_error
+from shellgs_method.evaluation.normals import normals_from_depth
+
+Convention = Literal["opencv", "opengl", "dsine", "stablenormal", "metric3d", "omnidata"]
+"""Axes of a normal map: opencv is x right, y down, z forward, facing the camera; opengl is x right, y up, z back."""
+
+_SIGNS: dict[Convention, tuple[int, int, int]] = {
+    "opencv": (1, 1, 1),
+    "opengl": (1, -1, -1),
+    "dsine": (-1, -1, -1),  # opencv, but pointing away from the camera
+    "stablenormal": (-1, -1, -1),
+    "metric3d": (1, 1, 1),
+    "omnidata": (1, 1, 1),
+}
+
+MAX_DISAGREEMENT = 45.0  # degrees, mean over a view; networks and the gradient of their depth differ by 10 to 30
+CLEARLY = 10.0  # degrees by which other axes must be better to prove the declared ones wrong
+
+
+def facing(normal: Float[np.ndarray, "H W 3"], camera: Camera) -> Float[np.ndarray, "H W 3"]:
+    """Unit normals, each turned towards the camera (n · ray < 0); zero where they are shorter than 1e-3 or unknown."""
+    normal = np.nan_to_num(normal.astype(np.float64), posinf=0.0, neginf=0.0)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    away = np.einsum("hwc,hwc->hw", normal, camera.rays().cpu().numpy()) > 0
+    return np.where(length < 1e-3, 0, normal / np.maximum(length, 1e-3)) * np.where(away, -1, 1)[..., None]
+
+
+def to_opencv(normal: Float[np.ndarray, "H W 3"], convention: Convention) -> Float[np.ndarray, "H W 3"]:
+    """Normals of a convention in the OpenCV camera frame."""
+    return normal * np.array(_SIGNS[convention], dtype=normal.dtype)
+
+
+def gradient_normals(depth: Float[np.ndarray, "H W"], camera: Camera) -> Float[np.ndarray, "H W 3"]:
+    """Normals of the depth's own gradient; zero on the border and beside pixels without depth."""
+    return normals_from_depth(torch.from_numpy(depth.astype(np.float64))[..., None], camera).numpy()
+
+
+def disagreement(cue: CueMap, camera: Camera, convention: Convention) -> str | None:
+    """What shows that normals read in ``convention`` have other axes, in words; None if they fit the view's depth.
+
+    The sign of a normal is known (it faces the camera), so that axes differ only by the flips that turning it around
+    does not undo: the three that are tried.
+    """
+    reference = gradient_normals(cue.depth, camera)
+    both = cue.mask & (np.abs(reference).sum(axis=-1) > 0)
+    if not both.any():
+        return None
+
+    def mean_angle(flip: tuple[int, int, int]) -> float:
+        flipped = torch.from_numpy(cue.normal[both].astype(np.float64) * flip)
+        return angular_error(flipped, torch.from_numpy(reference[both])).mean().item()
+
+    declared = mean_angle((1, 1, 1))
+    flip = min(((-1, 1, 1), (1, -1, 1), (1, 1, -1)), key=mean_angle)
+    better = mean_angle(flip)
+    if declared <= MAX_DISAGREEMENT and declared <= better + CLEARLY:
+        return None
+    problem = f"read as {convention} they are {declared:.0f}° from the normals of the depth"
+    axes = np.multiply(_SIGNS[convention], flip)
+    right = next((name for name, signs in _SIGNS.items() if abs(np.dot(axes, signs)) == 3), None)
+    if right and better < min(declared - CLEARLY, MAX_DISAGREEMENT):
+        problem += f", as {right} {better:.0f}°"
+    return problem

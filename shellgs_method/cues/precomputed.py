@@ -1,0 +1,196 @@
+"""Maps that were made elsewhere, one file a view."""
+
+from __future__ import annotations
+
+import shlex
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Literal, Optional
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from dataparsers.errors import SceneError
+
+if TYPE_CHECKING:
+    from dataparsers.photograph import View
+    from shellgs_method.cues.source import Prediction, Predictor
+
+SUFFIXES = (".npy", ".npz", ".png")
+ASPECT_TOLERANCE = 0.02  # networks round sizes to multiples of 14 or 32
+
+
+@dataclass(frozen=True)
+class Precomputed:
+    """Maps of the photographs in the scene's images folder, one npy, npz or 16-bit png for each.
+
+    A map belongs to the photograph of its name: images/left/0001.jpg takes left/0001.npy, 0001.npy or 0001.jpg.npy.
+    """
+
+    # tyro reads these types when it builds the command: they are spelled out, and Optional is for Python 3.10.
+    folder: Path
+    """Folder of the maps; zero and NaN stand for no value."""
+    values: Literal["disparity", "inverse-depth", "depth"] = "disparity"
+    """What the maps' numbers are, in any unit: disparity (up to a shift), inverse depth, or z-depth."""
+    normals: Optional[Path] = None
+    """Folder of normal maps, named alike; the same folder where an npz holds both."""
+    convention: Literal["opencv", "opengl", "dsine", "stablenormal", "metric3d", "omnidata"] = "opencv"
+    """Axes of the normals; which of the two sides they point to does not matter."""
+
+    @property
+    def command(self) -> str:
+        """The words of the command line that choose it."""
+        words = ["from", str(self.folder.absolute()), "--values", self.values]
+        if self.normals is not None:
+            words += ["--normals", str(self.normals.absolute()), "--convention", self.convention]
+        return shlex.join(words)
+
+    def load(self) -> Predictor:
+        """The maps, found by name when they are asked for.
+
+        Raises:
+            SceneError: a folder is missing or holds no map.
+        """
+        from shellgs_method.cues.disparity import as_disparity
+        from shellgs_method.cues.normals import to_opencv
+        from shellgs_method.cues.source import Prediction, Predictor, hash_of
+
+        maps = MapFolder(self.folder, (self.values.replace("-", "_"), "disparity", "inverse_depth", "depth", "arr_0"))
+        normals = None if self.normals is None else MapFolder(self.normals, ("normal", "normals", "arr_0"))
+
+        def predict(view: View) -> Prediction | None:
+            values = maps.read(view, channels=1)
+            if values is None:
+                return None
+            disparity = as_disparity(values[..., 0], self.values)
+            normal = normals.read(view, channels=3) if normals else None
+            if normal is not None:
+                normal = to_opencv(np.nan_to_num(normal, posinf=0.0, neginf=0.0), self.convention)
+                normal = _as_seen(view, normal, np.abs(normal).sum(axis=-1) > 1e-3)
+            return Prediction(_as_seen(view, disparity[..., None], np.isfinite(disparity))[..., 0], normal)
+
+        files = [*maps.files, *(normals.files if normals else ())]
+        revision = hash_of(files, self.values, self.convention)
+        return Predictor(
+            str(self.folder.absolute()), revision, predict, convention=self.convention if normals else None
+        )
+
+
+class MapFolder:
+    """The arrays in a folder's files, by the name of the view that they belong to.
+
+    Args:
+        folder: searched with its sub-folders.
+        keys: names of the wanted array in an npz that holds several, best first.
+
+    Raises:
+        SceneError: the folder is missing or holds no map.
+    """
+
+    def __init__(self, folder: Path, keys: tuple[str, ...]) -> None:
+        if not folder.is_dir():
+            raise SceneError(f"{folder} is not a folder: name the one that holds the maps")
+        self.files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+        if not self.files:
+            raise SceneError(f"{folder} holds no maps: no {', '.join(SUFFIXES)} file is in it")
+        self._keys = keys
+        self._by_name: dict[str, list[Path]] = {}
+        for path in self.files:
+            self._by_name.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
+        self._taken: dict[Path, str] = {}
+
+    def read(self, view: View, channels: int) -> Float[np.ndarray, "H W channels"] | None:
+        """The map of a view as it was stored, or None; colours are decoded to [-1, 1].
+
+        Raises:
+            SceneError: the file is damaged or holds something else, or is not the only one of the view.
+        """
+        path = self._find(view)
+        if path is None:
+            return None
+        try:
+            array = self._decode(path)
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+            raise SceneError(f"the map {path} of view {view.name!r} cannot be read ({error}): make it again") from error
+        array = array.squeeze()
+        if array.ndim == 3 and array.shape[0] == 3 != array.shape[-1]:
+            array = array.transpose(1, 2, 0)
+        array = array[..., None] if array.ndim == 2 else array
+        if array.ndim != 3 or array.shape[-1] != channels or array.dtype.kind not in "fiu":
+            wanted = "one number" if channels == 1 else "three numbers"
+            raise SceneError(
+                f"the map {path} of view {view.name!r} is {array.dtype} {list(array.shape)}, not {wanted} a pixel"
+            )
+        return array.astype(np.float32)
+
+    def _find(self, view: View) -> Path | None:
+        """The file named like the view: its path inside the scene, or the end of it, with or without its suffix."""
+        parts = PurePosixPath(view.name).parts
+        names = ["/".join(parts[k:]) for k in range(len(parts))]
+        for name in [*names, *(PurePosixPath(name).with_suffix("").as_posix() for name in names)]:
+            paths = self._by_name.get(name, [])
+            if len(paths) > 1:
+                raise SceneError(f"view {view.name!r} has two maps: {', '.join(map(str, paths))}; remove the wrong one")
+            if paths:
+                other = self._taken.setdefault(paths[0], view.name)
+                if other != view.name:
+                    raise SceneError(
+                        f"the map {paths[0]} is named like two views, {other!r} and {view.name!r}: keep the maps in "
+                        "the sub-folders of their images"
+                    )
+                return paths[0]
+        return None
+
+    def _decode(self, path: Path) -> np.ndarray:
+        if path.suffix.lower() == ".png":
+            with Image.open(path) as image:
+                array = np.asarray(image)
+            if array.ndim == 3:
+                colours = array[..., :3].astype(np.float32)
+                return np.where(colours.any(axis=-1, keepdims=True), colours / 127.5 - 1, 0)  # black is no normal
+            if array.dtype == np.uint8:
+                raise ValueError("its 8 bits are too few for depth; 16-bit png, npy or npz are enough")
+            return array
+        file = np.load(path, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            return file
+        with file:
+            if len(file.files) == 1:
+                return file[file.files[0]]
+            key = next((key for key in self._keys if key in file.files), None)
+            if key is None:
+                raise ValueError(f"none of its arrays {', '.join(file.files)} is named {self._keys[0]}")
+            return file[key]
+
+
+def _as_seen(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) -> Float[np.ndarray, "H W C"]:
+    """A map of the photograph, undistorted and resized to the view's camera; NaN where less than half is valid."""
+    import torch
+
+    from dataparsers.photograph import undistort
+
+    height, width = valid.shape
+    calibrated = view.camera if view.lens is None else view.lens
+    if abs(width / height / (int(calibrated.width) / int(calibrated.height)) - 1) > ASPECT_TOLERANCE:
+        raise SceneError(
+            f"the map of view {view.name!r} is {width}x{height} pixels, which is not the shape of its photograph "
+            f"({int(calibrated.width)}x{int(calibrated.height)}): make it of the whole, upright photograph"
+        )
+    # Invalid pixels carry no weight: values and weights are interpolated alike, and divided in the end.
+    weighted = np.concatenate([np.where(valid[..., None], values, 0), valid[..., None]], axis=-1).astype(np.float32)
+
+    def resized(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        if array.shape[:2] == size:
+            return array
+        planes = torch.from_numpy(array).permute(2, 0, 1)[None]
+        planes = torch.nn.functional.interpolate(planes, size, mode="bilinear", align_corners=False, antialias=True)
+        return planes[0].permute(1, 2, 0).numpy()
+
+    if view.lens is not None:
+        weighted = undistort(view.lens, resized(weighted, (int(view.lens.height), int(view.lens.width))))[1]
+    weighted = resized(weighted, (view.camera.height, view.camera.width))
+    weight = weighted[..., -1:]
+    return np.where(weight > 0.5, weighted[..., :-1] / np.maximum(weight, 0.5), np.nan).astype(np.float32)
