@@ -17,7 +17,8 @@ from torch import Tensor
 import method_configs
 from dataparsers.camera import Camera
 from shellgs_method.evaluation import colours_to_normals
-from shellgs_method.model import FacadeModel, facing_normals_and_depths, pinhole_camera
+from shellgs_method.geometry import geometry_channels
+from shellgs_method.model import FacadeModel, pinhole_camera
 from shellgs_method.trainer import FacadeTrainer
 
 Method = Literal["shellgs", "photo_gs"]
@@ -102,7 +103,7 @@ def test_the_normal_of_a_gaussian_is_its_shortest_axis_turned_to_the_camera():
     scales = torch.tensor([0.0, -3.0, 1.0]).expand(20, 3)
     means = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (20, 3))).float() + torch.tensor([0, 0, 5.0])
     camera = Camera(torch.eye(4), torch.eye(3), 4, 4)
-    normals, depths = facing_normals_and_depths({"means": means, "quats": quats, "scales": scales}, camera)
+    normals, depths = geometry_channels({"means": means, "quats": quats, "scales": scales}, camera, "expected")
     axis = torch.from_numpy(rotation.as_matrix()[:, :, 1]).float()
     torch.testing.assert_close((normals * axis).sum(dim=-1).abs(), torch.ones(20))
     assert ((normals * means).sum(dim=-1) < 0).all()
