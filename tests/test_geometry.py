@@ -19,7 +19,7 @@ from shellgs_method.geometry import (
 )
 from shellgs_method.rasterizer import rasterize
 
-WIDTH, HEIGHT = 40, 30
+CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]), width=40, height=30)
 
 
 def wall(yaw: float) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
@@ -40,13 +40,11 @@ def wall(yaw: float) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
 def render(
     gaussians: dict[str, torch.Tensor], primitive: Primitive, depth: DepthKind, opacity: float = 0.9
 ) -> Geometry:
-    K = torch.tensor([[30.0, 0, WIDTH / 2], [0, 30, HEIGHT / 2], [0, 0, 1]])
-    camera = Camera(torch.eye(4), K, WIDTH, HEIGHT)
-    channels = torch.cat(geometry_channels(gaussians, camera, depth), dim=-1)
+    channels = torch.cat(geometry_channels(gaussians, CAMERA, depth), dim=-1)
     opacities = torch.full((len(channels),), opacity)
     means, quats, scales = (gaussians[name] for name in ("means", "quats", "scales"))
-    composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, camera, primitive)
-    return rendered_geometry(composited, alpha, info, camera, depth)
+    composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, CAMERA, primitive)
+    return rendered_geometry(composited, alpha, info, CAMERA, depth)
 
 
 def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:
@@ -82,14 +80,12 @@ def test_normals_of_a_wall_and_of_its_depth_are_its_own(eager, primitive):
     assert ((known @ normal) > 0.999).float().mean() > 0.95  # but for those with a neighbour off the wall
 
 
-def test_plane_depth_depends_on_where_gaussians_are_turned(eager):
+@pytest.mark.parametrize(("depth", "moves"), [("plane", True), ("expected", False)])
+def test_plane_depth_depends_on_where_gaussians_are_turned(depth, moves):
     """It couples depth and normals; the depth of centres does not see a Gaussian turn."""
-    for depth, moves in (("plane", True), ("expected", False)):
-        gaussians, _ = wall(0.5)
-        gaussians["quats"].requires_grad_()
-        K = torch.tensor([[30.0, 0, WIDTH / 2], [0, 30, HEIGHT / 2], [0, 0, 1]])
-        channel = geometry_channels(gaussians, Camera(torch.eye(4), K, WIDTH, HEIGHT), depth)[1]
-        assert channel.requires_grad == moves
+    gaussians, _ = wall(0.5)
+    gaussians["quats"].requires_grad_()
+    assert geometry_channels(gaussians, CAMERA, depth)[1].requires_grad == moves
 
 
 def test_a_faint_disc_has_an_expected_depth_where_it_has_no_median(eager):
