@@ -11,6 +11,7 @@ from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.model import FacadeModelConfig
 from shellgs_method.pipeline import FacadePipelineConfig
+from shellgs_method.supervision import ExtraLossConfig
 from shellgs_method.trainer import FacadeTrainerConfig, RunLengthDecayConfig
 
 
@@ -52,8 +53,18 @@ shellgs = _method(
     "3D Gaussians supervised by an aligned exterior facade shell",
     FacadeModelConfig(cues="shell"),
 )
+mono_gs = _method(
+    "mono-gs",
+    "3D Gaussians supervised by depth and normals that networks see in the photographs",
+    FacadeModelConfig(cues="mono"),
+)
 photo_gs = _method(
     "photo-gs",
     "3D Gaussians from the photographs alone, the baseline of shellgs",
     FacadeModelConfig(cues="none"),
+)
+two_dgs = _method(
+    "2dgs",
+    "The discs of 2D Gaussian Splatting from the photographs alone",
+    FacadeModelConfig(primitive="2d", cull_alpha_thresh=0.05, extra=ExtraLossConfig(agreement=0.05)),
 )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -10,16 +12,19 @@ from jaxtyping import UInt8
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from dataparsers.errors import refusals_end_the_program
+from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
+from shellgs_method.bands import Bands, facade_bands
 
 
 class FacadeDataset(InputDataset):
     """Photographs at the size of their cameras, with ``K``, ``{cue}_depth``, ``{cue}_normal`` and ``{cue}_mask``.
 
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
-    kind lacks that kind's keys.
+    kind lacks that kind's keys. With ``bands``, all masks are those of pixels whose wall lies in them.
     """
+
+    bands: Bands | None = None
 
     @property
     def views(self) -> list[View]:
@@ -42,14 +47,18 @@ class FacadeDataset(InputDataset):
     def get_metadata(self, data: dict) -> dict:
         """The cue maps of the view ``data["image_idx"]``."""
         view = self.views[data["image_idx"]]
+        read = {
+            kind: maps.read(view.name, view.camera) for kind, maps in self._dataparser_outputs.metadata["cues"].items()
+        }
+        cues = {kind: cue for kind, cue in read.items() if cue is not None}
+        inside = True
+        if self.bands is not None:
+            inside = self.bands.mask(cues["shell"], view.camera) if "shell" in cues else False
         maps = {}
-        for kind, cue_maps in self._dataparser_outputs.metadata["cues"].items():
-            cue = cue_maps.read(view.name, view.camera)
-            if cue is not None:
-                depth = torch.from_numpy(cue.depth)[..., None]
-                maps[f"{kind}_depth"] = depth * self._dataparser_outputs.dataparser_scale
-                maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
-                maps[f"{kind}_mask"] = torch.from_numpy(cue.mask)[..., None]
+        for kind, cue in cues.items():
+            maps[f"{kind}_depth"] = torch.from_numpy(cue.depth)[..., None] * self._dataparser_outputs.dataparser_scale
+            maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
+            maps[f"{kind}_mask"] = torch.from_numpy(cue.mask & inside)[..., None]
         return maps
 
 
@@ -58,12 +67,38 @@ class FacadeDataManagerConfig(FullImageDatamanagerConfig):
     """Facade batches."""
 
     _target: type = field(default_factory=lambda: FacadeDataManager)
+    holdout: Literal["none", "A", "B"] = "none"
+    """Vertical bands of the facade that no cue supervises, and that alone are measured: every other one, A or B."""
+    band_width: float = 2.0
+    """Width of a band in metres, or in scene units where the shell maps do not know metres."""
 
 
 class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     """Full images with cue maps, cached on any machine."""
 
     config: FacadeDataManagerConfig
+
+    def create_train_dataset(self) -> FacadeDataset:
+        """The training views, whose maps leave out the bands held out."""
+        dataset = super().create_train_dataset()
+        held_out = self._held_out
+        dataset.bands = held_out and held_out.others
+        return dataset
+
+    def create_eval_dataset(self) -> FacadeDataset:
+        """The held-out views, whose maps are left in the bands held out."""
+        dataset = super().create_eval_dataset()
+        dataset.bands = self._held_out
+        return dataset
+
+    @cached_property
+    def _held_out(self) -> Bands | None:
+        if self.config.holdout == "none":
+            return None
+        metadata = self.train_dataparser_outputs.metadata
+        if "shell" not in metadata["cues"]:
+            raise SceneError("a holdout of bands needs the shell maps of the scene: run `shellgs cast SCENE` first")
+        return facade_bands(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
 
     def _load_images(self, split, cache_images_device):
         # "cpu" pins memory, which needs CUDA, and nerfstudio switches to it by itself above 500 images; "gpu" means

@@ -1,10 +1,9 @@
-"""One model for every method: Gaussians, and the cues that supervise their geometry."""
+"""One model for every method: primitive x cues, and the weights of the objective's terms."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Literal, Optional, cast
 
 import numpy as np
@@ -27,6 +26,7 @@ from tyro.conf import Suppress
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+from shellgs_method.densification import MCMCConfig, MCMCStrategy
 from shellgs_method.evaluation import (
     Reference,
     Rendering,
@@ -35,39 +35,20 @@ from shellgs_method.evaluation import (
     image_errors,
     normals_to_colours,
 )
-from shellgs_method.losses import (
-    ExponentialDecay,
-    consistency_loss,
-    ncc_loss,
-    normal_loss,
-    photometric_loss,
-    vid2sim_ncc_loss,
+from shellgs_method.geometry import (
+    DISC_LOG_THICKNESS,
+    DepthKind,
+    Geometry,
+    Primitive,
+    geometry_channels,
+    rendered_geometry,
 )
-from shellgs_method.rasterizer import quats_to_rotations, rasterize, spherical_harmonics
-
-PAPER_ITERATIONS = 30_000
-"""The run for which the iteration numbers of the config are stated; a shorter run shrinks them in proportion."""
+from shellgs_method.losses import PAPER_ITERATIONS, flattening_loss, photometric_loss
+from shellgs_method.rasterizer import rasterize, spherical_harmonics
+from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses, self_losses
 
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in any."""
-
-
-@dataclass
-class GeometryLossConfig:
-    """Weights of D, N and C from the first iteration to the last (paper, section 3.4); 0 0 leaves a term out."""
-
-    depth: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.5, 0.1))
-    """Weight α(t) of the inverse-depth NCC."""
-    normal: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
-    """Weight β(t) of the normal loss."""
-    consistency: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
-    """Weight γ(t) of the consistency of neighbouring normals."""
-    ncc: Literal["local", "vid2sim"] = "local"
-    """local: the paper's equation; vid2sim: the form of the released baseline."""
-    ncc_window: int = 9
-    """Side of the patches of the local NCC in pixels."""
-    ncc_eps: float = 1e-3
-    """Contrast of a patch, relative to its depth, below which the local NCC takes it for flat."""
 
 
 @dataclass
@@ -75,10 +56,21 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Gaussians of a facade. Numbers of iterations are those of a run of 30 000 and shrink with a shorter run."""
 
     _target: type = field(default_factory=lambda: FacadeModel)
-    cues: Literal["none", "shell"] = "none"
+    primitive: Primitive = "3d"
+    """3d: Gaussians; 2d: the discs of 2D Gaussian Splatting."""
+    cues: Literal["none", "mono", "shell"] = "none"
     """Maps that supervise the geometry."""
     geometry: GeometryLossConfig = field(default_factory=GeometryLossConfig)
     """Losses against the cues."""
+    # Values, not factories: a config.yml written before these settings were there finds them on the class.
+    extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
+    """Terms beyond the paper."""
+    depth: DepthKind = "expected"
+    """Depth that is rendered and supervised: expected, median (discs only), or that of the composited plane."""
+    densification: Literal["default", "mcmc"] = "default"
+    """default: clone, split and prune by the gradient; mcmc: move and add by opacity, up to a cap."""
+    mcmc: MCMCConfig = MCMCConfig()  # noqa: RUF009
+    """Settings of mcmc."""
 
     background_color: Literal["random", "black", "white"] = "black"
     cull_alpha_thresh: float = 0.005
@@ -124,10 +116,12 @@ class FacadeModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Gaussians at the SfM points."""
-        self._refuse_missing_cues()
+        self._refuse_what_cannot_be()
         points, colours = self._seed_points()
         spacing = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))[0][:, 1:].mean(axis=1)
         scales = torch.from_numpy(np.log(spacing.clip(min=1e-6))).float()[:, None].repeat(1, 3)
+        if self.config.primitive == "2d":
+            scales[:, 2] = DISC_LOG_THICKNESS
         self.gauss_params = nn.ParameterDict(
             {
                 "means": nn.Parameter(points),
@@ -143,29 +137,50 @@ class FacadeModel(SplatfactoModel):
             "black" if self.config.background_color == "random" else self.config.background_color
         )
         self.crop_box = None
+        self.geometry: Geometry | None = None
         self.metres_per_unit: float | None = self.kwargs["metadata"].get("metres_per_unit")
         self.step = 0
         self.plan(PAPER_ITERATIONS)
 
-    def _refuse_missing_cues(self) -> None:
-        cues = self.config.cues
-        if cues != "none" and cues not in self.kwargs["metadata"]["cues"]:
+    def _refuse_what_cannot_be(self) -> None:
+        config = self.config
+        if config.primitive == "3d" and (config.depth == "median" or config.extra.distortion > 0):
+            raise SceneError("median depth and distortion are those of discs: set pipeline.model.primitive to 2d")
+        if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
+            method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
             raise SceneError(
-                f"shellgs needs the {cues} maps of the scene, and there are none: run `shellgs cast SCENE` first, "
-                "or train photo-gs"
+                f"{method} needs the {config.cues} maps of the scene, and there are none: "
+                f"run `shellgs {command} SCENE` first, or train photo-gs"
             )
 
     def _seed_points(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
         if self.seed_points is None or len(self.seed_points[0]) < 4:
             raise SceneError("The scene has no SfM points to start from: its COLMAP model or ply_file_path is empty.")
-        return self.seed_points[0].float(), self.seed_points[1].float() / 255
+        points, colours = self.seed_points[0].float(), self.seed_points[1].float() / 255
+        if self.config.densification == "mcmc":
+            kept = torch.randperm(len(points))[: self.config.mcmc.cap_max]
+            points, colours = points[kept], colours[kept]
+        return points, colours
 
     def plan(self, num_iterations: int) -> None:
         """Fit every schedule to a run of ``num_iterations``."""
         self.num_iterations = num_iterations
-        config, shrink = self.config, num_iterations / PAPER_ITERATIONS
+        self.strategy = self._strategy(num_iterations / PAPER_ITERATIONS)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+
+    def _strategy(self, shrink: float) -> DefaultStrategy | MCMCStrategy:
+        """The densification, of a run that is ``shrink`` times as long as the config's."""
+        config = self.config
+        start, stop = round(config.warmup_length * shrink), round(config.stop_split_at * shrink)
+        # As it is: a Gaussian that was just split needs its time to settle in a short run too, or all split again.
+        every = config.refine_every
+        if config.densification == "mcmc":
+            return MCMCStrategy(config.mcmc.cap_max, start, stop, every, config.mcmc.noise)
         reset_every = config.reset_alpha_every * config.refine_every
-        self.strategy = DefaultStrategy(
+        return DefaultStrategy(
+            refine_start_iter=start,
+            refine_stop_iter=stop,
+            refine_every=every,
             prune_opa=config.cull_alpha_thresh,
             grow_grad2d=config.densify_grad_thresh,
             grow_scale3d=config.densify_size_thresh,
@@ -173,14 +188,10 @@ class FacadeModel(SplatfactoModel):
             prune_scale3d=config.cull_scale_thresh,
             prune_scale2d=config.cull_screen_size,
             refine_scale2d_stop_iter=round(config.stop_screen_size_at * shrink),
-            refine_start_iter=round(config.warmup_length * shrink),
-            refine_stop_iter=round(config.stop_split_at * shrink),
             reset_every=max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every)),
-            # As it is: a Gaussian that was just split needs its time to settle in a short run too, or all split again.
-            refine_every=config.refine_every,
             absgrad=config.use_absgrad,
+            key_for_gradient="gradient_2dgs" if config.primitive == "2d" else "means2d",
         )
-        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def get_training_callbacks(self, training_callback_attributes):
         """Splatfacto's callbacks; the trainer tells how long the run is."""
@@ -193,6 +204,8 @@ class FacadeModel(SplatfactoModel):
         """Densify and prune. gsplat 1.4 would reset the opacities at step 0 already."""
         if step > 0:
             super().step_post_backward(step)
+        if self.config.primitive == "2d":  # a split takes its share of all scales
+            self.scales.data[:, 2] = DISC_LOG_THICKNESS
 
     def load_state_dict(self, dict, **kwargs):
         """Load in place: the optimizers, built before, must go on holding the same parameters."""
@@ -209,10 +222,10 @@ class FacadeModel(SplatfactoModel):
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:
             return cast(dict[str, Tensor], self.get_empty_outputs(pinhole.width, pinhole.height, background))
-        with_geometry = self.config.cues != "none" or not self.training
+        with_geometry = not self.training or self._supervises_geometry
         features = [self._colours(gaussians, pinhole)]
         if with_geometry:
-            features += [*facing_normals_and_depths(gaussians, pinhole)]
+            features += geometry_channels(gaussians, pinhole, self.config.depth)
         composited, alpha, self.info = rasterize(
             gaussians["means"],
             gaussians["quats"],
@@ -220,6 +233,7 @@ class FacadeModel(SplatfactoModel):
             gaussians["opacities"].sigmoid().squeeze(-1),
             torch.cat(features, dim=-1),
             pinhole,
+            self.config.primitive,
         )
         if self.training:
             self.strategy.step_pre_backward(
@@ -230,11 +244,17 @@ class FacadeModel(SplatfactoModel):
             "accumulation": alpha,
             "background": background if self.training else background.expand(pinhole.height, pinhole.width, 3),
         }
+        self.geometry = None
         if with_geometry:
-            depth = composited[..., 6:7] / alpha.clamp_min(1e-6)
-            outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
-            outputs["normal"] = normals_to_colours(nn.functional.normalize(composited[..., 3:6], dim=-1))
+            self.geometry = rendered_geometry(composited[..., 3:], alpha, self.info, pinhole, self.config.depth)
+            outputs["depth"] = self.geometry.depth
+            outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
         return outputs
+
+    @property
+    def _supervises_geometry(self) -> bool:
+        extra = self.config.extra
+        return self.config.cues != "none" or extra.agreement > 0 or extra.distortion > 0
 
     def _inside_crop(self) -> dict[str, Tensor]:
         """The Gaussians, or in the viewer those inside its crop box."""
@@ -258,29 +278,28 @@ class FacadeModel(SplatfactoModel):
         return {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """R, and D, N and C where the view has a map of the cue (paper, equation of section 3.4)."""
+        """R, and the terms of the geometry last rendered: those of a cue where the view has its map."""
+        config, progress = self.config, self.step / self.num_iterations
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         kept = batch["mask"].to(self.device) if "mask" in batch else None
-        losses = {"photometric": photometric_loss(outputs["rgb"], target, kept, self.config.ssim_lambda)}
-        if f"{self.config.cues}_depth" in batch:
-            losses |= self._geometry_losses(outputs, _reference(batch, self.config.cues, self.device))
-        return losses
+        losses = {"photometric": photometric_loss(outputs["rgb"], target, kept, config.ssim_lambda)}
+        if self.geometry is not None:
+            losses |= self_losses(self.geometry, config.extra, progress)
+            if f"{config.cues}_depth" in batch:
+                cue = _reference(batch, config.cues, self.device)
+                losses |= cue_losses(self.geometry, cue, config.geometry, config.extra, progress, self.metres_per_unit)
+        return losses | self._shape_losses()
 
-    def _geometry_losses(self, outputs: dict[str, Tensor], cue: Reference) -> dict[str, Tensor]:
-        weights, progress = self.config.geometry, self.step / self.num_iterations
-        mask = cue.mask
-        inverse_depth = 1 / outputs["depth"].clamp_min(1e-6)
-        normal = colours_to_normals(outputs["normal"])
-        ncc = {"local": partial(ncc_loss, window=weights.ncc_window, eps=weights.ncc_eps), "vid2sim": vid2sim_ncc_loss}[
-            weights.ncc
-        ]
-        terms = {
-            "depth": lambda: ncc(inverse_depth, torch.where(mask, 1 / cue.depth, 0.0), mask),
-            "normal": lambda: normal_loss(normal, cue.normal, mask),
-            "consistency": lambda: consistency_loss(normal, cue.depth, mask),
-        }
-        scheduled = {name: getattr(weights, name)(progress) for name in terms}
-        return {name: scheduled[name] * term() for name, term in terms.items() if scheduled[name] > 0}
+    def _shape_losses(self) -> dict[str, Tensor]:
+        """Terms of the Gaussians themselves, wherever they are seen from."""
+        config, losses = self.config, {}
+        if config.extra.flattening > 0:
+            visible = (self.info["radii"][0] > 0).view(self.num_points, -1).all(dim=-1)
+            losses["flattening"] = config.extra.flattening * flattening_loss(self.scales.exp(), visible)
+        if config.densification == "mcmc":
+            losses["opacity"] = config.mcmc.opacity * self.opacities.sigmoid().mean()
+            losses["scale"] = config.mcmc.scale * self.scales.exp().mean()
+        return losses
 
     @torch.no_grad()
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
@@ -322,19 +341,3 @@ def pinhole_camera(camera: Cameras) -> Camera:
     viewmat[:3, 3] = -rotation @ pose[:, 3]
     K = camera.get_intrinsics_matrices()[0].to(pose.device)
     return Camera(viewmat, K, int(camera.width[0]), int(camera.height[0]))
-
-
-def facing_normals_and_depths(
-    gaussians: dict[str, Tensor], camera: Camera
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"]]:
-    """Normal of each Gaussian in the camera frame, facing the camera, and forward depth of its centre.
-
-    The normal of a Gaussian is its shortest axis.
-    """
-    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    centres = gaussians["means"] @ rotation.T + translation
-    shortest = gaussians["scales"].argmin(dim=-1)
-    axes = quats_to_rotations(gaussians["quats"])
-    normals = axes[torch.arange(len(axes), device=axes.device), :, shortest] @ rotation.T
-    away = (normals * centres).sum(dim=-1, keepdim=True) > 0
-    return torch.where(away, -normals, normals), centres[:, 2:]

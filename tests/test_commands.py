@@ -84,9 +84,9 @@ def test_ns_render_writes_pictures_of_every_output(demo, tmp_path):
 
 
 def test_ns_train_lists_the_methods_and_describes_their_settings(tmp_path):
-    assert {"shellgs", "photo-gs"} <= set(run("ns-train", "--help", cwd=tmp_path).split())
+    assert {"shellgs", "mono-gs", "photo-gs", "2dgs"} <= set(run("ns-train", "--help", cwd=tmp_path).split())
     described = run("ns-train", "shellgs", "--help", cwd=tmp_path)
-    assert "--pipeline.model.geometry.depth.initial" in described
+    assert {"--pipeline.model.geometry.depth.initial", "--pipeline.model.primitive"} <= set(described.split())
     assert "facade-data" in described
 
 

@@ -13,10 +13,13 @@ from torch.autograd import gradcheck
 from dataparsers.camera import Camera
 from shellgs_method.losses import (
     ExponentialDecay,
+    agreement_loss,
     consistency_loss,
+    flattening_loss,
     ncc_loss,
     normal_loss,
     photometric_loss,
+    point_to_plane_loss,
     vid2sim_ncc_loss,
 )
 
@@ -277,6 +280,71 @@ def test_photometric_loss_sends_no_gradient_to_pixels_left_out(random):
 
 
 # all of them
+
+
+# Beyond the paper
+
+
+def slanted_wall(depth: float, yaw: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Depth, normals and rays of a wall that the optical axis meets at ``depth``, turned by ``yaw``."""
+    K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+    rays = Camera(torch.eye(4, dtype=torch.float64), K, WIDTH, HEIGHT).rays()
+    normal = torch.tensor([math.sin(yaw), 0.0, -math.cos(yaw)], dtype=torch.float64)
+    z = depth * normal[2] / (rays @ normal)[..., None]
+    return z, normal.expand(HEIGHT, WIDTH, 3), rays
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.2])
+def test_point_to_plane_is_the_distance_of_two_parallel_walls(yaw):
+    """Whatever the angle they are seen at: 0.3 units apart along the axis are 0.3 cos(yaw) apart."""
+    target, normal, rays = slanted_wall(8.0, yaw)
+    loss = point_to_plane_loss(
+        slanted_wall(8.3, yaw)[0],
+        target,
+        normal,
+        rays,
+        torch.ones_like(target).bool(),
+        metres_per_unit=2.0,
+        tolerance=0.05,
+    )
+    assert float(loss) == pytest.approx(math.log(1 + 0.6 * math.cos(yaw) - 0.05))
+
+
+def test_point_to_plane_costs_nothing_within_the_tolerance_and_pulls_less_the_farther_away():
+    target, normal, rays = slanted_wall(8.0, 0.5)
+    distances = torch.tensor([0.04, 0.5, 5.0], dtype=torch.float64, requires_grad=True)
+    mask = torch.ones_like(target).bool()
+    losses = [
+        point_to_plane_loss(target - d / math.cos(0.5), target, normal, rays * 0 + rays[7, 8], mask, tolerance=0.05)
+        for d in distances
+    ]
+    near, middle, far = torch.autograd.grad(sum(losses), distances)[0].tolist()  # pyright: ignore
+    assert near == 0
+    assert middle > 3 * far > 0
+
+
+def test_agreement_equals_its_formula_pixel_by_pixel(random):
+    normal, depth_normal = some_normals(random), some_normals(random)
+    alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    expected = np.mean(
+        [1 - alpha[v, u, 0] * (normal[v, u] @ depth_normal[v, u]) for v in range(HEIGHT) for u in range(WIDTH)]
+    )
+    assert float(agreement_loss(normal, depth_normal, alpha)) == pytest.approx(expected)
+
+
+def test_agreement_does_not_make_splats_fade(random):
+    alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64).requires_grad_()
+    normal = some_normals(random).requires_grad_()
+    loss = agreement_loss(normal, some_normals(random), alpha)
+    assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
+
+
+def test_flattening_shrinks_the_thinnest_axis_of_visible_gaussians_alone():
+    scales = torch.tensor([[1.0, 2.0, 3.0], [6.0, 4.0, 5.0], [0.1, 0.1, 0.2]], requires_grad=True)
+    loss = flattening_loss(scales, torch.tensor([True, True, False]))
+    assert loss.item() == 2.5
+    (gradient,) = torch.autograd.grad(loss, scales)
+    assert gradient.tolist() == [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0]]
 
 
 @pytest.mark.parametrize(

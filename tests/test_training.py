@@ -2,41 +2,22 @@
 
 from __future__ import annotations
 
-import copy
 import shutil
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
 import torch
+from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
+from runs import held_out, model_of, render, trainer_of
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
-import method_configs
 from dataparsers.camera import Camera
 from shellgs_method.evaluation import colours_to_normals
-from shellgs_method.model import FacadeModel, facing_normals_and_depths, pinhole_camera
+from shellgs_method.geometry import geometry_channels
+from shellgs_method.model import pinhole_camera
 from shellgs_method.trainer import FacadeTrainer
-
-Method = Literal["shellgs", "photo_gs"]
-
-
-def trainer_of(
-    scene: Path, folder: Path, method: Method = "shellgs", iterations: int = 6, load_dir: Path | None = None
-) -> FacadeTrainer:
-    """A trainer as ns-train sets it up."""
-    config = copy.deepcopy(getattr(method_configs, method).config)
-    config.pipeline.datamanager.data = scene
-    config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
-    config.max_num_iterations, config.load_dir = iterations, load_dir
-    config.steps_per_eval_image = 0
-    config.logging.local_writer.enable = False
-    torch.manual_seed(0)
-    trainer = config.setup()
-    trainer.setup()
-    return trainer
 
 
 @pytest.fixture(scope="module")
@@ -46,20 +27,6 @@ def trained(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> F
     trainer.train()
     trainer.pipeline.eval()
     return trainer
-
-
-def model_of(trainer: FacadeTrainer) -> FacadeModel:
-    model = trainer.pipeline.model
-    assert isinstance(model, FacadeModel)
-    return model
-
-
-def held_out(trainer: FacadeTrainer) -> tuple[Cameras, dict]:
-    return trainer.pipeline.datamanager.fixed_indices_eval_dataloader[0]  # pyright: ignore
-
-
-def render(trainer: FacadeTrainer) -> dict[str, Tensor]:
-    return model_of(trainer).get_outputs_for_camera(held_out(trainer)[0])
 
 
 def test_every_output_of_a_held_out_view_is_an_image(trained):
@@ -102,7 +69,7 @@ def test_the_normal_of_a_gaussian_is_its_shortest_axis_turned_to_the_camera():
     scales = torch.tensor([0.0, -3.0, 1.0]).expand(20, 3)
     means = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (20, 3))).float() + torch.tensor([0, 0, 5.0])
     camera = Camera(torch.eye(4), torch.eye(3), 4, 4)
-    normals, depths = facing_normals_and_depths({"means": means, "quats": quats, "scales": scales}, camera)
+    normals, depths = geometry_channels({"means": means, "quats": quats, "scales": scales}, camera, "expected")
     axis = torch.from_numpy(rotation.as_matrix()[:, :, 1]).float()
     torch.testing.assert_close((normals * axis).sum(dim=-1).abs(), torch.ones(20))
     assert ((normals * means).sum(dim=-1) < 0).all()
@@ -119,6 +86,7 @@ def test_a_nerfstudio_camera_looks_along_minus_z_and_ours_along_plus_z():
 def test_schedules_shrink_with_the_run(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, iterations=3000)
     strategy = model_of(trainer).strategy
+    assert isinstance(strategy, DefaultStrategy)
     assert (strategy.refine_start_iter, strategy.refine_stop_iter) == (50, 1500)
     assert strategy.reset_every == 1000
     scheduler = trainer.optimizers.schedulers["means"]

@@ -1,20 +1,26 @@
 """The terms of the objective: plain differentiable functions of [H, W, C] maps in the camera frame.
 
-L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C consistency. Masks are true where a pixel
-counts; an empty one gives a zero that can be back-propagated.
+L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C consistency; the others are off in the paper's
+setting. Masks are true where a pixel counts; an empty one gives a zero that can be back-propagated.
 """
 
+from shellgs_method.losses.agreement import agreement_loss, flattening_loss
 from shellgs_method.losses.consistency import consistency_loss
 from shellgs_method.losses.depth import ncc_loss, vid2sim_ncc_loss
 from shellgs_method.losses.normal import normal_loss
 from shellgs_method.losses.photometric import photometric_loss
-from shellgs_method.losses.schedules import ExponentialDecay
+from shellgs_method.losses.schedules import PAPER_ITERATIONS, ExponentialDecay
+from shellgs_method.losses.surface import point_to_plane_loss
 
 __all__ = [
+    "PAPER_ITERATIONS",
     "ExponentialDecay",
+    "agreement_loss",
     "consistency_loss",
+    "flattening_loss",
     "ncc_loss",
     "normal_loss",
     "photometric_loss",
+    "point_to_plane_loss",
     "vid2sim_ncc_loss",
 ]

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def weighted_mean(values: Float[Tensor, "H W C"], weights: Tensor) -> Float[Tensor, ""]:
+def weighted_mean(values: Float[Tensor, "*shape"], weights: Tensor) -> Float[Tensor, ""]:
     """Average of ``values`` under non-negative ``weights`` (or a boolean mask) that broadcast to their shape.
 
     A value of no weight has no part in the result, whatever it is. Where all weights are zero the result is a zero

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+PAPER_ITERATIONS = 30_000
+"""The run for which the iteration numbers of configs are stated; a shorter run shrinks them in proportion."""
+
 
 @dataclass(frozen=True)
 class ExponentialDecay:

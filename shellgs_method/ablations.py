@@ -1,0 +1,34 @@
+"""Ablations by name: each is a registered method and the flags that change it, the words after ``ns-train``."""
+
+from __future__ import annotations
+
+
+def _off(*terms: str) -> tuple[str, ...]:
+    return tuple(word for term in terms for word in (f"--pipeline.model.geometry.{term}.initial", "0"))
+
+
+_FLATTENED = ("--pipeline.model.extra.flattening", "100")
+_DISCS = ("--pipeline.model.primitive", "2d", "--pipeline.model.cull-alpha-thresh", "0.05")
+
+ABLATIONS: dict[str, tuple[str, ...]] = {
+    # The paper's: which terms (table of the ablation), and what the baseline has beside them.
+    "shellgs-depth": ("shellgs", *_off("normal", "consistency")),
+    "shellgs-normal": ("shellgs", *_off("depth", "consistency")),
+    "shellgs-depth-normal": ("shellgs", *_off("consistency")),
+    "shellgs-vid2sim": ("shellgs", "--pipeline.model.geometry.ncc", "vid2sim"),
+    "shellgs-flat": ("shellgs", *_FLATTENED),
+    "mono-gs-flat": ("mono-gs", *_FLATTENED),
+    "photo-gs-flat": ("photo-gs", *_FLATTENED),
+    # Beyond the paper, one at a time.
+    "shellgs-2d": ("shellgs", *_DISCS),
+    "shellgs-plane": ("shellgs", "--pipeline.model.depth", "plane"),
+    "shellgs-normals-of-depth": ("shellgs", "--pipeline.model.extra.depth-normal", "0.1"),
+    "shellgs-point-to-plane": ("shellgs", "--pipeline.model.extra.point-to-plane", "1"),
+    "shellgs-occlusion-gate": ("shellgs", "--pipeline.model.extra.occlusion-gate", "0.5"),
+    "shellgs-mcmc": ("shellgs", "--pipeline.model.densification", "mcmc"),
+    # Supervised in half of the facade's bands, measured in the other half.
+    "shellgs-without-a": ("shellgs", "--pipeline.datamanager.holdout", "A"),
+    "shellgs-without-b": ("shellgs", "--pipeline.datamanager.holdout", "B"),
+    "photo-gs-without-a": ("photo-gs", "--pipeline.datamanager.holdout", "A"),
+    "photo-gs-without-b": ("photo-gs", "--pipeline.datamanager.holdout", "B"),
+}

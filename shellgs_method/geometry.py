@@ -1,0 +1,102 @@
+"""What Gaussians say of the surface: the channels they carry, and the depth and normals these composite to.
+
+A disc of 2D Gaussian Splatting is a Gaussian whose third axis has no length: everything here but the depth of its ray
+intersection is the same for both primitives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dataparsers.camera import Camera
+from shellgs_method.evaluation import normals_from_depth
+from shellgs_method.rasterizer import quats_to_rotations
+
+Primitive = Literal["3d", "2d"]
+DepthKind = Literal["expected", "median", "plane"]
+
+DISC_LOG_THICKNESS = -20.0
+"""Logarithm of a disc's third scale: nothing, yet finite in an exported file, and splits stay in the plane."""
+
+GRAZING = 0.01
+"""Least cosine of normal and ray at which a plane depth is taken: a plane seen edge-on is met nowhere near."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Differentiable maps of one rendered view, in the camera frame."""
+
+    depth: Float[Tensor, "H W 1"]
+    """Forward z-depth, positive and finite everywhere; the farthest of the view where nothing was rendered."""
+    normal: Float[Tensor, "H W 3"]
+    """Normals as composited, of length 1 at most."""
+    alpha: Float[Tensor, "H W 1"]
+    """Accumulated opacity."""
+    camera: Camera
+    distortion: Float[Tensor, "H W 1"] | None = None
+    """Spread of the splats along each ray, of discs only."""
+
+    @cached_property
+    def depth_normal(self) -> Float[Tensor, "H W 3"]:
+        """Unit normals of the depth, zero on the image's border."""
+        return normals_from_depth(self.depth, self.camera)
+
+
+def geometry_channels(
+    gaussians: Mapping[str, Tensor], camera: Camera, depth: DepthKind
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"]]:
+    """Of each Gaussian, in the camera frame: its normal, and what its depth is made of.
+
+    The normal is the shortest axis, facing the camera. The other is n·m, which is negative, for plane depth (m the
+    centre), else the forward depth of the centre.
+    """
+    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    centres = gaussians["means"] @ rotation.T + translation
+    shortest = gaussians["scales"].argmin(dim=-1)
+    axes = quats_to_rotations(gaussians["quats"])
+    normals = axes[torch.arange(len(axes), device=axes.device), :, shortest] @ rotation.T
+    along = (normals * centres).sum(dim=-1, keepdim=True)
+    normals = torch.where(along > 0, -normals, normals)
+    return normals, -along.abs() if depth == "plane" else centres[:, 2:]
+
+
+def rendered_geometry(
+    composited: Float[Tensor, "H W 4"],
+    alpha: Float[Tensor, "H W 1"],
+    info: Mapping[str, Any],
+    camera: Camera,
+    depth: DepthKind,
+) -> Geometry:
+    """Depth and normals of a view from the composite of :func:`geometry_channels`.
+
+    * ``expected``: mean depth of the Gaussians' centres; of discs, alpha / Σ w/z of the ray's intersections.
+    * ``median``: discs only, the intersection where half of the light has been stopped; where it never is, expected.
+    * ``plane``: Σ w n·m / (Σ w n · ray), the ray's intersection with the composited plane (PGSR, Chen et al. 2024).
+
+    Args:
+        composited: normals and the depth channel.
+        alpha: accumulated opacity.
+        info: what the rasterizer returned beside them.
+        camera: of the view.
+        depth: which depth; the channel must have been made for it.
+    """
+    normal, channel = composited.split([3, 1], dim=-1)
+    solid = alpha.clamp_min(1e-6)
+    if depth == "plane":
+        facing = (normal * camera.rays()).sum(dim=-1, keepdim=True)
+        z = channel / facing.minimum(-GRAZING * solid)
+    elif "inverse_depth" in info:
+        z = alpha / info["inverse_depth"].clamp_min(1e-9)
+        if depth == "median":
+            z = torch.where(info["median_depth"] > 0, info["median_depth"], z)
+    else:
+        z = channel / solid
+    z = torch.where(alpha > 0, z, z.detach().max())
+    return Geometry(z, normal, alpha, camera, info.get("distortion"))

@@ -1,0 +1,29 @@
+"""Terms that need no cue: the rendered geometry against itself, and the shape of the Gaussians."""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from shellgs_method.losses.reduction import weighted_mean
+
+
+def agreement_loss(
+    normal: Float[Tensor, "H W 3"], depth_normal: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]
+) -> Float[Tensor, ""]:
+    """Mean of 1 - <N, A n>: composited normals against those of the rendered depth (Huang et al. 2024, eq. 14).
+
+    Their opacity A only weights: no gradient goes through it. N is taken as composited, so that splats behind one
+    another gain by agreeing.
+
+    Args:
+        normal: N, composited and not normalised.
+        depth_normal: n, unit normals of the rendered depth, zero where there are none.
+        alpha: A.
+    """
+    return (1 - (normal * depth_normal * alpha.detach()).sum(dim=-1)).mean()
+
+
+def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> Float[Tensor, ""]:
+    """Mean of the smallest standard deviation of the visible Gaussians, in the units of the scales."""
+    return weighted_mean(scales.amin(dim=-1), visible)

@@ -1,0 +1,160 @@
+"""MCMC densification against its equation in float64, and the laws that make it leave the picture as it is."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
+from torch import nn
+
+from dataparsers.camera import Camera
+from shellgs_method.densification import MAX_COPIES, MCMCStrategy, relocated
+from shellgs_method.rasterizer import rasterize
+
+CASES = [(0.01, 2), (0.3, 3), (0.9, 7), (0.999, 20), (0.5, MAX_COPIES)]
+
+
+def one(opacity: float, copies: int) -> tuple[float, float]:
+    """Opacity and scale factor of one case."""
+    opacities, factors = relocated(torch.tensor([opacity], dtype=torch.float64), torch.tensor([copies]))
+    return float(opacities), float(factors)
+
+
+@pytest.mark.parametrize(("opacity", "copies"), CASES)
+def test_relocation_equals_equation_9(opacity, copies):
+    new = 1 - (1 - opacity) ** (1 / copies)
+    double_sum = math.fsum(
+        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+        for i in range(1, copies + 1)
+        for k in range(i)
+    )
+    assert one(opacity, copies) == pytest.approx((new, opacity / double_sum), rel=1e-8)
+
+
+@pytest.mark.parametrize(("opacity", "copies"), CASES)
+def test_copies_in_one_place_are_as_opaque_in_the_middle_and_in_sum(opacity, copies):
+    new, factor = one(opacity, copies)
+    assert 1 - (1 - new) ** copies == pytest.approx(opacity)
+    together, _ = quad(lambda x: 1 - (1 - new * math.exp(-0.5 * (x / factor) ** 2)) ** copies, -40, 40, points=[0])
+    assert together == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-6)
+
+
+def test_an_opaque_gaussian_can_be_divided():
+    opacities, factors = relocated(torch.ones(MAX_COPIES), torch.arange(1, MAX_COPIES + 1))
+    assert ((opacities > 0) & (opacities < 1)).all()
+    assert ((factors > 0) & (factors <= 1 + 1e-5)).all()
+
+
+def gaussians(n: int, opacity: float = 0.6) -> nn.ParameterDict:
+    random = torch.Generator().manual_seed(0)
+    return nn.ParameterDict(
+        {
+            "means": torch.rand(n, 3, generator=random) * 4 + torch.tensor([-2.0, -2.0, 4.0]),
+            "scales": torch.randn(n, 3, generator=random) * 0.3 - 2,
+            "quats": torch.randn(n, 4, generator=random),
+            "opacities": torch.full((n, 1), math.log(opacity / (1 - opacity))),
+        }
+    )
+
+
+def stepped(params: nn.ParameterDict, lr: float = 0.0) -> dict[str, torch.optim.Optimizer]:
+    """Optimizers that have moments."""
+    optimizers: dict[str, torch.optim.Optimizer] = {
+        name: torch.optim.Adam([parameter], lr=lr) for name, parameter in params.items()
+    }
+    for name, parameter in params.items():
+        parameter.grad = torch.ones_like(parameter)
+        optimizers[name].step()
+    return optimizers
+
+
+def strategy(cap: int = 1000, growth: float = 0.05) -> MCMCStrategy:
+    return MCMCStrategy(cap, refine_start_iter=0, refine_stop_iter=100, refine_every=1, growth=growth)
+
+
+def step(strategy: MCMCStrategy, params: nn.ParameterDict, optimizers: dict, at: int = 1) -> None:
+    strategy.step_post_backward(params, optimizers, strategy.initialize_state(), at, {})
+
+
+def test_gaussians_are_added_up_to_the_cap():
+    params = gaussians(100)
+    optimizers = stepped(params)
+    counts = []
+    for at in range(1, 5):
+        step(strategy(cap=112), params, optimizers, at)
+        counts.append(len(params["means"]))
+    assert counts == [105, 110, 112, 112]
+
+
+def test_optimizers_hold_the_new_parameters_and_can_step():
+    params = gaussians(100)
+    optimizers = stepped(params, lr=0.01)
+    step(strategy(), params, optimizers)
+    for name, parameter in params.items():
+        (group,) = optimizers[name].param_groups
+        assert group["params"][0] is parameter
+        assert optimizers[name].state[parameter]["exp_avg"].shape == parameter.shape
+        parameter.grad = torch.ones_like(parameter)
+        optimizers[name].step()
+
+
+def test_divided_gaussians_start_without_momentum():
+    params = gaussians(100)
+    optimizers = stepped(params)
+    step(strategy(), params, optimizers)
+    still = (optimizers["means"].state[params["means"]]["exp_avg"] == 0).all(dim=-1)
+    assert still[100:].all()
+    assert 0 < int(still[:100].sum()) <= 5
+
+
+def test_a_faint_gaussian_is_moved_onto_one_that_is_seen():
+    params = gaussians(100)
+    with torch.no_grad():
+        params["opacities"][:10] = -10.0
+    optimizers = stepped(params)
+    before = params["means"].detach().clone()
+    step(strategy(cap=100), params, optimizers)
+    same_place = (params["means"].detach()[:10, None] == before[None, 10:]).all(dim=-1)
+    assert same_place.any(dim=1).all()
+    assert params["opacities"].sigmoid().min() > 0.1
+
+
+def test_dividing_hardly_changes_the_picture(eager):
+    """Exactly, where a splat is alone, in 1D; that of the screen is 2D and splats overlap."""
+    camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), 40, 40)
+
+    def opacity_of(params: nn.ParameterDict) -> torch.Tensor:
+        means, quats, scales = (params[name].detach() for name in ("means", "quats", "scales"))
+        opacities = params["opacities"].detach().sigmoid().squeeze(-1)
+        return rasterize(means, quats, scales.exp(), opacities, torch.ones_like(means), camera)[1]
+
+    params = gaussians(30, opacity=0.3)
+    before = opacity_of(params)
+    step(strategy(growth=0.5), params, stepped(params))
+    assert len(params["means"]) == 45
+    assert (opacity_of(params) - before).abs().mean() < 0.02
+
+
+def test_noise_has_a_gaussians_own_shape_and_spares_opaque_ones():
+    n = 20_000
+    params = gaussians(n, opacity=0.001)
+    rotation = Rotation.from_rotvec([0.3, -0.5, 0.8])
+    with torch.no_grad():
+        params["quats"][:] = torch.from_numpy(rotation.as_quat()[[3, 0, 1, 2]]).float()
+        params["scales"][:] = torch.tensor([0.5, 0.2, 0.1]).log()
+        params["opacities"][0] = 5.0
+    before = params["means"].detach().clone()
+    torch.manual_seed(0)
+    optimizers = stepped(params)
+    optimizers["means"].param_groups[0]["lr"] = 1e-5
+    step(strategy(), params, optimizers, at=100)  # outside the window: noise alone
+    moved = params["means"].detach() - before
+    axes = torch.from_numpy(rotation.as_matrix()).float()
+    # Noise is the covariance, squares of the scales, times white noise; 5e5 · 1e-5 · 1 / (1 + exp(100 (0.001 - 0.005)))
+    size = 5 / (1 + math.exp(-0.4))
+    expected = size * torch.tensor([0.25, 0.04, 0.01])
+    torch.testing.assert_close((moved[1:] @ axes).std(dim=0), expected, rtol=0.03, atol=0)
+    assert moved[0].abs().max() < 1e-6

@@ -1,0 +1,108 @@
+"""Depth and normals of Gaussians and discs that lie on a wall, whose depth is known in closed form."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from dataparsers.camera import Camera
+from shellgs_method.geometry import (
+    DISC_LOG_THICKNESS,
+    DepthKind,
+    Geometry,
+    Primitive,
+    geometry_channels,
+    rendered_geometry,
+)
+from shellgs_method.rasterizer import rasterize
+
+CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]), width=40, height=30)
+
+
+def wall(yaw: float) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """Flat Gaussians side by side on a wall 5 ahead that is turned by ``yaw``, and the wall's normal."""
+    x, y = torch.meshgrid(torch.linspace(-6, 6, 41), torch.linspace(-3, 3, 21), indexing="ij")
+    on_wall = torch.stack([x.flatten(), y.flatten(), torch.zeros(x.numel())], dim=-1)
+    turn = Rotation.from_euler("y", yaw)
+    w, z = math.cos(yaw / 2), math.sin(yaw / 2)
+    rotation = torch.from_numpy(turn.as_matrix()).float()
+    gaussians = {
+        "means": on_wall @ rotation.T + torch.tensor([0.0, 0.0, 5.0]),
+        "quats": torch.tensor([w, 0.0, z, 0.0]).repeat(len(on_wall), 1),
+        "scales": torch.tensor([0.3, 0.3, 1e-4]).log().repeat(len(on_wall), 1),
+    }
+    return gaussians, -rotation[:, 2]
+
+
+def render(
+    gaussians: dict[str, torch.Tensor], primitive: Primitive, depth: DepthKind, opacity: float = 0.9
+) -> Geometry:
+    channels = torch.cat(geometry_channels(gaussians, CAMERA, depth), dim=-1)
+    opacities = torch.full((len(channels),), opacity)
+    means, quats, scales = (gaussians[name] for name in ("means", "quats", "scales"))
+    composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, CAMERA, primitive)
+    return rendered_geometry(composited, alpha, info, CAMERA, depth)
+
+
+def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:
+    """Distance from the wall's depth, as a share of it, where the wall is opaque."""
+    exact = 5 * normal[2] / (geometry.camera.rays() @ normal)[..., None]
+    return ((geometry.depth - exact) / exact).abs()[geometry.alpha > 0.9]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.9])
+@pytest.mark.parametrize(
+    ("primitive", "depth"), [("2d", "expected"), ("2d", "median"), ("2d", "plane"), ("3d", "plane")]
+)
+def test_depths_that_meet_the_ray_are_those_of_the_wall(eager, primitive, depth, yaw):
+    gaussians, normal = wall(yaw)
+    assert error(render(gaussians, primitive, depth), normal).max() < 1e-4
+
+
+def test_the_depth_of_centres_is_off_where_a_wall_recedes(eager):
+    gaussians, normal = wall(0.9)
+    assert error(render(gaussians, "3d", "expected"), normal).max() > 0.01
+
+
+@pytest.mark.parametrize("primitive", ["2d", "3d"])
+def test_normals_of_a_wall_and_of_its_depth_are_its_own(eager, primitive):
+    gaussians, normal = wall(0.9)
+    geometry = render(gaussians, primitive, "plane")
+    opaque = (geometry.alpha > 0.9)[..., 0]
+    torch.testing.assert_close(geometry.normal[opaque] / geometry.alpha[opaque], normal.expand(int(opaque.sum()), 3))
+    inner = torch.zeros_like(opaque)
+    inner[1:-1, 1:-1] = opaque[1:-1, 1:-1] & opaque[1:-1, 2:] & opaque[1:-1, :-2]
+    known = geometry.depth_normal[inner & (geometry.depth_normal != 0).any(-1)]
+    assert len(known) > 300
+    assert ((known @ normal) > 0.999).float().mean() > 0.95  # but for those with a neighbour off the wall
+
+
+@pytest.mark.parametrize(("depth", "moves"), [("plane", True), ("expected", False)])
+def test_plane_depth_depends_on_where_gaussians_are_turned(depth, moves):
+    """It couples depth and normals; the depth of centres does not see a Gaussian turn."""
+    gaussians, _ = wall(0.5)
+    gaussians["quats"].requires_grad_()
+    assert geometry_channels(gaussians, CAMERA, depth)[1].requires_grad == moves
+
+
+def test_a_faint_disc_has_an_expected_depth_where_it_has_no_median(eager):
+    gaussians, _ = wall(0.0)
+    one = {name: value[430:431] for name, value in gaussians.items()}  # the middle one
+    geometry = render(one, "2d", "median", opacity=0.3)
+    seen = geometry.alpha > 0
+    assert geometry.alpha.max() < 0.5
+    torch.testing.assert_close(geometry.depth[seen], torch.full_like(geometry.depth[seen], 5.0))
+
+
+def test_depth_is_positive_and_finite_where_planes_are_seen_edge_on(eager):
+    gaussians, _ = wall(math.pi / 2 - 1e-3)
+    geometry = render(gaussians, "3d", "plane")
+    assert geometry.depth.isfinite().all()
+    assert (geometry.depth > 0).all()
+
+
+def test_the_thickness_of_a_disc_is_finite_in_float32():
+    assert 0 < float(torch.tensor(DISC_LOG_THICKNESS).exp()) < 1e-8

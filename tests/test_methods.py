@@ -1,0 +1,369 @@
+"""The registered methods, the named ablations and the switches beyond the paper, inside nerfstudio."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import tyro
+import yaml
+from nerfstudio.scripts.exporter import ExportGaussianSplat
+from runs import data_of, held_out, model_of, render, trainer_of
+from torch.nn.functional import normalize
+
+import method_configs
+from dataparsers.cue_maps import CueMap, CueMaps
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.ablations import ABLATIONS
+from shellgs_method.evaluation import Reference
+from shellgs_method.geometry import DISC_LOG_THICKNESS
+from shellgs_method.losses import ExponentialDecay
+from shellgs_method.rasterizer import quats_to_rotations
+from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses
+
+pytestmark = pytest.mark.usefixtures("eager")
+
+METHODS = {"shellgs": "shellgs", "mono-gs": "mono_gs", "photo-gs": "photo_gs", "2dgs": "two_dgs"}
+
+
+@pytest.fixture
+def mono_scene(scene: Path) -> Path:
+    """The scene with the truth as what a perfect network sees, and no shell."""
+    truth = CueMaps.open(scene, "truth")
+    mono = CueMaps.create(scene, "mono", command="shellgs mono {scene}")
+    for view in read_views(FacadeDataParserConfig(data=scene)):
+        cue = truth.read(view.name, view.camera)
+        assert cue is not None
+        mono.write(view.name, CueMap(cue.depth, cue.normal, cue.mask), view.camera)
+    shutil.rmtree(scene / "cues" / "shell")
+    return scene
+
+
+# The registry
+
+
+def test_the_four_methods_are_registered_by_their_names():
+    toml = pytest.importorskip("tomllib", reason="Python 3.11")
+    project = toml.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
+    entries = project["entry-points"]["nerfstudio.method_configs"]
+    assert set(entries) == set(METHODS)
+    for name, entry in entries.items():
+        module, attribute = entry.split(":")
+        assert getattr(import_module(module), attribute).config.method_name == name
+
+
+def test_the_methods_are_points_of_primitive_and_cues():
+    models = {name: getattr(method_configs, attribute).config.pipeline.model for name, attribute in METHODS.items()}
+    assert {name: (model.primitive, model.cues) for name, model in models.items()} == {
+        "shellgs": ("3d", "shell"),
+        "mono-gs": ("3d", "mono"),
+        "photo-gs": ("3d", "none"),
+        "2dgs": ("2d", "none"),
+    }
+
+
+def parsed(words: tuple[str, ...]):
+    """The config that ns-train makes of a method and its flags."""
+    default = copy.deepcopy(getattr(method_configs, METHODS[words[0]]).config)
+    return tyro.cli(type(default), default=default, args=words[1:])
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("shellgs-depth", {"depth"}),
+        ("shellgs-normal", {"normal"}),
+        ("shellgs-depth-normal", {"depth", "normal"}),
+    ],
+)
+def test_an_ablation_leaves_out_the_terms_it_does_not_name(name, kept):
+    geometry = parsed(ABLATIONS[name]).pipeline.model.geometry
+    assert {term for term in ("depth", "normal", "consistency") if getattr(geometry, term)(0.5) > 0} == kept
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_an_ablation_is_a_registered_method_with_something_changed(name):
+    config = parsed(ABLATIONS[name])
+    assert config.pipeline != getattr(method_configs, METHODS[ABLATIONS[name][0]]).config.pipeline
+
+
+def test_a_config_file_from_before_the_settings_beyond_the_paper_still_loads():
+    stored = yaml.load(
+        "!!python/object:shellgs_method.model.FacadeModelConfig\n"
+        "cues: shell\n"
+        "geometry: !!python/object:shellgs_method.model.GeometryLossConfig\n"
+        "  ncc: local\n",
+        Loader=yaml.UnsafeLoader,
+    )
+    assert isinstance(stored.geometry, GeometryLossConfig)
+    assert stored.extra == ExtraLossConfig()
+    assert (stored.primitive, stored.depth, stored.densification) == ("3d", "expected", "default")
+
+
+# 2dgs
+
+
+@pytest.fixture(scope="module")
+def discs(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory):
+    """A 2dgs run of 30 iterations that densifies every 5 from the third on."""
+
+    def densify(config):
+        model = config.pipeline.model
+        model.warmup_length, model.refine_every, model.densify_grad_thresh = 2000, 5, 1e-6
+        model.densify_size_thresh = 1e-3
+        model.extra = ExtraLossConfig(agreement=0.05, agreement_from=0, distortion=10.0, distortion_from=0)
+
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "two_dgs", iterations=30, change=densify)
+    trainer.train()
+    trainer.pipeline.eval()
+    return trainer
+
+
+def test_2dgs_trains_to_more_discs_of_no_thickness(discs):
+    model = model_of(discs)
+    assert model.num_points > 320
+    assert (model.scales[:, 2] == DISC_LOG_THICKNESS).all()
+    assert all(parameter.isfinite().all() for parameter in model.gauss_params.values())
+
+
+def test_a_disc_splits_within_its_plane(discs):
+    """Gsplat's own split, on what the model gives it: children are scattered along the first two axes alone."""
+    model = model_of(discs)
+    params = torch.nn.ParameterDict({name: value.detach().clone() for name, value in model.gauss_params.items()})
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    n = model.num_points
+    state = {"grad2d": torch.ones(n), "count": torch.ones(n), "scene_scale": 0.0}  # all are large: all split
+    duplicated, split = model.strategy._grow_gs(params, optimizers, state, step=1)  # pyright: ignore
+    assert (duplicated, split) == (0, n)
+    offsets = params["means"].detach().view(2, n, 3) - model.means.detach()
+    axes = quats_to_rotations(model.quats.detach())
+    u, v, w = ((offsets * axes[..., i]).sum(-1) / model.scales.detach()[:, :2].exp().amax(-1) for i in range(3))
+    assert u.abs().median() > 0.1
+    assert v.abs().median() > 0.1
+    assert w.abs().max() < 1e-3
+
+
+def test_the_normal_of_a_disc_is_its_third_axis(discs):
+    assert (model_of(discs).scales.argmin(dim=-1) == 2).all()
+
+
+def test_2dgs_renders_images_and_has_its_own_losses(discs):
+    outputs, (_, batch) = render(discs), held_out(discs)
+    assert {name: image.shape[2] for name, image in outputs.items()} == {
+        "rgb": 3,
+        "accumulation": 1,
+        "background": 3,
+        "depth": 1,
+        "normal": 3,
+    }
+    assert all(image.isfinite().all() for image in outputs.values())
+    losses = model_of(discs).get_loss_dict(outputs, batch)
+    assert losses.keys() == {"photometric", "agreement", "distortion"}
+
+
+def test_the_terms_of_2dgs_start_when_they_are_to(discs):
+    model, (_, batch) = model_of(discs), held_out(discs)
+    outputs, extra = render(discs), model.config.extra
+    model.config.extra = ExtraLossConfig(agreement=0.05, distortion=10.0)  # from 7000 and 3000 of 30 000
+    terms = []
+    for model.step in (2, 3, 6, 7):  # of 30
+        terms.append(model.get_loss_dict(outputs, batch).keys() - {"photometric"})
+    model.config.extra = extra
+    assert terms == [set(), {"distortion"}, {"distortion"}, {"distortion", "agreement"}]
+
+
+def test_exported_discs_are_finite(discs, tmp_path, monkeypatch):
+    monkeypatch.setattr("nerfstudio.scripts.exporter.eval_setup", lambda *_, **__: (None, discs.pipeline, None, None))
+    ExportGaussianSplat(load_config=Path(), output_dir=tmp_path).main()
+    data = (tmp_path / "splat.ply").read_bytes().split(b"end_header\n")[1]
+    values = np.frombuffer(data, np.float32).reshape(model_of(discs).num_points, -1)
+    assert np.isfinite(values).all()
+
+
+def test_distortion_of_3d_gaussians_is_refused(pristine_scene, tmp_path):
+    def ask(config):
+        config.pipeline.model.extra = ExtraLossConfig(distortion=1.0)
+
+    with pytest.raises(SystemExit, match=r"set pipeline\.model\.primitive to 2d"):
+        trainer_of(pristine_scene, tmp_path, change=ask)
+
+
+# Primitive x cues
+
+
+def test_discs_take_the_shells_cues(pristine_scene, tmp_path):
+    def discs(config):
+        config.pipeline.model.primitive = "2d"
+
+    trainer = trainer_of(pristine_scene, tmp_path, iterations=20, change=discs)
+    before = _normal_error(trainer)
+    trainer.train()
+    assert _normal_error(trainer) < before - 1
+    trainer.pipeline.eval()
+    losses = model_of(trainer).get_loss_dict(render(trainer), held_out(trainer)[1])
+    assert losses.keys() == {"photometric", "depth", "normal", "consistency"}
+
+
+def test_mono_gs_learns_from_mono_maps_without_a_shell(mono_scene, tmp_path):
+    trainer = trainer_of(mono_scene, tmp_path, "mono_gs", iterations=20)
+    _, batch = held_out(trainer)
+    before = _normal_error(trainer, "truth")
+    trainer.train()
+    assert _normal_error(trainer, "truth") < before - 1
+    trainer.pipeline.eval()
+    assert model_of(trainer).get_loss_dict(render(trainer), batch).keys() >= {"depth", "normal", "consistency"}
+
+
+def test_mono_gs_without_its_maps_ends_with_one_sentence(scene, tmp_path):
+    with pytest.raises(SystemExit, match=r"mono-gs needs the mono maps .* run `shellgs mono SCENE`"):
+        trainer_of(scene, tmp_path, "mono_gs")
+
+
+def _normal_error(trainer, reference: str = "shell") -> float:
+    trainer.pipeline.eval()
+    figures, _ = model_of(trainer).get_image_metrics_and_images(render(trainer), held_out(trainer)[1])
+    trainer.pipeline.train()
+    return figures["normal_deg" if reference == "shell" else f"{reference}_normal_deg"]
+
+
+# Switches beyond the paper
+
+NONE = ExponentialDecay(0, 0)
+OFF = GeometryLossConfig(NONE, NONE, NONE)
+
+
+@pytest.fixture(scope="module")
+def untrained(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory):
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"))
+    trainer.pipeline.eval()
+    return trainer
+
+
+def rendered(trainer) -> tuple:
+    """Geometry of a training view, with gradients, and the shell's maps."""
+    camera, batch = data_of(trainer).next_train(0)
+    model = model_of(trainer)
+    model(camera)
+    return model.geometry, Reference(batch["shell_depth"], batch["shell_normal"].float(), batch["shell_mask"])
+
+
+def terms(geometry, cue, progress: float = 0.5, paper: GeometryLossConfig = OFF, metres: float | None = 2.0, **extra):
+    return cue_losses(geometry, cue, paper, ExtraLossConfig(**extra), progress, metres)
+
+
+def test_all_switches_are_off_in_the_papers_setting(untrained):
+    geometry, cue = rendered(untrained)
+    assert terms(geometry, cue, paper=GeometryLossConfig()).keys() == {"depth", "normal", "consistency"}
+
+
+def test_the_normals_of_depth_move_gaussians_where_those_composited_hardly_do(untrained):
+    """Shifting all splats of a pixel along its ray does not change N's value; it is what the other term acts on."""
+    geometry, cue = rendered(untrained)
+    (loss,) = terms(geometry, cue, depth_normal=0.1).values()
+    (gradient,) = torch.autograd.grad(loss, geometry.depth, retain_graph=True)
+    assert gradient.abs().sum() > 0
+    (only_n,) = terms(
+        geometry, cue, paper=GeometryLossConfig(OFF.depth, ExponentialDecay(1, 1), OFF.consistency)
+    ).values()
+    assert torch.autograd.grad(only_n, geometry.depth, allow_unused=True) == (None,)
+
+
+def test_point_to_plane_is_in_metres(untrained):
+    geometry, cue = rendered(untrained)
+    shifted = Reference(geometry.depth.detach() + 0.5, cue.normal, torch.ones_like(cue.mask))
+    slope = (normalize(shifted.normal, dim=-1) * geometry.camera.rays()).sum(-1).abs()
+    expected = (2.0 * 0.5 * slope - 0.1).clamp_min(0).log1p().mean()
+    (loss,) = terms(geometry, shifted, point_to_plane=1.0, tolerance=0.1).values()
+    torch.testing.assert_close(loss, expected)
+
+
+def test_the_occlusion_gate_waits_and_then_spares_what_stands_before_the_shell(untrained):
+    geometry, cue = rendered(untrained)
+    distance = torch.zeros_like(geometry.depth)
+    distance[:, ::2] = 0.3  # 60 cm behind what is rendered
+    occluded = Reference(geometry.depth.detach() + distance, cue.normal, torch.ones_like(cue.mask))
+
+    def gated(progress: float, gate: float) -> dict[str, torch.Tensor]:
+        return terms(geometry, occluded, progress, occlusion_gate=gate, point_to_plane=1.0, tolerance=0.0)
+
+    assert gated(progress=0.05, gate=0.5) == {}
+    assert gated(progress=0.15, gate=0.5)["point_to_plane"].item() < 1e-6
+    assert gated(progress=0.15, gate=0.7)["point_to_plane"].item() > 0.1
+
+
+def test_the_flattening_term_is_the_mean_thickness_of_what_the_view_shows(untrained):
+    model = model_of(untrained)
+    model.config.extra = ExtraLossConfig(flattening=100.0)
+    outputs = render(untrained)
+    visible = model.info["radii"][0] > 0
+    loss = model.get_loss_dict(outputs, held_out(untrained)[1])["flattening"]
+    model.config.extra = ExtraLossConfig()
+    assert 0 < int(visible.sum()) < model.num_points
+    torch.testing.assert_close(loss, 100 * model.scales[visible].exp().amin(dim=-1).mean())
+
+
+def test_the_unit_that_flattening_is_in_is_the_size_of_the_camera_path(untrained):
+    """Nerfstudio rescales every scene so, whence the weight means the same in each."""
+    outputs = data_of(untrained).train_dataparser_outputs
+    assert outputs.cameras.camera_to_worlds[:, :, 3].abs().max() == pytest.approx(1, rel=0.2)
+
+
+@pytest.mark.parametrize("depth", ["plane", "median"])
+def test_every_depth_trains(pristine_scene, tmp_path, depth):
+    def choose(config):
+        config.pipeline.model.depth = depth
+        config.pipeline.model.primitive = {"plane": "3d", "median": "2d"}[depth]
+
+    trainer = trainer_of(pristine_scene, tmp_path, iterations=5, change=choose)
+    trainer.train()
+    assert all(parameter.isfinite().all() for parameter in model_of(trainer).gauss_params.values())
+
+
+# MCMC
+
+
+def mcmc(cap: int):
+    def change(config):
+        model = config.pipeline.model
+        model.densification, model.mcmc = "mcmc", type(model.mcmc)(cap_max=cap)
+        model.warmup_length, model.refine_every = 0, 2
+
+    return change
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_mcmc_grows_to_its_cap_and_resumes_with_as_many(pristine_scene, tmp_path, primitive):
+    def change(config):
+        mcmc(330)(config)
+        config.pipeline.model.primitive = primitive
+
+    first = trainer_of(pristine_scene, tmp_path / "first", "photo_gs", iterations=20, change=change)
+    seeds = model_of(first).num_points
+    first.train()
+    assert seeds < model_of(first).num_points == 330
+    resumed = trainer_of(
+        pristine_scene, tmp_path / "second", "photo_gs", 22, load_dir=first.checkpoint_dir, change=change
+    )
+    resumed.train()
+    assert model_of(resumed).num_points == 330
+    assert all(parameter.isfinite().all() for parameter in model_of(resumed).gauss_params.values())
+
+
+def test_mcmc_never_has_more_gaussians_than_its_cap(pristine_scene, tmp_path):
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", 4, change=mcmc(100))
+    trainer.train()
+    assert model_of(trainer).num_points == 100
+
+
+def test_mcmc_brings_its_regularisers(pristine_scene, tmp_path):
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=mcmc(1000))
+    trainer.pipeline.eval()
+    model, outputs = model_of(trainer), render(trainer)
+    losses = model.get_loss_dict(outputs, held_out(trainer)[1])
+    assert losses["opacity"].item() == pytest.approx(0.01 * 0.1)
+    assert losses["scale"].item() == pytest.approx(0.01 * model.scales.exp().mean().item())
