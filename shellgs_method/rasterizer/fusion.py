@@ -41,6 +41,9 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor]) -> Any:
     fusible = tensors[0].dtype == torch.float32 and tensors[0].device.type == "cpu" and all(map(len, tensors))
     if _failed or not fusible or os.environ.get("SHELLGS_COMPILE") == "0":
         return kernel(*args)
+    # To dynamo the shape of a parameter is constant, but densification changes it; a view of it is any tensor.
+    args = tuple(arg.view_as(arg) if isinstance(arg, torch.nn.Parameter) else arg for arg in args)
+    tensors = _flatten(args)
     with_grad = torch.is_grad_enabled()
     key = tuple((len(tensor) > 1, with_grad and tensor.requires_grad) for tensor in tensors)
     try:
