@@ -17,8 +17,8 @@ from shellgs_method.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 
 CHUNK = 8  # splats a kernel takes at once
 LANES = 16  # tiles side by side in the innermost dimension
-# Tiles in a batch, and chunks before a look at which tiles are still at work. Small batches stay in a CPU's cache, large
-# ones call fewer kernels; a GPU wants much to do at once, and a look makes the host wait for it.
+# Tiles in a batch, and chunks before a look at which tiles are still at work. Small batches stay in a CPU's cache, and
+# large ones call fewer kernels; a GPU wants much to do at once, and a look makes the host wait for it.
 CPU_BATCHES = (2048, 1)
 GPU_BATCHES = (1 << 14, 4)
 MAX_SUMMED = 24 << 20  # bytes of gradients summed at once; from 32 MB, memory is new and slow each time it is allocated
