@@ -5,12 +5,14 @@ from __future__ import annotations
 import filecmp
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import open3d as o3d
 import pytest
 import torch
 from PIL import Image
+from scipy.stats import theilslopes
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps
@@ -117,6 +119,23 @@ def test_truth_faces_the_camera_and_leaves_out_street_and_sky(facade):
         assert (np.sum(cue.normal * camera.rays().numpy(), axis=-1)[cue.mask] < 0).all()
         assert not cue.mask[material > Material.RAILING].any()
         assert (cue.depth[material == 255] == 0).all()
+
+
+def test_predictions_are_affine_in_the_true_disparity_but_for_errors_of_some_percent(scene):
+    """A robust line is fitted to what both say of the wall; blurred edges are the outliers."""
+    truth = CueMaps.open(scene, "truth")
+    lines = []
+    for i in range(CONFIG.views):
+        name, camera = read_camera(scene, i)
+        cue = truth.read(name, camera)
+        assert cue is not None
+        predicted = np.load(scene / "predictions" / f"{Path(name).stem}.npy")[cue.mask]
+        inverse_depth = 1 / cue.depth[cue.mask]
+        scale, shift, *_ = theilslopes(predicted[::7], inverse_depth[::7])
+        lines.append((scale, shift))
+        error = np.abs((predicted - shift) / scale / inverse_depth - 1)
+        assert 0.005 < np.median(error) < 0.1
+    assert np.std(lines, axis=0).min() > 0  # no two views share their scale and shift
 
 
 def test_backprojected_truth_of_one_view_lands_on_that_of_another(scene):

@@ -28,12 +28,14 @@ from shellgs_method.synthetic.frames import (
     transformed,
 )
 from shellgs_method.synthetic.geometry import Material, Mesh, merge
+from shellgs_method.synthetic.monocular import predicted_disparity
 from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.sfm import Points, features, triangulate
 from shellgs_method.synthetic.street import street
 from shellgs_method.synthetic.world import World
 
 SHELL = "shell/facade.ply"
+PREDICTIONS = "predictions"  # disparity as a monocular network might see it
 
 
 @dataclass(frozen=True)
@@ -128,15 +130,18 @@ def _write(scene: Path, config: FacadeConfig) -> None:
     truth = CueMaps.create(scene, "truth", command="shellgs demo", metres_per_unit=1 / UNITS_PER_METRE)
     names = [f"images/frame_{i + 1:05d}.png" for i in range(config.views)]
     (scene / "images").mkdir()
+    (scene / PREDICTIONS).mkdir()
 
     # Half as many again as wanted: not every feature is seen in three views.
     found, per_view = [], -(-3 * config.points // (2 * config.views))
-    sensor, sfm = _generators(config.seed + 1, 2)
+    sensor, sfm, network = _generators(config.seed + 1, 3)
     for name, camera in track(list(zip(names, facade.cameras, strict=True)), "synthetic facade", transient=True):
         image = photograph(facade.daylight, camera, config.supersampling, sensor)
         Image.fromarray(image).save(scene / name)
         found.append(features(facade.daylight.world, camera, image, per_view, sfm))
-        truth.write(name, facade.truth(camera), scene_camera(camera))
+        maps = facade.truth(camera)
+        truth.write(name, maps, scene_camera(camera))
+        np.save(scene / PREDICTIONS / f"{Path(name).stem}.npy", predicted_disparity(maps, network))
         mask = scene / MASKS / f"{name}.png"
         mask.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(facade.unoccluded(camera)).save(mask)
