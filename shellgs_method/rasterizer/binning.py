@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -23,18 +24,28 @@ class Bins:
     The last tile and the last entry do not exist: they are what fills a batch up.
 
     Attributes:
-        rows: of tiles.
-        columns: of tiles.
+        width: of the image in pixels.
+        height: of the image in pixels.
         splats: splat of each entry, tile after tile, front to back; the last is the number of splats.
         starts: first entry of each tile.
         counts: entries of each tile.
     """
 
-    rows: int
-    columns: int
+    width: int
+    height: int
     splats: Int[Tensor, "entries+1"]
     starts: Int[Tensor, "tiles+1"]
     counts: Int[Tensor, "tiles+1"]
+
+    @property
+    def rows(self) -> int:
+        """Of tiles."""
+        return -(-self.height // TILE)
+
+    @property
+    def columns(self) -> int:
+        """Of tiles."""
+        return -(-self.width // TILE)
 
 
 def touches(ellipses: Float[Tensor, "*batch 7"], size: Float[Tensor, "1 2"]) -> Bool[Tensor, "*batch"]:
@@ -54,20 +65,23 @@ def bin_splats(outlines: Float[Tensor, "N O 7"], width: int, height: int) -> Bin
         width: of the image.
         height: of the image.
     """
-    rows, columns = -(-height // TILE), -(-width // TILE)
     size = outlines.new_tensor([[width, height]])
     splat, row = _count_up(*run_fused(_rows, outlines, size))
     strip, tile = _count_up(*run_fused(_columns, outlines, splat, row, size))
     # The entries follow the splats, front to back, and a stable sort keeps that order within a tile.
-    strip = strip.index_select(0, tile.sort(stable=True).indices)
-    counts = F.pad(torch.bincount(tile, minlength=rows * columns), (0, 1))
-    return Bins(
-        rows=rows,
-        columns=columns,
-        splats=F.pad(splat.index_select(0, strip), (0, 1), value=len(outlines)),
-        starts=counts.cumsum(0) - counts,
-        counts=counts,
-    )
+    strip = strip.index_select(0, stable_order(tile))
+    splats = F.pad(splat.index_select(0, strip), (0, 1), value=len(outlines))
+    n_tiles = -(-width // TILE) * -(-height // TILE)
+    counts = F.pad(torch.bincount(tile, minlength=n_tiles), (0, 1))
+    return Bins(width, height, splats, counts.cumsum(0) - counts, counts)
+
+
+def stable_order(keys: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
+    """The order that sorts integers from 0, equal ones as they stand."""
+    if keys.device.type == "cpu" and len(keys) < 1 << 15:
+        # From that length on torch sorts by radix. Below it, numpy does so 16 bits at a time, in a tenth of the time.
+        return torch.from_numpy(np.lexsort(keys.numpy()[:, None].view(np.uint16).T))
+    return keys.sort(stable=True).indices
 
 
 def _rows(outlines: Float[Tensor, "N O 7"], size: Float[Tensor, "1 2"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"]]:

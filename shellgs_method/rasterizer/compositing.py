@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from shellgs_method.rasterizer.binning import TILE, Bins
+from shellgs_method.rasterizer.binning import TILE, Bins, stable_order
 from shellgs_method.rasterizer.fusion import run_fused
 from shellgs_method.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 
@@ -19,10 +19,10 @@ CHUNK = 8  # splats a kernel takes at once
 LANES = 16  # tiles side by side in the innermost dimension
 # Tiles in a batch, and chunks before a look at which tiles are still at work. Small batches stay in a CPU's cache, and
 # large ones call fewer kernels; a GPU wants much to do at once, and a look makes the host wait for it.
-CPU_BATCHES = (2048, 1)
+CPU_BATCHES = (1024, 1)
 GPU_BATCHES = (1 << 14, 4)
 MAX_SUMMED = 24 << 20  # bytes of gradients summed at once; from 32 MB, memory is new and slow each time it is allocated
-REPACK_BELOW = 0.75  # share of tiles still at work
+REPACK_BELOW = 0.25  # share of tiles still at work; moving them costs as much as some chunks
 
 
 def composite(
@@ -33,7 +33,7 @@ def composite(
     bins: Bins,
     kernels: Kernels,
 ) -> Float[Tensor, "height width C+1+maps"]:
-    """Composite splats over the whole tiles of ``bins``: features, alpha, and the primitive's maps.
+    """Composite splats over the image of ``bins``: features, alpha, and the primitive's maps.
 
     Args:
         means2d: centres in pixels.
@@ -150,7 +150,7 @@ def _follow(
             at_work = (brightest > 0) & (counts[:n] > (plan.first_chunk + i + 1) * CHUNK)
             if int(at_work.sum()) < REPACK_BELOW * len(brightest) * LANES:
                 break
-    canvas[plan.tiles] = torch.stack(totals, -1).permute(0, 2, 3, 1)
+    canvas.index_copy_(0, plan.tiles.flatten(), torch.stack(totals, -1).permute(0, 2, 3, 1).flatten(0, 1))
     n = len(at_work)
     return plan.tiles[:n][at_work], transmittance[:n].transpose(1, 2)[at_work]
 
@@ -188,13 +188,13 @@ def _walk_back(
             *(transmittance, behind_here[:n], [gradient[:n] for gradient in gradients_here]),
             *(by_row[rows], table, plan.splats[rows], plan.centres[:n], *pixels, stop[:n]),
         )
-    behind[plan.tiles, 0] = behind_here.transpose(1, 2)
+    behind.index_copy_(0, plan.tiles.flatten(), behind_here.transpose(1, 2).reshape(-1, *behind.shape[1:]))
 
 
 def _sum_by_splat(rows: Float[Tensor, "n K"], splats: Int[Tensor, "n"], n_splats: int) -> Float[Tensor, "n_splats K"]:
     """Sums of the rows of each splat; several times as fast as a scatter."""
     ends = torch.bincount(splats, minlength=n_splats).cumsum(0)
-    return F.embedding_bag(splats.sort().indices, rows, F.pad(ends[:-1], (1, 0)), mode="sum")
+    return F.embedding_bag(stable_order(splats), rows, F.pad(ends[:-1], (1, 0)), mode="sum")
 
 
 def _in_groups(plans: list[_Plan], max_rows: int) -> Iterator[list[_Plan]]:
@@ -247,12 +247,13 @@ def _side_by_side(tiles: Float[Tensor, "G*V C P"], n_groups: int) -> list[Float[
 
 
 def _untile(canvas: Float[Tensor, "tiles C P"], bins: Bins) -> Float[Tensor, "height width C"]:
-    """Tiles to image; the image has whole tiles."""
+    """Tiles to image."""
     blocks = canvas.unflatten(0, (bins.rows, bins.columns)).unflatten(-1, (TILE, TILE))
-    return blocks.permute(0, 3, 1, 4, 2).flatten(2, 3).flatten(0, 1)
+    return blocks.permute(0, 3, 1, 4, 2).flatten(2, 3).flatten(0, 1)[: bins.height, : bins.width]
 
 
 def _tile(image: Float[Tensor, "height width C"], bins: Bins) -> Float[Tensor, "tiles+1 C P"]:
-    """Image to tiles, and the tile that does not exist, of zeros."""
+    """Image to tiles, filled up with zeros, as is the tile that does not exist."""
+    image = F.pad(image, (0, 0, 0, bins.columns * TILE - bins.width, 0, bins.rows * TILE - bins.height))
     blocks = image.unflatten(0, (bins.rows, TILE)).unflatten(2, (bins.columns, TILE))
     return F.pad(blocks.permute(0, 2, 4, 1, 3).flatten(3).flatten(0, 1), (0, 0, 0, 0, 0, 1))

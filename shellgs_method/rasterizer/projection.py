@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -40,6 +41,22 @@ class Projection:
     outlines: Float[Tensor, "B N O 7"]
     covars2d: Float[Tensor, "B N 3"]
     visible: Bool[Tensor, "B N"]
+
+    def views(self) -> Iterator[View]:
+        """What each camera sees of them."""
+        parts = (self.means2d, self.shapes, self.depths, self.outlines, self.visible)
+        # unbind, whose gradient is a stack, where indexing would fill a whole batch for each view.
+        return (View(*view) for view in zip(*(part.unbind(0) for part in parts), strict=True))
+
+
+class View(NamedTuple):
+    """Splats on the screen of one camera, see :class:`Projection`."""
+
+    means2d: Float[Tensor, "N 2"]
+    shapes: Float[Tensor, "N K"]
+    depths: Float[Tensor, "N"]
+    outlines: Float[Tensor, "N O 7"]
+    visible: Bool[Tensor, "N"]
 
 
 def project_gaussians(

@@ -8,19 +8,20 @@ from importlib.metadata import version
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer import gsplat_backend
-from shellgs_method.rasterizer.binning import bin_splats
+from shellgs_method.rasterizer.binning import bin_splats, stable_order
 from shellgs_method.rasterizer.compositing import composite
 from shellgs_method.rasterizer.disc_kernels import DISCS
 from shellgs_method.rasterizer.discs import disc_maps, project_discs
+from shellgs_method.rasterizer.fusion import run_fused
 from shellgs_method.rasterizer.gaussian_kernels import GAUSSIANS
 from shellgs_method.rasterizer.kernels import Kernels
 from shellgs_method.rasterizer.picture import Picture
-from shellgs_method.rasterizer.projection import Projection, project_gaussians
+from shellgs_method.rasterizer.projection import Projection, View, project_gaussians
 
 
 def rasterize(
@@ -105,9 +106,10 @@ def _rasterize(
     """Rasterize in torch the primitive of a projection and kernels."""
     projection = project(means, quats, scales, opacities, cameras)
     size = cameras[0].width, cameras[0].height
-    views = torch.stack([_render(projection, kernels, i, features, *size) for i in range(len(cameras))])
+    views = torch.stack([_render(view, kernels, features, *size) for view in projection.views()])
     composited, alpha, maps = views.split([features.shape[1], 1, kernels.n_maps], dim=-1)
-    return Picture(composited, alpha, maps, projection.means2d, _radii(projection))
+    radii = run_fused(_RADII, projection.outlines, projection.covars2d, projection.visible)
+    return Picture(composited, alpha, maps, projection.means2d, radii)
 
 
 _RASTERIZE = {
@@ -117,24 +119,28 @@ _RASTERIZE = {
 
 
 def _render(
-    projection: Projection, kernels: Kernels, i: int, features: Float[Tensor, "N C"], width: int, height: int
+    view: View, kernels: Kernels, features: Float[Tensor, "N C"], width: int, height: int
 ) -> Float[Tensor, "height width C+1+maps"]:
-    """Features, alpha and the primitive's maps as camera ``i`` sees them."""
-    visible = projection.visible[i].nonzero().squeeze(1)
-    depths = projection.depths[i].index_select(0, visible)
+    """Features, alpha and the primitive's maps as one camera sees them."""
+    visible = view.visible.nonzero().squeeze(1)
+    depths = view.depths.index_select(0, visible)
     # The bits of positive numbers are integers of the same order, which are sorted several times as fast.
     depths = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
-    order = visible.index_select(0, depths.sort(stable=True).indices)
-    bins = bin_splats(projection.outlines[i].index_select(0, order), width, height)
-    picture = composite(projection.means2d[i], projection.shapes[i], features, order, bins, kernels)
-    return picture[:height, :width]
+    order = visible.index_select(0, stable_order(depths))
+    bins = bin_splats(view.outlines.index_select(0, order), width, height)
+    return composite(view.means2d, view.shapes, features, order, bins, kernels)
 
 
-def _radii(projection: Projection) -> Int[Tensor, "B N ..."]:
-    """Radii of three standard deviations for gsplat 1.4; up to where alpha counts from 1.5."""
-    if tuple(map(int, version("gsplat").split(".")[:2])) >= (1, 5):
-        reach = projection.outlines[..., 5:].amax(-2)
-        return torch.where(projection.visible[..., None], reach.ceil(), 0).int()
-    xx, xy, yy = projection.covars2d.unbind(-1)
+def _three_sigmas(outlines: Tensor, covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Tensor:
+    """Radii as gsplat 1.4 has them, of three standard deviations."""
+    xx, xy, yy = covars2d.unbind(-1)
     variance = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
-    return torch.where(projection.visible, (3 * variance.sqrt()).ceil(), 0).int()
+    return torch.where(visible, (3 * variance.sqrt()).ceil(), 0).int()
+
+
+def _boxes(outlines: Float[Tensor, "B N O 7"], covars2d: Tensor, visible: Bool[Tensor, "B N"]) -> Tensor:
+    """Radii in x and y as gsplat has them from 1.5, up to where alpha counts."""
+    return torch.where(visible[..., None], outlines[..., 5:].amax(-2).ceil(), 0).int()
+
+
+_RADII = _boxes if tuple(map(int, version("gsplat").split(".")[:2])) >= (1, 5) else _three_sigmas

@@ -9,6 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from shellgs_method.rasterizer.fusion import run_fused
+
 
 def spherical_harmonics(
     degree: int, directions: Float[Tensor, "N 3"], coefficients: Float[Tensor, "N K 3"]
@@ -26,11 +28,21 @@ def spherical_harmonics(
     n_harmonics = (degree + 1) ** 2
     if coefficients.shape[1] < n_harmonics:
         raise ValueError(f"SH degree {degree} needs {n_harmonics} coefficients, not {coefficients.shape[1]}.")
-    harmonics = _harmonics(degree, F.normalize(directions, dim=-1))
-    return torch.einsum("nk,nkc->nc", harmonics, coefficients[:, :n_harmonics])
+    return run_fused(_sum, directions, coefficients[:, :n_harmonics])
 
 
-def _harmonics(degree: int, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
+def _sum(directions: Float[Tensor, "N 3"], coefficients: Float[Tensor, "N K 3"]) -> Float[Tensor, "N 3"]:
+    harmonics = _harmonics(math.isqrt(coefficients.shape[1]) - 1, F.normalize(directions, dim=-1))
+    return torch.stack(
+        [
+            sum((h * c for h, c in zip(harmonics, channel.unbind(1), strict=True)), start=torch.zeros(()))
+            for channel in coefficients.unbind(2)
+        ],
+        dim=-1,
+    )
+
+
+def _harmonics(degree: int, directions: Float[Tensor, "N 3"]) -> list[Float[Tensor, "N"]]:
     """Real harmonics of unit directions, Condon-Shortley phase included.
 
     The recurrences are those of Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013: of the associated Legendre
@@ -51,4 +63,4 @@ def _harmonics(degree: int, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "
             below, legendre = legendre, ((2 * l + 1) * z * legendre - (l + m) * below) / (l + 1 - m)
         cosine, sine = x * cosine - y * sine, x * sine + y * cosine
         sectoral *= -(2 * m + 1)
-    return torch.stack(harmonics, dim=-1)
+    return harmonics
