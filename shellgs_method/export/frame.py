@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -10,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float64
 
 from dataparsers.camera import Camera
+from dataparsers.cue_maps import atomic_write
 from shellgs_method.shell import Alignment, ShellMesh
 
 UpAxis = Literal["y", "z"]
@@ -79,26 +82,23 @@ class Frame:
         """Scene units in one unit of this frame."""
         return float(np.cbrt(np.linalg.det(self.to_scene[:3, :3])))
 
-    @property
-    def unit(self) -> str:
-        """The unit's name, for people."""
-        return "m" if self.metric else "scene units"
-
     def camera(self, camera: Camera) -> Camera:
         """A camera of the scene in this frame, where its depths are in this frame's unit."""
         rescaled = np.diag([1 / self.scale] * 3 + [1.0])
         viewmat = torch.from_numpy(rescaled @ camera.viewmat.double().cpu().numpy() @ self.to_scene)
         return Camera(viewmat, camera.K, camera.width, camera.height)
 
-    def description(self) -> dict:
-        """What a reader of a file must know of its coordinates, for json."""
-        return {
+    def describe(self, path: Path, facts: dict) -> None:
+        """Write beside ``path`` (as .json) what a reader of that file must know of its coordinates, and ``facts``."""
+        description = {
             "frame": self.name,
             "unit": "metre" if self.metric else "unknown",
             "up": self.up,
             "offset": self.offset.tolist(),
             "to_scene": self.to_scene.tolist(),
         }
+        with atomic_write(path.with_suffix(".json")) as file:
+            file.write((json.dumps(description | facts, indent=1) + "\n").encode())
 
 
 def shell_frame(alignment: Alignment, shell: ShellMesh, up: UpAxis = "z") -> Frame:

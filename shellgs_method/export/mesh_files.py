@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,7 +31,9 @@ def check_mesh_format(path: Path) -> None:
         try:
             import pxr  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            raise SceneError(f"{path}: USD needs a library that is not installed: pip install 'shellgs[usd]'") from error
+            raise SceneError(
+                f"{path}: USD needs a library that is not installed: pip install 'shellgs[usd]'"
+            ) from error
 
 
 def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | None = None) -> None:
@@ -50,12 +51,18 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
         if format == ".glb" and frame.up == "z":
             mesh = mesh.copy()
             mesh.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-        content = mesh.export(file_type=format[1:])
+        content: Any = mesh.export(file_type=format[1:])
         with atomic_write(path) as file:
             file.write(content.encode() if isinstance(content, str) else content)
-    with atomic_write(path.with_suffix(".json")) as file:
-        about = frame.description() | {"faces": len(mesh.faces), **mesh.metadata, **(facts or {})}
-        file.write((json.dumps(about, indent=1) + "\n").encode())
+    frame.describe(path, {"faces": len(mesh.faces), **mesh.metadata, **(facts or {})})
+
+
+def _usd_modules() -> tuple[Any, ...]:
+    try:
+        from pxr import Usd, UsdGeom, UsdPhysics, Vt
+    except ImportError as error:
+        raise SceneError("USD needs a library that is not installed: pip install usd-core") from error
+    return Usd, UsdGeom, UsdPhysics, Vt
 
 
 def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
@@ -63,8 +70,7 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
 
     A convex hull, which engines take where nothing is said, would close the windows and doors.
     """
-    from pxr import Gf, Usd, UsdGeom, UsdPhysics, Vt  # pyright: ignore[reportMissingImports]
-
+    Usd, UsdGeom, UsdPhysics, Vt = _usd_modules()
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         stage = Usd.Stage.CreateNew(str(temporary))
@@ -77,7 +83,7 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
         prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
         prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
         prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
-        prim.CreateExtentAttr([Gf.Vec3f(*map(float, corner)) for corner in (points.min(0), points.max(0))])
+        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(0), points.max(0)])))
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateDoubleSidedAttr(True)
         colours = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3] / 255, dtype=np.float32)  # pyright: ignore

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,9 +21,12 @@ from shellgs_method.evaluation import Rendering, geometry_errors, mean_over_view
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.export.frame import Box, Frame, UpAxis, scene_frame, shell_frame
 from shellgs_method.export.splats import Splats
-from shellgs_method.export.tsdf import DepthView, decimate, fuse
+from shellgs_method.export.tsdf import DepthView
 from shellgs_method.model import FacadeModel, reference_maps
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, load_shell
+
+if TYPE_CHECKING:
+    import trimesh
 
 SCENE_MARGIN = 0.05
 """Margin around the SfM points as a share of their box, where no shell says how far the facade goes."""
@@ -93,7 +97,7 @@ class TrainedRun:
         return np.linalg.inv(rescaled)
 
     def box(self, margin: float) -> Box:
-        """What of the frame is the facade: the shell's box, wider by ``margin`` metres, else that of most SfM points."""
+        """Where the facade is: the shell's box, wider by ``margin`` metres, else that of most SfM points."""
         to_frame = np.linalg.inv(self.frame.to_scene)
         if self.shell is not None:
             alignment, shell = self.shell
@@ -118,20 +122,14 @@ class TrainedRun:
             yield DepthView(depth, outputs["rgb"].cpu(), self.frame.camera(dataset.views[index].camera))
 
     def splats(self) -> Splats:
-        """The Gaussians in the model's own, rescaled world."""
-        model = self.model
-        gaussians = {name: parameter.detach().cpu() for name, parameter in model.gauss_params.items()}
-        harmonics = torch.cat([gaussians["features_dc"][:, None], gaussians["features_rest"]], dim=1)
-        return Splats(*(gaussians[name] for name in ("means", "quats", "scales", "opacities")), harmonics)
+        """The Gaussians in the frame."""
+        trained = {name: parameter.detach().cpu() for name, parameter in self.model.gauss_params.items()}
+        harmonics = torch.cat([trained["features_dc"][:, None], trained["features_rest"]], dim=1)
+        splats = Splats(trained["means"], trained["quats"], trained["scales"], trained["opacities"], harmonics)
+        return splats.transformed(np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
 
 
-def mesh_of_run(run: TrainedRun, margin: float, voxel: float | None, faces: int | None):
-    """The mesh of a run in its frame, of at most about ``faces`` triangles."""
-    mesh = fuse(run.views(), run.box(margin), voxel)
-    return mesh if faces is None else decimate(mesh, faces)
-
-
-def mesh_errors(run: TrainedRun, mesh) -> dict[str, float]:
+def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
     """Figures of :func:`geometry_errors` of the mesh as the held-out cameras see it, averaged over the views.
 
     They can be compared with those of ns-eval: against the shell, and as ``truth_…`` against the true geometry where
@@ -154,11 +152,6 @@ def mesh_errors(run: TrainedRun, mesh) -> dict[str, float]:
                 errors |= {prefix + name: value for name, value in found.items()}
         figures.append(errors)
     return mean_over_views(figures)
-
-
-def splats_of_run(run: TrainedRun, to_scene: np.ndarray) -> Splats:
-    """The Gaussians of a run in the frame that ``to_scene`` leads from."""
-    return run.splats().transformed(np.linalg.inv(to_scene) @ run.model_to_scene)
 
 
 def _apply(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:

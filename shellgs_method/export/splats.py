@@ -65,10 +65,10 @@ def turned_harmonics(rotation: Float64[Tensor, "3 3"], degree: int) -> Float64[T
     return torch.linalg.lstsq(spherical_harmonics(degree, directions, each), turned).solution
 
 
-def write_splats(path: Path, splats: Splats) -> None:
+def write_splats(path: Path, splats: Splats) -> int:
     """Write the ply of 3D Gaussian Splatting (Kerbl et al. 2023): float32, quaternions of norm 1, harmonics by colour.
 
-    A Gaussian with a NaN or infinite number, which viewers stumble over, is left out.
+    A Gaussian with a NaN or infinite number, which viewers stumble over, is left out. Returns how many are written.
     """
     rest = splats.harmonics[:, 1:].transpose(1, 2).flatten(1)
     columns = {
@@ -87,3 +87,4 @@ def write_splats(path: Path, splats: Splats) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         file.write("\n".join([*header, "end_header", ""]).encode() + table.tobytes())
+    return len(table)

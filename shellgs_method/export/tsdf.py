@@ -9,29 +9,25 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
-from shellgs_method.evaluation import normals_from_depth
 from shellgs_method.export.frame import Box
 from shellgs_method.shell.raycast import import_open3d
 
 if TYPE_CHECKING:
     import trimesh
 
-TRUNCATION = 4.0
-"""Voxels on each side of the surface in which the distance is kept."""
-GRAZING = 0.1
-"""Least cosine of a ray and the depth's normal: what is steeper is the bridge between an edge and what is behind it."""
-VIEWS = 3
-"""Views that must agree on a voxel."""
-SPECK = 100
-"""Voxels' faces that a separate piece of surface must be as large as to stay."""
+TRUNCATION = 6.0
+"""Voxels on each side of the surface in which the distance is kept; fewer leave holes, more round off reveals."""
+MIN_VIEWS = 2
+"""Views that must have seen a voxel."""
+SPECK = 100.0
+"""Least area of a separate piece of surface, in faces of a voxel; what is smaller floats."""
 
 
 class DepthView(NamedTuple):
-    """What one camera sees, in the frame of the mesh to be made."""
+    """What one camera sees, in the frame of the mesh to be made; on the CPU."""
 
     depth: Float[Tensor, "H W 1"]
     """Forward z-depth, 0 where there is none."""
@@ -50,38 +46,34 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
         views: rendered views, taken one at a time.
         box: where the surface is wanted.
         voxel: size of a voxel; if not given, the size of a pixel on the surface in the first view that sees the box,
-            but no less than a thousandth of the box.
+            but no less than a thousandth of the box. It is in the mesh's ``metadata``.
 
     Raises:
         SceneError: no surface is left in the box.
     """
-    import trimesh
-
     grid, seen = None, 0
     for view in views:
-        inside = _usable(view, box)
+        inside = _inside(view, box)
         if not inside.any():
             continue
         if grid is None:
-            pixel = (view.depth[..., 0][inside].median() / view.camera.K[0, 0].cpu()).item()
+            pixel = (view.depth[..., 0][inside].median() / view.camera.K[0, 0]).item()
             voxel = voxel or max(pixel, box.size / 1000)
             grid = _voxel_grid(voxel)
         _integrate(grid, view, inside)
         seen += 1
     if grid is None or voxel is None:
-        raise SceneError("there is no mesh: none of the views renders an opaque surface inside the facade's box")
-    mesh = _extract(grid, min(VIEWS, seen))
-    if mesh is not None:
-        mesh.update_faces(box.contains(mesh.vertices)[mesh.faces].all(axis=1))
-        mesh.update_faces(_without_specks(mesh, SPECK * voxel**2))
-        mesh.remove_unreferenced_vertices()
-    if mesh is None or len(mesh.faces) == 0:
+        raise SceneError("there is no mesh: no view renders an opaque surface inside the facade's box")
+    mesh = _extract(grid, min(MIN_VIEWS, seen))
+    mesh.update_faces(box.contains(mesh.vertices)[mesh.faces].all(axis=1))
+    mesh.update_faces(_without_specks(mesh, SPECK * voxel**2))
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) == 0:
         raise SceneError(
-            f"there is no mesh: the {seen} views that see the facade's box agree on no surface in voxels of "
-            f"{voxel:.3g}; render more views, or give a larger --voxel"
+            f"there is no mesh: the views have no surface in common inside the facade's box, in voxels of {voxel:.3g}; "
+            "check the run in ns-viewer, or give a larger --voxel"
         )
     mesh.metadata["voxel"] = voxel
-    assert isinstance(mesh, trimesh.Trimesh)
     return mesh
 
 
@@ -107,14 +99,12 @@ def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     )
 
 
-def _usable(view: DepthView, box: Box) -> Bool[np.ndarray, "H W"]:
-    """Pixels with depth inside the box, seen at an angle that tells something."""
-    depth, camera = view.depth.cpu().double(), view.camera.to("cpu", torch.float64)
-    rays = camera.rays()
-    facing = (normals_from_depth(depth, camera) * normalize(rays, dim=-1)).sum(dim=-1).abs() > GRAZING
+def _inside(view: DepthView, box: Box) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose depth lies in the box."""
+    camera = view.camera.to(torch.float64)
     to_world = torch.linalg.inv(camera.viewmat)
-    points = (depth * rays) @ to_world[:3, :3].T + to_world[:3, 3]
-    return (facing & (depth[..., 0] > 0)).numpy() & box.contains(points.numpy())
+    points = (view.depth.double() * camera.rays()) @ to_world[:3, :3].T + to_world[:3, 3]
+    return (view.depth[..., 0] > 0).numpy() & box.contains(points.numpy())
 
 
 def _voxel_grid(voxel: float):
@@ -129,28 +119,30 @@ def _voxel_grid(voxel: float):
     )
 
 
-def _integrate(grid, view: DepthView, usable: Bool[np.ndarray, "H W"]) -> None:
-    """Add one view. Open3D's projection truncates to the pixel: its centres are at 0.5 as ours."""
+def _integrate(grid, view: DepthView, inside: Bool[np.ndarray, "H W"]) -> None:
+    """Add one view. Open3D truncates a projection to its pixel: centres are at 0.5 there as here."""
     o3d = import_open3d()
-    tensor, image = o3d.core.Tensor, o3d.t.geometry.Image
-    kept = np.where(usable[..., None], view.depth.cpu().numpy(), 0).astype(np.float32)
-    depth = image(tensor(kept))
-    colour = image(tensor(np.ascontiguousarray(view.rgb.cpu().numpy(), dtype=np.float32)))
-    K = tensor(view.camera.K.cpu().double().numpy())
-    viewmat = tensor(view.camera.viewmat.cpu().double().numpy())
-    scale, far = 1.0, 2 * float(kept.max())
-    blocks = grid.compute_unique_block_coordinates(depth, K, viewmat, scale, far, TRUNCATION)
-    grid.integrate(blocks, depth, colour, K, K, viewmat, scale, far, TRUNCATION)
+    kept = np.where(inside[..., None], view.depth.numpy(), 0).astype(np.float32)
+    depth, colour = (
+        o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(picture, dtype=np.float32)))
+        for picture in (kept, view.rgb.numpy())
+    )
+    K, viewmat = (o3d.core.Tensor(matrix.double().numpy()) for matrix in (view.camera.K, view.camera.viewmat))
+    unit, far = 1.0, 2 * float(kept.max())
+    blocks = grid.compute_unique_block_coordinates(depth, K, viewmat, unit, far, TRUNCATION)
+    grid.integrate(blocks, depth, colour, K, K, viewmat, unit, far, TRUNCATION)
 
 
-def _extract(grid, views: int) -> trimesh.Trimesh | None:
-    """The zero crossing between voxels that ``views`` views saw; Open3D raises where there is none."""
+def _extract(grid, views: int) -> trimesh.Trimesh:
+    """The zero crossing between voxels that so many views saw; without faces where there is none."""
     import trimesh
 
     try:
         surface = grid.extract_triangle_mesh(weight_threshold=views - 0.5)
-    except RuntimeError:
-        return None
+    except RuntimeError as error:
+        if "colors" not in str(error).lower():  # Open3D trips over the colours of no vertices
+            raise
+        return trimesh.Trimesh()
     colours = np.round(255 * surface.vertex.colors.numpy()).clip(0, 255).astype(np.uint8)
     vertices, faces = surface.vertex.positions.numpy().astype(np.float64), surface.triangle.indices.numpy()
     return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
