@@ -195,6 +195,8 @@ def mesh(
     console.print(f"{output}: {len(made.faces)} triangles, voxels of {made.metadata['voxel']:.3g}. {_place(run.frame)}")
     if rows:
         console.print(rich_table(rows, SURFACE_COLUMNS, "Mesh in the held-out views, against"))
+    if "area_near_shell" in figures:
+        console.print(f"{figures['area_near_shell']:.0%} of its area is within 20 cm of the shell.")
 
 
 def splats(

@@ -94,6 +94,13 @@ def test_decimation_keeps_the_surface_and_its_colours(sphere):
     assert small.metadata == sphere.metadata
 
 
+def test_a_mesh_of_no_triangles_or_voxels_of_no_size_are_refused(sphere):
+    with pytest.raises(SceneError, match="nothing is left"):
+        decimate(sphere, 0)
+    with pytest.raises(SceneError, match="a voxel cannot be -1"):
+        fuse([], ROOM, -1)
+
+
 def test_a_box_has_the_size_of_a_turned_cuboid():
     corners = np.stack(np.meshgrid([0, 18.0], [0, 10.0], [0, 1.0]), -1).reshape(-1, 3)
     turned = corners @ Rotation.from_euler("zyx", [31, 12, -50], degrees=True).as_matrix().T + [5, 6, 7]
@@ -138,6 +145,7 @@ def test_a_mesh_file_gives_the_mesh_back(sphere, tmp_path, suffix):
     about = json.loads((tmp_path / "mesh.json").read_text())
     assert about["offset"] == [400_000, 5_000_000, 0]
     assert (about["unit"], about["up"], about["faces"]) == ("metre", "z", len(sphere.faces))
+    assert about["up_in_file"] == ("y" if suffix == ".glb" else "z")
 
 
 @pytest.mark.parametrize("suffix", [".usd", ".usda"])
@@ -198,6 +206,11 @@ def test_the_mesh_of_the_truth_is_near_truth_and_shell(run, facade):
     assert figures["truth_f_score_20cm"] > 0.8
     assert figures["truth_rendered"] > 0.8
     assert figures["chamfer_m"] < 0.2
+    assert figures["area_near_shell"] > 0.8
+    flap = np.add(facade.vertices, [0, 0, 30])
+    faces = np.concatenate([facade.faces, facade.faces + len(flap)])
+    both = trimesh.Trimesh(np.concatenate([facade.vertices, flap]), faces, process=False)
+    assert mesh_errors(run, both)["area_near_shell"] == pytest.approx(figures["area_near_shell"] / 2, abs=1e-3)
 
 
 def test_a_scene_without_alignment_is_meshed_in_its_own_frame(run, pristine_scene, monkeypatch):

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     import trimesh
 
 USD_FORMATS = (".usd", ".usda", ".usdc")
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Turns z-up coordinates into y-up ones."""
 MESH_FORMATS = (".ply", ".obj", ".glb", *USD_FORMATS)
 
 
@@ -44,17 +46,16 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
     """
     check_mesh_format(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    format = path.suffix.lower()
+    format, turned = path.suffix.lower(), path.suffix.lower() == ".glb" and frame.up == "z"
     if format in USD_FORMATS:
         _write_usd(path, mesh, frame)
     else:
-        if format == ".glb" and frame.up == "z":
-            mesh = mesh.copy()
-            mesh.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-        content: Any = mesh.export(file_type=format[1:])
+        placed = mesh.copy().apply_transform(Y_UP) if turned else mesh
+        content: Any = placed.export(file_type=format[1:])
         with atomic_write(path) as file:
             file.write(content.encode() if isinstance(content, str) else content)
-    frame.describe(path, {"faces": len(mesh.faces), **mesh.metadata, **(facts or {})})
+    about = {"up_in_file": "y" if turned else frame.up, "faces": len(mesh.faces)}
+    frame.describe(path, about | mesh.metadata | (facts or {}))
 
 
 def _usd_modules() -> tuple[Any, ...]:

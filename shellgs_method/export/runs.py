@@ -24,10 +24,13 @@ from shellgs_method.export.splats import Splats
 from shellgs_method.export.tsdf import DepthView
 from shellgs_method.model import FacadeModel, reference_maps
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, load_shell
+from shellgs_method.shell.raycast import import_open3d
 
 if TYPE_CHECKING:
     import trimesh
 
+NEAR = 0.2
+"""Metres from the shell up to which a mesh is near it: more than the details that a shell leaves out."""
 SCENE_MARGIN = 0.05
 """Margin around the SfM points as a share of their box, where no shell says how far the facade goes."""
 SCENE_TRIM = 0.02
@@ -84,6 +87,13 @@ class TrainedRun:
         return shell_frame(*self.shell, up=self.up or ("y" if gltf else "z"))
 
     @property
+    def shell_in_frame(self) -> ShellMesh:
+        """The shell, which must be there, in the frame."""
+        assert self.shell is not None
+        alignment, shell = self.shell
+        return ShellMesh(shell.vertices * alignment.metres_per_shell_unit - self.frame.offset, shell.faces)
+
+    @property
     def model_scale(self) -> float:
         """Units of nerfstudio's rescaled world, which the model lives in, in one scene unit."""
         return float(self.datamanager.train_dataparser_outputs.dataparser_scale)
@@ -98,12 +108,11 @@ class TrainedRun:
 
     def box(self, margin: float) -> Box:
         """Where the facade is: the shell's box, wider by ``margin`` metres, else that of most SfM points."""
-        to_frame = np.linalg.inv(self.frame.to_scene)
         if self.shell is not None:
-            alignment, shell = self.shell
-            return Box.around(_apply(to_frame @ alignment.shell_to_scene, shell.vertices), margin)
+            return Box.around(self.shell_in_frame.vertices, margin)
         assert self.model.seed_points is not None
-        points = _apply(to_frame @ self.model_to_scene, self.model.seed_points[0].double().cpu().numpy())
+        to_frame = np.linalg.inv(self.frame.to_scene) @ self.model_to_scene
+        points = _apply(to_frame, self.model.seed_points[0].double().cpu().numpy())
         box = Box.around(points, 0.0, SCENE_TRIM)
         widened = SCENE_MARGIN * box.size
         return replace(box, low=box.low - widened, high=box.high + widened)
@@ -133,7 +142,8 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
     """Figures of :func:`geometry_errors` of the mesh as the held-out cameras see it, averaged over the views.
 
     They can be compared with those of ns-eval: against the shell, and as ``truth_…`` against the true geometry where
-    the scene has it.
+    the scene has it. What no reference supports, such as flaps beside the building, only ``area_near_shell`` tells of:
+    the share of the mesh's area within :data:`NEAR` of the shell.
     """
     caster = ShellCaster(ShellMesh(mesh.vertices, mesh.faces), run.frame.to_scene)
     held_out, figures = run.datasets[1], []
@@ -151,7 +161,17 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
                 found = geometry_errors(rendering, camera, reference, metres_per_unit)
                 errors |= {prefix + name: value for name, value in found.items()}
         figures.append(errors)
-    return mean_over_views(figures)
+    near = {} if run.shell is None else {"area_near_shell": _area_near(mesh, run.shell_in_frame)}
+    return mean_over_views(figures) | near
+
+
+def _area_near(mesh: trimesh.Trimesh, shell: ShellMesh) -> float:
+    """Share of a mesh's area whose triangles' centres are near a shell in the same frame."""
+    o3d = import_open3d()
+    scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor
+    scene.add_triangles(tensor(shell.vertices.astype(np.float32)), tensor(shell.faces.astype(np.uint32)))
+    distance = scene.compute_distance(tensor(mesh.triangles_center.astype(np.float32))).numpy()
+    return float(np.average(distance < NEAR, weights=mesh.area_faces))
 
 
 def _apply(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -49,8 +49,10 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
             but no less than a thousandth of the box. It is in the mesh's ``metadata``.
 
     Raises:
-        SceneError: no surface is left in the box.
+        SceneError: no surface is left in the box, or a voxel has no size.
     """
+    if voxel is not None and not voxel > 0:
+        raise SceneError(f"a voxel cannot be {voxel} long: give a --voxel above 0")
     grid, seen = None, 0
     for view in views:
         inside = _inside(view, box)
@@ -78,7 +80,11 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
 
 
 def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """The mesh with at most about ``faces`` triangles, by quadric error (Garland and Heckbert 1997); colours stay."""
+    """The mesh with at most about ``faces`` triangles, by quadric error (Garland and Heckbert 1997); colours stay.
+
+    Raises:
+        SceneError: nothing is left of it.
+    """
     import trimesh
 
     if len(mesh.faces) <= faces:
@@ -88,7 +94,9 @@ def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
     )
     dense.vertex_colors = o3d.utility.Vector3dVector(mesh.visual.vertex_colors[:, :3] / 255)  # pyright: ignore
-    sparse = dense.simplify_quadric_decimation(faces)
+    sparse = dense.simplify_quadric_decimation(max(faces, 0))
+    if len(sparse.triangles) == 0:
+        raise SceneError(f"nothing is left of a mesh of {len(mesh.faces)} triangles that is thinned to {faces}")
     colours = np.round(255 * np.asarray(sparse.vertex_colors)).clip(0, 255).astype(np.uint8)
     return trimesh.Trimesh(
         np.asarray(sparse.vertices),
