@@ -67,7 +67,6 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
     if grid is None or voxel is None:
         raise SceneError("there is no mesh: no view renders an opaque surface inside the facade's box")
     mesh = _extract(grid, min(MIN_VIEWS, seen))
-    mesh.update_faces(box.contains(mesh.vertices)[mesh.faces].all(axis=1))
     mesh.update_faces(_without_specks(mesh, SPECK * voxel**2))
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) == 0:
