@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional, Union
+from typing import TYPE_CHECKING, Annotated, Literal, Optional, Union
 
 import tyro
 from rich.console import Console
@@ -19,6 +19,7 @@ from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 if TYPE_CHECKING:
     from dataparsers.cue_maps import CueMaps
     from dataparsers.photograph import View
+    from shellgs_method.export import Frame
 
 console = Console()
 
@@ -32,6 +33,7 @@ MonoSource = Annotated[
     tyro.conf.arg(name=""),
 ]
 _MOGE = MoGe2()
+UpAxis = Literal["y", "z"]
 
 
 def demo(
@@ -158,6 +160,78 @@ def _save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
     return panel
 
 
+def mesh(
+    config: Annotated[Path, tyro.conf.Positional],
+    output: Optional[Path] = None,
+    voxel: Optional[float] = None,
+    faces: int = 200_000,
+    margin: float = 0.5,
+    up: Optional[UpAxis] = None,
+) -> None:
+    """Triangle mesh of a trained method, in metres in the shell's frame, and how far it is from shell and truth.
+
+    Beside it, a json says where it stands: a georeferenced shell's large offset is there, not in the coordinates.
+
+    Args:
+        config: The run's config.yml.
+        output: The mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
+        voxel: Size of a voxel in metres. If not set: a pixel's size on the facade.
+        faces: Number of triangles that the mesh is thinned to.
+        margin: What is farther than this from the shell's box, in metres, is left out.
+        up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
+    """
+    from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
+    from shellgs_method.export import check_mesh_format, decimate, fuse, write_mesh
+    from shellgs_method.export.runs import TrainedRun, mesh_errors
+
+    output = output or config.with_name("mesh.ply")
+    check_mesh_format(output)
+    run = TrainedRun.load(config, up)
+    made = decimate(fuse(run.views(), run.box(margin), voxel), faces)
+    figures = mesh_errors(run, made)
+    write_mesh(output, made, run.frame, figures)
+    truth = {name.removeprefix("truth_"): value for name, value in figures.items() if name.startswith("truth_")}
+    rows = {name: row for name, row in (("shell", figures), ("truth", truth)) if "rendered" in row}
+    console.print(f"{output}: {len(made.faces)} triangles, voxels of {made.metadata['voxel']:.3g}. {_place(run.frame)}")
+    if rows:
+        console.print(rich_table(rows, SURFACE_COLUMNS, "Mesh in the held-out views, against"))
+    if "area_near_shell" in figures:
+        console.print(f"{figures['area_near_shell']:.0%} of its area is within 20 cm of the shell.")
+
+
+def splats(
+    config: Annotated[Path, tyro.conf.Positional],
+    output: Optional[Path] = None,
+    up: Optional[UpAxis] = None,
+) -> None:
+    """The Gaussians of a trained method as the ply that viewers open, in metres in the shell's frame.
+
+    `ns-export gaussian-splat` writes the same in nerfstudio's own frame.
+
+    Args:
+        config: The run's config.yml.
+        output: The ply. If not set: splats.ply beside the config.
+        up: Axis of the shell's frame that points up, for the json. If not set: y for a glTF shell, else z.
+    """
+    from shellgs_method.export import write_splats
+    from shellgs_method.export.runs import TrainedRun
+
+    output = output or config.with_name("splats.ply")
+    run = TrainedRun.load(config, up)
+    count = write_splats(output, run.splats())
+    run.frame.describe(output, {"splats": count})
+    console.print(f"{output}: {count} Gaussians. {_place(run.frame)}")
+
+
+def _place(frame: Frame) -> str:
+    """Where a result stands, in words."""
+    if not frame.metric:
+        return "The scene has no aligned shell: this is its own frame, and the size of its unit is unknown."
+    if not frame.offset.any():
+        return "In metres, in the shell's frame."
+    return f"In metres, in the shell's frame less {' '.join(f'{value:.0f}' for value in frame.offset)}."
+
+
 def doctor(install_libraries: bool = False) -> None:
     """What this machine can run, each with its remedy.
 
@@ -182,7 +256,7 @@ def doctor(install_libraries: bool = False) -> None:
 def main() -> None:
     """Entry point."""
     warnings.filterwarnings("ignore", category=FutureWarning)  # of the libraries below, and nothing to a user
-    commands = {"demo": demo, "cast": cast, "mono": mono, "doctor": doctor}
+    commands = {"demo": demo, "cast": cast, "mono": mono, "mesh": mesh, "splats": splats, "doctor": doctor}
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             commands, description="Everything around the training of the methods; these are trained by `ns-train`."

@@ -24,7 +24,7 @@ class Finding(NamedTuple):
 
 def examine() -> Iterator[Finding]:
     """Look at everything that a wheel or a package index cannot promise."""
-    for check in (_torch, _torchvision, _open3d, _compiler, _cuda):
+    for check in (_torch, _torchvision, _open3d, _compiler, _cuda, _lpips):
         yield check()
 
 
@@ -69,3 +69,16 @@ def _cuda() -> Finding:
     return Finding(
         "CUDA", works, torch.cuda.get_device_name() if works else "no device: training runs on the CPU", False
     )
+
+
+def _lpips() -> Finding:
+    """Looks for the weights and downloads nothing: the first evaluation does."""
+    try:
+        from shellgs_method.evaluation.image import lpips_weights
+
+        url, cached = lpips_weights()
+    except (ImportError, OSError, RuntimeError) as error:  # a torchvision that does not load is told above
+        return Finding("LPIPS weights", False, str(error).splitlines()[0], needed=False)
+    works = os.path.exists(cached)
+    detail = cached if works else f"fetched by the first evaluation; without network: put {url} at {cached}"
+    return Finding("LPIPS weights", works, detail, needed=False)

@@ -14,6 +14,7 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.splatfacto import (
     RGB2SH,
+    SH2RGB,
     SplatfactoModel,
     SplatfactoModelConfig,
     num_sh_bases,
@@ -256,6 +257,16 @@ class FacadeModel(SplatfactoModel):
         extra = self.config.extra
         return self.config.cues != "none" or extra.agreement > 0 or extra.distortion > 0
 
+    @property
+    def colors(self) -> Float[Tensor, "N 3"]:
+        """Colours without view dependence. They are harmonics at degree 0 too, where splatfacto's are logistic."""
+        return SH2RGB(self.features_dc)
+
+    @property
+    def shs_0(self) -> Float[Tensor, "N 3"]:
+        """First coefficient of the harmonics, as ns-export writes it."""
+        return self.features_dc
+
     def _inside_crop(self) -> dict[str, Tensor]:
         """The Gaussians, or in the viewer those inside its crop box."""
         if self.crop_box is None or self.training:
@@ -286,7 +297,7 @@ class FacadeModel(SplatfactoModel):
         if self.geometry is not None:
             losses |= self_losses(self.geometry, config.extra, progress)
             if f"{config.cues}_depth" in batch:
-                cue = _reference(batch, config.cues, self.device)
+                cue = reference_maps(batch, config.cues, self.device)
                 losses |= cue_losses(self.geometry, cue, config.geometry, config.extra, progress, self.metres_per_unit)
         return losses | self._shape_losses()
 
@@ -316,7 +327,7 @@ class FacadeModel(SplatfactoModel):
         for kind, prefix in (("shell", ""), ("truth", "truth_")):
             if f"{kind}_depth" not in batch:
                 continue
-            reference = _reference(batch, kind, self.device)
+            reference = reference_maps(batch, kind, self.device)
             rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
             errors = geometry_errors(rendering, camera, reference, self.metres_per_unit)
             figures |= {prefix + name: value for name, value in errors.items()}
@@ -324,7 +335,7 @@ class FacadeModel(SplatfactoModel):
         return figures, images
 
 
-def _reference(batch: dict, kind: str, device: torch.device) -> Reference:
+def reference_maps(batch: dict, kind: str, device: torch.device) -> Reference:
     """The maps of one kind in a batch; what the user masked out is not supported."""
     depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
     if "mask" in batch:

@@ -46,8 +46,7 @@ def lpips_network() -> Metric | str:
 
     Tried once a process, so that a machine without network pays for it once and is told once.
     """
-    url = torchvision.models.AlexNet_Weights.DEFAULT.url
-    cached = os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
+    url, cached = lpips_weights()
     if not os.path.exists(cached) and not _reachable(url):
         obstacle = f"the weights of AlexNet are not at {cached}, and {url} cannot be reached"
     else:
@@ -57,6 +56,12 @@ def lpips_network() -> Metric | str:
             obstacle = f"the weights of AlexNet cannot be loaded from {cached}: {error}"
     logger.warning("LPIPS is not available: %s.", obstacle)
     return obstacle
+
+
+def lpips_weights() -> tuple[str, str]:
+    """Where the weights of LPIPS' backbone are downloaded from, and the file they are looked for in first."""
+    url = torchvision.models.AlexNet_Weights.DEFAULT.url
+    return url, os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
 
 
 def _reachable(url: str, seconds: float = 5.0) -> bool:

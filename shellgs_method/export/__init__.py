@@ -1,0 +1,24 @@
+"""What leaves ShellGS: a triangle mesh to collide with, and the Gaussians, in metres where a shell knows them.
+
+:mod:`shellgs_method.export.runs` takes trained runs; everything else is plain numpy, torch and Open3D.
+"""
+
+from shellgs_method.export.frame import Box, Frame, scene_frame, shell_frame
+from shellgs_method.export.mesh_files import MESH_FORMATS, check_mesh_format, write_mesh
+from shellgs_method.export.splats import Splats, write_splats
+from shellgs_method.export.tsdf import DepthView, decimate, fuse
+
+__all__ = [
+    "MESH_FORMATS",
+    "Box",
+    "DepthView",
+    "Frame",
+    "Splats",
+    "check_mesh_format",
+    "decimate",
+    "fuse",
+    "scene_frame",
+    "shell_frame",
+    "write_mesh",
+    "write_splats",
+]

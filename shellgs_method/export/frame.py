@@ -1,0 +1,116 @@
+"""The frame that results are written in: the shell's, in metres, or the scene's where there is no shell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from dataparsers.camera import Camera
+from dataparsers.cue_maps import atomic_write
+from shellgs_method.shell import Alignment, ShellMesh
+
+UpAxis = Literal["y", "z"]
+
+FAR = 1000.0
+"""Distance from the origin from which coordinates are shifted: there float32 has steps of 0.06 mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box along any three perpendicular axes.
+
+    Attributes:
+        axes: its axes as rows.
+        low: least coordinate along each.
+        high: greatest coordinate along each.
+    """
+
+    axes: Float64[np.ndarray, "3 3"]
+    low: Float64[np.ndarray, " 3"]
+    high: Float64[np.ndarray, " 3"]
+
+    @classmethod
+    def around(cls, points: Float64[np.ndarray, "N 3"], margin: float, trim: float = 0.0) -> Box:
+        """The box of points along their principal axes, wider by ``margin`` on each side.
+
+        Args:
+            points: at least one.
+            margin: in the points' unit.
+            trim: share of the points that may lie beyond each face, before the margin.
+        """
+        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2] if len(points) > 2 else np.eye(3)
+        low, high = np.quantile(points @ axes.T, [trim, 1 - trim], axis=0)
+        return cls(axes, low - margin, high + margin)
+
+    @property
+    def size(self) -> float:
+        """Length of its longest side."""
+        return float((self.high - self.low).max())
+
+    def contains(self, points: Float64[np.ndarray, "*N 3"]) -> Bool[np.ndarray, " *N"]:
+        """Whether points lie in the box."""
+        along = points @ self.axes.T
+        return ((along >= self.low) & (along <= self.high)).all(axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame to write results in; all of them are similar to the scene's.
+
+    Attributes:
+        name: "shell" or "scene".
+        to_scene: similarity from this frame to the scene's.
+        offset: what brings coordinates back to where the shell has them, added; in metres.
+        metric: whether the unit is the metre; else it is unknown.
+        up: the axis that points up.
+    """
+
+    name: Literal["shell", "scene"]
+    to_scene: Float64[np.ndarray, "4 4"]
+    offset: Float64[np.ndarray, " 3"]
+    metric: bool
+    up: UpAxis
+
+    @property
+    def scale(self) -> float:
+        """Scene units in one unit of this frame."""
+        return float(np.cbrt(np.linalg.det(self.to_scene[:3, :3])))
+
+    def camera(self, camera: Camera) -> Camera:
+        """A camera of the scene in this frame, where its depths are in this frame's unit."""
+        rescaled = np.diag([1 / self.scale] * 3 + [1.0])
+        viewmat = torch.from_numpy(rescaled @ camera.viewmat.double().cpu().numpy() @ self.to_scene)
+        return Camera(viewmat, camera.K, camera.width, camera.height)
+
+    def describe(self, path: Path, facts: dict) -> None:
+        """Write beside ``path`` (as .json) what a reader of that file must know of its coordinates, and ``facts``."""
+        description = {
+            "frame": self.name,
+            "unit": "metre" if self.metric else "unknown",
+            "up": self.up,
+            "offset": self.offset.tolist(),
+            "to_scene": self.to_scene.tolist(),
+        }
+        with atomic_write(path.with_suffix(".json")) as file:
+            file.write((json.dumps(description | facts, indent=1) + "\n").encode())
+
+
+def shell_frame(alignment: Alignment, shell: ShellMesh, up: UpAxis = "z") -> Frame:
+    """The shell's axes in metres; a georeferenced shell's are shifted by whole hundreds of metres to its middle."""
+    metres = alignment.metres_per_shell_unit
+    bounds = shell.bounds * metres
+    offset = np.round(bounds.mean(axis=0), -2) if np.abs(bounds).max() > FAR else np.zeros(3)
+    to_shell = np.diag([1 / metres] * 3 + [1.0])
+    to_shell[:3, 3] = offset / metres
+    return Frame("shell", alignment.shell_to_scene @ to_shell, offset, metric=True, up=up)
+
+
+def scene_frame(up: UpAxis = "z") -> Frame:
+    """The scene's own frame, whose unit nobody knows."""
+    return Frame("scene", np.eye(4), np.zeros(3), metric=False, up=up)

@@ -1,0 +1,98 @@
+"""Mesh files: ply, obj, glb, and USD with what a physics engine needs to collide with it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dataparsers.cue_maps import atomic_write
+from dataparsers.errors import SceneError
+from shellgs_method.export.frame import Frame
+
+if TYPE_CHECKING:
+    import trimesh
+
+USD_FORMATS = (".usd", ".usda", ".usdc")
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Turns z-up coordinates into y-up ones."""
+MESH_FORMATS = (".ply", ".obj", ".glb", *USD_FORMATS)
+
+
+def check_mesh_format(path: Path) -> None:
+    """Refuse what cannot be written, before hours of work.
+
+    Raises:
+        SceneError: the format is none of :data:`MESH_FORMATS`, or its library is missing.
+    """
+    if path.suffix.lower() not in MESH_FORMATS:
+        raise SceneError(f"{path}: a mesh is written as one of {', '.join(MESH_FORMATS)}")
+    if path.suffix.lower() in USD_FORMATS:
+        try:
+            import pxr  # noqa: F401  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise SceneError(
+                f"{path}: USD needs a library that is not installed: pip install 'shellgs[usd]'"
+            ) from error
+
+
+def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | None = None) -> None:
+    """Write a mesh, and beside it (``.json``) its frame, the offset of georeferenced coordinates, and ``facts``.
+
+    glTF is y-up by its specification, and coordinates are turned for it; USD states its up axis and unit; ply and obj
+    know of neither. Coordinates in the files are float32, which is why the frame is near the facade.
+    """
+    check_mesh_format(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    format, turned = path.suffix.lower(), path.suffix.lower() == ".glb" and frame.up == "z"
+    if format in USD_FORMATS:
+        _write_usd(path, mesh, frame)
+    else:
+        placed = mesh.copy().apply_transform(Y_UP) if turned else mesh
+        content: Any = placed.export(file_type=format[1:])
+        with atomic_write(path) as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+    about = {"up_in_file": "y" if turned else frame.up, "faces": len(mesh.faces)}
+    frame.describe(path, about | mesh.metadata | (facts or {}))
+
+
+def _usd_modules() -> tuple[Any, ...]:
+    try:
+        from pxr import Usd, UsdGeom, UsdPhysics, Vt
+    except ImportError as error:
+        raise SceneError("USD needs a library that is not installed: pip install usd-core") from error
+    return Usd, UsdGeom, UsdPhysics, Vt
+
+
+def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
+    """A stage whose default prim is a static collider made of the triangles themselves.
+
+    A convex hull, which engines take where nothing is said, would close the windows and doors.
+    """
+    Usd, UsdGeom, UsdPhysics, Vt = _usd_modules()
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        stage = Usd.Stage.CreateNew(str(temporary))
+        UsdGeom.SetStageUpAxis(stage, frame.up.upper())
+        if frame.metric:
+            UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        prim = UsdGeom.Mesh.Define(stage, "/facade")
+        stage.SetDefaultPrim(prim.GetPrim())
+        points = np.ascontiguousarray(mesh.vertices, dtype=np.float32)
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
+        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(0), points.max(0)])))
+        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        prim.CreateDoubleSidedAttr(True)
+        colours = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3] / 255, dtype=np.float32)  # pyright: ignore
+        prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colours))
+        UsdPhysics.CollisionAPI.Apply(prim.GetPrim())
+        collider = UsdPhysics.MeshCollisionAPI.Apply(prim.GetPrim())
+        collider.CreateApproximationAttr(UsdPhysics.Tokens.none)
+        stage.GetRootLayer().Save()
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

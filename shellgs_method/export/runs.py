@@ -1,0 +1,178 @@
+"""Meshes and splats of trained runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from nerfstudio.utils.eval_utils import eval_setup
+from rich.progress import track
+
+from dataparsers.errors import SceneError
+from dataparsers.photograph import load_mask
+from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
+from shellgs_method.evaluation import Rendering, geometry_errors, mean_over_views
+from shellgs_method.evaluation.view import OPAQUE
+from shellgs_method.export.frame import Box, Frame, UpAxis, scene_frame, shell_frame
+from shellgs_method.export.splats import Splats
+from shellgs_method.export.tsdf import DepthView
+from shellgs_method.model import FacadeModel, reference_maps
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, load_shell
+from shellgs_method.shell.raycast import import_open3d
+
+if TYPE_CHECKING:
+    import trimesh
+
+NEAR = 0.2
+"""Metres from the shell up to which a mesh is near it: more than the details that a shell leaves out."""
+SCENE_MARGIN = 0.05
+"""Margin around the SfM points as a share of their box, where no shell says how far the facade goes."""
+SCENE_TRIM = 0.02
+"""Share of the SfM points beyond each face of that box."""
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A trained method with its scene."""
+
+    model: FacadeModel
+    datamanager: FacadeDataManager
+    up: UpAxis | None = None
+    """The axis of the shell's (else the scene's) frame that points up; None: y of a glTF shell, else z."""
+
+    @classmethod
+    def load(cls, config: Path, up: UpAxis | None = None) -> TrainedRun:
+        """The last checkpoint of the run that ``config`` (config.yml) belongs to.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            SceneError: the run is of a method that is not ours.
+        """
+        if not config.is_file():
+            raise FileNotFoundError(f"{config} does not exist: name the config.yml of a trained run")
+        _, pipeline, _, _ = eval_setup(config, test_mode="inference")
+        model, datamanager = pipeline.model, pipeline.datamanager
+        if not isinstance(model, FacadeModel) or not isinstance(datamanager, FacadeDataManager):
+            raise SceneError(f"{config} is of another method: only those of ShellGS render the depth that is needed")
+        return cls(model, datamanager, up)
+
+    @property
+    def datasets(self) -> tuple[FacadeDataset, FacadeDataset]:
+        """Training and held-out views."""
+        assert self.datamanager.train_dataset is not None
+        assert self.datamanager.eval_dataset is not None
+        return self.datamanager.train_dataset, self.datamanager.eval_dataset
+
+    @cached_property
+    def shell(self) -> tuple[Alignment, ShellMesh] | None:
+        """The scene's shell and its alignment, if there is one."""
+        scene = Path(self.datamanager.config.dataparser.data)
+        if not (scene / ALIGNMENT).is_file():
+            return None
+        alignment = Alignment.load(scene / ALIGNMENT)
+        return alignment, load_shell(scene / alignment.shell)
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The shell's frame in metres, else the scene's."""
+        if self.shell is None:
+            return scene_frame(self.up or "z")
+        gltf = self.shell[0].shell.lower().endswith((".glb", ".gltf"))
+        return shell_frame(*self.shell, up=self.up or ("y" if gltf else "z"))
+
+    @property
+    def shell_in_frame(self) -> ShellMesh:
+        """The shell, which must be there, in the frame."""
+        assert self.shell is not None
+        alignment, shell = self.shell
+        return ShellMesh(shell.vertices * alignment.metres_per_shell_unit - self.frame.offset, shell.faces)
+
+    @property
+    def model_scale(self) -> float:
+        """Units of nerfstudio's rescaled world, which the model lives in, in one scene unit."""
+        return float(self.datamanager.train_dataparser_outputs.dataparser_scale)
+
+    @property
+    def model_to_scene(self) -> Float64[np.ndarray, "4 4"]:
+        """The similarity that undoes nerfstudio's: its world is scale · (transform @ scene)."""
+        rescaled = np.eye(4)
+        rescaled[:3] = self.datamanager.train_dataparser_outputs.dataparser_transform.double().numpy()
+        rescaled[:3] *= self.model_scale
+        return np.linalg.inv(rescaled)
+
+    def box(self, margin: float) -> Box:
+        """Where the facade is: the shell's box, wider by ``margin`` metres, else that of most SfM points."""
+        if self.shell is not None:
+            return Box.around(self.shell_in_frame.vertices, margin)
+        assert self.model.seed_points is not None
+        to_frame = np.linalg.inv(self.frame.to_scene) @ self.model_to_scene
+        points = _apply(to_frame, self.model.seed_points[0].double().cpu().numpy())
+        box = Box.around(points, 0.0, SCENE_TRIM)
+        widened = SCENE_MARGIN * box.size
+        return replace(box, low=box.low - widened, high=box.high + widened)
+
+    @torch.no_grad()
+    def views(self) -> Iterator[DepthView]:
+        """All views, rendered, in the frame: depth of what is at least half opaque and not masked out."""
+        depth_scale = 1 / (self.model_scale * self.frame.scale)
+        indexed = [(dataset, index) for dataset in self.datasets for index in range(len(dataset.views))]
+        for dataset, index in track(indexed, "rendering", transient=True):
+            outputs = self.model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(self.model.device))
+            depth = (outputs["depth"] * depth_scale).where(outputs["accumulation"] >= OPAQUE, 0.0).cpu()
+            kept = load_mask(dataset.views[index])
+            if kept is not None:
+                depth = depth.where(torch.from_numpy(kept)[..., None], 0.0)
+            yield DepthView(depth, outputs["rgb"].cpu(), self.frame.camera(dataset.views[index].camera))
+
+    def splats(self) -> Splats:
+        """The Gaussians in the frame."""
+        trained = {name: parameter.detach().cpu() for name, parameter in self.model.gauss_params.items()}
+        harmonics = torch.cat([trained["features_dc"][:, None], trained["features_rest"]], dim=1)
+        splats = Splats(trained["means"], trained["quats"], trained["scales"], trained["opacities"], harmonics)
+        return splats.transformed(np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
+
+
+def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
+    """Figures of :func:`geometry_errors` of the mesh as the held-out cameras see it, averaged over the views.
+
+    They can be compared with those of ns-eval: against the shell, and as ``truth_…`` against the true geometry where
+    the scene has it. What no reference supports, such as flaps beside the building, only ``area_near_shell`` tells of:
+    the share of the mesh's area within :data:`NEAR` of the shell.
+    """
+    caster = ShellCaster(ShellMesh(mesh.vertices, mesh.faces), run.frame.to_scene)
+    held_out, figures = run.datasets[1], []
+    metres_per_unit = 1 / (run.frame.scale * run.model_scale) if run.frame.metric else None
+    for index, view in enumerate(held_out.views):
+        batch, cue = held_out.get_data(index), caster.cast(view.camera)
+        depth, mask = torch.from_numpy(cue.depth)[..., None] * run.model_scale, torch.from_numpy(cue.mask)[..., None]
+        normal = torch.from_numpy(cue.normal).float()
+        rendering = Rendering(torch.zeros_like(normal), depth, mask.float(), normal)
+        camera = view.camera.to(dtype=torch.float32)
+        errors = {}
+        for kind, prefix in (("shell", ""), ("truth", "truth_")):
+            if f"{kind}_depth" in batch:
+                reference = reference_maps(batch, kind, torch.device("cpu"))
+                found = geometry_errors(rendering, camera, reference, metres_per_unit)
+                errors |= {prefix + name: value for name, value in found.items()}
+        figures.append(errors)
+    near = {} if run.shell is None else {"area_near_shell": _area_near(mesh, run.shell_in_frame)}
+    return mean_over_views(figures) | near
+
+
+def _area_near(mesh: trimesh.Trimesh, shell: ShellMesh) -> float:
+    """Share of a mesh's area whose triangles' centres are near a shell in the same frame."""
+    o3d = import_open3d()
+    scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor
+    scene.add_triangles(tensor(shell.vertices.astype(np.float32)), tensor(shell.faces.astype(np.uint32)))
+    distance = scene.compute_distance(tensor(mesh.triangles_center.astype(np.float32))).numpy()
+    return float(np.average(distance < NEAR, weights=mesh.area_faces))
+
+
+def _apply(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
