@@ -5,8 +5,12 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
 import re
+import shutil
 import stat
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
-from runs import trainer_of
+from runs import Method, trainer_of
 
 from dataparsers.errors import SceneError
 from shellgs_method.compare import launch
@@ -135,13 +139,16 @@ def test_the_registry_is_named_to_who_asks_for_another_method(pristine_scene, tm
 
 # runs are kept
 
-FAKE_TRAIN = """#!/usr/bin/env python3
-import pathlib, sys, time
+FAKE_TRAIN = """
+import os, pathlib, signal, sys
 words = dict(zip(sys.argv[2::2], sys.argv[3::2]))
 folder = pathlib.Path(words["--output-dir"], words["--experiment-name"], sys.argv[1], words["--timestamp"])
 last = int(words["--max-num-iterations"]) - 1
 (folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
-(folder / "config.yml").write_text("")
+(folder / "config.yml").write_text(
+    "!!python/object:types.SimpleNamespace {pipeline: !!python/object:types.SimpleNamespace "
+    "{datamanager: !!python/object:types.SimpleNamespace {data: somewhere}}}"
+)
 if folder.parent.name == "mono-gs":
     print("mono-gs needs maps")
     sys.exit(1)
@@ -150,10 +157,9 @@ checkpoint = folder / "nerfstudio_models" / f"step-{2 if killed else last:09d}.c
 checkpoint.write_text(" ".join(sys.argv[1:]))
 print("10 (50.00%)", flush=True)
 if killed:
-    import os, signal
-    os.kill(os.getpid(), signal.SIGKILL)
+    os.kill(os.getppid() if "KILL_PARENT" in os.environ else os.getpid(), signal.SIGKILL)
 """
-FAKE_EVALUATE = """#!/usr/bin/env python3
+FAKE_EVALUATE = """
 import json, pathlib, sys
 assert sys.argv[1] == "evaluate"
 words = dict(zip(sys.argv[3::2], sys.argv[4::2]))
@@ -161,14 +167,18 @@ pathlib.Path(words["--output-path"]).write_text(json.dumps({"results": {"psnr": 
 """
 
 
+def write_fake_commands(folder: Path) -> None:
+    for name, text in {"ns-train": FAKE_TRAIN, "shellgs": FAKE_EVALUATE}.items():
+        (folder / name).write_text(f"#!{sys.executable} -SI{text}")
+        (folder / name).chmod(stat.S_IRWXU)
+
+
 @pytest.fixture
 def fake_commands(tmp_path, monkeypatch) -> None:
     """Trainer and evaluation that take no time: photo-gs is killed at its first start, mono-gs always fails."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    for name, text in {"ns-train": FAKE_TRAIN, "shellgs": FAKE_EVALUATE}.items():
-        (folder / name).write_text(text)
-        (folder / name).chmod(stat.S_IRWXU)
+    write_fake_commands(folder)
     monkeypatch.setattr(launch, "BIN", folder)
 
 
@@ -240,6 +250,41 @@ def test_methods_that_do_not_undistort_are_refused_resized_photographs(scene, tm
         fake_grid([scene], ["splatfacto"], tmp_path)[0].settle()
 
 
+@pytest.fixture
+def fake_environment(tmp_path) -> Path:
+    """Folder of programs of a virtual environment like this one, with the fake commands; also in Ray's workers."""
+    home = tmp_path / "environment"
+    (home / "bin").mkdir(parents=True)
+    (home / "bin" / "python").symlink_to(Path(sys.executable).resolve())
+    (home / "lib").symlink_to(Path(sys.prefix) / "lib")
+    shutil.copy(Path(sys.prefix) / "pyvenv.cfg", home)
+    write_fake_commands(home / "bin")
+    return home / "bin"
+
+
+def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pristine_scene, tmp_path, fake_environment):
+    """photo-gs takes its worker with it at its first start, mono-gs always fails, and all results come back."""
+    pytest.importorskip("ray")
+    words = ["compare", pristine_scene, "--methods", "photo-gs", "mono-gs", "shellgs", "--iterations", "20"]
+    command = [fake_environment / "python", "-c", "from shellgs_method.cli import main; main()", *words]
+    environment = os.environ | {"KILL_PARENT": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(
+        [str(word) for word in (*command, "--launcher", "ray", "--output", tmp_path / "out")],
+        env=environment,
+        cwd=tmp_path,
+        text=True,
+        capture_output=True,
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "1 of 3 runs failed: scene/mono-gs/seed-0" in done.stderr
+    assert "mono-gs needs maps" in done.stdout
+    photo_gs, mono_gs, shellgs = fake_grid([pristine_scene], ["photo-gs", "mono-gs", "shellgs"], tmp_path / "out")
+    assert photo_gs.finished
+    assert "--load-dir" in (photo_gs.checkpoints / "step-000000019.ckpt").read_text()
+    assert shellgs.finished
+    assert "mono-gs needs maps" in (mono_gs.folder / "log.txt").read_text()
+
+
 # measurements and pictures
 
 
@@ -249,14 +294,15 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SHELLGS_COMPILE", "0")
         runs = grid([pristine_scene], ["photo-gs", "shellgs"], [0], 4, tmp_path_factory.mktemp("compare"))
-        for run in runs:
+        methods: tuple[Method, Method] = ("photo_gs", "shellgs")
+        for run, method in zip(runs, methods, strict=True):
             run.settle()
 
             def place(config, run=run):
                 config.output_dir, config.experiment_name = run.folder.parents[2], run.variant.name
                 config.timestamp, config.steps_per_eval_all_images = "seed-0", 2
 
-            trainer_of(pristine_scene, run.output, run.variant.method.replace("-", "_"), 4, change=place).train()
+            trainer_of(pristine_scene, run.output, method, 4, change=place).train()
             write_figures(run.config, run.figures(), pictures=run.pictures)
     return runs
 
@@ -267,6 +313,7 @@ def test_our_figures_are_those_of_ns_eval(measured):
 
     _, pipeline, _, _ = eval_setup(measured[1].config)
     theirs = pipeline.get_average_eval_image_metrics(get_std=True)
+    assert theirs is not None
     ours = json.loads(measured[1].figures().read_text())["results"]
     timing = {"fps", "fps_std", "num_rays_per_sec", "num_rays_per_sec_std"}
     assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})

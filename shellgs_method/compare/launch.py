@@ -46,7 +46,11 @@ def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run
     return {run: failures[run] for run in runs if run in failures}
 
 
-def finish(run: Run, announce: Callable[[Sequence[str]], None], step: Callable[[int], None]) -> None:
+def finish(
+    run: Run,
+    announce: Callable[[Sequence[str]], None] = lambda _: None,
+    step: Callable[[int], None] = lambda _: None,
+) -> None:
     """Bring a run to its end from where it stands; its output goes to log.txt in its folder.
 
     Args:
