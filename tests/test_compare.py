@@ -302,7 +302,9 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
                 config.output_dir, config.experiment_name = run.folder.parents[2], run.variant.name
                 config.timestamp, config.steps_per_eval_all_images = "seed-0", 2
 
-            trainer_of(pristine_scene, run.output, method, 4, change=place).train()
+            trainer = trainer_of(pristine_scene, run.output, method, 4, change=place)
+            trainer.config.save_config()
+            trainer.train()
             write_figures(run.config, run.figures(), pictures=run.pictures)
     return runs
 

@@ -30,7 +30,7 @@ from shellgs_method.compare.launch import CommandError, finish
 from shellgs_method.compare.runs import Run
 
 RETRIES = 3
-"""How often a task whose worker was killed is tried again."""
+"""How often a task whose worker was killed is tried again; its command ends at the next line of output, unread."""
 
 Archive = UInt8[np.ndarray, " N"]
 """A tar file; as an array, since workers of one node read those from shared memory."""

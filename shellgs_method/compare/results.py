@@ -30,7 +30,7 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
         run.settle()
     unfinished = [run for run in runs if not run.finished]
     console.print(f"{len(runs) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
-    failures = launch(unfinished)
+    failures = launch(unfinished) if unfinished else {}
     for table in write_results(runs, output, {run.label: why for run, why in failures.items()}):
         console.print(rich_table(table.rows, table.columns, table.title))
     for run, why in failures.items():
