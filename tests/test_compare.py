@@ -137,6 +137,11 @@ def test_the_registry_is_named_to_who_asks_for_another_method(pristine_scene, tm
         fake_grid([pristine_scene], ["shelgs"], tmp_path)
 
 
+def test_a_name_that_leaves_its_folder_is_refused(pristine_scene, tmp_path):
+    with pytest.raises(SceneError, match="is to name a folder"):
+        fake_grid([pristine_scene], ["../mine=shellgs"], tmp_path)
+
+
 # runs are kept
 
 FAKE_TRAIN = """
@@ -223,6 +228,14 @@ def test_a_changed_setting_is_refused_before_anything_starts(pristine_scene, tmp
     with pytest.raises(SceneError, match=r"seed-0 is a run of other settings \(iterations: 20, now 30\)"):
         finish_all(longer)
     assert not longer[0].trained
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_run_that_failed_before_its_first_checkpoint_may_change(pristine_scene, tmp_path):
+    finish_all(fake_grid([pristine_scene], ["mono-gs"], tmp_path / "out"))
+    (longer,) = fake_grid([pristine_scene], ["mono-gs"], tmp_path / "out", iterations=30)
+    longer.settle()
+    assert json.loads((longer.folder / "settings.json").read_text())["iterations"] == 30
 
 
 @pytest.mark.usefixtures("fake_commands")

@@ -32,7 +32,7 @@ def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run
     """Finish all runs, ``jobs`` at once; those that failed, with their last lines. One's failure stops no other."""
     runs = list(runs)
     failures: dict[Run, str] = {}
-    with Progress(console=console, transient=True) as progress, ThreadPoolExecutor(jobs) as pool:
+    with Progress(console=console, transient=True) as progress, ThreadPoolExecutor(max(jobs, 1)) as pool:
         futures = {pool.submit(_finish_visibly, run, console, progress): run for run in runs}
         try:
             for future in as_completed(futures):

@@ -77,7 +77,7 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
     Args:
         config_path: config.yml of the run.
         half: bands of the facade that alone are measured; None: what the run itself held out, or all.
-        pictures: folder that gets a :class:`Snapshot` of each view.
+        pictures: folder that gets a :class:`Snapshot` of each view that sees the shell.
 
     Raises:
         FileNotFoundError: there is no such config.
@@ -97,7 +97,7 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
         figures.append(
             image_errors(rendering.rgb, photograph) | reference_errors(rendering, camera, batch, metres_per_unit)
         )
-        if pictures and "shell_depth" in batch:
+        if pictures and "shell_mask" in batch and batch["shell_mask"].any():
             _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(pictures / f"{index:04d}.npz")
     return {
         "experiment_name": config.experiment_name,

@@ -76,7 +76,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
 
     A row an azimuth, a column a run. Points are thinned to the voxels that the figures are measured with.
     """
-    shots = {run.variant.name: _on_the_shell(run) for run in runs}
+    shots = {run.variant.name: [Snapshot.load(path) for path in sorted(run.pictures.glob("*.npz"))] for run in runs}
     seen = next(iter(shots.values()))
     unit, voxel = _resolution(seen[0])
     reference = voxel_means(np.concatenate([_world(shot, shot.shell_depth) for shot in seen]), voxel)
@@ -105,12 +105,6 @@ def _events(run: Run) -> dict[str, dict[int, float]]:
     events.Reload()
     found = (tag for tag in events.Tags()["scalars"] if tag.startswith(_EVENTS))
     return {tag.removeprefix(_EVENTS): {event.step: event.value for event in events.Scalars(tag)} for tag in found}
-
-
-def _on_the_shell(run: Run) -> list[Snapshot]:
-    """The views of a run that see the shell."""
-    shots = (Snapshot.load(path) for path in sorted(run.pictures.glob("*.npz")))
-    return [shot for shot in shots if shot.mask.any()]
 
 
 def _resolution(shot: Snapshot) -> tuple[str, float]:

@@ -58,10 +58,10 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[str, str]
 
 
 def _shown(runs: Sequence[Run]) -> list[Run]:
-    """The runs that pictures show: the first of each method that has some of the shell, ablations aside."""
+    """The runs that pictures show: the first of each method that is measured, ablations aside."""
     first: dict[str, Run] = {}
     for run in runs:
-        if run.variant.name not in ABLATIONS and any(run.pictures.glob("*.npz")):
+        if run.variant.name not in ABLATIONS and run.figures().exists() and any(run.pictures.glob("*.npz")):
             first.setdefault(run.variant.name, run)
     return list(first.values())
 

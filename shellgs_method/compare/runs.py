@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -45,6 +46,8 @@ class Variant:
             SceneError: there is no such method.
         """
         name, _, words = text.partition("=")
+        if not re.fullmatch(r"[\w.+-]*\w[\w.+-]*", name):
+            raise SceneError(f"{name!r} is to name a folder: take letters, digits, dots and dashes")
         method, *flags = shlex.split(words) or ABLATIONS.get(name, (name,))
         if method not in all_methods:
             ours = ", ".join([*METHODS, *ABLATIONS])
@@ -166,10 +169,10 @@ class Run:
         """Write the settings into the run's folder, where a later comparison finds them.
 
         Raises:
-            SceneError: the folder holds a run of other settings, which is left as it is.
+            SceneError: the folder holds a run of other settings that has come to a checkpoint; it is left as it is.
         """
         path, settings = self.folder / "settings.json", self.settings
-        if path.exists():
+        if path.exists() and any(self.checkpoints.glob("step-*.ckpt")):
             before = json.loads(path.read_text())
             changed = [key for key in settings if settings[key] != before.get(key)]
             if changed:
@@ -180,7 +183,7 @@ class Run:
             return
         if not self.variant.ours:
             _refuse_photographs_that_change(self.scene, self.variant.method)
-        if self.config.exists():
+        if self.config.exists() and not path.exists():
             raise SceneError(f"{self.folder} is a run that `shellgs compare` did not make: give another --output")
         self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as file:
@@ -222,7 +225,7 @@ def grid(
             () if variant.held_out else halves,
             curve_points,
         )
-        for seed in seeds
+        for seed in dict.fromkeys(seeds)
         for scene in scenes
         for variant in variants
     ]
