@@ -100,7 +100,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
 
 
 def recorded_figures(run: Run) -> dict[str, dict[int, float]]:
-    """Figures of all held-out views by name, by iteration, from the tensorboard files; where a resumed run wrote one twice, the last."""
+    """Figures of all held-out views by name, by iteration; where a resumed run wrote one twice, the last."""
     events = EventAccumulator(str(run.folder), size_guidance={"scalars": 0})
     events.Reload()
     found = (tag for tag in events.Tags()["scalars"] if tag.startswith(_EVENTS))
