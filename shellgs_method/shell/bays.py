@@ -53,7 +53,7 @@ class ShiftScan:
     @property
     def elsewhere(self) -> tuple[float, float]:
         """The best other place: its shift in metres, and its fit relative to the one in place."""
-        away = np.abs(self.shifts) >= _SHORTEST / 2
+        away = np.abs(self.shifts) >= _SHORTEST
         best = np.argmax(np.where(away, self.fits, -1.0))
         return float(self.shifts[best]), float(self.fits[best] / max(self.in_place, 1e-9))
 

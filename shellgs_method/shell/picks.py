@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float64
 
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, to_camera
+from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.surface import fit_similarity, transformed
 
 MAX_ERROR = 0.15
@@ -183,6 +184,15 @@ def align_picks(
     survey_from_shell[:3, 3] = -metres_per_shell_unit * centre
     matrix = np.linalg.inv(survey_from_scene) @ survey_from_shell
     return matrix, sorted(points, key=lambda point: -point.residual)
+
+
+def measured_again(points: Sequence[PickedPoint], alignment: Alignment) -> list[PickedPoint]:
+    """The points with their residuals under another alignment, worst first."""
+    again = []
+    for point in points:
+        offset = alignment.apply(point.pick.shell[None])[0] - point.scene
+        again.append(replace(point, residual=alignment.metres_per_unit * float(np.linalg.norm(offset))))
+    return sorted(again, key=lambda point: -point.residual)
 
 
 def _triangulate_all(

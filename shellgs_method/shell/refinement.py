@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from dataparsers.errors import SceneError
 from shellgs_method.shell.surface import ShellSurface, transformed
 
 FINAL_GATE = 0.05
@@ -98,7 +99,7 @@ def refine(
         reach: metres by which the start may be off.
 
     Raises:
-        ValueError: fewer than 7 points are within reach of the shell.
+        SceneError: fewer than 7 points are within reach of the shell.
     """
     start = transformed(points, survey_from_scene)
     similarity = survey_from_scene
@@ -120,7 +121,7 @@ def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evid
     offset = points - closest.foot
     used = np.linalg.norm(offset, axis=1) < gate
     if used.sum() < 7:
-        raise ValueError(
+        raise SceneError(
             f"only {used.sum()} SfM points are within {gate:.2g} m of the shell: the start is too far off, or the "
             "points are of something else"
         )

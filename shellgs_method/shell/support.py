@@ -62,6 +62,17 @@ class ViewSupport:
         return float(along.min()), float(along.max())
 
 
+def positions(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
+    """Where the cameras stand, in the scene's frame."""
+    return np.stack([view.camera.position.cpu().double().numpy() for view in views])
+
+
+def upwards(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
+    """Unit vector up in the scene's frame, as the cameras are held; tilted where they look up or down."""
+    up = -np.mean([view.camera.viewmat[1, :3].cpu().double().numpy() for view in views], axis=0)
+    return up / np.linalg.norm(up)
+
+
 def look(
     caster: ShellCaster,
     view: View,
@@ -94,15 +105,15 @@ def look(
 def representative(
     supports: Sequence[ViewSupport], axis: Float64[np.ndarray, " 3"], count: int = 8
 ) -> list[ViewSupport]:
-    """Views spread over the facade, from the one that sees most of its left end to that of its right end."""
+    """Views spread over the facade, from the one that shows its left end best to that of its right end."""
     seeing = [support for support in supports if len(support.hits)]
     if len(seeing) <= count:
         return sorted(seeing, key=lambda s: sum(s.span(axis)))
     spans = np.array([support.span(axis) for support in seeing])
-    edge = 0.05 * (spans[:, 1].max() - spans[:, 0].min())
-    supported = np.array([support.supported for support in seeing])
-    left = np.argmax(np.where(spans[:, 0] < spans[:, 0].min() + edge, supported, -1))
-    right = np.argmax(np.where(spans[:, 1] > spans[:, 1].max() - edge, supported, -1))
+    first, last = spans[:, 0].min(), spans[:, 1].max()
+    near = 0.1 * (last - first)
+    left = np.argmax([(support.hits @ axis < first + near).mean() * support.supported for support in seeing])
+    right = np.argmax([(support.hits @ axis > last - near).mean() * support.supported for support in seeing])
     order = [k for k in np.argsort(spans.sum(axis=1)) if k not in (left, right)]
     between = [order[k] for k in np.linspace(0, len(order) - 1, count - 2).round().astype(int)]
     return [seeing[k] for k in (left, *between, right)]

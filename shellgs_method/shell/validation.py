@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
+from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.bays import BETTER, RIVALRY, ShiftScan, facade_axes, scan_shifts
@@ -20,7 +21,7 @@ from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.picks import PickedPoint
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.refinement import Refinement, refine
-from shellgs_method.shell.support import NEAR, OCCLUDING, ViewSupport, look
+from shellgs_method.shell.support import NEAR, OCCLUDING, ViewSupport, look, positions, upwards
 from shellgs_method.shell.surface import ShellSurface, transformed
 
 if TYPE_CHECKING:
@@ -166,14 +167,14 @@ def validate(
     size = _check(key, distance, "Distance from cameras to shell, median (units)", "{:.3g} m")
     if size.verdict == "refused":
         return Validation(alignment, [sight, size], supports)
-    cameras = transformed(_positions(views), survey_from_scene)
+    cameras = transformed(positions(views), survey_from_scene)
     axes = _axes(seeing, survey_from_scene)
     placed = transformed(points.positions, survey_from_scene)
     signed = _signed_distances(surface, placed, cameras)
     near = np.abs(signed) < NEAR
     try:
         test = refine(surface, points.positions, survey_from_scene, _REACH)
-    except ValueError:
+    except SceneError:
         test = None
     measured = Validation(
         alignment=alignment,
@@ -192,13 +193,13 @@ def validate(
 def _judge(measured: Validation) -> Iterator[Check]:
     yield _check("points", len(measured.signed), "SfM points within 1 m of the shell", "{:.0f}")
     yield _check("share", measured.share_within(0.10), "of these, within 10 cm", "{:.0%}")
-    yield _check("bias", abs(measured.bias), "Bias along the normal, median", "{:.3f} m")
+    yield _check("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
     if measured.test is not None:
         evidence = measured.test.evidence
         yield _check("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
         words = "; ".join(evidence.in_words(measured.axes))
         yield _check("weak", int(evidence.weak.sum()), "Directions the points cannot tell", f"{{:.0f}} {words}".strip())
-    for scan in measured.scans:
+    for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
         yield _check("rival", fit, f"Fit {shift:+.1f} m {scan.name}, relative", "{:.2f}")
     if held_out := [point.residual for point in measured.picked if point.pick.held_out]:
@@ -214,14 +215,9 @@ def _check(key: str, value: float, name: str, form: str) -> Check:
     return Check(name, form.format(value), limits, limit.judge(value), limit.why)
 
 
-def _positions(views: Sequence[View]) -> np.ndarray:
-    return np.stack([view.camera.position.cpu().double().numpy() for view in views])
-
-
 def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.ndarray:
     """Right, up and out of the facade that the views see most of."""
-    cameras_up = -np.mean([support.view.camera.viewmat[1, :3].cpu().double().numpy() for support in seeing], axis=0)
-    up = survey_from_scene[:3, :3] @ cameras_up
+    up = survey_from_scene[:3, :3] @ upwards([support.view for support in seeing])
     normals = np.concatenate([support.normals for support in seeing])
     return facade_axes(normals, up / np.linalg.norm(up))
 
