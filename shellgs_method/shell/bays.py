@@ -52,8 +52,10 @@ class ShiftScan:
 
     @property
     def elsewhere(self) -> tuple[float, float]:
-        """The best other place: its shift in metres, and its fit relative to the one in place."""
+        """The best place a metre or more away: its shift in metres, and its fit relative to the one in place."""
         away = np.abs(self.shifts) >= _SHORTEST
+        if not away.any():  # the shell is no longer than that
+            return 0.0, 0.0
         best = np.argmax(np.where(away, self.fits, -1.0))
         return float(self.shifts[best]), float(self.fits[best] / max(self.in_place, 1e-9))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 
@@ -25,6 +26,7 @@ AMBIGUOUS = 0.90
 """Share of the best score from which another place is named beside it."""
 _DIFFERENT = 0.5  # metres of mean displacement from which two places are two
 _REFINED = 12  # places that are refined
+_PEAKS = 6  # shifts that are kept for a wall and a scale, a metre or more apart
 _SCALE_STEP = 1.04
 _FLAT = 0.05  # breadth of the SfM wall over its length within which points are on it
 _FIT = 0.10  # metres
@@ -158,13 +160,14 @@ def _places(
         hits, covered = (fftconvolve(shell_cells[0], c[::-1, ::-1, ::-1]) for c in (counts[0], occupied[0]))
         precision, recall = hits / counts[0].sum(), covered / shell_cells[0].sum()
         score = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
-        for flat_index in np.argsort(score, axis=None)[:-4:-1]:
-            index = np.array(np.unravel_index(flat_index, score.shape))
+        peaks = np.flatnonzero(score == maximum_filter(score, 2 * round(1.0 / cell) + 1))
+        for peak in peaks[np.argsort(-score.flat[peaks])][:_PEAKS]:
+            index = np.array(np.unravel_index(peak, score.shape))
             shift = (index - np.array(counts[0].shape) + 1 + shell_cells[1] - counts[1]) * cell
             similarity = np.eye(4)
             similarity[:3, :3] = scale * axes.T @ scene_axes
             similarity[:3, 3] = axes.T @ (target + shift - scale * middle)
-            found.append((float(score.flat[flat_index]), similarity))
+            found.append((float(score.flat[peak]), similarity))
     return found
 
 
