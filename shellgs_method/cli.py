@@ -96,7 +96,8 @@ def align(
 
     if (shell is None and (matrix or picks)) or (matrix and picks) or (accept and (shell or matrix or picks)):
         raise SceneError("give the shell with --matrix, with --picks or alone, or no shell to judge what is there")
-    views, points = (read(FacadeDataParserConfig(data=scene)) for read in (read_views, read_sparse_points))
+    config = FacadeDataParserConfig(data=scene)
+    views, points = read_views(config), read_sparse_points(config)
     name = relative_path(shell, scene) if shell else ""
     if shell is None:
         placement = Placement(Alignment.load(scene / (PROPOSAL if accept else ALIGNMENT)))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
 from shellgs_method.shell.raycast import import_open3d
@@ -185,7 +185,7 @@ def _cells(points: np.ndarray, cell: float, counted: bool = False) -> tuple[np.n
 def _score(surface: ShellSurface, points: np.ndarray) -> float:
     precision = float((surface.distance(points) < _FIT).mean())
     samples, _ = surface.samples(5000)
-    recall = float((cKDTree(points).query(samples)[0] < 5 * _FIT).mean())
+    recall = float((KDTree(points).query(samples)[0] < 5 * _FIT).mean())
     return 2 * precision * recall / max(precision + recall, 1e-9)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
@@ -58,7 +58,11 @@ LIMITS = {
     "bias": Limit(
         0.025, 0.15, "5 cm out of the wall is 3 times the scatter; sills and frames shift the median by 1 cm"
     ),
-    "pull": Limit(0.03, 0.25, "5 cm sideways turns the supervision at the shell's edges by 5.6° on average"),
+    "pull": Limit(
+        0.03,
+        0.25,
+        "5 cm sideways turn the supervision at the shell's edges by 5.6° on average; --refine makes that motion",
+    ),
     "weak": Limit(0, 7, "a bare wall cannot tell along it from truth: only pictures or picked points can"),
     "rival": Limit(RIVALRY, BETTER, "on repeated windows a bay further along fits almost as well"),
     "check": Limit(0.10, 0.50, "a careful pick is good to 3 to 5 cm"),
@@ -108,7 +112,7 @@ class Validation:
     @property
     def verdict(self) -> Verdict:
         """The worst of the checks'."""
-        return max((check.verdict for check in self.checks), key=_ORDER.index)
+        return _ORDER[max(_ORDER.index(check.verdict) for check in self.checks)]
 
     @property
     def reasons(self) -> list[str]:
@@ -192,7 +196,7 @@ def validate(
 
 def _judge(measured: Validation) -> Iterator[Check]:
     yield _check("points", len(measured.signed), "SfM points within 1 m of the shell", "{:.0f}")
-    yield _check("share", measured.share_within(0.10), "of these, within 10 cm", "{:.0%}")
+    yield _check("share", measured.share_within(0.10), "SfM points within 1 m, share within 10 cm", "{:.0%}")
     yield _check("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
     if measured.test is not None:
         evidence = measured.test.evidence
@@ -225,7 +229,7 @@ def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.nd
 def _signed_distances(surface: ShellSurface, points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
     """Distances of points from the shell, positive on the side of the nearest camera."""
     closest = surface.closest(points)
-    towards = cameras[cKDTree(cameras).query(closest.foot)[1]] - closest.foot
+    towards = cameras[KDTree(cameras).query(closest.foot)[1]] - closest.foot
     normal = closest.normal * np.sign(np.einsum("nd,nd->n", closest.normal, towards))[:, None]
     offset = points - closest.foot
     side = np.where(np.einsum("nd,nd->n", normal, offset) < 0, -1.0, 1.0)
