@@ -117,7 +117,7 @@ def test_refinement_returns_from_30_cm_1_degree_and_1_percent(surface, points, s
     start = displaced(0.3, 1.0, growth, seed=5) @ survey_from_scene
     assert error(surface, start, survey_from_scene) > 0.25
     found = refine(surface, points.positions, start, reach=1.0)
-    assert error(surface, found.survey_from_scene, survey_from_scene) < 0.004  # 1.5 cm of noise in 1500 points
+    assert error(surface, found.survey_from_scene, survey_from_scene) < 0.006  # 1.5 cm of noise in 1500 points
     assert not found.evidence.weak.any()
 
 

@@ -25,7 +25,7 @@ from shellgs_method.shell.surface import ShellSurface, transformed
 AMBIGUOUS = 0.90
 """Share of the best score from which another place is named beside it."""
 _DIFFERENT = 0.5  # metres of mean displacement from which two places are two
-_REFINED = 12  # places that are refined
+_REFINED = 5  # places on each wall that are refined
 _PEAKS = 6  # shifts that are kept for a wall and a scale, a metre or more apart
 _SCALE_STEP = 1.04
 _FLAT = 0.05  # breadth of the SfM wall over its length within which points are on it
@@ -69,12 +69,11 @@ def propose(
         SceneError: the SfM points have no main wall, or it fits nowhere.
     """
     scene_wall, wall_points = _main_wall(points, cameras, scene_up)
-    starts: list[tuple[float, np.ndarray]] = []
+    starts: list[np.ndarray] = []  # of each wall, for the scores of walls of different sizes do not compare
     for axes, samples in _shell_walls(surface, shell_up):
-        starts += _places(scene_wall, wall_points, axes, samples)
-    starts.sort(key=lambda start: -start[0])
+        starts += _distinct(_places(scene_wall, wall_points, axes, samples), surface.vertices)
     found: list[Candidate] = []
-    for _, start in _distinct(starts, surface.vertices)[:_REFINED]:
+    for start in starts:
         try:
             refined = refine(surface, wall_points, start, _REACH).survey_from_scene
         except ValueError:
@@ -195,12 +194,12 @@ def _displacement(one: np.ndarray, other: np.ndarray, vertices: np.ndarray) -> f
     return float(np.linalg.norm(moved - vertices, axis=1).mean())
 
 
-def _distinct(starts: Sequence[tuple[float, np.ndarray]], vertices: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """The first of each group of places that differ by little."""
-    kept: list[tuple[float, np.ndarray]] = []
-    for score, start in starts:
-        if all(_displacement(other, start, vertices) > _DIFFERENT for _, other in kept):
-            kept.append((score, start))
+def _distinct(starts: Sequence[tuple[float, np.ndarray]], vertices: np.ndarray) -> list[np.ndarray]:
+    """The best of each group of places that differ by little, as far as they are refined."""
+    kept: list[np.ndarray] = []
+    for _, start in sorted(starts, key=lambda start: -start[0]):
+        if all(_displacement(other, start, vertices) > _DIFFERENT for other in kept):
+            kept.append(start)
         if len(kept) == _REFINED:
             break
     return kept
