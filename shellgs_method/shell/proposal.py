@@ -25,7 +25,7 @@ from shellgs_method.shell.surface import ShellSurface, transformed
 AMBIGUOUS = 0.90
 """Share of the best score from which another place is named beside it."""
 _DIFFERENT = 0.5  # metres of mean displacement from which two places are two
-_REFINED = 5  # places on each wall that are refined
+_REFINED = 10  # places on each wall that are refined
 _PEAKS = 6  # shifts that are kept for a wall and a scale, a metre or more apart
 _SCALE_STEP = 1.04
 _FLAT = 0.05  # breadth of the SfM wall over its length within which points are on it
@@ -75,7 +75,7 @@ def propose(
     found: list[Candidate] = []
     for start in starts:
         try:
-            refined = refine(surface, wall_points, start, _REACH).survey_from_scene
+            refined = refine(surface, points, start, _REACH).survey_from_scene
         except ValueError:
             continue
         found.append(Candidate(refined, _score(surface, transformed(wall_points, refined))))
