@@ -121,6 +121,6 @@ def judge(
     write_report(scene / REPORT, mesh, validation, placement.history)
     kept = Alignment.load(target) if target.is_file() else None
     if validation.verdict != "refused" and not (kept and kept.places_like(placement.alignment)):
-        judged = replace(placement.alignment, verdict=validation.verdict, residuals=validation.figures())
+        judged = replace(placement.alignment, verdict=validation.verdict, figures=validation.figures())
         judged.save(target)
     return validation

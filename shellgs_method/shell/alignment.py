@@ -24,7 +24,7 @@ class Alignment:
         metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
         source: how the alignment was found, for people.
         verdict: of the validation, "good" or "doubtful"; empty where there was none.
-        residuals: the main numbers behind the verdict.
+        figures: the main numbers behind the verdict.
 
     Raises:
         SceneError: the matrix is no similarity, or mirrors.
@@ -35,7 +35,7 @@ class Alignment:
     metres_per_shell_unit: float = 1.0
     source: str = "matrix"
     verdict: str = ""
-    residuals: Mapping[str, float | None] = field(default_factory=dict)
+    figures: Mapping[str, float | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the matrix."""
@@ -101,8 +101,8 @@ class Alignment:
             fields = json.loads(path.read_bytes())
             matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
             unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
-            verdict, residuals = str(fields.get("verdict", "")), dict(fields.get("residuals", {}))
-            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, residuals)
+            verdict, figures = str(fields.get("verdict", "")), dict(fields.get("figures", {}))
+            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, figures)
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
         except (ValueError, TypeError, AttributeError) as error:
