@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from dataparsers.cue_maps import CueMaps
     from dataparsers.photograph import View
     from shellgs_method.export import Frame
+    from shellgs_method.shell.align import Placement
+    from shellgs_method.shell.validation import Validation
 
 console = Console()
 
@@ -60,6 +62,84 @@ def demo(
     from shellgs_method.synthetic import FacadeConfig
 
     run_demo(folder, FacadeConfig(width, height, views, seed), iterations, console)
+
+
+def align(
+    scene: Scene,
+    shell: Annotated[Optional[Path], tyro.conf.Positional] = None,
+    matrix: Optional[Path] = None,
+    picks: Optional[Path] = None,
+    refine: Optional[float] = None,
+    accept: bool = False,
+    global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    metres_per_shell_unit: float = 1.0,
+) -> None:
+    """Find the shell's place in the scene, judge it, and write scene/shell/alignment.json unless it is refused.
+
+    The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
+    verdict. Without --matrix and --picks, a place is proposed, for you to look at and to take with --accept. Without a
+    shell, the alignment that is there is judged again, or refined.
+
+    Args:
+        scene: Scene folder.
+        shell: The shell's file.
+        matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare's text, json or npy).
+        picks: Text file of picked points, a line each: X Y Z of the shell, x y in the photograph, image, name.
+        refine: Then fit the SfM points to the shell, from a start that is off by up to this many metres.
+        accept: Take the proposal made before.
+        global_shift: CloudCompare's global shift, with --matrix.
+        metres_per_shell_unit: Length of the shell's unit in metres.
+    """
+    from dataparsers.cue_maps import relative_path
+    from dataparsers.facade import FacadeDataParserConfig, read_views
+    from dataparsers.sparse_points import read_sparse_points
+    from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
+    from shellgs_method.shell.align import PROPOSAL, Placement, judge, place_by_guess, place_by_picks, refined
+
+    if (shell is None and (matrix or picks)) or (matrix and picks) or (accept and (shell or matrix or picks)):
+        raise SceneError("give the shell with --matrix, with --picks or alone, or no shell to judge what is there")
+    config = FacadeDataParserConfig(data=scene)
+    views, points = read_views(config), read_sparse_points(config)
+    name = relative_path(shell, scene) if shell else ""
+    if shell is None:
+        placement = Placement(Alignment.load(scene / (PROPOSAL if accept else ALIGNMENT)))
+    elif matrix:
+        placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
+    elif picks:
+        placement = place_by_picks(picks, views, name, metres_per_shell_unit)
+    else:
+        placement = place_by_guess(load_shell(shell), views, points, name, metres_per_shell_unit)
+    mesh = load_shell(scene / placement.alignment.shell)
+    if refine is not None:
+        placement = refined(placement, mesh, views, points, refine)
+    target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
+    _show_alignment(scene, target, placement, judge(scene, placement, mesh, views, points, target))
+
+
+def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
+    """What the user needs to know of a judged alignment; a refused one ends the program."""
+    from shellgs_method.shell.align import REPORT
+    from shellgs_method.shell.report import PICK_COLUMNS, pick_rows
+
+    for sentence in placement.history:
+        console.print(sentence, highlight=False)
+    if placement.picked:
+        table = Table(*PICK_COLUMNS)
+        for row in pick_rows(validation):
+            table.add_row(*row)
+        console.print(table)
+    for reason in validation.reasons:
+        console.print(f"[yellow]{reason}.", highlight=False)
+    report = scene / REPORT / "index.html"
+    if validation.verdict == "refused":
+        raise SceneError(f"the alignment is refused, and {target} left as it was: see {report}")
+    console.print(
+        f"Verdict: {validation.verdict}. Look at {report}: the shell's edges must lie on the photographed ones."
+    )
+    if placement.proposed:
+        console.print(f"This is a proposal. If the pictures agree: shellgs align {scene} --accept")
+    else:
+        console.print(f"Written: {target}.")
 
 
 def cast(
@@ -256,7 +336,15 @@ def doctor(install_libraries: bool = False) -> None:
 def main() -> None:
     """Entry point."""
     warnings.filterwarnings("ignore", category=FutureWarning)  # of the libraries below, and nothing to a user
-    commands = {"demo": demo, "cast": cast, "mono": mono, "mesh": mesh, "splats": splats, "doctor": doctor}
+    commands = {
+        "demo": demo,
+        "align": align,
+        "cast": cast,
+        "mono": mono,
+        "mesh": mesh,
+        "splats": splats,
+        "doctor": doctor,
+    }
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             commands, description="Everything around the training of the methods; these are trained by `ns-train`."
