@@ -43,6 +43,7 @@ class Benchmark:
         rounds: that every contender is timed, after one that is not.
         twin_up_to: number of splats up to which the twin takes part; it is slow.
         threads: of torch.
+        memory: also measure it, in a fresh process for each row.
         save_scene: write the scene of the first number and size here (npz), for other programs, and stop.
         figure: draw time against (splat, pixel) pairs here.
     """
@@ -54,6 +55,7 @@ class Benchmark:
     rounds: int = 5
     twin_up_to: int = 10_000
     threads: int = 2
+    memory: bool = True
     save_scene: Path | None = None
     figure: Path | None = None
 
@@ -93,7 +95,7 @@ def main(benchmark: Benchmark) -> None:
         for width, height in sizes:
             cases = [Case(n, width, height, p, c) for p in benchmark.primitives for c in benchmark.channels]
             own, twins = time_in_turns(cases, benchmark.rounds, with_twins=n <= benchmark.twin_up_to)
-            memory = {case: peak_memory(case, benchmark.threads) for case in cases}
+            memory = {case: peak_memory(case, benchmark.threads) for case in cases if benchmark.memory}
             console.print(tabulate(own, twins, memory))
             timings |= own
     if benchmark.figure is not None:
@@ -185,7 +187,7 @@ def tabulate(own: dict[Case, Timing], twins: dict[Case, Timing], memory: dict[Ca
             _ratios(twins[case], timing) if case in twins else "",
             _ratios(timing, own[first]),
             f"{pairs(case.n, case.width, case.height, case.primitive) / 1e6:.2f}",
-            f"{memory[case]:.1f}",
+            f"{memory[case]:.1f}" if case in memory else "",
         )
     return table
 
