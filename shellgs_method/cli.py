@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dataparsers.errors import SceneError, refusals_end_the_program
+from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ MonoSource = Annotated[
     tyro.conf.arg(name=""),
 ]
 _MOGE = MoGe2()
+_CAPTURE = CaptureConfig()
 
 
 def demo(
@@ -58,6 +60,41 @@ def demo(
     from shellgs_method.synthetic import FacadeConfig
 
     run_demo(folder, FacadeConfig(width, height, views, seed), iterations, console)
+
+
+def capture(
+    source: Annotated[Path, tyro.conf.Positional],
+    scene: Scene,
+    config: Annotated[CaptureConfig, tyro.conf.arg(name="")] = _CAPTURE,
+) -> None:
+    """Photographs or a video to a scene: cameras and points by structure from motion, photographs undistorted.
+
+    An interrupted capture goes on where it stopped: give the same command again.
+
+    Args:
+        source: Folder of photographs, or a video.
+        scene: Scene folder.
+        config: Settings.
+    """
+    from shellgs_method.capture import capture
+
+    try:
+        summary = capture(source, scene, config, console=console)
+    except KeyboardInterrupt:
+        raise SystemExit("shellgs: interrupted; the same command goes on from here") from None
+    total = len(summary.registered) + len(summary.missing)
+    console.print(
+        f"{len(summary.registered)} of {total} photographs have a camera; {summary.points} points, each seen by "
+        f"{summary.track_length:.1f} photographs, reprojected to {summary.reprojection_error:.2f} px (means).",
+        highlight=False,
+    )
+    if summary.missing:
+        console.print(f"Without a camera: {', '.join(summary.missing)}.", highlight=False)
+    console.print(
+        f"Look at the cameras before you go on (`ns-viewer`, or any viewer of COLMAP models, on {scene}/colmap): where "
+        "identical windows were mistaken for each other, the walk jumps or folds.",
+        highlight=False,
+    )
 
 
 def cast(
@@ -182,7 +219,7 @@ def doctor(install_libraries: bool = False) -> None:
 def main() -> None:
     """Entry point."""
     warnings.filterwarnings("ignore", category=FutureWarning)  # of the libraries below, and nothing to a user
-    commands = {"demo": demo, "cast": cast, "mono": mono, "doctor": doctor}
+    commands = {"demo": demo, "capture": capture, "cast": cast, "mono": mono, "doctor": doctor}
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             commands, description="Everything around the training of the methods; these are trained by `ns-train`."
