@@ -76,7 +76,7 @@ def capture(
         scene: Scene folder.
         config: Settings.
     """
-    from shellgs_method.capture import capture
+    from shellgs_method.capture import SUSPICIOUS_ERROR, capture
 
     try:
         summary = capture(source, scene, config, console=console)
@@ -90,11 +90,12 @@ def capture(
     )
     if summary.missing:
         console.print(f"Without a camera: {', '.join(summary.missing)}.", highlight=False)
-    console.print(
-        f"Look at the cameras before you go on (`ns-viewer`, or any viewer of COLMAP models, on {scene}/colmap): where "
-        "identical windows were mistaken for each other, the walk jumps or folds.",
-        highlight=False,
-    )
+    if summary.reprojection_error > SUSPICIOUS_ERROR:
+        console.print(
+            f"[yellow]More than {SUSPICIOUS_ERROR} px is a sign that identical windows were taken for each other. Look "
+            f"at the cameras in {scene}/colmap: does their path jump or fold? Then try --matching sequential --overlap 5, "
+            "more --frames, or --masks."
+        )
 
 
 def cast(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import av
 import av.container
+import av.error
 import numpy as np
 from jaxtyping import Float, UInt8
 from rich.progress import Progress
@@ -77,5 +78,5 @@ def _opened(video: Path) -> Iterator[av.container.InputContainer]:
                 raise SceneError(f"{video} holds no video")
             container.streams.video[0].thread_type = "AUTO"
             yield container
-    except av.FFmpegError as error:
+    except av.error.FFmpegError as error:
         raise SceneError(f"{video} cannot be read as a video ({error.strerror}); convert it to mp4") from error

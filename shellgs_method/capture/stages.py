@@ -26,6 +26,9 @@ from shellgs_method.capture.work import Work, fingerprint, listing
 WORK = Path("capture")
 """Work folder, in the scene's."""
 
+SUSPICIOUS_ERROR = 0.75
+"""Mean reprojection error in pixels. Sound models of real and synthetic facades had 0.4 to 0.65, folded ones more."""
+
 _SIFT = {
     "fast": {"max_image_size": 1600, "max_num_features": 4096, "first_octave": 0},
     "high": {"max_image_size": 3200, "max_num_features": 8192, "first_octave": -1},
@@ -185,7 +188,7 @@ class _Capture:
     def _judged(self, found: dict[str, Any]) -> Summary:
         """The largest model, if it is large enough."""
         names, models = found["photographs"], found["models"]
-        largest = models[0] if models else {"names": []}
+        largest: dict[str, Any] = models[0] if models else {"names": []}
         missing = sorted(set(names) - set(largest["names"]))
         registered = len(largest["names"])
         if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
