@@ -93,7 +93,7 @@ def capture(
     if summary.reprojection_error > SUSPICIOUS_ERROR:
         console.print(
             f"[yellow]More than {SUSPICIOUS_ERROR} px is a sign that identical windows were taken for each other. Look "
-            f"at the cameras in {scene}/colmap: does their path jump or fold? Then try --matching sequential --overlap 5, "
+            f"at the cameras in {scene}/colmap: does their path jump or fold? Then try --overlap 5 (sequential), "
             "more --frames, or --masks."
         )
 

@@ -165,11 +165,13 @@ def test_photographs_of_any_mode_become_8_bits(tmp_path, mode):
 
 
 def test_an_unreadable_photograph_is_refused_by_name(tmp_path):
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
     for name in "abc":
-        picture().save(tmp_path / f"{name}.jpg")
-    (tmp_path / "b.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:500])
+        picture().save(photographs / f"{name}.jpg")
+    (photographs / "b.jpg").write_bytes((photographs / "a.jpg").read_bytes()[:500])
     with pytest.raises(SceneError, match=r"b\.jpg cannot be read as an image"):
-        capture(tmp_path, tmp_path / "scene")
+        capture(photographs, tmp_path / "scene")
     assert not (tmp_path / "scene" / "images").exists()
 
 
@@ -304,6 +306,12 @@ def test_a_missing_source_is_refused(tmp_path):
         capture(tmp_path / "nowhere", tmp_path / "scene")
 
 
+def test_a_scene_among_the_photographs_is_refused(tmp_path):
+    picture().save(tmp_path / "a.jpg")
+    with pytest.raises(SceneError, match="outside of it"):
+        capture(tmp_path, tmp_path / "scene")
+
+
 @pytest.mark.parametrize("name", ["images", "colmap", "transforms.json"])
 def test_a_scene_that_is_there_already_is_left_alone(tmp_path, name):
     (tmp_path / "photographs").mkdir()
@@ -362,19 +370,25 @@ def similarity(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def captured(tmp_path_factory) -> tuple[Path, Path]:
-    """A synthetic facade with true cameras, and the scene captured from its photographs with their masks."""
-    truth, scene = (tmp_path_factory.mktemp("capture") / name for name in ("truth", "scene"))
-    write_scene(truth, FacadeConfig(width=640, height=360, views=24, bays=3, storeys=2, points=50, supersampling=2))
-    capture(truth / "images", scene, CaptureConfig(masks=truth / "shell" / "masks" / "images"))
-    return truth, scene
+def truth(tmp_path_factory) -> Path:
+    """A synthetic facade with true cameras."""
+    scene = tmp_path_factory.mktemp("capture") / "truth"
+    write_scene(scene, FacadeConfig(width=640, height=360, views=24, bays=3, storeys=2, points=50, supersampling=2))
+    return scene
+
+
+@pytest.fixture(scope="module")
+def captured(truth) -> Path:
+    """The scene captured from its photographs."""
+    scene = truth.parent / "scene"
+    capture(truth / "images", scene)
+    return scene
 
 
 @pytest.mark.slow
-def test_cameras_of_the_synthetic_facade_are_found(captured):
-    truth, scene = captured
+def test_cameras_of_the_synthetic_facade_are_found(truth, captured):
     true = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=truth))}
-    found = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=scene))}
+    found = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=captured))}
     assert len(found) >= 22
     positions = np.stack([true[name].camera.position.numpy() for name in found])
     errors = similarity(np.stack([view.camera.position.numpy() for view in found.values()]), positions) - positions
@@ -385,21 +399,19 @@ def test_cameras_of_the_synthetic_facade_are_found(captured):
 
 
 @pytest.mark.slow
-def test_a_captured_scene_loads_with_its_masks(captured):
-    _, scene = captured
-    for view in read_views(FacadeDataParserConfig(data=scene, masks_path=Path("masks")))[:3]:
+def test_a_finished_capture_is_not_repeated_and_an_unlike_one_refused(truth, captured):
+    before = (captured / "colmap" / "sparse" / "0" / "images.bin").stat()
+    capture(truth / "images", captured)
+    assert (captured / "colmap" / "sparse" / "0" / "images.bin").stat() == before
+    with pytest.raises(SceneError, match="is there already"):
+        capture(truth / "images", captured, CaptureConfig(quality="high"))
+
+
+@pytest.mark.slow
+def test_a_scene_captured_with_masks_loads_with_them(truth, tmp_path):
+    capture(truth / "images", tmp_path / "scene", CaptureConfig(masks=truth / "shell" / "masks" / "images"))
+    for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene", masks_path=Path("masks")))[:3]:
         mask = load_mask(view)
         assert mask is not None
         assert mask.shape == load_photograph(view).shape[:2] == (view.camera.height, view.camera.width)
         assert 0.5 < mask.mean() < 1.0
-
-
-@pytest.mark.slow
-def test_a_finished_capture_is_not_repeated_and_an_unlike_one_refused(captured):
-    truth, scene = captured
-    masks = truth / "shell" / "masks" / "images"
-    before = (scene / "colmap" / "sparse" / "0" / "images.bin").stat()
-    capture(truth / "images", scene, CaptureConfig(masks=masks))
-    assert (scene / "colmap" / "sparse" / "0" / "images.bin").stat() == before
-    with pytest.raises(SceneError, match="is there already"):
-        capture(truth / "images", scene, CaptureConfig(masks=masks, quality="high"))

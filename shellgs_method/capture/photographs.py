@@ -66,7 +66,7 @@ def add_photograph(source: Path, target: Path) -> None:
         upright.save(target, wanted, quality=95, subsampling=0, exif=upright.getexif())
         return
     try:
-        os.link(source, target)
+        os.link(source.resolve(), target)
     except OSError:  # another file system
         shutil.copyfile(source, target)
 

@@ -76,6 +76,8 @@ def capture(
     config = config or CaptureConfig()
     if not source.exists():
         raise FileNotFoundError(f"{source} does not exist; give a folder of photographs or a video.")
+    if scene.resolve().is_relative_to(source.resolve()):
+        raise SceneError(f"{scene} lies in the folder of the photographs, {source}: give a scene folder outside of it")
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     try:
         with Progress(*columns, console=console) as progress:
