@@ -65,7 +65,8 @@ def sharpest(sharpnesses: Float[np.ndarray, " N"], times: Float[np.ndarray, " N"
     relative = sharpnesses / np.maximum(median_filter(sharpnesses, _NEIGHBOURHOOD), 1e-6)
     since = times - times.min()
     count = max(1, min(count, round(FRAMES_PER_SECOND * since.max())))
-    stretch = np.minimum(since / max(since.max(), 1e-6) * count, count - 1).astype(int)
+    # A hair more, so that a frame on the border of two stretches does not fall short of its own by rounding.
+    stretch = np.minimum(since / max(since.max(), 1e-6) * count + 1e-6, count - 1).astype(int)
     members = (np.flatnonzero(stretch == k) for k in range(count))
     return {int(m[relative[m].argmax()]) for m in members if len(m)}
 
