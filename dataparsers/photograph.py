@@ -42,14 +42,14 @@ def load_photograph(view: View) -> UInt8[np.ndarray, "H W C"]:
     Raises:
         SceneError: the file is no readable image, or its shape is not the camera's.
     """
-    return _as_seen(view, _read(view.image))
+    return _as_seen(view, read_image(view.image))
 
 
 def load_mask(view: View) -> Bool[np.ndarray, "H W"] | None:
     """The user's mask of the photograph, true where a pixel is kept; None where there is none."""
     if view.mask is None:
         return None
-    return _as_seen(view, _read(view.mask).convert("RGB"))[..., 0] > 127
+    return _as_seen(view, read_image(view.mask).convert("RGB"))[..., 0] > 127
 
 
 def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "3 3"], np.ndarray]:
@@ -76,7 +76,7 @@ def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndar
     from nerfstudio.cameras.cameras import CameraType
 
     width, height = _calibrated_size(view)
-    picture = _upright(view, _read(view.image))
+    picture = _upright(view, read_image(view.image))
     pixels = pixels * [width / picture.width, height / picture.height]
     if view.lens is None:
         return pixels
@@ -94,8 +94,12 @@ def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndar
     return rays[:, 0] @ undistorted[:2, :2].T + undistorted[:2, 2]
 
 
-def _read(path: Path) -> Image.Image:
-    """An image file in mode RGB or RGBA, 8 bits."""
+def read_image(path: Path) -> Image.Image:
+    """An image file in mode RGB or RGBA, 8 bits, its EXIF data kept and its orientation not yet applied.
+
+    Raises:
+        SceneError: the file is no readable image.
+    """
     try:
         with Image.open(path) as image:
             image.load()
