@@ -51,7 +51,7 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor]) -> Any:
     args = tuple(arg.view_as(arg) if isinstance(arg, torch.nn.Parameter) else arg for arg in args)
     tensors = _flatten(args)
     with_grad = torch.is_grad_enabled()
-    key = tuple((tensor.shape[0] > 1, tensor.shape[1:], with_grad and tensor.requires_grad) for tensor in tensors)
+    key = tuple((tensor.shape[0] > 1, with_grad and tensor.requires_grad) for tensor in tensors)
     try:
         return _compiled(kernel, key)(*args)
     except (
@@ -64,15 +64,14 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor]) -> Any:
 
 
 @functools.cache
-def _compiled(kernel: Callable[..., Any], key: tuple[tuple[bool, torch.Size, bool], ...]) -> Callable[..., Any]:
-    """A kernel compiled for tensors that vary in length or do not, of further sizes as they are, with gradients or not."""
+def _compiled(kernel: Callable[..., Any], key: tuple[tuple[bool, bool], ...]) -> Callable[..., Any]:
+    """A kernel compiled for tensors that vary in length or do not, and need gradients or do not."""
     assert isinstance(kernel, FunctionType)
     _keep_freed_memory()
-    # Dynamo limits the compilations per code object, and takes sizes that differ between them for variable: each key
-    # gets one of its own.
+    # Dynamo limits the compilations per code object: each key gets one of its own.
     own = FunctionType(kernel.__code__.replace(), kernel.__globals__, kernel.__name__)
     compiled = torch.compile(own, fullgraph=True, options=_OPTIONS)
-    varies = [varies for varies, _, _ in key]
+    varies = [varies for varies, _ in key]
     first = True
 
     def call(*args: Tensor | list[Tensor]) -> Any:
