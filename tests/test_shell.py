@@ -500,3 +500,13 @@ def test_what_a_mask_paints_black_is_no_shell(tmp_path: Path, alignment: Alignme
     assert after is not None
     np.testing.assert_array_equal(after.mask, before.mask & (painted > 0))
     np.testing.assert_array_equal(after.depth, before.depth)
+
+
+def test_a_mask_painted_after_the_cast_makes_the_maps_stale(tmp_path: Path, alignment: Alignment):
+    cast_views(tmp_path, VIEWS, alignment)
+    assert CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera) is not None
+    path = tmp_path / "shell" / "masks" / "images" / "2.jpg.png"
+    path.parent.mkdir(parents=True)
+    Image.fromarray(np.zeros((48, 64), np.uint8)).save(path)
+    with pytest.raises(SceneError, match=r"shell/masks has changed since; run `shellgs cast"):
+        CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)

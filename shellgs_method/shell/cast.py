@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -78,20 +79,29 @@ def cast_views(
     kept = scene / ALIGNMENT
     if not kept.is_file() or Alignment.load(kept) != alignment:
         alignment.save(kept)
+    (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a mask that is painted later is missed if it is not there
     maps = CueMaps.create(
         scene,
         "shell",
         command="shellgs cast {scene}" + (f" --max-image-size {max_image_size}" if max_image_size else ""),
-        sources=[shell, kept, *sorted((scene / MASKS).rglob("*.png"))],
+        sources=[shell, kept, scene / MASKS],
         metres_per_unit=alignment.metres_per_unit,
         max_image_size=max_image_size,
     )
     cast = 0
-    for full_size in track(views, description="casting the shell"):
-        view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
-        if not maps.current(view.name, view.camera):
-            maps.write(view.name, _unoccluded(caster.cast(view.camera), view, scene), view.camera)
+    with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast; there are never more in memory
+        written: Future[None] | None = None
+        for full_size in track(views, description="casting the shell"):
+            view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
+            if maps.current(view.name, view.camera):
+                continue
+            cue = _unoccluded(caster.cast(view.camera), view, scene)
+            if written:
+                written.result()
+            written = writer.submit(maps.write, view.name, cue, view.camera)
             cast += 1
+        if written:
+            written.result()
     supported = [record.supported for view in views if (record := maps.record(view.name))]
     return CastSummary(
         cast=cast,
