@@ -5,6 +5,7 @@
 
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.cast import ALIGNMENT, MASKS, CastSummary, cast_views
+from shellgs_method.shell.clouds import Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell
 from shellgs_method.shell.panel import supervision_panel
 from shellgs_method.shell.raycast import ShellCaster
@@ -14,9 +15,12 @@ __all__ = [
     "MASKS",
     "Alignment",
     "CastSummary",
+    "Mesher",
+    "Meshing",
     "ShellCaster",
     "ShellMesh",
     "cast_views",
     "load_shell",
+    "mesh_cloud",
     "supervision_panel",
 ]

@@ -17,6 +17,7 @@ from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask
 from shellgs_method.shell.alignment import Alignment
+from shellgs_method.shell.clouds import VERSION, Mesher, Meshing
 from shellgs_method.shell.mesh import load_shell
 from shellgs_method.shell.raycast import ShellCaster
 
@@ -37,6 +38,7 @@ class CastSummary:
         seeing: views with at least one pixel on the shell.
         supported: share of the pixels of all views that lie on the shell.
         seconds: wall time.
+        meshing: how the shell, a point cloud, became a mesh; None if it is one.
     """
 
     cast: int
@@ -44,6 +46,7 @@ class CastSummary:
     seeing: int
     supported: float
     seconds: float
+    meshing: Meshing | None
 
 
 def cast_views(
@@ -52,6 +55,7 @@ def cast_views(
     alignment: Alignment,
     *,
     max_image_size: int | None = None,
+    mesher: Mesher = "planes",
 ) -> CastSummary:
     """Cast the scene's shell into views and store the maps in ``scene/cues/shell``.
 
@@ -67,6 +71,7 @@ def cast_views(
         views: the photographs, with full-size cameras.
         alignment: names the shell and places it.
         max_image_size: cast for photographs resized to this longer side.
+        mesher: makes a mesh of a shell that is a point cloud; the mesh is kept in ``scene/shell``.
 
     Raises:
         FileNotFoundError: the shell is missing.
@@ -74,7 +79,10 @@ def cast_views(
     """
     start = time.monotonic()
     shell = scene / alignment.shell
-    caster = ShellCaster(load_shell(shell), alignment.shell_to_scene)
+    positions = np.array([view.camera.position.detach().cpu().double().numpy() for view in views]).reshape(-1, 3)
+    viewpoints = (positions - alignment.shell_to_scene[:3, 3]) @ np.linalg.inv(alignment.shell_to_scene[:3, :3]).T
+    mesh = load_shell(shell, cache=scene / "shell", viewpoints=viewpoints, mesher=mesher)
+    caster = ShellCaster(mesh, alignment.shell_to_scene)
     _check_placement(caster, [view.camera for view in views], shell)
     kept = scene / ALIGNMENT
     if not kept.is_file() or Alignment.load(kept) != alignment:
@@ -83,8 +91,9 @@ def cast_views(
     maps = CueMaps.create(
         scene,
         "shell",
-        command="shellgs cast {scene}" + (f" --max-image-size {max_image_size}" if max_image_size else ""),
+        command=_command(max_image_size, mesh.meshing),
         sources=[shell, kept, scene / MASKS],
+        revisions={"mesher": f"{mesh.meshing.mesher} {VERSION}"} if mesh.meshing else {},
         metres_per_unit=alignment.metres_per_unit,
         max_image_size=max_image_size,
     )
@@ -109,7 +118,17 @@ def cast_views(
         seeing=int(np.count_nonzero(supported)),
         supported=float(np.mean(supported)),
         seconds=time.monotonic() - start,
+        meshing=mesh.meshing,
     )
+
+
+def _command(max_image_size: int | None, meshing: Meshing | None) -> str:
+    command = "shellgs cast {scene}"
+    if max_image_size:
+        command += f" --max-image-size {max_image_size}"
+    if meshing and meshing.mesher != "planes":
+        command += f" --mesher {meshing.mesher}"
+    return command
 
 
 def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:

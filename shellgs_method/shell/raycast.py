@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 from jaxtyping import Float16, Float32, Float64
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
+from shellgs_method.shell._open3d import import_open3d
 from shellgs_method.shell.mesh import ShellMesh
 
 
@@ -84,15 +83,3 @@ class ShellCaster:
         viewmat = camera.viewmat.detach().cpu().double().numpy()
         rotation = viewmat[:3, :3]
         return -rotation.T @ viewmat[:3, 3] - self.origin, rotation
-
-
-def import_open3d() -> ModuleType:
-    """Open3D, or an ImportError that says which system libraries its wheel takes for granted."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise ImportError(
-            f"Open3D cannot be loaded ({error}); it needs libraries of the system: "
-            "apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
-        ) from error
-    return open3d
