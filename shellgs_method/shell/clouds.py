@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from dataparsers.errors import SceneError
@@ -26,7 +26,8 @@ LONGEST_EDGE = 3.0  # all lengths below are in units of the cloud's spacing
 NEIGHBOURHOOD = 2.5
 BALLS = 0.8, 1.6
 NORMAL_AGREEMENT = 0.85  # cosine
-PLANES, FAILURES = 150, 6
+NO_PLANE = -1
+HYPOTHESES, JUDGES, FAILURES = 300, 4000, 6
 LEAST_POINTS = 150  # of a plane
 
 
@@ -139,7 +140,7 @@ class _Cloud:
         extent = np.max(high - low) or np.ptp(points, axis=0).max()
         legacy = _legacy(points)
         points = np.asarray((legacy.voxel_down_sample(extent / CELLS) if extent > 0 else legacy).points)
-        spread = np.linalg.svd(points - points.mean(0), compute_uv=False) if len(points) > 2 else np.zeros(2)
+        spread = np.linalg.svd(points - points.mean(0), compute_uv=False) if len(points) > 1 else np.zeros(2)
         if not spread[1] > 1e-6 * spread[0]:
             what = "is a single point" if spread[0] == 0 else "lies on one straight line"
             raise SceneError(f"the point cloud makes no surface: it {what}")
@@ -165,26 +166,48 @@ def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray) -
 
 
 def _planes(cloud: _Cloud) -> Iterator[_Part]:
-    """Planes one after the other, the largest first, then balls over what lies on none."""
-    o3d = import_open3d()
-    o3d.utility.random.seed(0)
-    tolerance = float(np.clip(4 * cloud.roughness, 0.1 * cloud.spacing, cloud.spacing))
+    """Planes one after the other, the largest first, then balls over their seams and over what lies on none."""
+    rng, points = np.random.default_rng(0), cloud.points.copy()
+    plane = np.full(len(points), NO_PLANE)
     least = max(3, min(LEAST_POINTS, len(cloud.points) // 20))
-    left, found, failures = np.arange(len(cloud.points)), 0, 0
-    while len(left) >= least and found < PLANES and failures < FAILURES:
-        plane, inliers = _legacy(cloud.points[left]).segment_plane(tolerance, 3, 1000)
-        inliers = np.asarray(inliers, np.int64)
-        agree = np.abs(cloud.normals[left[inliers]] @ plane[:3]) > NORMAL_AGREEMENT
-        members = left[inliers[agree]]
+    left, failures = np.arange(len(cloud.points)), 0
+    while len(left) >= least and failures < FAILURES:
+        members = left[_largest_plane(cloud, left, rng)]
         part = _flat(cloud.points[members], LONGEST_EDGE * cloud.spacing) if len(members) >= least else None
         if part is None:
             failures += 1
             continue
         yield part
-        found += 1
+        points[members], plane[members] = part.vertices, members[0]
         left = np.setdiff1d(left, members, assume_unique=True)
-    if len(left):
-        yield _balls_over(cloud, left)
+    yield _balls_between(replace(cloud, points=points), plane)
+
+
+def _largest_plane(cloud: _Cloud, left: Int64[np.ndarray, " L"], rng: np.random.Generator) -> Bool[np.ndarray, " L"]:
+    """The points that RANSAC finds on one plane, as to place and normal, after fitting it to them until it settles.
+
+    One point and its normal make a hypothesis, which a sample of the others judges. Open3D's ``segment_plane`` knows
+    no normals, and gives another plane in each run.
+    """
+    points, normals = cloud.points[left], cloud.normals[left]
+    tolerance = float(np.clip(4 * cloud.roughness, 0.1 * cloud.spacing, cloud.spacing))
+
+    def on(centres: np.ndarray, axes: np.ndarray, among: np.ndarray | slice) -> np.ndarray:
+        near = np.abs(points[among] @ axes.T - np.einsum("hc,hc->h", centres, axes)) <= tolerance
+        return near & (np.abs(normals[among] @ axes.T) > NORMAL_AGREEMENT)
+
+    hypotheses = rng.integers(len(points), size=HYPOTHESES)
+    judges = rng.permutation(len(points))[:JUDGES]
+    best = hypotheses[on(points[hypotheses], normals[hypotheses], judges).sum(axis=0).argmax()]
+    members = on(points[[best]], normals[[best]], slice(None))[:, 0]
+    for _ in range(10):
+        centre = points[members].mean(0)
+        axis = np.linalg.eigh(np.cov(points[members].T, bias=True))[1][:, :1].T
+        grown = on(centre[None], axis, slice(None))[:, 0]
+        if grown.sum() <= members.sum():
+            break
+        members = grown
+    return members
 
 
 def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
@@ -202,15 +225,14 @@ def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
     return _Part(centre + flat @ axes, faces.astype(np.int64), is_plane=True) if len(faces) else None
 
 
-def _balls_over(cloud: _Cloud, left: Int64[np.ndarray, " L"]) -> _Part:
-    """Triangles that balls find at the points ``left``, their seams to the points around included."""
-    near = np.zeros(len(cloud.points), bool)
-    distance, _ = cKDTree(cloud.points[left]).query(cloud.points, distance_upper_bound=2 * BALLS[-1] * cloud.spacing)
-    near[np.isfinite(distance)] = True
-    is_left = np.zeros(len(cloud.points), bool)
-    is_left[left] = True
+def _balls_between(cloud: _Cloud, plane: Int64[np.ndarray, " N"]) -> _Part:
+    """The triangles that balls find between points of different planes, or at points of none."""
+    neighbours = cKDTree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
+    seam = (plane == NO_PLANE) | (plane[neighbours] != plane[:, None]).any(axis=1)
+    near = seam[neighbours].any(axis=1)
     part = _balls(cloud.points[near], cloud.normals[near], cloud.spacing)
-    return _Part(part.vertices, part.faces[is_left[near][part.faces].any(axis=1)])
+    planes = plane[near][part.faces]
+    return _Part(part.vertices, part.faces[(planes == NO_PLANE).any(axis=1) | np.ptp(planes, axis=1).astype(bool)])
 
 
 def _balls(points: np.ndarray, normals: np.ndarray, spacing: float) -> _Part:
