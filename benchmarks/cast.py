@@ -100,9 +100,13 @@ def main(benchmark: Benchmark) -> None:
     mesh, views = make_shell(benchmark.subdivisions), make_views(benchmark.views, benchmark.size)
     caster = ShellCaster(mesh, np.eye(4))
     rays = [o3d.core.Tensor(caster.rays(view.camera)) for view in views]
-    bare, maps = np.array([(cast_bare(caster, rays), cast_maps(mesh, views)) for _ in range(benchmark.rounds + 1)])[1:].T
+    bare, maps = np.array([(cast_bare(caster, rays), cast_maps(mesh, views)) for _ in range(benchmark.rounds + 1)])[
+        1:
+    ].T
     n_rays = sum(view.camera.width * view.camera.height for view in views)
-    table = Table(title=f"{len(views)} views of {benchmark.size}, {len(mesh.faces)} triangles, {benchmark.rounds} rounds")
+    table = Table(
+        title=f"{len(views)} views of {benchmark.size}, {len(mesh.faces)} triangles, {benchmark.rounds} rounds"
+    )
     for heading in ("", "Mray/s, best", "median", "share of the ray caster's: best", "median of the rounds"):
         table.add_column(heading, justify="right")
     for name, seconds in (("ray caster alone", bare), ("maps written", maps)):

@@ -303,7 +303,7 @@ _UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZi
 
 
 def _write_npz(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
-    """An npz, like :func:`numpy.savez_compressed` at a tenth of the time: zlib makes little of the digits of a depth."""
+    """An npz, like :func:`numpy.savez_compressed` at a tenth of the time: zlib makes little of a depth's digits."""
     with zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
             data = io.BytesIO()

@@ -78,7 +78,9 @@ class FacadeDataParser(DataParser):
         try:
             outputs = self._cameras_parser().get_dataparser_outputs(split)
         except (AssertionError, NotImplementedError) as error:  # a camera model it does not know, or two at once
-            raise SceneError(f"nerfstudio cannot read the cameras of {self.config.data}: {error}; {UNDISTORT}") from error
+            raise SceneError(
+                f"nerfstudio cannot read the cameras of {self.config.data}: {error}; {UNDISTORT}"
+            ) from error
         _refuse_missing_images(outputs.image_filenames, self.config.data)
         return outputs, _views(outputs, self.config.data)
 
@@ -183,8 +185,8 @@ def _views(outputs: DataparserOutputs, scene: Path) -> list[View]:
         camera, lens = scene_camera(outputs, i), outputs.cameras[i]
         _refuse_lens(lens, path)
         distortion = lens.distortion_params
-        is_pinhole = distortion is None or not bool((distortion != 0).any())
-        if is_pinhole and lens.camera_type.item() == CameraType.PERSPECTIVE.value:
+        assert distortion is not None  # both of nerfstudio's parsers give zeros
+        if not bool((distortion != 0).any()) and lens.camera_type.item() == CameraType.PERSPECTIVE.value:
             lens = None
         else:
             key = (
@@ -204,7 +206,9 @@ def _refuse_lens(lens: Cameras, path: Path) -> None:
     """Refuse what nerfstudio's undistortion makes no pinhole camera of."""
     kind = CameraType(lens.camera_type.item())
     if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
-        raise SceneError(f"the camera of {path} is {kind.name}, but only perspective and fisheye ones work; {UNDISTORT}")
+        raise SceneError(
+            f"the camera of {path} is {kind.name}, but only perspective and fisheye ones work; {UNDISTORT}"
+        )
     distortion = lens.distortion_params
     if kind is CameraType.PERSPECTIVE and distortion is not None and distortion[3] != 0:
         raise SceneError(f"the camera of {path} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")

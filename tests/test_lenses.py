@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from test_facade_dataparser import write_colmap
 
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, load_photograph
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
-from test_facade_dataparser import write_colmap
 
 BROWN = {"k1": -0.2, "k2": 0.05, "k3": 0.02, "p1": 0.004, "p2": -0.003}
 FISHEYE = {"k1": 0.08, "k2": -0.03, "k3": 0.01, "k4": 0.004}
@@ -99,7 +99,8 @@ def test_browns_fourth_radial_coefficient_is_refused(scene: Path):
 
 
 @pytest.mark.parametrize(
-    ("model", "extra"), [("FULL_OPENCV", "0.1 0 0 0 0 0 0.1 0"), ("FOV", "0.9"), ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 0 0")]
+    ("model", "extra"),
+    [("FULL_OPENCV", "0.1 0 0 0 0 0 0.1 0"), ("FOV", "0.9"), ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 0 0")],
 )
 def test_a_colmap_model_that_nerfstudio_does_not_know_is_refused(scene: Path, model: str, extra: str):
     views = read_views(FacadeDataParserConfig(data=scene))

@@ -189,7 +189,8 @@ def write_e57(path: Path, points: np.ndarray) -> None:
 
 
 def write_open3d(path: Path, points: np.ndarray) -> None:
-    o3d.t.io.write_point_cloud(str(path), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(points))
+    o3d.t.io.write_point_cloud(str(path), cloud)  # pyright: ignore[reportArgumentType]
 
 
 WRITERS: dict[str, tuple[Callable[[Path, np.ndarray], object], float]] = {
@@ -226,7 +227,9 @@ def test_text_clouds_may_have_comments_colours_and_commas(tmp_path: Path, line: 
         load_shell(tmp_path / "a.xyz")
 
 
-@pytest.mark.parametrize(("suffix", "module", "extra"), [("las", "laspy", "las"), ("laz", "lazrs", "las"), ("e57", "pye57", "e57")])
+@pytest.mark.parametrize(
+    ("suffix", "module", "extra"), [("las", "laspy", "las"), ("laz", "lazrs", "las"), ("e57", "pye57", "e57")]
+)
 def test_a_reader_that_is_not_installed_is_named_with_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, module: str, extra: str
 ):

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import Delaunay, KDTree, QhullError
 
 from dataparsers.errors import SceneError
 from shellgs_method.shell._open3d import import_open3d
@@ -146,7 +146,7 @@ class _Cloud:
             raise SceneError(f"the point cloud makes no surface: it {what}")
         # The k-th neighbour of points of density ρ on a surface is √(k / π ρ) away.
         k = min(6, len(points) - 1)
-        nearest = cKDTree(points).query(points, k + 1)[0][:, k]
+        nearest = KDTree(points).query(points, k + 1)[0][:, k]
         spacing = float(np.median(nearest) * np.sqrt(np.pi / k))
         legacy = _legacy(points)
         search = import_open3d().geometry.KDTreeSearchParamHybrid(NEIGHBOURHOOD * spacing, 30)
@@ -158,7 +158,7 @@ class _Cloud:
 
 def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray) -> np.ndarray:
     if len(viewpoints):
-        towards = viewpoints[cKDTree(viewpoints).query(points)[1]] - points
+        towards = viewpoints[KDTree(viewpoints).query(points)[1]] - points
         return np.where(np.einsum("nc,nc->n", normals, towards)[:, None] < 0, -normals, normals)
     legacy = _legacy(points, normals)
     legacy.orient_normals_consistent_tangent_plane(min(10, len(points) - 1))
@@ -227,7 +227,7 @@ def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
 
 def _balls_between(cloud: _Cloud, plane: Int64[np.ndarray, " N"]) -> _Part:
     """The triangles that balls find between points of different planes, or at points of none."""
-    neighbours = cKDTree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
+    neighbours = KDTree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
     seam = (plane == NO_PLANE) | (plane[neighbours] != plane[:, None]).any(axis=1)
     near = seam[neighbours].any(axis=1)
     part = _balls(cloud.points[near], cloud.normals[near], cloud.spacing)
@@ -256,7 +256,7 @@ def _poisson(cloud: _Cloud) -> Iterator[_Part]:
         _legacy(cloud.points, cloud.normals), depth=depth
     )
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64)
-    near = cKDTree(cloud.points).query(vertices)[0] <= 1.5 * cloud.spacing
+    near = KDTree(cloud.points).query(vertices)[0] <= 1.5 * cloud.spacing
     yield _Part(vertices, faces[near[faces].all(axis=1)])
 
 
@@ -281,9 +281,7 @@ def _merge(parts: list[_Part]) -> tuple[np.ndarray, np.ndarray]:
 def _distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
     o3d = import_open3d()
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
-    )
+    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32)))
     return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from dataparsers.cue_maps import atomic_write, content_hash
 from dataparsers.errors import SceneError
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
-from shellgs_method.shell.files import NOWHERE, read_geometry
+from shellgs_method.shell.files import read_geometry
 
 log = logging.getLogger(__name__)
 
