@@ -79,7 +79,7 @@ def cast(
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
-        mesher: Makes a mesh of a point cloud: planes (and balls between), balls alone (bpa), or poisson for round things.
+        mesher: Makes a mesh of a point cloud: planes (balls between), balls alone (bpa), poisson for round things.
     """
     from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, read_views
