@@ -7,7 +7,6 @@ of resident memory of fresh processes that cast few and many views (Linux).
 from __future__ import annotations
 
 import multiprocessing
-import resource
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -91,7 +90,9 @@ def cast_bare(caster: ShellCaster, rays: list[o3d.core.Tensor]) -> float:
 def peak_memory(benchmark: Benchmark, n: int) -> float:
     """MB resident at the peak of a process that casts n views."""
     cast_maps(make_shell(benchmark.subdivisions), make_views(n, benchmark.size))
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    # Not ru_maxrss, which a process inherits from the one that started it.
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status["VmHWM"].split()[0]) / 1024
 
 
 def main(benchmark: Benchmark) -> None:

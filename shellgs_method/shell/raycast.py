@@ -54,9 +54,10 @@ class ShellCaster:
         if self._rays.shape[:2] != (camera.height, camera.width):  # fresh memory costs more than what is written to it
             self._rays = np.empty((camera.height, camera.width, 6), np.float32)
         rays = self._rays
-        rays[..., :3] = position
         across, down = (u * step_u).astype(np.float32), (v * step_v + first).astype(np.float32)
-        np.add(across, down[:, None], out=rays[..., 3:])
+        for axis in range(3):  # numpy's innermost loop is then over pixels
+            rays[..., axis] = position[axis]
+            np.add.outer(down[:, axis], across[:, axis], out=rays[..., 3 + axis])
         return rays
 
     def cast(self, camera: Camera) -> CueMap:
