@@ -146,8 +146,8 @@ def align(
     elif picks:
         placement = place_by_picks(picks, views, name, metres_per_shell_unit)
     else:
-        placement = place_by_guess(load_shell(shell), views, points, name, metres_per_shell_unit)
-    mesh = load_shell(scene / placement.alignment.shell)
+        placement = place_by_guess(load_shell(shell, cache=scene / "shell"), views, points, name, metres_per_shell_unit)
+    mesh = load_shell(scene / placement.alignment.shell, cache=scene / "shell")
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
@@ -186,6 +186,7 @@ def cast(
     matrix: Optional[Path] = None,
     metres_per_shell_unit: float = 1.0,
     max_image_size: Optional[int] = None,
+    mesher: Literal["planes", "bpa", "poisson"] = "planes",
 ) -> None:
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
@@ -194,10 +195,11 @@ def cast(
 
     Args:
         scene: Scene folder.
-        shell: The shell's mesh, with --matrix; else what scene/shell/alignment.json names.
+        shell: The shell's mesh or point cloud, with --matrix; else what scene/shell/alignment.json names.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
+        mesher: Makes a mesh of a point cloud: planes (balls between), balls alone (bpa), poisson for round things.
     """
     from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -210,7 +212,9 @@ def cast(
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
     views = read_views(FacadeDataParserConfig(data=scene))
-    summary = cast_views(scene, views, alignment, max_image_size=max_image_size)
+    summary = cast_views(scene, views, alignment, max_image_size=max_image_size, mesher=mesher)
+    if summary.meshing:
+        console.print(f"The shell is a point cloud, whose mesh is kept in {scene / 'shell'}: {summary.meshing}")
     console.print(
         f"{summary.cast} views cast, {summary.skipped} there already, in {summary.seconds:.1f} s; the shell is in "
         f"{summary.seeing} of {len(views)} views and in {summary.supported:.0%} of their pixels."

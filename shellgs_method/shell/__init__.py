@@ -6,6 +6,7 @@
 
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.cast import ALIGNMENT, MASKS, CastSummary, cast_views
+from shellgs_method.shell.clouds import Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell
 from shellgs_method.shell.panel import supervision_panel
 from shellgs_method.shell.picks import align_picks
@@ -20,6 +21,8 @@ __all__ = [
     "MASKS",
     "Alignment",
     "CastSummary",
+    "Mesher",
+    "Meshing",
     "ShellCaster",
     "ShellMesh",
     "ShellSurface",
@@ -27,6 +30,7 @@ __all__ = [
     "align_picks",
     "cast_views",
     "load_shell",
+    "mesh_cloud",
     "propose",
     "refine",
     "supervision_panel",
