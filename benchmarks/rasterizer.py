@@ -201,20 +201,19 @@ def _ratios(timing: Timing, reference: Timing) -> str:
 
 
 def draw(timings: dict[Case, Timing], path: Path) -> None:
-    """Time against pairs of all scenes, a line for each primitive and number of channels."""
+    """Time against pairs of all scenes, a colour for each primitive and number of channels."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     forward, both = figure.subplots(1, 2, sharey=True)
     for primitive, n_features in dict.fromkeys((case.primitive, case.n_features) for case in timings):
         of_kind = [case for case in timings if (case.primitive, case.n_features) == (primitive, n_features)]
-        of_kind.sort(key=lambda case: pairs(case.n, case.width, case.height, primitive))
         n_pairs = [pairs(case.n, case.width, case.height, primitive) for case in of_kind]
         for axes, seconds in ((forward, "forward"), (both, "both")):
             least = [1e3 * min(getattr(timings[case], seconds)) for case in of_kind]
-            axes.loglog(n_pairs, least, "o-", label=f"{primitive}, {n_features} channels")
+            axes.loglog(n_pairs, least, "o", label=f"{primitive}, {n_features} channels")
     forward.set(title="forward", xlabel="(splat, pixel) pairs", ylabel="ms")
     both.set(title="forward and backward", xlabel="(splat, pixel) pairs")
     both.legend()
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=100)
 
 
 if __name__ == "__main__":
