@@ -345,6 +345,74 @@ def splats(
     console.print(f"{output}: {count} Gaussians. {_place(run.frame)}")
 
 
+def compare(
+    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    methods: tuple[str, ...] = ("photo-gs", "mono-gs", "2dgs", "shellgs"),
+    seeds: tuple[int, ...] = (0,),
+    iterations: int = 30_000,
+    output: Path = Path("compare"),
+    curve_points: int = 5,
+    launcher: Literal["local", "ray"] = "local",
+    jobs: int = 1,
+    address: Optional[str] = None,
+) -> None:
+    """Train and evaluate methods on scenes; end with the paper's tables, its figures, and a report to look at.
+
+    Finished runs are kept, killed ones go on, and one that fails stops no other. Settings that changed are refused.
+
+    Args:
+        scenes: Scene folders; the first has the part of the paper's primary scene, others that of its second.
+        methods: What is compared: methods of ShellGS, its ablations (docs/methods.md), other methods of nerfstudio that
+            render depth (splatfacto), NAME='METHOD FLAGS' for your own, or paper for all of the paper's tables.
+        seeds: Each method is trained once with each; tables show mean ± deviation.
+        iterations: Length of each training run.
+        output: Folder of the runs, tables, pictures and report.html.
+        curve_points: How often a run is evaluated on all held-out views while it trains, for the curves; 0: never.
+        launcher: local: on this machine; ray: on a Ray cluster.
+        jobs: Runs at once, with the local launcher.
+        address: Of a running Ray cluster, say auto. If not set: one is started on this machine.
+    """
+    from functools import partial
+
+    from shellgs_method.compare.launch import launch_locally
+    from shellgs_method.compare.results import compare as compare_runs
+    from shellgs_method.compare.runs import grid
+
+    runs = grid(scenes, methods, seeds, iterations, output, curve_points)
+    if launcher == "ray":
+        from shellgs_method.compare.cluster import launch_on_ray
+
+        launch = partial(launch_on_ray, address=address, console=console)
+    else:
+        launch = partial(launch_locally, jobs=jobs, console=console)
+    failures = compare_runs(runs, launch, output, console)
+    console.print(f"Tables: {output / 'results.md'}, {output / 'tables'}. Report: {output / 'report.html'}.")
+    if failures:
+        sys.exit(f"shellgs: {len(failures)} of {len(runs)} runs failed: {', '.join(run.label for run in failures)}")
+
+
+def evaluate(
+    config: Annotated[Path, tyro.conf.Positional],
+    output_path: Path = Path("eval.json"),
+    holdout: Optional[Literal["A", "B"]] = None,
+    pictures: Optional[Path] = None,
+) -> None:
+    """All figures of a trained run, as `ns-eval` writes them, for any nerfstudio method that renders depth.
+
+    Args:
+        config: The run's config.yml. Other methods than ours are trained with `ns-train METHOD … facade-data`.
+        output_path: The json.
+        holdout: Measure these vertical bands of the facade alone, whatever the run was trained on.
+        pictures: Folder that gets what was rendered for each held-out view, as npz.
+    """
+    from shellgs_method.compare.measure import write_figures
+    from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, rich_table
+
+    figures = {"run": write_figures(config, output_path, holdout, pictures)}
+    for columns in (MAIN_COLUMNS, SURFACE_COLUMNS):
+        console.print(rich_table(figures, columns))
+
+
 def _place(frame: Frame) -> str:
     """Where a result stands, in words."""
     if not frame.metric:
@@ -384,6 +452,8 @@ def main() -> None:
         "align": align,
         "cast": cast,
         "mono": mono,
+        "compare": compare,
+        "evaluate": evaluate,
         "mesh": mesh,
         "splats": splats,
         "doctor": doctor,

@@ -48,6 +48,8 @@ from shellgs_method.losses import PAPER_ITERATIONS, flattening_loss, photometric
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses, self_losses
 
+REFERENCES = {"shell": "", "truth": "truth_"}
+"""Kinds of maps that geometry is measured against, and what the names of their figures begin with."""
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in any."""
 
@@ -322,17 +324,28 @@ class FacadeModel(SplatfactoModel):
         normal = colours_to_normals(outputs["normal"])
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
-        figures = image_errors(outputs["rgb"], target)
+        rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
+        figures = image_errors(rendering.rgb, target)
+        figures |= reference_errors(rendering, camera, batch, self.metres_per_unit)
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}
-        for kind, prefix in (("shell", ""), ("truth", "truth_")):
-            if f"{kind}_depth" not in batch:
-                continue
-            reference = reference_maps(batch, kind, self.device)
-            rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
-            errors = geometry_errors(rendering, camera, reference, self.metres_per_unit)
-            figures |= {prefix + name: value for name, value in errors.items()}
-            images[f"{prefix}normal"] = torch.cat([normals_to_colours(reference.normal), outputs["normal"]], 1)
+        for kind, prefix in REFERENCES.items():
+            if f"{kind}_depth" in batch:
+                expected = normals_to_colours(reference_maps(batch, kind, self.device).normal)
+                images[f"{prefix}normal"] = torch.cat([expected, outputs["normal"]], dim=1)
         return figures, images
+
+
+def reference_errors(
+    rendering: Rendering, camera: Camera, batch: dict, metres_per_unit: float | None
+) -> dict[str, float]:
+    """Figures of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``."""
+    figures = {}
+    for kind, prefix in REFERENCES.items():
+        if f"{kind}_depth" in batch:
+            reference = reference_maps(batch, kind, rendering.depth.device)
+            errors = geometry_errors(rendering, camera, reference, metres_per_unit)
+            figures |= {prefix + name: value for name, value in errors.items()}
+    return figures
 
 
 def reference_maps(batch: dict, kind: str, device: torch.device) -> Reference:

@@ -36,7 +36,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(demo: Path) -> Path:
-    return demo / "runs" / "scene" / "shellgs" / "demo" / "config.yml"
+    return demo / "runs" / "scene" / "shellgs" / "shellgs" / "seed-0" / "config.yml"
 
 
 def test_the_demo_ends_with_a_table_and_pictures(demo):

@@ -17,6 +17,9 @@ from torch import Tensor
 
 from shellgs_method.evaluation.colours import GREY, normal_colours
 
+MAX_ERROR = 45.0
+"""Angle in degrees from which errors have the last colour of the scale."""
+
 
 class Panel(NamedTuple):
     """What one method, or the reference, shows of a view."""
@@ -30,7 +33,7 @@ class Panel(NamedTuple):
     """True where the reference has a normal; grey elsewhere."""
 
 
-def save_strip(path: Path, panels: Sequence[Panel], max_error: float = 45.0, panel_inches: float = 2.5) -> None:
+def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR, panel_inches: float = 2.5) -> None:
     """Write a PNG of one column a panel: picture, normals, angular error with one colour bar for all, up to a limit."""
     height, width = panels[0].rgb.shape[:2]
     size = (panel_inches * len(panels) + 0.8, panel_inches * 3 * height / width + 0.3)

@@ -1,15 +1,25 @@
-"""Tables of figures, methods down and figures across, for Markdown and for the terminal."""
+"""Tables of figures, methods down and figures across: Markdown, LaTeX, HTML, CSV, and for the terminal."""
 
 from __future__ import annotations
 
+import csv
+import html
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-Rows = Mapping[str, Mapping[str, float]]
-"""Figures by name, by method."""
+Rows = Mapping[str, Mapping[str, float | Sequence[float]]]
+"""Figures by name, by method; a figure is one number, or one for each seed: then mean ± sample deviation is shown."""
+
+_LATEX = str.maketrans(
+    {character: rf"\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "°": r"$^\circ$", "±": r"$\pm$", "<": "$<$", ">": "$>$", "–": "--"}
+)
 
 
 @dataclass(frozen=True)
@@ -52,16 +62,54 @@ SURFACE_COLUMNS = (
 """The paper's comparison of visible surfaces."""
 
 
-def markdown_table(rows: Rows, columns: Sequence[Column]) -> str:
-    """A Markdown table with the best of each column in bold; a figure that a method lacks is a dash."""
+def markdown_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
+    """A Markdown table with the best of each column in bold; a figure that a method lacks is a dash.
+
+    Args:
+        rows: figures of the methods.
+        columns: figures that are shown.
+        quoted: figures measured elsewhere, say a paper's; below the others, never bold.
+    """
     lines = [["Method", *(column.heading for column in columns)], ["---", *("---:" for _ in columns)]]
-    for method, cells in _cells(rows, columns):
+    for method, cells in _cells(rows, columns, quoted):
         lines.append([method.replace("|", r"\|"), *(f"**{text}**" if best else text for text, best in cells)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
+def latex_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
+    """The same as a tabular of booktabs."""
+    head = ["Method", *(column.heading for column in columns)]
+    lines = [rf"\begin{{tabular}}{{l{'c' * len(columns)}}}", r"\toprule", _latex_line(head), r"\midrule"]
+    for method, cells in _cells(rows, columns, quoted):
+        texts = [rf"\textbf{{{text.translate(_LATEX)}}}" if best else text.translate(_LATEX) for text, best in cells]
+        lines.append(" & ".join([method.translate(_LATEX), *texts]) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
+
+
+def html_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
+    """The same as an HTML table."""
+    lines = ["<tr><th>Method" + "".join(f"<th>{html.escape(column.heading)}" for column in columns)]
+    for method, cells in _cells(rows, columns, quoted):
+        texts = "".join(f"<td><b>{text}</b>" if best else f"<td>{text}" for text, best in cells)
+        lines.append(f"<tr><td>{html.escape(method)}{texts}")
+    return "\n".join(["<table>", *lines, "</table>"])
+
+
+def csv_table(rows: Rows, columns: Sequence[Column]) -> str:
+    """All digits, for programs: mean and sample deviation of each column's figure, and the number of seeds."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["method", *(key for column in columns for key in (column.key, f"{column.key}_std")), "seeds"])
+    for method, figures in rows.items():
+        samples = [figures.get(column.key, ()) for column in columns]
+        spread = [(_mean(values), _deviation(values)) for values in samples]
+        cells = ["" if value is None else value for pair in spread for value in pair]
+        writer.writerow([method, *cells, max((np.size(values) for values in samples), default=0)])
+    return text.getvalue()
+
+
 def rich_table(rows: Rows, columns: Sequence[Column], title: str | None = None) -> Table:
-    """The same table for a terminal."""
+    """The same as :func:`markdown_table` for a terminal."""
     table = Table(title=title)
     table.add_column("Method", no_wrap=True)
     for column in columns:
@@ -71,13 +119,41 @@ def rich_table(rows: Rows, columns: Sequence[Column], title: str | None = None) 
     return table
 
 
-def _cells(rows: Rows, columns: Sequence[Column]) -> Iterator[tuple[str, list[tuple[str, bool]]]]:
+def _cells(
+    rows: Rows, columns: Sequence[Column], quoted: Rows | None = None
+) -> Iterator[tuple[str, list[tuple[str, bool]]]]:
     """Each method with its cells' texts and whether they are the column's best; what reads the same is equally good."""
     best = {}
     for column in columns:
-        values = [figures[column.key] for figures in rows.values() if column.key in figures]
-        if values:
-            best[column.key] = format(column.best(values), column.format)
+        means = [_mean(figures[column.key]) for figures in rows.values() if column.key in figures]
+        if means:
+            best[column.key] = format(column.best(means), column.format)
     for method, figures in rows.items():
-        texts = [format(figures[c.key], c.format) if c.key in figures else "–" for c in columns]
-        yield method, [(text, text == best.get(c.key)) for c, text in zip(columns, texts, strict=True)]
+        cells = [(_text(figures, column), _mean(figures.get(column.key, ())), column) for column in columns]
+        yield (
+            method,
+            [(text, mean is not None and format(mean, c.format) == best[c.key]) for text, mean, c in cells],
+        )
+    for source, figures in (quoted or {}).items():
+        yield source, [(_text(figures, column), False) for column in columns]
+
+
+def _text(figures: Mapping[str, float | Sequence[float]], column: Column) -> str:
+    values = figures.get(column.key, ())
+    mean, deviation = _mean(values), _deviation(values)
+    if mean is None:
+        return "–"
+    text = format(mean, column.format)
+    return text if deviation is None else f"{text} ± {format(deviation, column.format)}"
+
+
+def _mean(values: float | Sequence[float]) -> float | None:
+    return float(np.mean(values)) if np.size(values) else None
+
+
+def _deviation(values: float | Sequence[float]) -> float | None:
+    return float(np.std(values, ddof=1)) if np.size(values) > 1 else None
+
+
+def _latex_line(texts: Sequence[str]) -> str:
+    return " & ".join(text.translate(_LATEX) for text in texts) + r" \\"

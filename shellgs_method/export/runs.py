@@ -17,12 +17,12 @@ from rich.progress import track
 from dataparsers.errors import SceneError
 from dataparsers.photograph import load_mask
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
-from shellgs_method.evaluation import Rendering, geometry_errors, mean_over_views
+from shellgs_method.evaluation import Rendering, mean_over_views
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.export.frame import Box, Frame, UpAxis, scene_frame, shell_frame
 from shellgs_method.export.splats import Splats
 from shellgs_method.export.tsdf import DepthView
-from shellgs_method.model import FacadeModel, reference_maps
+from shellgs_method.model import FacadeModel, reference_errors
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, load_shell
 from shellgs_method.shell.raycast import import_open3d
 
@@ -154,13 +154,7 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
         normal = torch.from_numpy(cue.normal).float()
         rendering = Rendering(torch.zeros_like(normal), depth, mask.float(), normal)
         camera = view.camera.to(dtype=torch.float32)
-        errors = {}
-        for kind, prefix in (("shell", ""), ("truth", "truth_")):
-            if f"{kind}_depth" in batch:
-                reference = reference_maps(batch, kind, torch.device("cpu"))
-                found = geometry_errors(rendering, camera, reference, metres_per_unit)
-                errors |= {prefix + name: value for name, value in found.items()}
-        figures.append(errors)
+        figures.append(reference_errors(rendering, camera, batch, metres_per_unit))
     near = {} if run.shell is None else {"area_near_shell": _area_near(mesh, run.shell_in_frame)}
     return mean_over_views(figures) | near
 

@@ -1,0 +1,1 @@
+"""Methods, seeds and scenes side by side: a grid of runs, launched, measured, and written as the paper's tables."""

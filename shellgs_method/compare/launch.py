@@ -1,0 +1,110 @@
+"""Runs brought to their end on this machine, with the commands that a user would type."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from shellgs_method.compare.runs import Run
+
+# OpenMP's threads spin while they wait, which slows shared and virtual machines down many times.
+ENVIRONMENT = {"OMP_WAIT_POLICY": "passive"}
+BIN = Path(sys.executable).parent
+LAST_LINES = 30
+_STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
+
+
+class CommandError(RuntimeError):
+    """A command failed; the message is its last lines."""
+
+
+def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run, str]:
+    """Finish all runs, ``jobs`` at once; those that failed, with their last lines. One's failure stops no other."""
+    runs = list(runs)
+    failures: dict[Run, str] = {}
+    with Progress(console=console, transient=True) as progress, ThreadPoolExecutor(max(jobs, 1)) as pool:
+        futures = {pool.submit(_finish_visibly, run, console, progress): run for run in runs}
+        try:
+            for future in as_completed(futures):
+                if isinstance(error := future.exception(), (CommandError, OSError)):
+                    failures[futures[future]] = str(error)
+                else:
+                    future.result()
+        except BaseException:  # Ctrl-C, which the commands get too: they end, and nothing new begins
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return {run: failures[run] for run in runs if run in failures}
+
+
+def finish(
+    run: Run,
+    announce: Callable[[Sequence[str]], None] = lambda _: None,
+    step: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Bring a run to its end from where it stands; its output goes to log.txt in its folder.
+
+    Args:
+        run: the run, settled.
+        announce: told of each command before it starts.
+        step: told of each iteration that nerfstudio reports.
+
+    Raises:
+        CommandError: a command failed.
+    """
+    for command in run.commands():
+        announce(command)
+        follow(command, step, run.folder / "log.txt")
+
+
+def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None, log: Path | None = None) -> None:
+    """Run a command of this environment, which is to be silent unless it fails.
+
+    Raises:
+        CommandError: it failed.
+    """
+    output: list[str] = []
+    with subprocess.Popen(
+        [BIN / command[0], *command[1:]],
+        env=ENVIRONMENT | os.environ,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                output.append(line)
+                if match := _STEP.match(line):
+                    step(int(match[1]))
+        except BaseException:
+            process.terminate()
+            raise
+        finally:
+            if log:
+                with log.open("a") as file:
+                    file.writelines([f"$ {shlex.join(command)}\n", *output])
+    if process.returncode:
+        raise CommandError(f"{command[0]} failed:\n{''.join(output[-LAST_LINES:])}")
+
+
+def _finish_visibly(run: Run, console: Console, progress: Progress) -> None:
+    task = progress.add_task(run.label, total=run.iterations)
+
+    def announce(command: Sequence[str]) -> None:
+        console.print(f"[bold]$ {escape(shlex.join(command))}", highlight=False, soft_wrap=True)
+
+    try:
+        finish(run, announce, lambda iteration: progress.update(task, completed=iteration))
+    finally:
+        progress.remove_task(task)

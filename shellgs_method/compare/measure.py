@@ -1,0 +1,174 @@
+"""A trained run of any nerfstudio method that renders depth, measured on the held-out views of a facade."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float16, UInt8
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.base_model import Model
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.eval_utils import eval_setup
+from rich.progress import track
+from torch import Tensor
+
+from dataparsers.camera import Camera
+from dataparsers.cue_maps import atomic_write
+from dataparsers.errors import SceneError
+from dataparsers.facade import FacadeDataParserConfig
+from shellgs_method.compare.runs import Half
+from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
+from shellgs_method.evaluation import (
+    Rendering,
+    angular_error,
+    colours_to_normals,
+    image_errors,
+    mean_over_views,
+    normals_from_depth,
+)
+from shellgs_method.evaluation.view import OPAQUE
+from shellgs_method.model import FacadeModel, pinhole_camera, reference_errors, reference_maps
+
+PICTURE_SIZE = 640
+"""Most pixels along the longer side of a picture in a report."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What a run rendered for a held-out view, thinned to a picture's size; lengths in units of the rescaled world."""
+
+    photograph: UInt8[np.ndarray, "H W 3"]
+    rgb: UInt8[np.ndarray, "H W 3"]
+    normal: Float16[np.ndarray, "H W 3"]
+    """Composited normals, or those of the depth where a method has none."""
+    error: Float16[np.ndarray, "H W 1"]
+    """Unsigned angle to the shell's normals in degrees."""
+    depth: Float[np.ndarray, "H W 1"]
+    """0 where nothing is half opaque."""
+    shell_normal: Float16[np.ndarray, "H W 3"]
+    shell_depth: Float[np.ndarray, "H W 1"]
+    mask: Bool[np.ndarray, "H W 1"]
+    """True on the shell."""
+    K: Float[np.ndarray, "3 3"]
+    viewmat: Float[np.ndarray, "4 4"]
+    metres_per_unit: Float[np.ndarray, ""]
+    """NaN where unknown."""
+
+    def save(self, path: Path) -> None:
+        """Write an npz."""
+        with atomic_write(path) as file:
+            np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Snapshot:
+        """Read what :meth:`save` wrote."""
+        with np.load(path, allow_pickle=False) as arrays:
+            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+
+
+@torch.no_grad()
+def measure(config_path: Path, half: Half | None = None, pictures: Path | None = None) -> dict:
+    """What ns-eval writes of a run, with the geometric figures of our methods for every method.
+
+    Args:
+        config_path: config.yml of the run.
+        half: bands of the facade that alone are measured; None: what the run itself held out, or all.
+        pictures: folder that gets a :class:`Snapshot` of each view that sees the shell.
+
+    Raises:
+        FileNotFoundError: there is no such config.
+        SceneError: the run renders no depth, or was not trained on a facade of undistorted photographs.
+    """
+    if not config_path.is_file():
+        raise FileNotFoundError(f"{config_path} does not exist: name the config.yml of a trained run")
+    config, pipeline, checkpoint, _ = eval_setup(config_path, test_mode="test")
+    model, datamanager = pipeline.model, _held_out_views(config.pipeline.datamanager, half, pipeline.device)
+    metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
+    figures = []
+    if pictures:
+        pictures.mkdir(parents=True, exist_ok=True)
+    for index, (cameras, batch) in enumerate(track(datamanager.fixed_indices_eval_dataloader, transient=True)):
+        camera = pinhole_camera(cameras)
+        rendering, photograph = _render(model, cameras, camera), _photograph(model, batch)
+        figures.append(
+            image_errors(rendering.rgb, photograph) | reference_errors(rendering, camera, batch, metres_per_unit)
+        )
+        if pictures and "shell_mask" in batch and batch["shell_mask"].any():
+            _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(pictures / f"{index:04d}.npz")
+    return {
+        "experiment_name": config.experiment_name,
+        "method_name": config.method_name,
+        "checkpoint": str(checkpoint),
+        "results": mean_over_views(figures, deviation=True),
+    }
+
+
+def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDataManager:
+    """Our datamanager on the scene of any method's."""
+    if not isinstance(config, FacadeDataManagerConfig):
+        if not isinstance(config.dataparser, FacadeDataParserConfig):
+            raise SceneError("the run was not trained on a facade: end its ns-train command with `facade-data`")
+        config = FacadeDataManagerConfig(dataparser=config.dataparser, data=config.data, cache_images_type="uint8")
+    if half:
+        config = replace(config, holdout=half)
+    return config.setup(device=device, test_mode="test", world_size=1, local_rank=0)
+
+
+def _render(model: Model, cameras: Cameras, camera: Camera) -> Rendering:
+    outputs = model.get_outputs_for_camera(cameras.to(model.device))
+    if "depth" not in outputs or "accumulation" not in outputs:
+        raise SceneError(f"{type(model).__name__} renders no depth, which all geometric figures are made of")
+    depth = outputs["depth"]
+    if not isinstance(model, SplatfactoModel):  # along the ray, in nerfstudio's radiance fields
+        depth = depth / camera.rays().to(depth).norm(dim=-1, keepdim=True)
+    normal = colours_to_normals(outputs["normal"]) if isinstance(model, FacadeModel) else None
+    return Rendering(outputs["rgb"], depth, outputs["accumulation"], normal)
+
+
+def _photograph(model: Model, batch: dict) -> Float[Tensor, "H W 3"]:
+    """As the method is to see it: transparency is black, the background of our methods."""
+    image = batch["image"].to(model.device)
+    image = image / 255 if image.dtype == torch.uint8 else image
+    return image[..., :3] * image[..., 3:] if image.shape[-1] == 4 else image
+
+
+def _snapshot(
+    rendering: Rendering, photograph: Tensor, camera: Camera, batch: dict, metres_per_unit: float | None
+) -> Snapshot:
+    reference = reference_maps(batch, "shell", rendering.depth.device)
+    depth = rendering.depth.where(rendering.alpha >= OPAQUE, 0.0)
+    normal = normals_from_depth(depth, camera) if rendering.normal is None else rendering.normal
+    step = -(-max(camera.width, camera.height) // PICTURE_SIZE)
+    K = camera.K.double().cpu().numpy().copy()
+    K[:2] /= step
+    K[:2, 2] += 0.5 - 0.5 / step  # pixel i of the picture is pixel step * i: centres at 0.5 in both
+
+    def thin(values: Tensor, dtype: type) -> np.ndarray:
+        return values[::step, ::step].cpu().numpy().astype(dtype)
+
+    return Snapshot(
+        thin(photograph.clamp(0, 1) * 255, np.uint8),
+        thin(rendering.rgb.clamp(0, 1) * 255, np.uint8),
+        thin(normal, np.float16),
+        thin(angular_error(normal, reference.normal), np.float16),
+        thin(depth, np.float32),
+        thin(reference.normal, np.float16),
+        thin(reference.depth, np.float32),
+        thin(reference.mask, np.bool_),
+        K,
+        camera.viewmat.double().cpu().numpy(),
+        np.array(np.nan if metres_per_unit is None else metres_per_unit),
+    )
+
+
+def write_figures(config: Path, output: Path, half: Half | None = None, pictures: Path | None = None) -> dict:
+    """:func:`measure`, as the json that ns-eval would write; returns the figures."""
+    measured = measure(config, half, pictures)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(output) as file:
+        file.write(json.dumps(measured, indent=2).encode())
+    return measured["results"]

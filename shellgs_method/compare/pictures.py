@@ -1,0 +1,142 @@
+"""The paper's figures of finished runs: qualitative strip, curves, point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from scipy.spatial import KDTree
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from dataparsers.camera import Camera
+from shellgs_method.compare.measure import Snapshot
+from shellgs_method.compare.runs import Run
+from shellgs_method.evaluation import back_project, voxel_means
+from shellgs_method.evaluation.figures import Panel, save_strip
+from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
+from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
+
+CURVES = tuple(
+    c for c in (*MAIN_COLUMNS, *SURFACE_COLUMNS) if c.key in ("psnr", "normal_deg", "depth_mae_m", "chamfer_m")
+)
+_EVENTS = "Eval Images Metrics Dict (all images)/"
+AZIMUTHS = (-60, 0, 60)
+"""Degrees that the orbit of the point clouds stops at, from the front of the facade."""
+FAR = 10
+"""Voxels from which a point's colour is the last of the scale: 20 cm."""
+
+
+def strip(runs: Sequence[Run], view: str, path: Path) -> None:
+    """One held-out view: the photograph with the shell's normals, then each run; below, the errors of the normals."""
+    panels = []
+    for run in runs:
+        shot = Snapshot.load(run.pictures / view)
+        mask = torch.from_numpy(shot.mask)
+        if not panels:
+            shell = torch.from_numpy(shot.shell_normal.astype(np.float32))
+            photograph = torch.from_numpy(shot.photograph) / 255
+            panels.append(Panel("photograph, shell", photograph, shell, torch.zeros_like(shell[..., :1]), mask))
+        normal, error = (torch.from_numpy(values.astype(np.float32)) for values in (shot.normal, shot.error))
+        panels.append(Panel(run.variant.name, torch.from_numpy(shot.rgb) / 255, normal, error, mask))
+    save_strip(path, panels)
+
+
+def curves(runs: Sequence[Run], path: Path) -> bool:
+    """Figures of all held-out views against the iteration, a line a variant (mean over seeds); whether there are any.
+
+    They are in the tensorboard files of runs that were measured while they trained.
+    """
+    recorded = {run: _events(run) for run in runs}
+    columns = [column for column in CURVES if any(column.key in curve for curve in recorded.values())]
+    if not columns:
+        return False
+    figure = Figure(figsize=(4 * len(columns), 3), layout="constrained")
+    for axis, column in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True):
+        for name in dict.fromkeys(run.variant.name for run in runs):
+            found = [c[column.key] for run, c in recorded.items() if run.variant.name == name and column.key in c]
+            if found:
+                steps = sorted(set.intersection(*(set(curve) for curve in found)))
+                axis.plot(steps, [np.mean([curve[step] for curve in found]) for step in steps], "o-", ms=3, label=name)
+        axis.set(title=column.heading, xlabel="iteration")
+        axis.grid(alpha=0.3)
+    figure.axes[0].legend(fontsize=8)
+    figure.savefig(path, dpi=130)
+    return True
+
+
+def surfaces(runs: Sequence[Run], path: Path) -> None:
+    """Visible points of all held-out views, seen from around the facade, coloured by their distance from the shell's.
+
+    A row an azimuth, a column a run. Points are thinned to the voxels that the figures are measured with.
+    """
+    shots = {run.variant.name: [Snapshot.load(path) for path in sorted(run.pictures.glob("*.npz"))] for run in runs}
+    seen = next(iter(shots.values()))
+    unit, voxel = _resolution(seen[0])
+    reference = voxel_means(np.concatenate([_world(shot, shot.shell_depth) for shot in seen]), voxel)
+    tree, centre, frame = KDTree(reference), np.median(reference, axis=0), _facade_frame(seen)
+    extent = 0.5 * np.linalg.norm(np.percentile(reference, 99, axis=0) - np.percentile(reference, 1, axis=0))
+    figure = Figure(figsize=(3.4 * len(shots) + 0.8, 2.2 * len(AZIMUTHS)), layout="constrained")
+    axes = figure.subplots(len(AZIMUTHS), len(shots), squeeze=False)
+    colours = ScalarMappable(Normalize(0, FAR * voxel), colormaps["turbo"])
+    for column, (name, views) in zip(axes.T, shots.items(), strict=True):
+        points = voxel_means(np.concatenate([_world(shot, shot.depth) for shot in views]), voxel)
+        distance = tree.query(points)[0]
+        for axis, azimuth in zip(column, AZIMUTHS, strict=True):
+            right, up, towards = _seen_from(frame, azimuth) @ (points - centre).T
+            order = np.argsort(towards)
+            axis.scatter(right[order], up[order], c=colours.to_rgba(distance[order]), s=0.4, linewidths=0)
+            axis.set(aspect="equal", xlim=(-extent, extent), ylim=(-extent / 1.6, extent / 1.6))
+            axis.set_axis_off()
+        column[0].set_title(name, fontsize=9)
+    figure.colorbar(colours, ax=axes, extend="max", label=f"distance from the shell's points ({unit})", shrink=0.6)
+    figure.savefig(path, dpi=130)
+
+
+def _events(run: Run) -> dict[str, dict[int, float]]:
+    """Figures by name, by iteration; where a resumed run wrote one twice, the last."""
+    events = EventAccumulator(str(run.folder), size_guidance={"scalars": 0})
+    events.Reload()
+    found = (tag for tag in events.Tags()["scalars"] if tag.startswith(_EVENTS))
+    return {tag.removeprefix(_EVENTS): {event.step: event.value for event in events.Scalars(tag)} for tag in found}
+
+
+def _resolution(shot: Snapshot) -> tuple[str, float]:
+    """Unit of lengths, and the voxel."""
+    if np.isfinite(shot.metres_per_unit):
+        return "m", VOXEL_METRES
+    return "units of the rescaled world", VOXEL_SHARE * float(np.median(shot.shell_depth[shot.mask]))
+
+
+def _facade_frame(shots: Sequence[Snapshot]) -> Float[np.ndarray, "3 3"]:
+    """The facade's right, up and front, as rows: front is the mean normal of the shell, up that of the cameras."""
+    up = -np.mean([shot.viewmat[1, :3] for shot in shots], axis=0)
+    facing = [shot.shell_normal[shot.mask[..., 0]].astype(float).mean(axis=0) @ shot.viewmat[:3, :3] for shot in shots]
+    right = np.cross(up, np.mean(facing, axis=0))
+    up, right = up / np.linalg.norm(up), right / np.linalg.norm(right)
+    return np.stack([right, up, np.cross(right, up)])
+
+
+def _world(shot: Snapshot, depth: Float[np.ndarray, "H W 1"]) -> Float[np.ndarray, "N 3"]:
+    height, width = depth.shape[:2]
+    camera = Camera(torch.from_numpy(shot.viewmat), torch.from_numpy(shot.K), width, height)
+    points = back_project(torch.from_numpy(depth), camera, torch.from_numpy(shot.mask & (depth > 0)))
+    scale = shot.metres_per_unit if np.isfinite(shot.metres_per_unit) else 1.0
+    return scale * (points - shot.viewmat[:3, 3]) @ shot.viewmat[:3, :3]
+
+
+def _seen_from(frame: Float[np.ndarray, "3 3"], azimuth: float) -> Float[np.ndarray, "3 3"]:
+    cosine, sine = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+    return np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ frame
+
+
+def common_views(runs: Sequence[Run]) -> list[str]:
+    """Names of the snapshots that all runs have, in order."""
+    views = [{path.name for path in run.pictures.glob("*.npz")} for run in runs]
+    return sorted(set.intersection(*views)) if views else []

@@ -1,0 +1,142 @@
+"""One HTML file with everything in it: tables, pictures, and a slider between methods on the held-out views."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib import colormaps
+from PIL import Image
+
+from dataparsers.cue_maps import atomic_write
+from shellgs_method.compare.measure import Snapshot
+from shellgs_method.compare.runs import Run
+from shellgs_method.compare.tables import FiguresTable
+from shellgs_method.evaluation.colours import GREY, normal_colours
+from shellgs_method.evaluation.figures import MAX_ERROR
+
+_PAGE = """<!doctype html>
+<meta charset="utf-8">
+<title>{title}</title>
+<style>
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
+table {{ border-collapse: collapse; margin: .5rem 0 }}
+th, td {{ padding: .15rem .7rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap }}
+th:first-child, td:first-child {{ text-align: left }}
+.scroll {{ overflow-x: auto }}
+.stage {{ position: relative; margin: .5rem 0 }}
+.stage img {{ width: 100%; display: block }}
+.stage img + img {{ position: absolute; inset: 0 }}
+figure img {{ max-width: 100% }}
+figure {{ margin: 1rem 0 }}
+input[type=range] {{ width: 100% }}
+pre {{ background: #f4f4f4; padding: .5rem; overflow-x: auto }}
+</style>
+<h1>{title}</h1>
+{body}
+<script>
+for (const box of document.querySelectorAll(".slider")) {{
+  const shots = JSON.parse(box.querySelector("script").textContent);
+  const [view, kind, left, right] = box.querySelectorAll("select");
+  const [under, over] = box.querySelectorAll("img");
+  const range = box.querySelector("input");
+  const show = () => {{
+    under.src = shots[view.value][right.value][kind.value];
+    over.src = shots[view.value][left.value][kind.value];
+    over.style.clipPath = `inset(0 ${{100 - range.value}}% 0 0)`;
+  }};
+  box.addEventListener("input", show);
+  show();
+}}
+</script>
+"""
+_KINDS = {"picture": "picture", "normals": "normals", "error": "angular error of the normals"}
+_REFERENCE = "photograph, shell"
+
+
+def write_report(
+    path: Path,
+    tables: Sequence[FiguresTable],
+    figures: Mapping[str, Path],
+    views: Mapping[str, Sequence[Run]],
+    failures: Mapping[str, str],
+) -> None:
+    """Write the report.
+
+    Args:
+        path: the HTML file, which needs no other.
+        tables: in order.
+        figures: captions and PNG files.
+        views: for the name of each scene, the runs that its slider shows, all with the same snapshots.
+        failures: what went wrong, by run.
+    """
+    parts = [f"<p>Failed: {html.escape(run)}</p><pre>{html.escape(why)}</pre>" for run, why in failures.items()]
+    parts += [f'<div class="scroll">{table.html}</div>' for table in tables]
+    parts += [
+        f'<figure><img alt="" src="{_data_uri(file.read_bytes(), "png")}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        for caption, file in figures.items()
+    ]
+    parts += [_slider(scene, runs) for scene, runs in views.items() if runs]
+    with atomic_write(path) as file:
+        file.write(_PAGE.format(title="Comparison", body="\n".join(parts)).encode())
+
+
+def _slider(scene: str, runs: Sequence[Run]) -> str:
+    names = sorted(path.name for path in runs[0].pictures.glob("*.npz"))
+    shots = {}
+    for name in names:
+        loaded = {run.variant.name: Snapshot.load(run.pictures / name) for run in runs}
+        first = next(iter(loaded.values()))
+        exact = np.zeros_like(first.error)
+        reference = _pictures(first.photograph, first.shell_normal, exact, first.mask)
+        shots[Path(name).stem] = {_REFERENCE: reference} | {
+            method: _pictures(shot.rgb, shot.normal, shot.error, shot.mask) for method, shot in loaded.items()
+        }
+    methods = [_REFERENCE, *(run.variant.name for run in runs)]
+    selects = [
+        _select("view", {view: view for view in shots}),
+        _select("show", _KINDS),
+        _select("left", {method: method for method in methods}, methods[1]),
+        _select("right", {method: method for method in methods}, methods[-1]),
+    ]
+    data = json.dumps(shots).replace("</", "<\\/")
+    return (
+        f'<h3>{html.escape(scene)}: held-out views</h3>\n<div class="slider">{" ".join(selects)}\n'
+        f'<script type="application/json">{data}</script>\n'
+        '<div class="stage"><img alt="right"><img alt="left"></div>\n'
+        '<input type="range" min="0" max="100" value="50" aria-label="border between left and right"></div>'
+    )
+
+
+def _pictures(
+    rgb: UInt8[np.ndarray, "H W 3"], normal: np.ndarray, error: np.ndarray, mask: np.ndarray
+) -> dict[str, str]:
+    colours = colormaps["inferno"](np.clip(error[..., 0].astype(float) / MAX_ERROR, 0, 1))[..., :3]
+    errors = np.where(mask, np.rint(255 * colours), GREY).astype(np.uint8)
+    pictures = {"picture": rgb, "normals": normal_colours(normal, mask[..., 0]), "error": errors}
+    return {kind: _jpeg(picture) for kind, picture in pictures.items()}
+
+
+def _jpeg(picture: UInt8[np.ndarray, "H W 3"]) -> str:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "jpeg", quality=88)
+    return _data_uri(file.getvalue(), "jpeg")
+
+
+def _data_uri(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _select(label: str, options: Mapping[str, str], chosen: str = "") -> str:
+    words = "".join(
+        f'<option value="{html.escape(value)}"{" selected" if value == chosen else ""}>{html.escape(text)}</option>'
+        for value, text in options.items()
+    )
+    return f"<label>{label} <select>{words}</select></label>"

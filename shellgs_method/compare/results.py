@@ -1,0 +1,86 @@
+"""From a grid of runs to the paper's tables, figures and a report."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from dataparsers.cue_maps import atomic_write
+from shellgs_method.ablations import ABLATIONS
+from shellgs_method.compare.pictures import common_views, curves, strip, surfaces
+from shellgs_method.compare.report import write_report
+from shellgs_method.compare.runs import Run
+from shellgs_method.compare.tables import FiguresTable, tables
+from shellgs_method.evaluation.tables import rich_table
+
+Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
+"""Finishes runs; returns those that failed, with the reason."""
+
+
+def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Console) -> Mapping[Run, str]:
+    """Finish the runs that are not, write all results, and show the tables; the runs that failed, with the reason.
+
+    Raises:
+        SceneError: a run was made with other settings. Nothing is started then.
+    """
+    for run in runs:
+        run.settle()
+    unfinished = [run for run in runs if not run.finished]
+    console.print(f"{len(runs) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
+    failures = launch(unfinished) if unfinished else {}
+    for table in write_results(runs, output, {run.label: why for run, why in failures.items()}):
+        console.print(rich_table(table.rows, table.columns, table.title))
+    for run, why in failures.items():
+        console.print(f"[red]{run.label} failed.[/red] {run.folder / 'log.txt'} has all of its output.")
+        console.print(why, markup=False, highlight=False)
+    return failures
+
+
+def write_results(runs: Sequence[Run], output: Path, failures: Mapping[str, str]) -> list[FiguresTable]:
+    """Write results.md, tables/, the pictures and report.html of what is measured so far."""
+    made = list(tables(runs))
+    for table in made:
+        table.save(output / "tables")
+    with atomic_write(output / "results.md") as file:
+        file.write("\n".join(table.markdown for table in made).encode())
+    figures: dict[str, Path] = {}
+    shown: dict[str, list[Run]] = {}
+    for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):
+        suffix = "" if index == 0 else f"-{scene.name}"
+        of_scene = [run for run in runs if run.scene == scene]
+        shown[scene.name] = _shown(of_scene)
+        figures |= _figures(of_scene, shown[scene.name], output, suffix)
+    write_report(output / "report.html", made, figures, shown, failures)
+    return made
+
+
+def _shown(runs: Sequence[Run]) -> list[Run]:
+    """The runs that pictures show: the first of each method that is measured, ablations aside."""
+    first: dict[str, Run] = {}
+    for run in runs:
+        if run.variant.name not in ABLATIONS and run.figures().exists() and any(run.pictures.glob("*.npz")):
+            first.setdefault(run.variant.name, run)
+    return list(first.values())
+
+
+def _figures(runs: Sequence[Run], shown: Sequence[Run], output: Path, suffix: str) -> dict[str, Path]:
+    """Draw what can be drawn of one scene; captions and files."""
+    scene, figures = runs[0].scene, {}
+    panel = output / f"supervision{suffix}.png"
+    if (scene / "cues" / "shell" / "panel.png").exists():
+        shutil.copyfile(scene / "cues" / "shell" / "panel.png", panel)
+        figures[f"{scene.name}: what supervises a view."] = panel
+    if views := common_views(shown):
+        path = output / f"strip{suffix}.png"
+        strip(shown, views[0], path)
+        figures[f"{scene.name}: a held-out view, its normals, and their unsigned angular error; grey: no shell."] = path
+        path = output / f"surfaces{suffix}.png"
+        surfaces(shown, path)
+        figures[f"{scene.name}: visible points, coloured by the distance from the shell's, from three sides."] = path
+    path = output / f"curves{suffix}.png"
+    if curves([run for run in runs if run.variant.name not in ABLATIONS], path):
+        figures[f"{scene.name}: figures of all held-out views while training."] = path
+    return figures

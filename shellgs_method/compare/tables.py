@@ -1,0 +1,137 @@
+"""The paper's tables of a grid of runs, with the paper's own figures beside them."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+from dataparsers.cue_maps import atomic_write
+from shellgs_method.ablations import ABLATIONS
+from shellgs_method.compare.runs import HALVES, Half, Run
+from shellgs_method.evaluation.tables import (
+    MAIN_COLUMNS,
+    SURFACE_COLUMNS,
+    Column,
+    Rows,
+    csv_table,
+    html_table,
+    latex_table,
+    markdown_table,
+)
+
+_BY_KEY = {column.key: column for column in (*MAIN_COLUMNS, *SURFACE_COLUMNS)}
+_GEOMETRY = ("depth_mae_m", "normal_deg", "normal_below_10deg", "normal_below_20deg", "depth_normal_deg", "chamfer_m")
+GEOMETRY_COLUMNS = tuple(_BY_KEY[key] for key in _GEOMETRY)
+TRUTH_COLUMNS = tuple(
+    replace(column, key=f"truth_{column.key}") for column in (*GEOMETRY_COLUMNS, *SURFACE_COLUMNS[3:])
+)
+
+
+@dataclass(frozen=True)
+class FiguresTable:
+    """A table with what it says."""
+
+    name: str
+    """Of its files."""
+    title: str
+    columns: Sequence[Column]
+    rows: Rows
+    paper: Rows = field(default_factory=dict)
+    """The paper's figures where the scene has the same role; they are of the paper's own scene."""
+
+    @property
+    def heading(self) -> str:
+        """Title, and what the rows of the paper are."""
+        return self.title + (" (rows of the paper: its own scene)" if self.paper else "")
+
+    @property
+    def markdown(self) -> str:
+        """With its title."""
+        return f"**{self.heading}**\n\n{markdown_table(self.rows, self.columns, self.paper)}"
+
+    @property
+    def html(self) -> str:
+        """With its title."""
+        return f"<h3>{html.escape(self.heading)}</h3>\n{html_table(self.rows, self.columns, self.paper)}"
+
+    def save(self, folder: Path) -> None:
+        """Write it as md, tex, csv and json."""
+        folder.mkdir(parents=True, exist_ok=True)
+        everything = {"title": self.title, "figures": self.rows, "paper": self.paper}
+        texts = {
+            "md": self.markdown,
+            "tex": f"% {self.heading}\n{latex_table(self.rows, self.columns, self.paper)}",
+            "csv": csv_table(self.rows, self.columns),
+            "json": json.dumps(everything, indent=2),
+        }
+        for suffix, text in texts.items():
+            with atomic_write(folder / f"{self.name}.{suffix}") as file:
+                file.write(text.encode())
+
+
+def read_figures(path: Path) -> dict[str, float]:
+    """Figures of a run from the json that ns-eval, or we, wrote; without the deviations over the views."""
+    results = json.loads(path.read_text())["results"]
+    spread = {f"{key}{suffix}" for key in results for suffix in ("_std", "_views")}
+    return {key: value for key, value in results.items() if key not in spread}
+
+
+def tables(runs: Sequence[Run]) -> Iterator[FiguresTable]:
+    """All tables that the figures there are make; the first scene has the paper's primary role, others its second."""
+    for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):
+        yield from _scene_tables([run for run in runs if run.scene == scene], "" if index == 0 else f"{scene.name}-")
+
+
+def _scene_tables(runs: Sequence[Run], prefix: str) -> Iterator[FiguresTable]:
+    whole = [run for run in runs if run.variant.held_out is None]
+    methods = [run for run in whole if run.variant.name not in ABLATIONS]
+    scene = runs[0].scene.name
+    found = [
+        FiguresTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
+        FiguresTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
+        FiguresTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, _rows(methods)),
+    ]
+    if any(run.variant.name in ABLATIONS for run in whole):
+        ordered = [run for run in whole if run.variant.name in ("photo-gs", "shellgs", *ABLATIONS)]
+        found.append(FiguresTable("ablation", f"{scene}: ablations", GEOMETRY_COLUMNS, _rows(ordered)))
+    for half in HALVES:
+        apart = [run for run in runs if run.variant.held_out == half]
+        if apart:
+            rows = _rows(methods, half) | _rows(apart)
+            title = f"{scene}: in half {half} of the facade alone; -without-{half.lower()}: which no cue supervised"
+            found.append(FiguresTable(f"holdout-{half.lower()}", title, GEOMETRY_COLUMNS, rows))
+    for table in found:
+        role = table.name if not prefix else {"main": "second"}.get(table.name, "")
+        rows = {name: row for name, row in table.rows.items() if any(c.key in row for c in table.columns)}
+        if rows:
+            yield replace(table, name=prefix + table.name, rows=rows, paper=_paper(role))
+
+
+def _rows(runs: Sequence[Run], half: Half | None = None) -> dict[str, dict[str, list[float]]]:
+    """Figures of each variant, one for each seed that has them."""
+    rows: dict[str, dict[str, list[float]]] = {}
+    for run in runs:
+        if run.figures(half).exists():
+            row = rows.setdefault(run.variant.name, {})
+            for key, value in read_figures(run.figures(half)).items():
+                row.setdefault(key, []).append(value)
+    return rows
+
+
+def _paper(role: str) -> dict[str, dict[str, float]]:
+    table = _paper_tables().get(role)
+    if table is None:
+        return {}
+    return {
+        f"{name} (paper)": dict(zip(table["columns"], values, strict=True)) for name, values in table["rows"].items()
+    }
+
+
+@cache
+def _paper_tables() -> Mapping[str, dict]:
+    return json.loads(resources.files("shellgs_method.compare").joinpath("paper.json").read_text())

@@ -1,0 +1,374 @@
+"""`shellgs compare`: tables, runs that are kept, and the report."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+from runs import Method, trainer_of
+
+from dataparsers.errors import SceneError
+from shellgs_method.compare import launch
+from shellgs_method.compare.launch import launch_locally
+from shellgs_method.compare.measure import Snapshot, measure, write_figures
+from shellgs_method.compare.results import compare, write_results
+from shellgs_method.compare.runs import Run, Variant, grid
+from shellgs_method.compare.tables import tables
+from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
+
+COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("normal_deg", "Normal (°)", min, ".2f"))
+SEEDS = {"shellgs_&_all": {"psnr": [25.0, 27.0], "normal_deg": [9.0, 11.0]}, "photo-gs": {"psnr": [26.6, 27.0]}}
+
+
+# tables
+
+
+def test_a_cell_is_mean_and_sample_deviation_over_the_seeds():
+    values = np.random.default_rng(0).normal(24, 2, 5).tolist()
+    table = markdown_table({"shellgs": {"psnr": values}}, COLUMNS[:1])
+    assert f"{np.mean(values):.1f} ± {np.std(values, ddof=1):.1f}" in table
+
+
+def test_the_best_mean_is_bold_whichever_way_is_better():
+    # Means: PSNR 26.0 and 26.8, more is better; normals 10 and 12, less is better.
+    rows = {"a": {"psnr": [25.0, 27.0], "normal_deg": [9.0, 11.0]}, "b": {"psnr": [26.6, 27.0], "normal_deg": 12.0}}
+    a, b = markdown_table(rows, COLUMNS).splitlines()[2:]
+    assert a == "| a | 26.0 ± 1.4 | **10.00 ± 1.41** |"
+    assert b == "| b | **26.8 ± 0.3** | 12.00 |"
+
+
+def test_quoted_rows_are_never_bold():
+    paper = {"paper": {"psnr": 99.0, "normal_deg": 0.0}}
+    ours, quoted = markdown_table({"ours": {"psnr": 20.0, "normal_deg": 30.0}}, COLUMNS, paper).splitlines()[2:]
+    assert ours == "| ours | **20.0** | **30.00** |"
+    assert quoted == "| paper | 99.0 | 0.00 |"
+
+
+def test_latex_escapes_names_and_signs():
+    table = latex_table(SEEDS, (*COLUMNS, Column("share", "<10° %", max, ".0%")))
+    assert r"shellgs\_\&\_all & 26.0 $\pm$ 1.4 & \textbf{10.00 $\pm$ 1.41} & -- \\" in table
+    assert r"Method & PSNR $\uparrow$ & Normal ($^\circ$) $\downarrow$ & $<$10$^\circ$ \% $\uparrow$ \\" in table
+    assert r"\begin{tabular}{lccc}" in table
+    assert table.isascii()
+
+
+def test_html_escapes_names():
+    assert "<td>shellgs_&amp;_all" in html_table(SEEDS, COLUMNS)
+
+
+def test_csv_has_all_digits():
+    shellgs, photo_gs = csv.DictReader(csv_table(SEEDS, COLUMNS).splitlines())
+    assert float(shellgs["psnr_std"]) == np.std([25.0, 27.0], ddof=1)
+    assert photo_gs["normal_deg"] == photo_gs["normal_deg_std"] == ""
+    assert shellgs["seeds"] == "2"
+
+
+# the grid
+
+
+def fabricate(run: Run, half=None, **figures: float) -> None:
+    run.folder.mkdir(parents=True, exist_ok=True)
+    run.figures(half).write_text(json.dumps({"results": figures}))
+
+
+def fake_grid(scenes: list[Path], names: list[str], folder: Path, seeds=(0,), iterations: int = 20) -> list[Run]:
+    return grid(scenes, names, seeds, iterations, folder)
+
+
+def test_tables_gather_the_seeds_and_leave_out_the_spread_over_views(pristine_scene, tmp_path):
+    for run in fake_grid([pristine_scene], ["shellgs"], tmp_path, seeds=(0, 1)):
+        fabricate(run, psnr=20.0 + run.seed, psnr_std=3.0, normal_deg=10.0, normal_deg_views=4.0)
+    (main,) = tables(fake_grid([pristine_scene], ["shellgs"], tmp_path, seeds=(0, 1, 2)))
+    assert main.rows["shellgs"] == {"psnr": [20.0, 21.0], "normal_deg": [10.0, 10.0]}
+
+
+def test_the_paper_stands_beside_scenes_of_the_same_part(pristine_scene, tmp_path):
+    other = tmp_path / "copy"
+    other.mkdir()
+    for file in pristine_scene.iterdir():
+        (other / file.name).symlink_to(file)
+    runs = fake_grid([pristine_scene, other], ["photo-gs", "shellgs", "shellgs-depth"], tmp_path)
+    for run in runs:
+        fabricate(run, psnr=20.0, normal_deg=10.0, depth_mae_m=0.1, chamfer_m=0.1)
+    found = {table.name: table for table in tables(runs)}
+    assert found["main"].paper["shellgs (paper)"]["psnr"] == 23.06
+    assert found["surface"].paper["2dgs (paper)"]["f_score_20cm"] == 0.938
+    assert found["ablation"].paper["shellgs-depth (paper)"]["depth_mae_m"] == 0.113
+    assert found["copy-main"].paper["shellgs (paper)"]["normal_deg"] == 23.44
+    assert not found["copy-ablation"].paper
+    assert list(found["main"].rows) == ["photo-gs", "shellgs"]
+    assert list(found["ablation"].rows) == ["photo-gs", "shellgs", "shellgs-depth"]
+
+
+def test_a_holdout_is_compared_with_all_methods_in_the_same_half(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["photo-gs", "shellgs", "shellgs-without-b"], tmp_path)
+    photo_gs, shellgs, without_b = runs
+    assert shellgs.halves == photo_gs.halves == ("B",)
+    assert without_b.halves == ()
+    fabricate(shellgs, normal_deg=1.0)
+    fabricate(shellgs, "B", normal_deg=2.0)
+    fabricate(without_b, normal_deg=3.0)
+    found = {table.name: table.rows for table in tables(runs)}
+    assert found["holdout-b"] == {"shellgs": {"normal_deg": [2.0]}, "shellgs-without-b": {"normal_deg": [3.0]}}
+
+
+def test_a_variant_is_a_method_an_ablation_or_the_users_own():
+    assert Variant.parse("splatfacto") == Variant("splatfacto", "splatfacto")
+    assert not Variant.parse("splatfacto").ours
+    assert Variant.parse("shellgs-plane").flags == ("--pipeline.model.depth", "plane")
+    assert Variant.parse("wide=shellgs --pipeline.model.geometry.ncc-window 11").method == "shellgs"
+
+
+def test_the_registry_is_named_to_who_asks_for_another_method(pristine_scene, tmp_path):
+    with pytest.raises(SceneError, match=r"no method 'shelgs': take photo-gs, .*shellgs-depth"):
+        fake_grid([pristine_scene], ["shelgs"], tmp_path)
+
+
+def test_a_name_that_leaves_its_folder_is_refused(pristine_scene, tmp_path):
+    with pytest.raises(SceneError, match="is to name a folder"):
+        fake_grid([pristine_scene], ["../mine=shellgs"], tmp_path)
+
+
+# runs are kept
+
+FAKE_TRAIN = """
+import os, pathlib, signal, sys
+words = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+folder = pathlib.Path(words["--output-dir"], words["--experiment-name"], sys.argv[1], words["--timestamp"])
+last = int(words["--max-num-iterations"]) - 1
+(folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
+(folder / "config.yml").write_text(
+    "!!python/object:types.SimpleNamespace {pipeline: !!python/object:types.SimpleNamespace "
+    "{datamanager: !!python/object:types.SimpleNamespace {data: somewhere}}}"
+)
+if folder.parent.name == "mono-gs":
+    print("mono-gs needs maps")
+    sys.exit(1)
+killed = folder.parent.name == "photo-gs" and "--load-dir" not in words
+checkpoint = folder / "nerfstudio_models" / f"step-{2 if killed else last:09d}.ckpt"
+checkpoint.write_text(" ".join(sys.argv[1:]))
+print("10 (50.00%)", flush=True)
+if killed:
+    os.kill(os.getppid() if "KILL_PARENT" in os.environ else os.getpid(), signal.SIGKILL)
+"""
+FAKE_EVALUATE = """
+import json, pathlib, sys
+assert sys.argv[1] == "evaluate"
+words = dict(zip(sys.argv[3::2], sys.argv[4::2]))
+pathlib.Path(words["--output-path"]).write_text(json.dumps({"results": {"psnr": 20.0}}))
+"""
+
+
+def write_fake_commands(folder: Path) -> None:
+    for name, text in {"ns-train": FAKE_TRAIN, "shellgs": FAKE_EVALUATE}.items():
+        (folder / name).write_text(f"#!{sys.executable} -SI{text}")
+        (folder / name).chmod(stat.S_IRWXU)
+
+
+@pytest.fixture
+def fake_commands(tmp_path, monkeypatch) -> None:
+    """Trainer and evaluation that take no time: photo-gs is killed at its first start, mono-gs always fails."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    write_fake_commands(folder)
+    monkeypatch.setattr(launch, "BIN", folder)
+
+
+def finish_all(runs: list[Run], jobs: int = 1):
+    console = Console(quiet=True)
+    return compare(runs, partial(launch_locally, jobs=jobs, console=console), runs[0].output, console)
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_one_failure_stops_no_other_run(pristine_scene, tmp_path, jobs):
+    runs = fake_grid([pristine_scene], ["mono-gs", "shellgs", "2dgs"], tmp_path / "out")
+    failures = finish_all(runs, jobs)
+    assert [run.variant.name for run in failures] == ["mono-gs"]
+    assert "mono-gs needs maps" in failures[runs[0]]
+    assert "mono-gs needs maps" in (tmp_path / "out" / "report.html").read_text()
+    assert [run.finished for run in runs] == [False, True, True]
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_finished_run_is_not_touched_again(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
+    finish_all(runs)
+    before = {path: path.stat().st_mtime_ns for path in runs[0].folder.rglob("*")}
+    finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+    assert {path: path.stat().st_mtime_ns for path in runs[0].folder.rglob("*")} == before
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_killed_run_goes_on_from_its_checkpoint(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path / "out")
+    assert list(finish_all(runs)) == runs
+    assert not finish_all(runs)
+    resumed = (runs[0].checkpoints / "step-000000019.ckpt").read_text()
+    assert f"--load-dir {runs[0].checkpoints}" in resumed
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_changed_setting_is_refused_before_anything_starts(pristine_scene, tmp_path):
+    finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+    longer = fake_grid([pristine_scene], ["2dgs", "shellgs"], tmp_path / "out", iterations=30)
+    with pytest.raises(SceneError, match=r"seed-0 is a run of other settings \(iterations: 20, now 30\)"):
+        finish_all(longer)
+    assert not longer[0].trained
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_run_that_failed_before_its_first_checkpoint_may_change(pristine_scene, tmp_path):
+    finish_all(fake_grid([pristine_scene], ["mono-gs"], tmp_path / "out"))
+    (longer,) = fake_grid([pristine_scene], ["mono-gs"], tmp_path / "out", iterations=30)
+    longer.settle()
+    assert json.loads((longer.folder / "settings.json").read_text())["iterations"] == 30
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_other_maps_make_another_run(scene, tmp_path):
+    finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+    manifest = scene / "cues" / "shell" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"max_image_size": null', '"max_image_size": 32'))
+    with pytest.raises(SceneError, match="shell maps"):
+        finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+
+
+def test_a_folder_of_somebody_elses_run_is_left_alone(pristine_scene, tmp_path):
+    (run,) = fake_grid([pristine_scene], ["shellgs"], tmp_path)
+    run.folder.mkdir(parents=True)
+    run.config.write_text("mine")
+    with pytest.raises(SceneError, match="did not make"):
+        run.settle()
+    assert [path.name for path in run.folder.iterdir()] == ["config.yml"]
+
+
+def test_methods_that_do_not_undistort_are_refused_resized_photographs(scene, tmp_path):
+    manifest = scene / "cues" / "shell" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"max_image_size": null', '"max_image_size": 32'))
+    with pytest.raises(SceneError, match="splatfacto takes photographs as they are"):
+        fake_grid([scene], ["splatfacto"], tmp_path)[0].settle()
+
+
+@pytest.fixture
+def fake_environment(tmp_path) -> Path:
+    """Folder of programs of a virtual environment like this one, with the fake commands; also in Ray's workers."""
+    home = tmp_path / "environment"
+    (home / "bin").mkdir(parents=True)
+    (home / "bin" / "python").symlink_to(Path(sys.executable).resolve())
+    (home / "lib").symlink_to(Path(sys.prefix) / "lib")
+    shutil.copy(Path(sys.prefix) / "pyvenv.cfg", home)
+    write_fake_commands(home / "bin")
+    return home / "bin"
+
+
+@pytest.mark.slow
+def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pristine_scene, tmp_path, fake_environment):
+    """photo-gs takes its worker with it at its first start, mono-gs always fails, and all results come back."""
+    pytest.importorskip("ray")
+    words = ["compare", pristine_scene, "--methods", "photo-gs", "mono-gs", "shellgs", "--iterations", "20"]
+    command = [fake_environment / "python", "-c", "from shellgs_method.cli import main; main()", *words]
+    environment = os.environ | {"KILL_PARENT": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(
+        [str(word) for word in (*command, "--launcher", "ray", "--output", tmp_path / "out")],
+        env=environment,
+        cwd=tmp_path,
+        text=True,
+        capture_output=True,
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "1 of 3 runs failed: scene/mono-gs/seed-0" in done.stderr
+    assert "mono-gs needs maps" in done.stdout
+    photo_gs, mono_gs, shellgs = fake_grid([pristine_scene], ["photo-gs", "mono-gs", "shellgs"], tmp_path / "out")
+    assert photo_gs.finished
+    assert "--load-dir" in (photo_gs.checkpoints / "step-000000019.ckpt").read_text()
+    assert shellgs.finished
+    assert "mono-gs needs maps" in (mono_gs.folder / "log.txt").read_text()
+
+
+# measurements and pictures
+
+
+@pytest.fixture(scope="module")
+def measured(pristine_scene, tmp_path_factory) -> list[Run]:
+    """Two methods, trained in process for a moment and measured, as the launcher leaves them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SHELLGS_COMPILE", "0")
+        runs = grid([pristine_scene], ["photo-gs", "shellgs"], [0], 4, tmp_path_factory.mktemp("compare"))
+        methods: tuple[Method, Method] = ("photo_gs", "shellgs")
+        for run, method in zip(runs, methods, strict=True):
+            run.settle()
+
+            def place(config, run=run):
+                config.output_dir, config.experiment_name = run.folder.parents[2], run.variant.name
+                config.timestamp, config.steps_per_eval_all_images = "seed-0", 2
+
+            trainer = trainer_of(pristine_scene, run.output, method, 4, change=place)
+            trainer.config.save_config()
+            trainer.train()
+            write_figures(run.config, run.figures(), pictures=run.pictures)
+    return runs
+
+
+@pytest.mark.usefixtures("eager")
+def test_our_figures_are_those_of_ns_eval(measured):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    _, pipeline, _, _ = eval_setup(measured[1].config)
+    theirs = pipeline.get_average_eval_image_metrics(get_std=True)
+    assert theirs is not None
+    ours = json.loads(measured[1].figures().read_text())["results"]
+    timing = {"fps", "fps_std", "num_rays_per_sec", "num_rays_per_sec_std"}
+    assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})
+
+
+@pytest.mark.usefixtures("eager")
+def test_a_half_is_measured_of_a_run_that_knows_no_halves(measured):
+    whole = json.loads(measured[0].figures().read_text())["results"]
+    halves = [measure(measured[0].config, half)["results"]["supported"] for half in ("A", "B")]
+    assert sum(halves) == pytest.approx(whole["supported"], rel=1e-5)
+    assert min(halves) > 0.1 * whole["supported"]
+
+
+def test_snapshots_keep_the_camera(measured):
+    """The shell's depth back-projected through the thinned picture's camera has the shell's own scale in metres."""
+    shot = Snapshot.load(sorted(measured[0].pictures.glob("*.npz"))[0])
+    assert shot.rgb.shape == shot.photograph.shape == (32, 48, 3)
+    assert shot.mask.any()
+    assert shot.error[shot.mask].max() <= 90
+
+
+def test_the_report_needs_no_other_file_and_shows_every_view(measured, tmp_path):
+    runs = [dataclasses.replace(run) for run in measured]
+    write_results(runs, tmp_path, {})
+    report = (tmp_path / "report.html").read_text()
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", report)
+    assert "http" not in report
+    (data,) = re.findall(r'<script type="application/json">(.*?)</script>', report, re.DOTALL)
+    views = json.loads(data)
+    assert len(views) == 2
+    for methods in views.values():
+        assert list(methods) == ["photograph, shell", "photo-gs", "shellgs"]
+    for picture in ("strip.png", "surfaces.png", "curves.png"):
+        with Image.open(tmp_path / picture) as image:
+            assert np.asarray(image).std() > 5
+
+
+def test_curves_are_of_all_held_out_views(measured, tmp_path):
+    from shellgs_method.compare.pictures import _events
+
+    curves = _events(measured[1])
+    assert sorted(curves["normal_deg"]) == [2]
