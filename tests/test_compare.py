@@ -328,8 +328,7 @@ def test_our_figures_are_those_of_ns_eval(measured):
     from nerfstudio.utils.eval_utils import eval_setup
 
     _, pipeline, _, _ = eval_setup(measured[1].config)
-    theirs = pipeline.get_average_eval_image_metrics(get_std=True)
-    assert theirs is not None
+    theirs: dict[str, float] = pipeline.get_average_eval_image_metrics(get_std=True)  # pyright: ignore
     ours = json.loads(measured[1].figures().read_text())["results"]
     timing = {"fps", "fps_std", "num_rays_per_sec", "num_rays_per_sec_std"}
     assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})
