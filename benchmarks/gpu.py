@@ -3,12 +3,11 @@
 Forward and backward from the parameters to a picture: SH of degree 3, and for ShellGS normals and depths besides. The
 contestants take turns; the figures are medians, and ratios to splatfacto's.
 
-    python benchmarks/gpu.py --n 200000 --width 960 --height 540
+    python -m benchmarks.gpu --n 200000 --width 960 --height 540
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 
@@ -18,38 +17,22 @@ import tyro
 from gsplat import rasterization
 from torch import Tensor
 
+from benchmarks.scenes import Scene, make_camera, make_scene
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer import quats_to_rotations, rasterize, spherical_harmonics
 from shellgs_method.rasterizer.gsplat_backend import Backend
 
-DEPTH = 6.0  # of the facade
-FOV = math.radians(70)
 
-
-def facade(n: int, camera: Camera) -> dict[str, Tensor]:
-    """Parameters as splatfacto holds them: a relief of thin splats, and three tenths of them anywhere before it."""
-    generator = torch.Generator().manual_seed(n)
-    uniform, normal = partial(torch.rand, generator=generator), partial(torch.randn, generator=generator)
-    n_relief = n * 7 // 10
-    z = torch.cat([torch.full((n_relief,), DEPTH) + 0.02 * normal(n_relief), 2.5 + 6.5 * uniform(n - n_relief)])
-    slopes = 1.15 * math.tan(FOV / 2) * (2 * uniform(n, 2) - 1) * torch.tensor([1.0, camera.height / camera.width])
-    means = torch.cat([slopes * z[:, None], z[:, None]], dim=1)
-    means[:n_relief, 2] += 0.15 * (2.1 * means[:n_relief, 0]).sin().sign() * (2.7 * means[:n_relief, 1]).sin().sign()
-
-    # Standard deviations of 2.2 pixels in 480 at 10 000 splats, log-normal, fewer where there are more.
-    pixel = 2 * math.tan(FOV / 2) / 480
-    scales = 2.2 * (n / 1e4) ** -0.2 * pixel * z[:, None] * (0.55 * normal(n, 1) + 0.45 * normal(n, 3)).exp()
-    scales[:n_relief, 2] *= 0.2
-    quats = normal(n, 4)
-    quats[:n_relief, :3] = torch.tensor([1.0, 0.0, 0.0]) + 0.08 * normal(n_relief, 3)
-    harmonics = torch.cat([normal(n, 1, 3), 0.1 * normal(n, 15, 3)], dim=1)
-    return {
-        "means": means,
-        "quats": quats,
-        "scales": scales.log(),
-        "opacities": 0.3 + 1.6 * normal(n),
-        "harmonics": harmonics,
+def parameters(scene: Scene) -> dict[str, Tensor]:
+    """The splats of a scene as splatfacto holds them, on the device."""
+    held = {
+        "means": scene.means,
+        "quats": scene.quats,
+        "scales": scene.scales.log(),
+        "opacities": scene.opacities.logit(),
+        "harmonics": scene.sh,
     }
+    return {name: values.cuda().requires_grad_() for name, values in held.items()}
 
 
 def splatfacto(splats: dict[str, Tensor], camera: Camera) -> Tensor:
@@ -109,10 +92,7 @@ def main(n: int = 200_000, width: int = 960, height: int = 540, rounds: int = 20
     """
     if not torch.cuda.is_available():
         raise SystemExit("This benchmark needs a CUDA device.")
-    focal = width / 2 / math.tan(FOV / 2)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    camera = Camera(torch.eye(4), K, width, height).to("cuda")
-    splats = {name: values.cuda().requires_grad_() for name, values in facade(n, camera).items()}
+    camera, splats = make_camera(width, height).to("cuda"), parameters(make_scene(n))
     contestants = {
         "splatfacto": splatfacto,
         "shellgs, gsplat": partial(shellgs, "gsplat"),

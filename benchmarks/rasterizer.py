@@ -43,6 +43,7 @@ class Benchmark:
         rounds: that every contender is timed, after one that is not.
         twin_up_to: number of splats up to which the twin takes part; it is slow.
         threads: of torch.
+        memory: also measure it, in a fresh process for each row.
         save_scene: write the scene of the first number and size here (npz), for other programs, and stop.
         figure: draw time against (splat, pixel) pairs here.
     """
@@ -54,6 +55,7 @@ class Benchmark:
     rounds: int = 5
     twin_up_to: int = 10_000
     threads: int = 2
+    memory: bool = True
     save_scene: Path | None = None
     figure: Path | None = None
 
@@ -93,7 +95,7 @@ def main(benchmark: Benchmark) -> None:
         for width, height in sizes:
             cases = [Case(n, width, height, p, c) for p in benchmark.primitives for c in benchmark.channels]
             own, twins = time_in_turns(cases, benchmark.rounds, with_twins=n <= benchmark.twin_up_to)
-            memory = {case: peak_memory(case, benchmark.threads) for case in cases}
+            memory = {case: peak_memory(case, benchmark.threads) for case in cases if benchmark.memory}
             console.print(tabulate(own, twins, memory))
             timings |= own
     if benchmark.figure is not None:
@@ -185,7 +187,7 @@ def tabulate(own: dict[Case, Timing], twins: dict[Case, Timing], memory: dict[Ca
             _ratios(twins[case], timing) if case in twins else "",
             _ratios(timing, own[first]),
             f"{pairs(case.n, case.width, case.height, case.primitive) / 1e6:.2f}",
-            f"{memory[case]:.1f}",
+            f"{memory[case]:.1f}" if case in memory else "",
         )
     return table
 
@@ -199,20 +201,19 @@ def _ratios(timing: Timing, reference: Timing) -> str:
 
 
 def draw(timings: dict[Case, Timing], path: Path) -> None:
-    """Time against pairs of all scenes, a line for each primitive and number of channels."""
+    """Time against pairs of all scenes, a colour for each primitive and number of channels."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     forward, both = figure.subplots(1, 2, sharey=True)
     for primitive, n_features in dict.fromkeys((case.primitive, case.n_features) for case in timings):
         of_kind = [case for case in timings if (case.primitive, case.n_features) == (primitive, n_features)]
-        of_kind.sort(key=lambda case: pairs(case.n, case.width, case.height, primitive))
         n_pairs = [pairs(case.n, case.width, case.height, primitive) for case in of_kind]
         for axes, seconds in ((forward, "forward"), (both, "both")):
             least = [1e3 * min(getattr(timings[case], seconds)) for case in of_kind]
-            axes.loglog(n_pairs, least, "o-", label=f"{primitive}, {n_features} channels")
+            axes.loglog(n_pairs, least, "o", label=f"{primitive}, {n_features} channels")
     forward.set(title="forward", xlabel="(splat, pixel) pairs", ylabel="ms")
     both.set(title="forward and backward", xlabel="(splat, pixel) pairs")
     both.legend()
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=100)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Per-view cue maps on disk: one compressed npz for each photograph, bound to the camera it was made for.
+"""Per-view cue maps on disk: one npz for each photograph, bound to the camera it was made for.
 
 ``scene/cues/<kind>/<image name>.npz`` holds a view's depth, normal and mask, and a record (json) of the camera they
 belong to; ``scene/cues/<kind>/manifest.json`` holds what is true of the whole set. The record travels inside the map:
@@ -8,6 +8,7 @@ writing a view touches one file, and an interrupted set is a smaller set, never 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import shlex
@@ -61,8 +62,8 @@ class Manifest:
 
     Attributes:
         command: the command that makes the set, with ``{scene}`` for the scene's folder.
-        sources: sha256 of each file the maps were made from, by its path relative to the scene; what is no file (a
-            network's weights) is here by its name and revision.
+        sources: sha256 of each file or folder the maps were made from, by its path relative to the scene; what is
+            neither (a network's weights) is here by its name and revision.
         metres_per_unit: metres in one scene unit, None where unknown.
         max_image_size: longer side the photographs are resized to for these maps, None for full size.
         licence: of the network's weights, for maps that a network made.
@@ -113,7 +114,7 @@ class CueMaps:
         max_image_size: int | None = None,
         licence: str | None = None,
     ) -> CueMaps:
-        """Write the manifest of a set made from the files ``sources`` and from what ``revisions`` names.
+        """Write the manifest of a set made from the files and folders ``sources`` and from what ``revisions`` names.
 
         Maps already there stay, and count while they match it.
         """
@@ -205,7 +206,7 @@ class CueMaps:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as file:
             text = np.array(json.dumps(asdict(record)))
-            np.savez_compressed(file, depth=cue.depth, normal=cue.normal, mask=cue.mask, record=text)
+            _write_npz(file, {"depth": cue.depth, "normal": cue.normal, "mask": cue.mask, "record": text})
         claims = self._files.setdefault(name, [path])
         if path not in claims:
             claims.append(path)
@@ -249,7 +250,7 @@ class CueMaps:
         """Which source has changed since the maps were made; a source that is gone tells nothing."""
         for source, sha256 in self.manifest.sources.items():
             path = self.scene / source
-            if path.is_file() and content_hash(path) != sha256:
+            if path.exists() and content_hash(path) != sha256:
                 return f"{source} has changed since"
         return None
 
@@ -286,8 +287,12 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
 
 
 def content_hash(path: Path) -> str:
-    """sha256 of a file's bytes."""
+    """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden ones do not count."""
     digest = hashlib.sha256()
+    if path.is_dir():
+        for file in sorted(file for file in path.rglob("[!.]*") if file.is_file()):
+            digest.update(f"{file.relative_to(path).as_posix()}\0{content_hash(file)}\n".encode())
+        return digest.hexdigest()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)
@@ -295,6 +300,16 @@ def content_hash(path: Path) -> str:
 
 
 _UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error)
+
+
+def _write_npz(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
+    """An npz, like :func:`numpy.savez_compressed` at a tenth of the time: zlib makes little of a depth's digits."""
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            data = io.BytesIO()
+            np.lib.format.write_array(data, array, allow_pickle=False)
+            method = zipfile.ZIP_STORED if name == "depth" else zipfile.ZIP_DEFLATED
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getbuffer(), method, compresslevel=1)
 
 
 def _read_record(path: Path) -> MapRecord:

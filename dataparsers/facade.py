@@ -8,7 +8,7 @@ from typing import Literal, Optional
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -16,8 +16,10 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps
+from dataparsers.errors import SceneError
 from dataparsers.photograph import View, undistort
 
+UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "colmap/sparse", "sparse")
 
 
@@ -73,7 +75,12 @@ class FacadeDataParser(DataParser):
 
     def read(self, split: str) -> tuple[DataparserOutputs, list[View]]:
         """Nerfstudio's outputs as its own parser makes them, and the views of the split at full size."""
-        outputs = self._cameras_parser().get_dataparser_outputs(split)
+        try:
+            outputs = self._cameras_parser().get_dataparser_outputs(split)
+        except (AssertionError, NotImplementedError) as error:  # a camera model it does not know, or two at once
+            raise SceneError(
+                f"nerfstudio cannot read the cameras of {self.config.data}: {error}; {UNDISTORT}"
+            ) from error
         _refuse_missing_images(outputs.image_filenames, self.config.data)
         return outputs, _views(outputs, self.config.data)
 
@@ -121,7 +128,22 @@ class FacadeDataParser(DataParser):
 
 
 class _SortedColmapDataParser(ColmapDataParser):
-    """ColmapDataParser orders and splits by COLMAP's image ids; the split here is by sorted name."""
+    """ColmapDataParser without two of its faults.
+
+    It orders and splits by COLMAP's image ids; the split here is by sorted name. It takes the fourth coefficient of a
+    fisheye for one of Brown's model, which it refuses; here that comes through.
+    """
+
+    def _get_all_images_and_cameras(self, recon_dir):
+        meta = super()._get_all_images_and_cameras(recon_dir)
+        self._k4 = {Path(frame["file_path"]): frame.pop("k4", 0.0) for frame in meta["frames"]}
+        return meta
+
+    def _generate_dataparser_outputs(self, split="train", **kwargs):
+        outputs = super()._generate_dataparser_outputs(split, **kwargs)
+        assert outputs.cameras.distortion_params is not None
+        outputs.cameras.distortion_params[:, 3] = torch.tensor([self._k4[path] for path in outputs.image_filenames])
+        return outputs
 
     def _get_image_indices(self, image_filenames, split):
         order = np.argsort([str(path) for path in image_filenames], kind="stable")
@@ -161,8 +183,10 @@ def _views(outputs: DataparserOutputs, scene: Path) -> list[View]:
     pinholes: dict[bytes, Camera] = {}  # photographs of one lens share their undistorted camera
     for i, path in enumerate(outputs.image_filenames):
         camera, lens = scene_camera(outputs, i), outputs.cameras[i]
+        _refuse_lens(lens, path)
         distortion = lens.distortion_params
-        if distortion is None or not bool((distortion != 0).any()):
+        assert distortion is not None  # both of nerfstudio's parsers give zeros
+        if not bool((distortion != 0).any()) and lens.camera_type.item() == CameraType.PERSPECTIVE.value:
             lens = None
         else:
             key = (
@@ -176,6 +200,18 @@ def _views(outputs: DataparserOutputs, scene: Path) -> list[View]:
         name = path.relative_to(scene).as_posix() if path.is_relative_to(scene) else path.name
         views.append(View(name, path, camera, lens, mask))
     return views
+
+
+def _refuse_lens(lens: Cameras, path: Path) -> None:
+    """Refuse what nerfstudio's undistortion makes no pinhole camera of."""
+    kind = CameraType(lens.camera_type.item())
+    if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
+        raise SceneError(
+            f"the camera of {path} is {kind.name}, but only perspective and fisheye ones work; {UNDISTORT}"
+        )
+    distortion = lens.distortion_params
+    if kind is CameraType.PERSPECTIVE and distortion is not None and distortion[3] != 0:
+        raise SceneError(f"the camera of {path} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
 
 
 def _pinhole_cameras(cameras: Cameras, views: list[View]) -> Cameras:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from PIL import Image, ImageOps
 
 from dataparsers.camera import Camera
@@ -42,14 +42,14 @@ def load_photograph(view: View) -> UInt8[np.ndarray, "H W C"]:
     Raises:
         SceneError: the file is no readable image, or its shape is not the camera's.
     """
-    return _as_seen(view, _read(view.image))
+    return _as_seen(view, read_image(view.image))
 
 
 def load_mask(view: View) -> Bool[np.ndarray, "H W"] | None:
     """The user's mask of the photograph, true where a pixel is kept; None where there is none."""
     if view.mask is None:
         return None
-    return _as_seen(view, _read(view.mask).convert("RGB"))[..., 0] > 127
+    return _as_seen(view, read_image(view.mask).convert("RGB"))[..., 0] > 127
 
 
 def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "3 3"], np.ndarray]:
@@ -63,8 +63,43 @@ def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[n
     return K, image
 
 
-def _read(path: Path) -> Image.Image:
-    """An image file in mode RGB or RGBA, 8 bits."""
+def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+    """Pixels of the photograph as it lies on disk, in the view's undistorted camera.
+
+    Where the EXIF orientation turns the picture and the camera's shape says that SfM turned it too, they are pixels of
+    the turned picture, which is what an image viewer shows.
+
+    Raises:
+        SceneError: the file is no readable image, or its shape is not the camera's.
+    """
+    import cv2
+    from nerfstudio.cameras.cameras import CameraType
+
+    width, height = _calibrated_size(view)
+    picture = _upright(view, read_image(view.image))
+    pixels = pixels * [width / picture.width, height / picture.height]
+    if view.lens is None:
+        return pixels
+    assert view.lens.distortion_params is not None
+    k1, k2, k3, k4, p1, p2 = view.lens.distortion_params.double().ravel().tolist()
+    K = view.lens.get_intrinsics_matrices().double().numpy().reshape(3, 3)
+    if int(view.lens.camera_type) == CameraType.FISHEYE.value:
+        rays = cv2.fisheye.undistortPoints(pixels[:, None], K, np.array([k1, k2, k3, k4]))
+    else:
+        precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+        rays = cv2.undistortPointsIter(
+            pixels[:, None], K, np.array([k1, k2, p1, p2, k3]), np.eye(3), np.eye(3), precise
+        )
+    undistorted = view.camera.K.cpu().double().numpy()
+    return rays[:, 0] @ undistorted[:2, :2].T + undistorted[:2, 2]
+
+
+def read_image(path: Path) -> Image.Image:
+    """An image file in mode RGB or RGBA, 8 bits, its EXIF data kept and its orientation not yet applied.
+
+    Raises:
+        SceneError: the file is no readable image.
+    """
     try:
         with Image.open(path) as image:
             image.load()
@@ -80,23 +115,27 @@ def _read(path: Path) -> Image.Image:
 
 
 def _as_seen(view: View, image: Image.Image) -> UInt8[np.ndarray, "H W C"]:
-    calibrated = view.camera if view.lens is None else view.lens
-    width, height = int(calibrated.width), int(calibrated.height)
-    upright = _upright(image, width / height)
-    if upright is None:
-        raise SceneError(
-            f"{view.image} is {image.width}x{image.height} pixels, but its camera is {width}x{height}: "
-            "the photographs and the cameras do not belong together"
-        )
+    upright = _upright(view, image)
     if view.lens is not None:
-        if upright.size != (width, height):
-            upright = upright.resize((width, height), Image.Resampling.BOX)
+        if upright.size != _calibrated_size(view):
+            upright = upright.resize(_calibrated_size(view), Image.Resampling.BOX)
         upright = Image.fromarray(undistort(view.lens, np.asarray(upright))[1])
     size = (view.camera.width, view.camera.height)
     return np.array(upright if upright.size == size else upright.resize(size, Image.Resampling.BOX))
 
 
-def _upright(image: Image.Image, aspect: float) -> Image.Image | None:
+def _calibrated_size(view: View) -> tuple[int, int]:
+    calibrated = view.camera if view.lens is None else view.lens
+    return int(calibrated.width), int(calibrated.height)
+
+
+def _upright(view: View, image: Image.Image) -> Image.Image:
     """SfM may or may not have honoured the EXIF orientation: the shape of its camera tells."""
-    candidates = (image, ImageOps.exif_transpose(image))
-    return next((c for c in candidates if abs(c.width / c.height / aspect - 1) < 0.01), None)
+    width, height = _calibrated_size(view)
+    for candidate in (image, ImageOps.exif_transpose(image)):
+        if abs(candidate.width / candidate.height / (width / height) - 1) < 0.01:
+            return candidate
+    raise SceneError(
+        f"{view.image} is {image.width}x{image.height} pixels, but its camera is {width}x{height}: "
+        "the photographs and the cameras do not belong together"
+    )

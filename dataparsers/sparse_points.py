@@ -54,8 +54,8 @@ def read_sparse_points(config: FacadeDataParserConfig) -> SparsePoints:
     points = _read_cloud(parser) if folder is None else _read_model(config.data / folder, config.images_path)
     if len(points.positions) == 0:
         raise SceneError(
-            f"{config.data} has no SfM points, which give monocular depth its scale: put points3D.bin beside the "
-            "COLMAP cameras, or name a cloud as ply_file_path in transforms.json"
+            f"{config.data} has no SfM points, which monocular depth and the shell are held against: put points3D.bin "
+            "beside the COLMAP cameras, or name a cloud as ply_file_path in transforms.json"
         )
     return points
 

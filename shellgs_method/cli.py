@@ -14,12 +14,15 @@ from rich.console import Console
 from rich.table import Table
 
 from dataparsers.errors import SceneError, refusals_end_the_program
+from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 
 if TYPE_CHECKING:
     from dataparsers.cue_maps import CueMaps
     from dataparsers.photograph import View
     from shellgs_method.export import Frame
+    from shellgs_method.shell.align import Placement
+    from shellgs_method.shell.validation import Validation
 
 console = Console()
 
@@ -34,6 +37,7 @@ MonoSource = Annotated[
 ]
 _MOGE = MoGe2()
 UpAxis = Literal["y", "z"]
+_CAPTURE = CaptureConfig()
 
 
 def demo(
@@ -62,12 +66,127 @@ def demo(
     run_demo(folder, FacadeConfig(width, height, views, seed), iterations, console)
 
 
+def capture(
+    source: Annotated[Path, tyro.conf.Positional],
+    scene: Scene,
+    config: Annotated[CaptureConfig, tyro.conf.arg(name="")] = _CAPTURE,
+) -> None:
+    """Photographs or a video to a scene: cameras and points by structure from motion, photographs undistorted.
+
+    An interrupted capture goes on where it stopped: give the same command again.
+
+    Args:
+        source: Folder of photographs, or a video.
+        scene: Scene folder.
+        config: Settings.
+    """
+    from shellgs_method.capture import SUSPICIOUS_ERROR, capture
+
+    try:
+        summary = capture(source, scene, config, console=console)
+    except KeyboardInterrupt:
+        raise SystemExit("shellgs: interrupted; the same command goes on from here") from None
+    total = len(summary.registered) + len(summary.missing)
+    console.print(
+        f"{len(summary.registered)} of {total} photographs have a camera; {summary.points} points, each seen by "
+        f"{summary.track_length:.1f} photographs, reprojected to {summary.reprojection_error:.2f} px (means).",
+        highlight=False,
+    )
+    if summary.missing:
+        console.print(f"Without a camera: {', '.join(summary.missing)}.", highlight=False)
+    if summary.reprojection_error > SUSPICIOUS_ERROR:
+        console.print(
+            f"[yellow]More than {SUSPICIOUS_ERROR} px is a sign that identical windows were taken for each other. Look "
+            f"at the cameras in {scene}/colmap: does their path jump or fold? Then try --overlap 5 (sequential), "
+            "more --frames, or --masks."
+        )
+
+
+def align(
+    scene: Scene,
+    shell: Annotated[Optional[Path], tyro.conf.Positional] = None,
+    matrix: Optional[Path] = None,
+    picks: Optional[Path] = None,
+    refine: Optional[float] = None,
+    accept: bool = False,
+    global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    metres_per_shell_unit: float = 1.0,
+) -> None:
+    """Find the shell's place in the scene, judge it, and write scene/shell/alignment.json unless it is refused.
+
+    The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
+    verdict. Without --matrix and --picks, a place is proposed, for you to look at and to take with --accept. Without a
+    shell, the alignment that is there is judged again, or refined.
+
+    Args:
+        scene: Scene folder.
+        shell: The shell's file.
+        matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare's text, json or npy).
+        picks: Text file of picked points, a line each: X Y Z of the shell, x y in the photograph, image, name.
+        refine: Then fit the SfM points to the shell, from a start that is off by up to this many metres.
+        accept: Take the proposal made before.
+        global_shift: CloudCompare's global shift, with --matrix.
+        metres_per_shell_unit: Length of the shell's unit in metres.
+    """
+    from dataparsers.cue_maps import relative_path
+    from dataparsers.facade import FacadeDataParserConfig, read_views
+    from dataparsers.sparse_points import read_sparse_points
+    from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
+    from shellgs_method.shell.align import PROPOSAL, Placement, judge, place_by_guess, place_by_picks, refined
+
+    if (shell is None and (matrix or picks)) or (matrix and picks) or (accept and (shell or matrix or picks)):
+        raise SceneError("give the shell with --matrix, with --picks or alone, or no shell to judge what is there")
+    config = FacadeDataParserConfig(data=scene)
+    views, points = read_views(config), read_sparse_points(config)
+    name = relative_path(shell, scene) if shell else ""
+    if shell is None:
+        placement = Placement(Alignment.load(scene / (PROPOSAL if accept else ALIGNMENT)))
+    elif matrix:
+        placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
+    elif picks:
+        placement = place_by_picks(picks, views, name, metres_per_shell_unit)
+    else:
+        placement = place_by_guess(load_shell(shell, cache=scene / "shell"), views, points, name, metres_per_shell_unit)
+    mesh = load_shell(scene / placement.alignment.shell, cache=scene / "shell")
+    if refine is not None:
+        placement = refined(placement, mesh, views, points, refine)
+    target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
+    _show_alignment(scene, target, placement, judge(scene, placement, mesh, views, points, target))
+
+
+def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
+    """What the user needs to know of a judged alignment; a refused one ends the program."""
+    from shellgs_method.shell.align import REPORT
+    from shellgs_method.shell.report import PICK_COLUMNS, pick_rows
+
+    for sentence in placement.history:
+        console.print(sentence, highlight=False)
+    if placement.picked:
+        table = Table(*PICK_COLUMNS)
+        for row in pick_rows(validation):
+            table.add_row(*row)
+        console.print(table)
+    for reason in validation.reasons:
+        console.print(f"[yellow]{reason}.", highlight=False)
+    report = scene / REPORT / "index.html"
+    if validation.verdict == "refused":
+        raise SceneError(f"the alignment is refused, and {target} left as it was: see {report}")
+    console.print(
+        f"Verdict: {validation.verdict}. Look at {report}: the shell's edges must lie on the photographed ones."
+    )
+    if placement.proposed:
+        console.print(f"This is a proposal. If the pictures agree: shellgs align {scene} --accept")
+    else:
+        console.print(f"Written: {target}.")
+
+
 def cast(
     scene: Scene,
     shell: Optional[Path] = None,
     matrix: Optional[Path] = None,
     metres_per_shell_unit: float = 1.0,
     max_image_size: Optional[int] = None,
+    mesher: Literal["planes", "bpa", "poisson"] = "planes",
 ) -> None:
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
@@ -76,10 +195,11 @@ def cast(
 
     Args:
         scene: Scene folder.
-        shell: The shell's mesh, with --matrix; else what scene/shell/alignment.json names.
+        shell: The shell's mesh or point cloud, with --matrix; else what scene/shell/alignment.json names.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
+        mesher: Makes a mesh of a point cloud: planes (balls between), balls alone (bpa), poisson for round things.
     """
     from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -92,7 +212,9 @@ def cast(
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
     views = read_views(FacadeDataParserConfig(data=scene))
-    summary = cast_views(scene, views, alignment, max_image_size=max_image_size)
+    summary = cast_views(scene, views, alignment, max_image_size=max_image_size, mesher=mesher)
+    if summary.meshing:
+        console.print(f"The shell is a point cloud, whose mesh is kept in {scene / 'shell'}: {summary.meshing}")
     console.print(
         f"{summary.cast} views cast, {summary.skipped} there already, in {summary.seconds:.1f} s; the shell is in "
         f"{summary.seeing} of {len(views)} views and in {summary.supported:.0%} of their pixels."
@@ -324,8 +446,18 @@ def doctor(install_libraries: bool = False) -> None:
 def main() -> None:
     """Entry point."""
     warnings.filterwarnings("ignore", category=FutureWarning)  # of the libraries below, and nothing to a user
-    commands = {"demo": demo, "cast": cast, "mono": mono, "compare": compare, "evaluate": evaluate, "mesh": mesh}
-    commands |= {"splats": splats, "doctor": doctor}
+    commands = {
+        "demo": demo,
+        "capture": capture,
+        "align": align,
+        "cast": cast,
+        "mono": mono,
+        "compare": compare,
+        "evaluate": evaluate,
+        "mesh": mesh,
+        "splats": splats,
+        "doctor": doctor,
+    }
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             commands, description="Everything around the training of the methods; these are trained by `ns-train`."

@@ -279,6 +279,7 @@ def fake_environment(tmp_path) -> Path:
     return home / "bin"
 
 
+@pytest.mark.slow
 def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pristine_scene, tmp_path, fake_environment):
     """photo-gs takes its worker with it at its first start, mono-gs always fails, and all results come back."""
     pytest.importorskip("ray")

@@ -19,8 +19,9 @@ from shellgs_method.export import Box, DepthView, Frame, decimate, fuse, scene_f
 from shellgs_method.export.runs import TrainedRun, mesh_errors
 from shellgs_method.model import pinhole_camera
 from shellgs_method.shell import Alignment, ShellCaster, ShellMesh, load_shell
+from shellgs_method.shell.surface import transformed
 from shellgs_method.synthetic.building import Layout, building
-from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, transformed
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 
 ROOM = Box(np.eye(3), np.full(3, -3.0), np.full(3, 3.0))
 FRAME = Frame("shell", np.eye(4), np.array([400_000.0, 5_000_000.0, 0.0]), metric=True, up="z")

@@ -615,7 +615,7 @@ def test_a_networks_disparity_is_aligned_to_what_each_view_observes(
     assert "10 of 10 views have a map" in output
     assert "licence not stated" in output
     found = CueMaps.open(scene, "mono")
-    assert str(depth_anything) in found.manifest.sources
+    assert f"predictions of {depth_anything}" in found.manifest.sources
     for view in views:
         cue = found.read(view.name, view.camera)
         assert cue is not None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from scipy import special
 
-from shellgs_method.rasterizer import spherical_harmonics
+from shellgs_method.rasterizer import fusion, spherical_harmonics
+from shellgs_method.rasterizer.spherical_harmonics import _sum
 
 DIRECTIONS = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
@@ -50,6 +53,20 @@ def test_gradients_are_those_of_finite_differences():
     coefficients = torch.randn(4, 16, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     inputs = DIRECTIONS[:4].clone().requires_grad_(), coefficients.requires_grad_()
     assert torch.autograd.gradcheck(lambda d, c: spherical_harmonics(3, d, c), inputs)
+
+
+def test_compiled_harmonics_of_each_degree_are_the_plain_ones(compiler):
+    """Degrees follow each other in training; none may make those after it fall back to plain torch."""
+    fusion._compiled.cache_clear()
+    directions = DIRECTIONS.float()
+    for degree in range(4):
+        coefficients = torch.randn(50, (degree + 1) ** 2, 3, requires_grad=True)
+        fused, plain = (run(directions, coefficients) for run in (partial(spherical_harmonics, degree), _sum))
+        torch.testing.assert_close(fused, plain)
+        gradients = [torch.autograd.grad(each.square().sum(), coefficients)[0] for each in (fused, plain)]
+        torch.testing.assert_close(*gradients)
+    assert not fusion._failed
+    assert fusion._compiled.cache_info().currsize == 1
 
 
 def test_too_few_coefficients_are_refused():

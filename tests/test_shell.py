@@ -212,7 +212,6 @@ HALF_A_PLY = (
         (lambda path: path.write_bytes(b""), "empty file"),
         (lambda path: path.write_text("not a mesh"), "cannot be read"),
         (lambda path: path.write_text(HALF_A_PLY), "cannot be read"),
-        (lambda path: write_ply(path, CORNERS, []), "point cloud (3 points)"),
         (lambda path: write_ply(path, [], []), "no triangles"),
         (lambda path: write_ply(path, CORNERS, ["3 0 1 3"]), "beyond the 3 there are"),
         (lambda path: write_ply(path, CORNERS, ["3 0 1 -1"]), "beyond the 3 there are"),
@@ -236,9 +235,9 @@ def test_a_missing_shell_is_refused_by_name(tmp_path: Path):
 
 
 def test_a_file_that_is_no_mesh_is_refused(tmp_path: Path):
-    (tmp_path / "shell.las").write_bytes(b"LASF")
-    with pytest.raises(SceneError, match=r"shell\.las .* export it as one of \.ply, \.obj"):
-        load_shell(tmp_path / "shell.las")
+    (tmp_path / "shell.dxf").write_bytes(b"0")
+    with pytest.raises(SceneError, match=r"shell\.dxf .* export it as one of \.ply, \.obj"):
+        load_shell(tmp_path / "shell.dxf")
 
 
 def test_triangles_with_nan_are_dropped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -500,3 +499,13 @@ def test_what_a_mask_paints_black_is_no_shell(tmp_path: Path, alignment: Alignme
     assert after is not None
     np.testing.assert_array_equal(after.mask, before.mask & (painted > 0))
     np.testing.assert_array_equal(after.depth, before.depth)
+
+
+def test_a_mask_painted_after_the_cast_makes_the_maps_stale(tmp_path: Path, alignment: Alignment):
+    cast_views(tmp_path, VIEWS, alignment)
+    assert CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera) is not None
+    path = tmp_path / "shell" / "masks" / "images" / "2.jpg.png"
+    path.parent.mkdir(parents=True)
+    Image.fromarray(np.zeros((48, 64), np.uint8)).save(path)
+    with pytest.raises(SceneError, match=r"shell/masks has changed since; run `shellgs cast"):
+        CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)

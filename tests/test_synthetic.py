@@ -19,10 +19,11 @@ from dataparsers.cue_maps import CueMaps
 from shellgs_method.shell import Alignment
 from shellgs_method.shell.mesh import load_shell
 from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.surface import transformed
 from shellgs_method.synthetic import FacadeConfig, write_scene
 from shellgs_method.synthetic.appearance import rays
 from shellgs_method.synthetic.building import RECESS, Layout, building, shell
-from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, UNITS_PER_METRE, scene_camera, transformed
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, UNITS_PER_METRE, scene_camera
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.scene import Facade
 from shellgs_method.synthetic.sfm import NOISE, features, triangulate

@@ -75,7 +75,7 @@ def make_maps(
         scene,
         "mono",
         command=command,
-        revisions={predictor.name: predictor.revision, "SfM points": _hash_of(points)},
+        revisions={f"predictions of {predictor.name}": predictor.revision, "SfM points": _hash_of(points)},
         max_image_size=max_image_size,
         licence=predictor.licence,
     )

@@ -76,7 +76,7 @@ class TrainedRun:
         if not (scene / ALIGNMENT).is_file():
             return None
         alignment = Alignment.load(scene / ALIGNMENT)
-        return alignment, load_shell(scene / alignment.shell)
+        return alignment, load_shell(scene / alignment.shell, cache=scene / "shell")
 
     @cached_property
     def frame(self) -> Frame:

@@ -29,6 +29,7 @@ _OPTIONS = {
     "cpp.dynamic_threads": True,  # as many as torch has when it runs, not when it compiled
     "assert_indirect_indexing": False,
 }
+_LONG = 5.0  # seconds
 _failed = False  # one failure to compile is enough for a process
 
 
@@ -83,7 +84,10 @@ def _compiled(kernel: Callable[..., Any], key: tuple[tuple[bool, bool], ...]) ->
         start = time.perf_counter()
         result = compiled(*args)
         first = False
-        logger.info("%s took %.1f s to compile or load.", kernel.__qualname__, time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+        level = logging.WARNING if seconds > _LONG else logging.INFO  # people are told why they waited
+        name = f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}"
+        logger.log(level, "%s: %.1f s to compile or load; compiled kernels are kept on disk", name, seconds)
         return result
 
     return call

@@ -32,14 +32,10 @@ def spherical_harmonics(
 
 
 def _sum(directions: Float[Tensor, "N 3"], coefficients: Float[Tensor, "N K 3"]) -> Float[Tensor, "N 3"]:
-    harmonics = _harmonics(math.isqrt(coefficients.shape[1]) - 1, F.normalize(directions, dim=-1))
-    return torch.stack(
-        [
-            sum((h * c for h, c in zip(harmonics, channel.unbind(1), strict=True)), start=torch.zeros(()))
-            for channel in coefficients.unbind(2)
-        ],
-        dim=-1,
-    )
+    terms = coefficients.unbind(1)
+    harmonics = _harmonics(math.isqrt(len(terms)) - 1, F.normalize(directions, dim=-1))
+    weighted = (harmonic[:, None] * term for harmonic, term in zip(harmonics, terms, strict=True))
+    return sum(weighted, start=torch.zeros_like(terms[0]))
 
 
 def _harmonics(degree: int, directions: Float[Tensor, "N 3"]) -> list[Float[Tensor, "N"]]:

@@ -1,22 +1,38 @@
 """The facade shell: its file, where it stands in the scene, and what each camera sees of it.
 
-:func:`cast_views` is the whole pipeline; the parts it is made of can be used alone.
+:func:`align_picks`, :func:`refine` and :func:`propose` find its place, :func:`validate` judges it, and
+:func:`cast_views` makes the maps; the parts these are made of can be used alone.
 """
 
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.cast import ALIGNMENT, MASKS, CastSummary, cast_views
+from shellgs_method.shell.clouds import Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell
 from shellgs_method.shell.panel import supervision_panel
+from shellgs_method.shell.picks import align_picks
+from shellgs_method.shell.proposal import propose
 from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.refinement import refine
+from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.shell.validation import Validation, validate
 
 __all__ = [
     "ALIGNMENT",
     "MASKS",
     "Alignment",
     "CastSummary",
+    "Mesher",
+    "Meshing",
     "ShellCaster",
     "ShellMesh",
+    "ShellSurface",
+    "Validation",
+    "align_picks",
     "cast_views",
     "load_shell",
+    "mesh_cloud",
+    "propose",
+    "refine",
     "supervision_panel",
+    "validate",
 ]

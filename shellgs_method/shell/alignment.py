@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,8 @@ class Alignment:
         shell: the shell's file, relative to the scene's folder (or absolute).
         metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
         source: how the alignment was found, for people.
+        verdict: of the validation, "good" or "doubtful"; empty where there was none.
+        figures: the main numbers behind the verdict.
 
     Raises:
         SceneError: the matrix is no similarity, or mirrors.
@@ -32,6 +34,8 @@ class Alignment:
     shell: str
     metres_per_shell_unit: float = 1.0
     source: str = "matrix"
+    verdict: str = ""
+    figures: Mapping[str, float | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the matrix."""
@@ -62,6 +66,14 @@ class Alignment:
         """Metres in one scene unit."""
         return self.metres_per_shell_unit / self.scale
 
+    def places_like(self, other: Alignment) -> bool:
+        """Whether both put the same shell in the same place, however they were found."""
+        return (
+            np.array_equal(self.shell_to_scene, other.shell_to_scene)
+            and self.shell == other.shell
+            and self.metres_per_shell_unit == other.metres_per_shell_unit
+        )
+
     def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the shell in the scene's frame, in double precision."""
         points = np.asarray(points, dtype=np.float64)
@@ -83,13 +95,14 @@ class Alignment:
         """
         if not path.is_file():
             raise FileNotFoundError(
-                f"{path} does not exist: name the shell and its place with `shellgs cast --shell … --matrix …`"
+                f"{path} does not exist: align the shell with `shellgs align {path.parent.parent} SHELL …`"
             )
         try:
             fields = json.loads(path.read_bytes())
             matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
             unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
-            return cls(matrix, str(fields["shell"]), float(unit), str(source))
+            verdict, figures = str(fields.get("verdict", "")), dict(fields.get("figures", {}))
+            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, figures)
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
         except (ValueError, TypeError, AttributeError) as error:

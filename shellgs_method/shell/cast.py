@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask
 from shellgs_method.shell.alignment import Alignment
+from shellgs_method.shell.clouds import VERSION, Mesher, Meshing
 from shellgs_method.shell.mesh import load_shell
 from shellgs_method.shell.raycast import ShellCaster
 
@@ -36,6 +38,7 @@ class CastSummary:
         seeing: views with at least one pixel on the shell.
         supported: share of the pixels of all views that lie on the shell.
         seconds: wall time.
+        meshing: how the shell, a point cloud, became a mesh; None if it is one.
     """
 
     cast: int
@@ -43,6 +46,7 @@ class CastSummary:
     seeing: int
     supported: float
     seconds: float
+    meshing: Meshing | None
 
 
 def cast_views(
@@ -51,6 +55,7 @@ def cast_views(
     alignment: Alignment,
     *,
     max_image_size: int | None = None,
+    mesher: Mesher = "planes",
 ) -> CastSummary:
     """Cast the scene's shell into views and store the maps in ``scene/cues/shell``.
 
@@ -66,6 +71,7 @@ def cast_views(
         views: the photographs, with full-size cameras.
         alignment: names the shell and places it.
         max_image_size: cast for photographs resized to this longer side.
+        mesher: makes a mesh of a shell that is a point cloud; the mesh is kept in ``scene/shell``.
 
     Raises:
         FileNotFoundError: the shell is missing.
@@ -73,25 +79,38 @@ def cast_views(
     """
     start = time.monotonic()
     shell = scene / alignment.shell
-    caster = ShellCaster(load_shell(shell), alignment.shell_to_scene)
+    positions = np.array([view.camera.position.detach().cpu().double().numpy() for view in views]).reshape(-1, 3)
+    viewpoints = (positions - alignment.shell_to_scene[:3, 3]) @ np.linalg.inv(alignment.shell_to_scene[:3, :3]).T
+    mesh = load_shell(shell, cache=scene / "shell", viewpoints=viewpoints, mesher=mesher)
+    caster = ShellCaster(mesh, alignment.shell_to_scene)
     _check_placement(caster, [view.camera for view in views], shell)
     kept = scene / ALIGNMENT
-    if not kept.is_file() or Alignment.load(kept) != alignment:
+    if not kept.is_file() or not Alignment.load(kept).places_like(alignment):  # else it keeps its verdict
         alignment.save(kept)
+    (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a mask that is painted later is missed if it is not there
     maps = CueMaps.create(
         scene,
         "shell",
-        command="shellgs cast {scene}" + (f" --max-image-size {max_image_size}" if max_image_size else ""),
-        sources=[shell, kept, *sorted((scene / MASKS).rglob("*.png"))],
+        command=_command(max_image_size, mesh.meshing),
+        sources=[shell, kept, scene / MASKS],
+        revisions={"mesher": f"{mesh.meshing.mesher} {VERSION}"} if mesh.meshing else {},
         metres_per_unit=alignment.metres_per_unit,
         max_image_size=max_image_size,
     )
     cast = 0
-    for full_size in track(views, description="casting the shell"):
-        view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
-        if not maps.current(view.name, view.camera):
-            maps.write(view.name, _unoccluded(caster.cast(view.camera), view, scene), view.camera)
+    with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast; there are never more in memory
+        written: Future[None] | None = None
+        for full_size in track(views, description="casting the shell"):
+            view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
+            if maps.current(view.name, view.camera):
+                continue
+            cue = _unoccluded(caster.cast(view.camera), view, scene)
+            if written:
+                written.result()
+            written = writer.submit(maps.write, view.name, cue, view.camera)
             cast += 1
+        if written:
+            written.result()
     supported = [record.supported for view in views if (record := maps.record(view.name))]
     return CastSummary(
         cast=cast,
@@ -99,7 +118,17 @@ def cast_views(
         seeing=int(np.count_nonzero(supported)),
         supported=float(np.mean(supported)),
         seconds=time.monotonic() - start,
+        meshing=mesh.meshing,
     )
+
+
+def _command(max_image_size: int | None, meshing: Meshing | None) -> str:
+    command = "shellgs cast {scene}"
+    if max_image_size:
+        command += f" --max-image-size {max_image_size}"
+    if meshing and meshing.mesher != "planes":
+        command += f" --mesher {meshing.mesher}"
+    return command
 
 
 def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:

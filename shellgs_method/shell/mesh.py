@@ -1,19 +1,23 @@
-"""The shell as a triangle mesh, read from the file it came in."""
+"""The shell as a triangle mesh, read from the file it came in; a point cloud is meshed once, and the mesh is kept."""
 
 from __future__ import annotations
 
+import json
 import logging
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from dataparsers.cue_maps import atomic_write, content_hash
 from dataparsers.errors import SceneError
+from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
+from shellgs_method.shell.files import read_geometry
 
 log = logging.getLogger(__name__)
 
-FORMATS = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+COMMENT = "comment shellgs "
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,7 @@ class ShellMesh:
     Attributes:
         vertices: in the shell's own frame and units, georeferenced as they came.
         faces: three vertex indices for each triangle.
+        meshing: how a point cloud became this mesh; None if it always was one.
 
     Raises:
         SceneError: the arrays make no such mesh.
@@ -30,6 +35,7 @@ class ShellMesh:
 
     vertices: Float64[np.ndarray, "V 3"]
     faces: Int64[np.ndarray, "F 3"]
+    meshing: Meshing | None = None
 
     def __post_init__(self) -> None:
         """Check what Open3D does not: it reads out of range indices without a word."""
@@ -55,52 +61,73 @@ class ShellMesh:
         return np.where(areas > 1e-14, areas, 0.0)
 
 
-def load_shell(path: Path) -> ShellMesh:
-    """Read a shell mesh (ply, obj, glb, gltf, stl, off) in full double precision where the file has it.
+def load_shell(
+    path: Path,
+    *,
+    cache: Path | None = None,
+    viewpoints: Float64[np.ndarray, "V 3"] | None = None,
+    mesher: Mesher = "planes",
+) -> ShellMesh:
+    """Read a shell, a triangle mesh or a point cloud, in full double precision where the file has it.
 
-    Triangles with a NaN or infinite vertex are dropped, and the number of them is logged.
+    Triangles with a NaN or infinite vertex and points that are NaN or infinite are dropped; their number is logged. A
+    point cloud is meshed by :func:`~shellgs_method.shell.clouds.mesh_cloud`, and its mesh kept, as
+    ``<cache>/<file name>.<mesher>.ply``, until the cloud changes.
+
+    Args:
+        path: ply, obj, glb, gltf, stl, off, pcd, xyz, las, laz or e57; the last three need the extras ``las``, ``e57``.
+        cache: folder for the mesh of a point cloud; None does not keep it.
+        viewpoints: places that see the surface, in the shell's frame: they orient the normals of a cloud whose file
+            does not tell where its scanner stood. They do not count for a mesh that was kept.
+        mesher: turns a point cloud into a mesh.
 
     Raises:
         FileNotFoundError: there is no such file.
-        SceneError: the file is empty, damaged, a point cloud, or holds no usable triangle.
+        SceneError: the file is empty or damaged, its reader is not installed, or it holds no surface.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"the shell {path} does not exist")
-    if path.stat().st_size == 0:
-        raise SceneError(f"the shell {path} is an empty file: export it again")
-    if path.suffix.lower() not in FORMATS:
-        raise SceneError(f"the shell {path} is no mesh file that can be read: export it as one of {', '.join(FORMATS)}")
-    vertices, faces = _read(path)
-    if len(faces) == 0 and len(vertices) > 0:
-        raise SceneError(f"the shell {path} is a point cloud ({len(vertices)} points): a triangle mesh is needed here")
+    kept = None if cache is None else cache / f"{path.name}.{mesher}.ply"
+    if kept is not None and path.is_file() and (mesh := _read_kept(kept, path)):
+        return mesh
+    geometry = read_geometry(path)
     try:
-        mesh = ShellMesh(*_without_nan(vertices, faces, path))
+        if len(geometry.faces) or not len(geometry.vertices):
+            return ShellMesh(*_without_nan(geometry.vertices, geometry.faces, path))
+        seen_from = viewpoints if viewpoints is not None and not len(geometry.scanners) else geometry.scanners
+        mesh = ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
-    _warn_of_float32(mesh, path)
+    if kept is not None:
+        _keep(mesh, kept, path)
     return mesh
 
 
-def _read(path: Path) -> tuple[Float64[np.ndarray, "V 3"], Int64[np.ndarray, "F 3"]]:
-    """All triangles of a file, the nodes of a scene graph placed and joined."""
-    import trimesh
+def _keep(mesh: ShellMesh, kept: Path, source: Path) -> None:
+    """Write the mesh as a PLY of doubles, with a comment that says what it was made from."""
+    assert mesh.meshing is not None
+    record = json.dumps({"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)})
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
+    faces["count"], faces["indices"] = 3, mesh.faces
+    header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]
+    header += [*(f"property double {axis}" for axis in "xyz"), f"element face {len(faces)}"]
+    header += ["property list uchar int vertex_indices", "end_header\n"]
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(kept) as file:
+        file.write("\n".join(header).encode() + mesh.vertices.astype("<f8").tobytes() + faces.tobytes())
 
+
+def _read_kept(kept: Path, source: Path) -> ShellMesh | None:
+    """The mesh made of a point cloud before, if it was made of this one, in this way, and is whole."""
     try:
-        # process=False: merging vertices would round them. trimesh, unlike Open3D's tensor reader, keeps doubles.
-        loaded = trimesh.load(path, process=False, skip_materials=True)
-    except Exception as error:  # each format's reader has its own kinds of error for a damaged file
-        raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({error})") from error
-    scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
-    vertices, faces, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
-    for node in scene.graph.nodes_geometry:
-        pose, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        points = np.asarray(geometry.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
-        vertices.append(trimesh.transform_points(points, pose))
-        faces.append(np.asarray(getattr(geometry, "faces", faces[0]), np.int64) + count)  # a point cloud has none
-        count += len(points)
-    return np.concatenate(vertices), np.concatenate(faces)
+        with kept.open("rb") as file:
+            comment = file.read(4096).decode(errors="replace").splitlines()[2]
+        record = json.loads(comment.removeprefix(COMMENT))
+        if (record["version"], record["sha256"]) != (VERSION, content_hash(source)):
+            return None
+        geometry = read_geometry(kept)
+        return ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]))
+    except (OSError, IndexError, KeyError, TypeError, ValueError):  # none, or damaged: it is made again
+        return None
 
 
 def _without_nan(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -114,17 +141,3 @@ def _without_nan(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[n
     log.warning("%s: dropped %d of %d triangles with a NaN or infinite vertex", path, (~usable).sum(), len(faces))
     renumbered = np.cumsum(finite) - 1
     return vertices[finite], renumbered[faces[usable]]
-
-
-def _warn_of_float32(mesh: ShellMesh, path: Path) -> None:
-    """Georeferenced coordinates that a file stores as float32 were rounded before we could read them."""
-    single = mesh.vertices.astype(np.float32)
-    step = float(np.spacing(np.abs(single).max()))
-    extent = np.ptp(mesh.bounds, axis=0).max()
-    if step > 1e-4 * extent and np.array_equal(single, mesh.vertices):
-        log.warning(
-            "%s stores large coordinates in single precision, in steps of %.2g units: export the shell as double "
-            "precision PLY or OBJ, or move it near the origin first",
-            path,
-            step,
-        )

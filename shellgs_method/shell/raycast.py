@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float16, Float32, Float64
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
+from shellgs_method.shell._open3d import import_open3d
 from shellgs_method.shell.mesh import ShellMesh
 
 
@@ -18,6 +17,11 @@ class ShellCaster:
     Args:
         mesh: the shell in its own frame.
         shell_to_scene: similarity from that frame to the scene's.
+
+    Attributes:
+        scene: Open3D's ray casting scene, whose origin is :attr:`origin`.
+        origin: middle of the shell's bounds, in the scene's frame.
+        extent: longest side of the shell's bounds, in scene units.
 
     Raises:
         ImportError: Open3D cannot be loaded.
@@ -29,40 +33,54 @@ class ShellCaster:
         # Embree computes in float32, whose steps are 3 cm at 4e5: everything it sees is relative to the shell's centre.
         self.origin = (placed.min(0) + placed.max(0)) / 2
         self.extent = float(np.ptp(placed, axis=0).max())
+        placed -= self.origin
         tensor = self._o3d.core.Tensor
-        self._scene = self._o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            tensor((placed - self.origin).astype(np.float32)), tensor(mesh.faces.astype(np.uint32))
-        )
+        self.scene = self._o3d.t.geometry.RaycastingScene()
+        self.scene.add_triangles(tensor(placed.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
+        a, b, c = (placed[mesh.faces[:, k]] for k in range(3))
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+        self._planes = np.concatenate([normals, np.einsum("fc,fc->f", normals, a)[:, None]], axis=1)  # n · x = d
+        self._rays = np.empty((0, 0, 6), np.float32)
+
+    def rays(self, camera: Camera) -> Float32[np.ndarray, "H W 6"]:
+        """Position and direction of each pixel's ray in the frame of :attr:`scene`, valid until the next call.
+
+        Directions have z = 1 in the camera's frame, which makes the parameter of a hit its z-depth.
+        """
+        position, rotation = self._pose(camera)
+        step_u, step_v, first = (rotation.T @ np.linalg.inv(camera.K.detach().cpu().double().numpy())).T
+        u, v = (np.arange(count)[:, None] + 0.5 for count in (camera.width, camera.height))
+        if self._rays.shape[:2] != (camera.height, camera.width):  # fresh memory costs more than what is written to it
+            self._rays = np.empty((camera.height, camera.width, 6), np.float32)
+        rays = self._rays
+        across, down = (u * step_u).astype(np.float32), (v * step_v + first).astype(np.float32)
+        for axis in range(3):  # numpy's innermost loop is then over pixels
+            rays[..., axis] = position[axis]
+            np.add.outer(down[:, axis], across[:, axis], out=rays[..., 3 + axis])
+        return rays
 
     def cast(self, camera: Camera) -> CueMap:
         """What the camera sees of the shell: z-depth in scene units, normals that face it, and where it hits."""
-        viewmat = camera.viewmat.detach().cpu().double().numpy()
-        rotation = viewmat[:3, :3]
-        # The rays have z = 1 in the camera frame, which makes the hit's parameter the z-depth.
-        directions = camera.to("cpu").rays().numpy().astype(np.float32)
-        rays = np.empty((camera.height, camera.width, 6), np.float32)
-        rays[..., :3] = -rotation.T @ viewmat[:3, 3] - self.origin
-        rays[..., 3:] = directions @ rotation.astype(np.float32)
-        hits = self._scene.cast_rays(self._o3d.core.Tensor(rays))
+        hits = self.scene.cast_rays(self._o3d.core.Tensor.from_numpy(self.rays(camera)))
         depth = hits["t_hit"].numpy()
         mask = np.isfinite(depth)
-        # Open3D's normals follow the triangles' winding, which shells do not keep.
-        normal = hits["primitive_normals"].numpy() @ rotation.T.astype(np.float32)
-        away = np.einsum("hwc,hwc->hw", normal, directions) > 0
-        normal[away] *= -1
-        return CueMap(
-            np.where(mask, depth, np.float32(0)), np.where(mask[..., None], normal, 0).astype(np.float16), mask
-        )
+        depth[~mask] = 0
+        triangles = hits["primitive_ids"].numpy()  # of a miss: 2³² - 1, which clips to the last row
+        return CueMap(depth, self._facing(camera).take(triangles, axis=0, mode="clip"), mask)
 
+    def _facing(self, camera: Camera) -> Float16[np.ndarray, "F+1 3"]:
+        """The normal of each triangle in the camera's frame, and zero for none.
 
-def import_open3d() -> ModuleType:
-    """Open3D, or an ImportError that says which system libraries its wheel takes for granted."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise ImportError(
-            f"Open3D cannot be loaded ({error}); it needs libraries of the system: "
-            "apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
-        ) from error
-    return open3d
+        Shells do not keep to one winding; but a triangle turns the same side to a camera in all of its pixels.
+        """
+        position, rotation = self._pose(camera)
+        normals, offsets = self._planes[:, :3], self._planes[:, 3]
+        facing = np.where((normals @ position < offsets)[:, None], -normals, normals) @ rotation.T
+        return np.concatenate([facing, np.zeros((1, 3))]).astype(np.float16)
+
+    def _pose(self, camera: Camera) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"]]:
+        """The camera's centre in the frame of :attr:`scene`, and its rotation from the world."""
+        viewmat = camera.viewmat.detach().cpu().double().numpy()
+        rotation = viewmat[:3, :3]
+        return -rotation.T @ viewmat[:3, 3] - self.origin, rotation

@@ -28,13 +28,6 @@ SCENE_FROM_BUILDING = _similarity(
 SHELL_FROM_BUILDING = _similarity(1.0, Rotation.from_euler("Z", 31, degrees=True), [412_345.678, 5_123_456.789, 212.34])
 
 
-def transformed(
-    points: Float64[np.ndarray, "*N 3"], similarity: Float64[np.ndarray, "4 4"]
-) -> Float64[np.ndarray, "*N 3"]:
-    """The points after the similarity."""
-    return points @ similarity[:3, :3].T + similarity[:3, 3]
-
-
 def scene_camera(camera: Camera) -> Camera:
     """A camera of the building's frame in the scene's, where depths are ``UNITS_PER_METRE`` times as long."""
     rescaled = np.diag([UNITS_PER_METRE] * 3 + [1.0])

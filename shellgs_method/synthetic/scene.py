@@ -18,6 +18,7 @@ from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
 from shellgs_method.shell import ALIGNMENT, MASKS, Alignment
 from shellgs_method.shell.raycast import import_open3d
+from shellgs_method.shell.surface import transformed
 from shellgs_method.synthetic.appearance import Daylight, photograph, rays
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.frames import (
@@ -25,7 +26,6 @@ from shellgs_method.synthetic.frames import (
     SHELL_FROM_BUILDING,
     UNITS_PER_METRE,
     scene_camera,
-    transformed,
 )
 from shellgs_method.synthetic.geometry import Material, Mesh, merge
 from shellgs_method.synthetic.monocular import predicted_disparity

@@ -1,0 +1,6 @@
+"""Photographs or a video to a scene folder, by structure from motion with pycolmap."""
+
+from shellgs_method.capture.config import CaptureConfig
+from shellgs_method.capture.stages import SUSPICIOUS_ERROR, Summary, capture
+
+__all__ = ["SUSPICIOUS_ERROR", "CaptureConfig", "Summary", "capture"]

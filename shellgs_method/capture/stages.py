@@ -1,0 +1,243 @@
+"""Photographs or a video to a scene folder: frames, features, matches, mapping, undistortion, each kept."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from dataparsers.errors import SceneError
+from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
+from shellgs_method.capture.pairs import choose_matching, image_pairs
+from shellgs_method.capture.photographs import add_mask, add_photograph, find_masks, find_photographs, group_by_lens
+from shellgs_method.capture.process import run_step
+from shellgs_method.capture.work import Work, fingerprint, listing
+
+WORK = Path("capture")
+"""Work folder, in the scene's."""
+
+SUSPICIOUS_ERROR = 0.75
+"""Mean reprojection error in pixels. Sound models of real and synthetic facades had 0.4 to 0.65, folded ones more."""
+
+_SIFT = {
+    "fast": {"max_image_size": 1600, "max_num_features": 4096, "first_octave": 0},
+    "high": {"max_image_size": 3200, "max_num_features": 8192, "first_octave": -1},
+}
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What structure from motion found.
+
+    Attributes:
+        registered: photographs whose camera was found.
+        missing: the others.
+        points: number of 3D points.
+        reprojection_error: mean, in pixels.
+        track_length: mean number of photographs that observe a point.
+    """
+
+    registered: list[str]
+    missing: list[str]
+    points: int
+    reprojection_error: float
+    track_length: float
+
+
+def capture(
+    source: Path, scene: Path, config: CaptureConfig | None = None, *, console: Console | None = None
+) -> Summary:
+    """Make ``scene/images`` and ``scene/colmap/sparse/0``, of pinhole cameras, from photographs or a video.
+
+    With masks, ``scene/masks`` holds them undistorted. The model appears last and whole, so that no half-made scene is
+    taken for a finished one. An interrupted run goes on from the stage it was in, and a changed setting repeats only
+    the stages it touches: their products stay in ``scene/capture``.
+
+    Args:
+        source: folder of photographs, or a video file.
+        scene: scene folder; what else it holds is left alone.
+        config: settings.
+        console: where progress is shown.
+
+    Raises:
+        FileNotFoundError: the source or the folder of masks is missing.
+        SceneError: the source cannot be used, the scene holds cameras already, or too few photographs are registered.
+    """
+    config = config or CaptureConfig()
+    if not source.exists():
+        raise FileNotFoundError(f"{source} does not exist; give a folder of photographs or a video.")
+    if scene.resolve().is_relative_to(source.resolve()):
+        raise SceneError(f"{scene} lies in the folder of the photographs, {source}: give a scene folder outside of it")
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    try:
+        with Progress(*columns, console=console) as progress:
+            return _Capture(source, scene, config, progress).run()
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise SceneError(f"the disk of {scene} is full: make room, and the same command goes on from here") from error
+
+
+class _Capture:
+    """One capture: its inputs, the keys of its stages, and the stages."""
+
+    def __init__(self, source: Path, scene: Path, config: CaptureConfig, progress: Progress):
+        self.source, self.scene, self.config, self.progress = source, scene, config, progress
+        self.is_video = source.is_file()
+        self.photographs = {source.name: source} if self.is_video else find_photographs(source)
+        self.masks: dict[str, Path] = {}
+        if config.masks and self.is_video:
+            raise SceneError(
+                f"frames of a video have no masks yet: capture without, then again with masks from {scene / WORK}/"
+                "photographs into another scene folder"
+            )
+        if config.masks:
+            self.masks = find_masks(self.photographs, source, config.masks)
+        # What each stage depends on; a stage depends on all before it.
+        self.photographs_key = fingerprint(listing(self.photographs), config.frames if self.is_video else None)
+        self.masks_key = fingerprint(self.photographs_key, listing(self.masks))
+        self.features_key = fingerprint(self.masks_key, config.cameras, config.quality)
+        self.model_key = fingerprint(self.features_key, config.matching, config.overlap)
+
+    def run(self) -> Summary:
+        self._refuse_to_overwrite()
+        self.work = Work(self.scene / WORK)
+        if not self.work.has("undistorted", self.model_key):
+            self._photographs()
+            database = self._features()
+            self._model(database)
+        summary = self._judged(json.loads((self.work.folder / "model" / "models.json").read_text()))
+        self._undistorted(summary)
+        return summary
+
+    def _refuse_to_overwrite(self) -> None:
+        """The scene's photographs and cameras are replaced by nothing but the end of their own capture."""
+        if (self.scene / WORK).is_dir() and Work(self.scene / WORK).has("undistorted", self.model_key):
+            return
+        for name in ("transforms.json", "colmap", "sparse", "images", *(["masks"] if self.masks else [])):
+            if (self.scene / name).exists():
+                raise SceneError(
+                    f"{self.scene / name} is there already, and not from these photographs and settings: give another "
+                    "scene folder, or move it away (the photographs to be captured too, if they are there)"
+                )
+
+    def _photographs(self) -> None:
+        if not self.work.has("photographs", self.photographs_key):
+            with self.work.making("photographs", self.photographs_key) as folder:
+                if self.is_video:
+                    from shellgs_method.capture.frames import extract_frames
+
+                    extract_frames(self.source, folder, self.config.frames, self.progress)
+                else:
+                    for name, path in self._tracked(self.photographs, "reading photographs"):
+                        add_photograph(path, folder / name)
+        self.folder = self.work.folder / "photographs"
+        self.names = sorted(p.relative_to(self.folder).as_posix() for p in self.folder.rglob("*") if p.is_file())
+        if len(self.names) < LEAST_REGISTERED:
+            raise SceneError(f"a scene needs at least {LEAST_REGISTERED} photographs, not {len(self.names)}")
+        if self.masks and not self.work.has("masks", self.masks_key):
+            with self.work.making("masks", self.masks_key) as folder:
+                for name, mask in self._tracked(self.masks, "reading masks"):
+                    add_mask(mask, self.photographs[name], self.folder / name, folder / f"{name}.png")
+
+    def _features(self) -> Path:
+        """The database, with features and matches."""
+        database = self.work.growing("features", self.features_key) / "database.db"
+        lenses = group_by_lens(self.folder, self.names, self.config.cameras)
+        self._step(
+            "extract",
+            "finding features",
+            len(self.names),
+            partial(_rows, database, "descriptors"),
+            database=str(database),
+            photographs=str(self.folder),
+            lenses=[asdict(lens) for lens in lenses],
+            masks=str(self.work.folder / "masks") if self.masks else None,
+            sift=_SIFT[self.config.quality],
+        )
+        return database
+
+    def _model(self, database: Path) -> None:
+        if self.work.has("model", self.model_key):
+            return
+        matching = choose_matching(self.config.matching, len(self.names), self.is_video)
+        pairs = image_pairs(len(self.names), matching, self.config.overlap)
+        listed = database.with_name("pairs.txt")
+        listed.write_text("".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs))
+        self._step(
+            "match",
+            f"matching ({matching})",
+            len(pairs),
+            partial(_rows, database, "two_view_geometries"),
+            database=str(database),
+            pairs=str(listed),
+        )
+        with self.work.making("model", self.model_key) as folder:
+            arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
+            models = self._step("reconstruct", "finding cameras", len(self.names), None, **arguments)
+            (folder / "models.json").write_text(json.dumps({"photographs": self.names, "models": models}))
+
+    def _judged(self, found: dict[str, Any]) -> Summary:
+        """The largest model, if it is large enough."""
+        names, models = found["photographs"], found["models"]
+        largest: dict[str, Any] = models[0] if models else {"names": []}
+        missing = sorted(set(names) - set(largest["names"]))
+        registered = len(largest["names"])
+        if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
+            groups = f", in {len(models)} groups that share too little" if len(models) > 1 else ""
+            shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
+            raise SceneError(
+                f"the cameras of only {registered} of {len(names)} photographs were found{groups}; a scene needs "
+                f"{LEAST_SHARE:.0%} of them and {LEAST_REGISTERED}. Not found: {shown}. Try --matching exhaustive and "
+                "--quality high; leave out photographs of other things; photograph with more overlap, in small "
+                "sidesteps rather than turns on the spot; from a video, take more --frames"
+            )
+        return Summary(missing=missing, registered=largest.pop("names"), **largest)
+
+    def _undistorted(self, summary: Summary) -> None:
+        if not self.work.has("undistorted", self.model_key):
+            with self.work.making("undistorted", self.model_key) as folder:
+                self._step(
+                    "undistort",
+                    "undistorting",
+                    len(summary.registered),
+                    lambda: sum(path.is_file() for path in (folder / "images").rglob("*")),
+                    model=str(self.work.folder / "model"),
+                    photographs=str(self.folder),
+                    masks=str(self.work.folder / "masks") if self.masks else None,
+                    output=str(folder),
+                )
+                (folder / "colmap" / "sparse").mkdir(parents=True)
+                os.replace(folder / "sparse", folder / "colmap" / "sparse" / "0")
+        # The model last: without it, no dataparser takes the folder for a scene.
+        for name in ("images", "masks", "colmap"):
+            if (self.work.folder / "undistorted" / name).exists():
+                os.replace(self.work.folder / "undistorted" / name, self.scene / name)
+
+    def _step(self, step: str, description: str, total: int, count: Callable[[], int] | None, **arguments: Any) -> Any:
+        log = self.work.folder / "colmap.log"
+        return run_step(
+            step, arguments, log=log, progress=self.progress, description=description, total=total, count=count
+        )
+
+    def _tracked(self, files: dict[str, Path], description: str):
+        return self.progress.track(files.items(), description=description)
+
+
+def _rows(database: Path, table: str) -> int:
+    """Rows of a table that another process is writing."""
+    try:
+        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection:
+            return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+    except sqlite3.Error:  # not there yet, or busy
+        return 0

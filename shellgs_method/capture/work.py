@@ -1,0 +1,70 @@
+"""The work folder of a capture: what each stage made, and from what."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+class Work:
+    """Products of stages, each a folder, with a key of all that it was made from.
+
+    An interrupted run finds the products that it finished; one whose key has changed is made anew.
+    """
+
+    def __init__(self, folder: Path):
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self._file = folder / "record.json"
+        self._keys: dict[str, str] = json.loads(self._file.read_text()) if self._file.is_file() else {}
+
+    def has(self, product: str, key: str) -> bool:
+        """Whether the product is there and was made from this."""
+        return self._keys.get(product) == key and (self.folder / product).exists()
+
+    @contextmanager
+    def making(self, product: str, key: str) -> Iterator[Path]:
+        """An empty folder to fill, which then becomes the product."""
+        part = self._cleared(f"{product}.part")
+        part.mkdir()
+        yield part
+        os.replace(part, self._cleared(product))
+        self._record(product, key)
+
+    def growing(self, product: str, key: str) -> Path:
+        """A product that takes up by itself where it was interrupted; empty if it was made from something else."""
+        if not self.has(product, key):
+            self._cleared(product).mkdir()
+            self._record(product, key)
+        return self.folder / product
+
+    def _cleared(self, product: str) -> Path:
+        self._record(product, None)  # first: a product must never stand under another's key
+        path = self.folder / product
+        if path.exists():
+            shutil.rmtree(path)
+        return path
+
+    def _record(self, product: str, key: str | None) -> None:
+        self._keys.pop(product, None)
+        if key is not None:
+            self._keys[product] = key
+        unfinished = self._file.with_suffix(".tmp")
+        unfinished.write_text(json.dumps(self._keys, indent=1) + "\n")
+        os.replace(unfinished, self._file)
+
+
+def fingerprint(*parts: Any) -> str:
+    """A key that changes with any of the parts, which are such as JSON can hold."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def listing(files: Mapping[str, Path]) -> list[tuple[str, int, int]]:
+    """Names, sizes and times of change of files."""
+    return [(name, (stat := path.stat()).st_size, stat.st_mtime_ns) for name, path in sorted(files.items())]

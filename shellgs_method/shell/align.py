@@ -1,0 +1,126 @@
+"""From a shell and what is known of its place to an alignment that has been judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dataparsers.photograph import View
+from shellgs_method.shell.alignment import Alignment
+from shellgs_method.shell.bays import facade_axes
+from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.picks import PickedPoint, align_picks, measured_again, read_picks
+from shellgs_method.shell.proposal import propose
+from shellgs_method.shell.refinement import refine
+from shellgs_method.shell.report import write_report
+from shellgs_method.shell.support import positions, upwards
+from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.shell.validation import Validation, validate
+
+if TYPE_CHECKING:
+    from dataparsers.sparse_points import SparsePoints
+
+# In the scene's folder:
+PROPOSAL = Path("shell/proposal.json")
+REPORT = Path("shell/report")
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An alignment and what led to it.
+
+    Attributes:
+        alignment: the shell's place.
+        history: a sentence for each step, for the report.
+        picked: the picks with their residuals, where there are any.
+        proposed: whether nobody but the program has said so.
+    """
+
+    alignment: Alignment
+    history: Sequence[str] = ()
+    picked: Sequence[PickedPoint] = ()
+    proposed: bool = False
+
+
+def place_by_picks(path: Path, views: Sequence[View], shell: str, metres_per_shell_unit: float) -> Placement:
+    """The place that a file of picked correspondences tells.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        SceneError: the picks cannot be read, triangulated or trusted.
+    """
+    matrix, picked = align_picks(read_picks(path, views), views, metres_per_shell_unit)
+    used = [point.residual for point in picked if point.is_used]
+    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
+    mean = np.sqrt(np.mean(np.square(used)))
+    history = f"{len(used)} of {len(picked)} picks decide; they are {mean:.3f} m off (root mean square)."
+    return Placement(alignment, [history], picked)
+
+
+def place_by_guess(
+    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shell: str, metres_per_shell_unit: float
+) -> Placement:
+    """A proposal for the place, from the outline of the main wall.
+
+    Up in the shell is taken to be y in glTF, as that format has it, and z in all others.
+
+    Raises:
+        SceneError: the points show no wall, or it fits nowhere.
+    """
+    surface = ShellSurface(mesh, metres_per_shell_unit)
+    up = np.array([0.0, 1.0, 0.0] if shell.lower().endswith((".glb", ".gltf")) else [0.0, 0.0, 1.0])
+    best, *rivals = propose(surface, points.positions, positions(views), upwards(views), up)
+    history = ["Proposed by the program from the outline of the main wall; nobody has confirmed it."]
+    history += [
+        f"Ambiguous: a place {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
+        for rival in rivals
+    ]
+    matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
+    return Placement(Alignment(matrix, shell, metres_per_shell_unit, source="proposal"), history, proposed=True)
+
+
+def refined(
+    placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, reach: float
+) -> Placement:
+    """The placement brought closer to the SfM points.
+
+    Raises:
+        SceneError: too few points are within ``reach`` metres of the shell.
+    """
+    alignment = placement.alignment
+    surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
+    start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
+    result = refine(surface, points.positions, start, reach)
+    up = start[:3, :3] @ upwards(views)
+    axes = facade_axes(surface.samples(5000)[1], up / np.linalg.norm(up))
+    sentence = f"Refined against {result.evidence.points} SfM points, which moved them by {result.moved:.3f} m."
+    if words := result.evidence.in_words(axes):
+        sentence += f" Left as it was, for the points cannot tell: {'; '.join(words)}."
+    matrix = np.linalg.inv(result.survey_from_scene) @ surface.survey_from_shell
+    moved = replace(alignment, shell_to_scene=matrix, source=f"{alignment.source}, refined")
+    return replace(
+        placement,
+        alignment=moved,
+        history=[*placement.history, sentence],
+        picked=measured_again(placement.picked, moved),
+    )
+
+
+def judge(
+    scene: Path, placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, target: Path
+) -> Validation:
+    """Validate a placement, write the report, and unless it is refused write it to ``target``.
+
+    A file there that names the same place is left alone: cue maps are bound to its content.
+    """
+    validation = validate(mesh, placement.alignment, views, points, placement.picked)
+    write_report(scene / REPORT, mesh, validation, placement.history)
+    kept = Alignment.load(target) if target.is_file() else None
+    if validation.verdict != "refused" and not (kept and kept.places_like(placement.alignment)):
+        judged = replace(placement.alignment, verdict=validation.verdict, figures=validation.figures())
+        judged.save(target)
+    return validation

@@ -1,0 +1,294 @@
+"""Point clouds into triangle meshes that keep openings open and walls flat."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.spatial import Delaunay, KDTree, QhullError
+
+from dataparsers.errors import SceneError
+from shellgs_method.shell._open3d import import_open3d
+
+log = logging.getLogger(__name__)
+
+Mesher = Literal["planes", "bpa", "poisson"]
+
+VERSION = 1
+"""Of the meshers: another one meshes clouds again."""
+
+CELLS = 1500  # points are merged in cells of this part of the cloud's extent: 2 cm of 30 m
+LONGEST_EDGE = 3.0  # all lengths below are in units of the cloud's spacing
+NEIGHBOURHOOD = 2.5
+BALLS = 0.8, 1.6
+NORMAL_AGREEMENT = 0.85  # cosine
+NO_PLANE = -1
+HYPOTHESES, JUDGES, FAILURES = 300, 4000, 6
+LEAST_POINTS = 150  # of a plane
+
+
+@dataclass(frozen=True)
+class Meshing:
+    """How a point cloud became a mesh; lengths are in the shell's units.
+
+    Attributes:
+        mesher: the method.
+        points: read from the file.
+        dropped: of these, how many were NaN or infinite.
+        spacing: mean distance between neighbouring points after merging them in cells.
+        planes: found by RANSAC.
+        triangles: of the mesh.
+        meshed: share of the points within a spacing of the mesh.
+        median: distance from a point to the mesh.
+        p95: 95th percentile of that distance.
+    """
+
+    mesher: Mesher
+    points: int
+    dropped: int
+    spacing: float
+    planes: int
+    triangles: int
+    meshed: float
+    median: float
+    p95: float
+
+    def __str__(self) -> str:
+        """One sentence for people."""
+        planes = f" and {self.planes} planes" if self.planes else ""
+        nan = f" ({self.dropped} NaN or infinite ones dropped)" if self.dropped else ""
+        return (
+            f"{self.points} points{nan}, {self.spacing:.3g} apart, became {self.triangles} triangles{planes} "
+            f"({self.mesher}); {self.meshed:.1%} of the points are within {self.spacing:.3g} of these, the median is "
+            f"{self.median:.2g} and the 95th percentile {self.p95:.2g} away."
+        )
+
+
+def mesh_cloud(
+    points: Float64[np.ndarray, "N 3"],
+    viewpoints: Float64[np.ndarray, "V 3"],
+    mesher: Mesher = "planes",
+) -> tuple[Float64[np.ndarray, "M 3"], Int64[np.ndarray, "F 3"], Meshing]:
+    """A triangle mesh of a point cloud's surface, its vertices and faces, and a report.
+
+    ``planes``: RANSAC planes, each with a Delaunay triangulation of the points on it, and ball pivoting for the rest;
+    the least noise on buildings. ``bpa``: ball pivoting alone. ``poisson``: Poisson reconstruction, trimmed to what is
+    near points; for ornament and other round things. None of them closes openings wider than three times the spacing
+    of the points.
+
+    Args:
+        points: in any frame, georeferenced as they came; NaN and duplicates are dropped.
+        viewpoints: where scanners or cameras stood; a point's normal faces the nearest. Without them, normals are
+            made to agree with their neighbours.
+        mesher: the method.
+
+    Raises:
+        SceneError: the points make no surface.
+    """
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        raise SceneError("the point cloud has no points" if len(points) == 0 else "all points are NaN or infinite")
+    if not finite.all():
+        log.warning("dropped %d of %d points that are NaN or infinite", (~finite).sum(), len(points))
+    kept = points[finite]
+    origin = np.median(kept, axis=0)  # what follows is relative to it: georeferenced digits would swamp squares
+    kept = kept - origin
+    cloud = _Cloud.of(kept, viewpoints - origin)
+    parts = list(_MESHERS[mesher](cloud))
+    vertices, faces = _merge(parts)
+    if len(faces) == 0:
+        raise SceneError(f"the points make no surface with the mesher {mesher!r}: try another, or a denser cloud")
+    sample = np.random.default_rng(0).permutation(len(kept))[:200_000]
+    distance = _distances(vertices, faces, kept[sample])
+    report = Meshing(
+        mesher=mesher,
+        points=len(points),
+        dropped=int((~finite).sum()),
+        spacing=cloud.spacing,
+        planes=sum(part.is_plane for part in parts),
+        triangles=len(faces),
+        meshed=float((distance <= cloud.spacing).mean()),
+        median=float(np.median(distance)),
+        p95=float(np.percentile(distance, 95)),
+    )
+    return vertices + origin, faces, report
+
+
+@dataclass(frozen=True)
+class _Part:
+    vertices: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    is_plane: bool = False
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    """Evenly thinned points near the origin, with their oriented normals and their typical distance."""
+
+    points: Float64[np.ndarray, "N 3"]
+    normals: Float64[np.ndarray, "N 3"]
+    spacing: float
+    roughness: float  # standard deviation of the points across the surface
+
+    @classmethod
+    def of(cls, points: np.ndarray, viewpoints: np.ndarray) -> _Cloud:
+        low, high = np.percentile(points, [1, 99], axis=0)  # a stray point far away is not the building's size
+        extent = np.max(high - low) or np.ptp(points, axis=0).max()
+        legacy = _legacy(points)
+        points = np.asarray((legacy.voxel_down_sample(extent / CELLS) if extent > 0 else legacy).points)
+        spread = np.linalg.svd(points - points.mean(0), compute_uv=False) if len(points) > 1 else np.zeros(2)
+        if not spread[1] > 1e-6 * spread[0]:
+            what = "is a single point" if spread[0] == 0 else "lies on one straight line"
+            raise SceneError(f"the point cloud makes no surface: it {what}")
+        # The k-th neighbour of points of density ρ on a surface is √(k / π ρ) away.
+        k = min(6, len(points) - 1)
+        nearest = KDTree(points).query(points, k + 1)[0][:, k]
+        spacing = float(np.median(nearest) * np.sqrt(np.pi / k))
+        legacy = _legacy(points)
+        search = import_open3d().geometry.KDTreeSearchParamHybrid(NEIGHBOURHOOD * spacing, 30)
+        legacy.estimate_covariances(search)
+        variances, axes = np.linalg.eigh(np.asarray(legacy.covariances))
+        normals = _oriented(points, axes[:, :, 0], viewpoints)
+        return cls(points, normals, spacing, float(np.sqrt(np.median(variances[:, 0].clip(0)))))
+
+
+def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray) -> np.ndarray:
+    if len(viewpoints):
+        towards = viewpoints[KDTree(viewpoints).query(points)[1]] - points
+        return np.where(np.einsum("nc,nc->n", normals, towards)[:, None] < 0, -normals, normals)
+    legacy = _legacy(points, normals)
+    legacy.orient_normals_consistent_tangent_plane(min(10, len(points) - 1))
+    return np.asarray(legacy.normals)
+
+
+def _planes(cloud: _Cloud) -> Iterator[_Part]:
+    """Planes one after the other, the largest first, then balls over their seams and over what lies on none."""
+    rng, points = np.random.default_rng(0), cloud.points.copy()
+    plane = np.full(len(points), NO_PLANE)
+    least = max(3, min(LEAST_POINTS, len(cloud.points) // 20))
+    left, failures = np.arange(len(cloud.points)), 0
+    while len(left) >= least and failures < FAILURES:
+        members = left[_largest_plane(cloud, left, rng)]
+        part = _flat(cloud.points[members], LONGEST_EDGE * cloud.spacing) if len(members) >= least else None
+        if part is None:
+            failures += 1
+            continue
+        yield part
+        points[members], plane[members] = part.vertices, members[0]
+        left = np.setdiff1d(left, members, assume_unique=True)
+    yield _balls_between(replace(cloud, points=points), plane)
+
+
+def _largest_plane(cloud: _Cloud, left: Int64[np.ndarray, " L"], rng: np.random.Generator) -> Bool[np.ndarray, " L"]:
+    """The points that RANSAC finds on one plane, as to place and normal, after fitting it to them until it settles.
+
+    One point and its normal make a hypothesis, which a sample of the others judges. Open3D's ``segment_plane`` knows
+    no normals, and gives another plane in each run.
+    """
+    points, normals = cloud.points[left], cloud.normals[left]
+    tolerance = float(np.clip(4 * cloud.roughness, 0.1 * cloud.spacing, cloud.spacing))
+
+    def on(centres: np.ndarray, axes: np.ndarray, among: np.ndarray | slice) -> np.ndarray:
+        near = np.abs(points[among] @ axes.T - np.einsum("hc,hc->h", centres, axes)) <= tolerance
+        return near & (np.abs(normals[among] @ axes.T) > NORMAL_AGREEMENT)
+
+    hypotheses = rng.integers(len(points), size=HYPOTHESES)
+    judges = rng.permutation(len(points))[:JUDGES]
+    best = hypotheses[on(points[hypotheses], normals[hypotheses], judges).sum(axis=0).argmax()]
+    members = on(points[[best]], normals[[best]], slice(None))[:, 0]
+    for _ in range(10):
+        centre = points[members].mean(0)
+        axis = np.linalg.eigh(np.cov(points[members].T, bias=True))[1][:, :1].T
+        grown = on(centre[None], axis, slice(None))[:, 0]
+        if grown.sum() <= members.sum():
+            break
+        members = grown
+    return members
+
+
+def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
+    """The Delaunay triangulation of points in their best plane, without triangles that have a longer edge."""
+    centre = points.mean(0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
+    flat = (points - centre) @ axes.T
+    try:
+        faces = Delaunay(flat).simplices
+    except QhullError:  # all on a line
+        return None
+    corners = flat[faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    faces = faces[edges.max(axis=1) <= longest]
+    return _Part(centre + flat @ axes, faces.astype(np.int64), is_plane=True) if len(faces) else None
+
+
+def _balls_between(cloud: _Cloud, plane: Int64[np.ndarray, " N"]) -> _Part:
+    """The triangles that balls find between points of different planes, or at points of none."""
+    neighbours = KDTree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
+    seam = (plane == NO_PLANE) | (plane[neighbours] != plane[:, None]).any(axis=1)
+    near = seam[neighbours].any(axis=1)
+    part = _balls(cloud.points[near], cloud.normals[near], cloud.spacing)
+    planes = plane[near][part.faces]
+    return _Part(part.vertices, part.faces[(planes == NO_PLANE).any(axis=1) | np.ptp(planes, axis=1).astype(bool)])
+
+
+def _balls(points: np.ndarray, normals: np.ndarray, spacing: float) -> _Part:
+    o3d = import_open3d()
+    if len(points) < 3:
+        return _Part(points, np.empty((0, 3), np.int64))
+    radii = o3d.utility.DoubleVector([spacing * radius for radius in BALLS])
+    mesh = o3d.geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(_legacy(points, normals), radii)
+    return _Part(np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64))
+
+
+def _ball_pivoting(cloud: _Cloud) -> Iterator[_Part]:
+    yield _balls(cloud.points, cloud.normals, cloud.spacing)
+
+
+def _poisson(cloud: _Cloud) -> Iterator[_Part]:
+    """Screened Poisson reconstruction (Kazhdan and Hoppe 2013), trimmed by distance: density fills windows."""
+    cells = np.ptp(cloud.points, axis=0).max() / (2 * cloud.spacing)
+    depth = int(np.clip(np.round(np.log2(cells)), 5, 10))
+    mesh, _ = import_open3d().geometry.TriangleMesh.create_from_point_cloud_poisson(
+        _legacy(cloud.points, cloud.normals), depth=depth
+    )
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64)
+    near = KDTree(cloud.points).query(vertices)[0] <= 1.5 * cloud.spacing
+    yield _Part(vertices, faces[near[faces].all(axis=1)])
+
+
+_MESHERS: dict[Mesher, Callable[[_Cloud], Iterator[_Part]]] = {
+    "planes": _planes,
+    "bpa": _ball_pivoting,
+    "poisson": _poisson,
+}
+
+
+def _merge(parts: list[_Part]) -> tuple[np.ndarray, np.ndarray]:
+    """One mesh of all parts, without the vertices that no triangle uses."""
+    vertices, faces, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
+    for part in parts:
+        used, renumbered = np.unique(part.faces, return_inverse=True)
+        vertices.append(part.vertices[used])
+        faces.append(renumbered.reshape(-1, 3) + count)
+        count += len(used)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    o3d = import_open3d()
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32)))
+    return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
+
+
+def _legacy(points: np.ndarray, normals: np.ndarray | None = None):
+    """Open3D's point cloud of doubles."""
+    o3d = import_open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    if normals is not None:
+        cloud.normals = o3d.utility.Vector3dVector(normals)
+    return cloud

@@ -1,0 +1,119 @@
+"""What each view sees of the shell, and how its SfM points agree with that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from dataparsers.photograph import View
+from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.surface import transformed
+
+if TYPE_CHECKING:
+    from dataparsers.sparse_points import SparsePoints
+
+NEAR = 1.0
+"""Metres from the shell within which an SfM point is taken to be of the building or of something just before it."""
+OCCLUDING = 0.3
+"""Metres in front of the shell from which a point is of something that hides it."""
+_THUMBNAIL = 320  # pixels
+_MAX_HITS = 500
+
+
+@dataclass(frozen=True)
+class ViewSupport:
+    """What one view sees of the shell; positions are in the survey frame.
+
+    Attributes:
+        view: the view.
+        supported: share of its pixels on the shell.
+        hits: some of the places on the shell that it sees.
+        normals: of the shell there, facing the view.
+        distance: median depth of the shell in metres; NaN where the view does not see it.
+        errors: depth of the view's SfM points less the shell's in the same pixel, in metres.
+    """
+
+    view: View
+    supported: float
+    hits: Float64[np.ndarray, "M 3"]
+    normals: Float64[np.ndarray, "M 3"]
+    distance: float
+    errors: Float64[np.ndarray, " P"]
+
+    @property
+    def error(self) -> float:
+        """Median depth error of the points within a metre of the shell, in metres; NaN without any."""
+        near = np.abs(self.errors[np.abs(self.errors) < NEAR])
+        return float(np.median(near)) if len(near) else float("nan")
+
+    @property
+    def occluded(self) -> float:
+        """Share of the points not behind the shell that stand before it, where it is hidden therefore."""
+        before = self.errors[self.errors < NEAR] < -OCCLUDING
+        return float(before.mean()) if len(before) else 0.0
+
+    def span(self, axis: Float64[np.ndarray, " 3"]) -> tuple[float, float]:
+        """Where along an axis the part of the shell that it sees begins and ends, in metres."""
+        along = self.hits @ axis
+        return float(along.min()), float(along.max())
+
+
+def positions(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
+    """Where the cameras stand, in the scene's frame."""
+    return np.stack([view.camera.position.cpu().double().numpy() for view in views])
+
+
+def upwards(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
+    """Unit vector up in the scene's frame, as the cameras are held; tilted where they look up or down."""
+    up = -np.mean([view.camera.viewmat[1, :3].cpu().double().numpy() for view in views], axis=0)
+    return up / np.linalg.norm(up)
+
+
+def look(
+    caster: ShellCaster,
+    view: View,
+    points: SparsePoints,
+    survey_from_scene: Float64[np.ndarray, "4 4"],
+) -> ViewSupport:
+    """Cast the shell into a thumbnail of the view and compare its SfM points."""
+    thumbnail = view.camera.shrunk(_THUMBNAIL)
+    metres = float(np.cbrt(np.linalg.det(survey_from_scene[:3, :3])))
+    cue = caster.cast(thumbnail)
+    seen = np.flatnonzero(cue.mask)
+    seen = seen[:: max(1, len(seen) // _MAX_HITS)]
+    depth = cue.depth.reshape(-1)[seen].astype(np.float64)
+    viewmat = thumbnail.viewmat.cpu().double().numpy()
+    in_camera = depth[:, None] * thumbnail.rays().cpu().double().numpy().reshape(-1, 3)[seen]
+    hits = transformed(transformed(in_camera, np.linalg.inv(viewmat)), survey_from_scene)
+    normals = (
+        cue.normal.reshape(-1, 3)[seen].astype(np.float64) @ viewmat[:3, :3] @ survey_from_scene[:3, :3].T / metres
+    )
+
+    pixels, depths = points.seen_in(view)
+    scale = [thumbnail.width / view.camera.width, thumbnail.height / view.camera.height]
+    column, row = np.minimum((pixels * scale).astype(int), [thumbnail.width - 1, thumbnail.height - 1]).T
+    on_shell = cue.mask[row, column]
+    errors = metres * (depths - cue.depth[row, column])[on_shell]
+    distance = metres * float(np.median(depth)) if len(seen) else float("nan")
+    return ViewSupport(view, float(cue.mask.mean()), hits, normals, distance, errors)
+
+
+def representative(
+    supports: Sequence[ViewSupport], axis: Float64[np.ndarray, " 3"], count: int = 8
+) -> list[ViewSupport]:
+    """Views spread over the facade, from the one that shows its left end best to that of its right end."""
+    seeing = [support for support in supports if len(support.hits)]
+    if len(seeing) <= count:
+        return sorted(seeing, key=lambda s: sum(s.span(axis)))
+    spans = np.array([support.span(axis) for support in seeing])
+    first, last = spans[:, 0].min(), spans[:, 1].max()
+    near = 0.1 * (last - first)
+    left = np.argmax([(support.hits @ axis < first + near).mean() * support.supported for support in seeing])
+    right = np.argmax([(support.hits @ axis > last - near).mean() * support.supported for support in seeing])
+    order = [k for k in np.argsort(spans.sum(axis=1)) if k not in (left, right)]
+    between = [order[k] for k in np.linspace(0, len(order) - 1, count - 2).round().astype(int)]
+    return [seeing[k] for k in (left, *between, right)]

@@ -1,0 +1,96 @@
+"""The shell as a surface to measure against, in metres and near the origin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.raycast import import_open3d
+
+
+def transformed(
+    points: Float64[np.ndarray, "*N 3"], similarity: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "*N 3"]:
+    """The points after the similarity."""
+    return points @ similarity[:3, :3].T + similarity[:3, 3]
+
+
+def fit_similarity(source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"]) -> np.ndarray:
+    """Least-squares similarity that carries points onto others (Umeyama 1991), as a 4x4 matrix."""
+    centre, goal = source.mean(0), target.mean(0)
+    source, target = source - centre, target - goal
+    u, s, vt = np.linalg.svd(target.T @ source)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    matrix = np.eye(4)
+    matrix[:3, :3] = (s @ signs) / (source**2).sum() * (u * signs) @ vt
+    matrix[:3, 3] = goal - matrix[:3, :3] @ centre
+    return matrix
+
+
+@dataclass(frozen=True)
+class Closest:
+    """For each of some points the nearest one of the surface.
+
+    Attributes:
+        foot: that point.
+        normal: unit normal of its triangle, as the triangle winds.
+    """
+
+    foot: Float64[np.ndarray, "N 3"]
+    normal: Float64[np.ndarray, "N 3"]
+
+
+class ShellSurface:
+    """A shell in its *survey frame*: the shell's axes, in metres, with the origin at the middle of its box.
+
+    Open3D computes in float32, which is accurate to a micrometre there, and to decimetres in national coordinates.
+
+    Args:
+        mesh: the shell in its own frame.
+        metres_per_shell_unit: 1 for a shell in metres.
+
+    Attributes:
+        survey_from_shell: similarity from the shell's own frame.
+        bounds: lowest and highest corner of the shell's box.
+    """
+
+    def __init__(self, mesh: ShellMesh, metres_per_shell_unit: float = 1.0) -> None:
+        self._o3d = import_open3d()
+        self.survey_from_shell = np.diag([metres_per_shell_unit] * 3 + [1.0])
+        self.survey_from_shell[:3, 3] = -metres_per_shell_unit * mesh.bounds.mean(axis=0)
+        self.vertices = transformed(mesh.vertices, self.survey_from_shell)
+        self.faces: Int64[np.ndarray, "F 3"] = mesh.faces
+        self.bounds = np.stack([self.vertices.min(0), self.vertices.max(0)])
+        tensor = self._o3d.core.Tensor
+        self._scene = self._o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(tensor(self.vertices.astype(np.float32)), tensor(self.faces.astype(np.uint32)))
+
+    def closest(self, points: Float64[np.ndarray, "N 3"]) -> Closest:
+        """The surface's nearest point to each of the points, all in the survey frame."""
+        answer = self._scene.compute_closest_points(self._o3d.core.Tensor(points.astype(np.float32)))
+        foot, normal = answer["points"].numpy(), answer["primitive_normals"].numpy()
+        return Closest(foot.astype(np.float64), normal.astype(np.float64))
+
+    def distance(self, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
+        """Unsigned distances of points from the surface, in metres."""
+        return self._scene.compute_distance(self._o3d.core.Tensor(points.astype(np.float32))).numpy()
+
+    def first_hit(self, origins: np.ndarray, direction: np.ndarray) -> Float32[np.ndarray, " *N"]:
+        """How far parallel rays travel to the surface, in metres; inf where they miss it."""
+        rays = np.empty((*origins.shape[:-1], 6), np.float32)
+        rays[..., :3], rays[..., 3:] = origins, direction
+        return self._scene.cast_rays(self._o3d.core.Tensor(rays))["t_hit"].numpy()
+
+    def samples(self, count: int) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
+        """Points spread evenly over the surface, and their normals; the same ones each time."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        area = np.linalg.norm(normal, axis=1)
+        random = np.random.default_rng(0)
+        chosen = random.choice(len(area), count, p=area / area.sum())
+        weights = random.dirichlet(np.ones(3), count)
+        points = np.einsum("nk,nkd->nd", weights, np.stack([a, b, c], axis=1)[chosen])
+        return points, (normal / np.maximum(area, 1e-300)[:, None])[chosen]

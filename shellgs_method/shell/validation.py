@@ -1,0 +1,236 @@
+"""Whether an alignment can be trusted, from the SfM points and the cameras alone: figures, limits, verdict.
+
+Everything is measured before any training and against what was there before the alignment, never tuned on results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import KDTree
+
+from dataparsers.errors import SceneError
+from dataparsers.photograph import View
+from shellgs_method.shell.alignment import Alignment
+from shellgs_method.shell.bays import BETTER, RIVALRY, ShiftScan, facade_axes, scan_shifts
+from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.picks import PickedPoint
+from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.refinement import Refinement, refine
+from shellgs_method.shell.support import NEAR, OCCLUDING, ViewSupport, look, positions, upwards
+from shellgs_method.shell.surface import ShellSurface, transformed
+
+if TYPE_CHECKING:
+    from dataparsers.sparse_points import SparsePoints
+
+Verdict = Literal["good", "doubtful", "refused"]
+_ORDER: tuple[Verdict, ...] = ("good", "doubtful", "refused")
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a figure must be: good as far as ``good``, refused beyond ``refused``, doubtful between the two."""
+
+    good: float
+    refused: float
+    why: str
+
+    def judge(self, value: float) -> Verdict:
+        """The verdict on a value; NaN is refused."""
+        sign = 1 if self.good <= self.refused else -1
+        if sign * value <= sign * self.good:
+            return "good"
+        return "doubtful" if sign * value <= sign * self.refused else "refused"
+
+
+LIMITS = {
+    "distance": Limit(300.0, 2000.0, "a facade is photographed from metres, not millimetres or kilometres"),
+    "closeness": Limit(0.5, 0.1, "a facade is photographed from metres, not millimetres or kilometres"),
+    "views": Limit(0.25, 0.01, "the shell supervises only the views it is in"),
+    "points": Limit(200, 30, "fewer SfM points than this beside the shell prove little"),
+    "share": Limit(
+        0.55, 0.30, "SfM points of a wall scatter by 1 to 3 cm; a wall in the wrong place has 10 to 25 % near it"
+    ),
+    "bias": Limit(
+        0.025, 0.15, "5 cm out of the wall is 3 times the scatter; sills and frames shift the median by 1 cm"
+    ),
+    "pull": Limit(
+        0.03,
+        0.25,
+        "5 cm sideways turn the supervision at the shell's edges by 5.6° on average; --refine makes that motion",
+    ),
+    "weak": Limit(0, 7, "a bare wall cannot tell along it from truth: only pictures or picked points can"),
+    "rival": Limit(RIVALRY, BETTER, "on repeated windows a bay further along fits almost as well"),
+    "check": Limit(0.10, 0.50, "a careful pick is good to 3 to 5 cm"),
+}
+"""All thresholds of the verdict, with their reasons."""
+
+_REACH = 0.25  # metres that the test refinement looks around
+
+
+@dataclass(frozen=True)
+class Check:
+    """One figure and what it says."""
+
+    name: str
+    figure: str
+    limits: str
+    verdict: Verdict
+    why: str
+
+
+@dataclass(frozen=True)
+class Validation:
+    """All figures of an alignment.
+
+    Attributes:
+        alignment: what is judged.
+        checks: figures with a verdict each.
+        views: what each view sees.
+        axes: right, up and out of the facade in the survey frame, as rows.
+        signed: distances in metres of the SfM points within :data:`NEAR`, positive in front of the shell.
+        near: share of all SfM points that these are.
+        scans: the shell moved along the facade and upwards.
+        test: where refinement would take the alignment; None where too few points are near.
+        picked: the picks and their residuals, where there are any.
+    """
+
+    alignment: Alignment
+    checks: Sequence[Check]
+    views: Sequence[ViewSupport] = ()
+    axes: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    signed: Float64[np.ndarray, " N"] = field(default_factory=lambda: np.empty(0))
+    near: float = 0.0
+    scans: Sequence[ShiftScan] = ()
+    test: Refinement | None = None
+    picked: Sequence[PickedPoint] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the checks'."""
+        return _ORDER[max(_ORDER.index(check.verdict) for check in self.checks)]
+
+    @property
+    def reasons(self) -> list[str]:
+        """The checks that are not good, the worst first."""
+        faults = sorted((c for c in self.checks if c.verdict != "good"), key=lambda c: -_ORDER.index(c.verdict))
+        return [f"{check.name}: {check.figure} ({check.limits}); {check.why}" for check in faults]
+
+    def share_within(self, metres: float) -> float:
+        """Share of the points near the shell that are this close to it."""
+        return float((np.abs(self.signed) < metres).mean()) if len(self.signed) else 0.0
+
+    @property
+    def bias(self) -> float:
+        """Median signed distance of the points within 30 cm, in metres; NaN without any."""
+        close = self.signed[np.abs(self.signed) < OCCLUDING]
+        return float(np.median(close)) if len(close) else float("nan")
+
+    def figures(self) -> dict[str, float | None]:
+        """The main numbers, for json."""
+        values = {f"within_{round(100 * d)}cm": self.share_within(d) for d in (0.05, 0.10, 0.20)}
+        values |= {"bias_m": self.bias, "near": self.near, "metres_per_unit": self.alignment.metres_per_unit}
+        if self.test is not None:
+            values |= {"pull_m": self.test.moved, "condition": self.test.evidence.condition}
+        values |= {f"best_elsewhere_{scan.name.replace(' ', '_')}": scan.elsewhere[1] for scan in self.scans}
+        if held := [p.residual for p in self.picked if p.pick.held_out]:
+            values["check_points_m"] = float(np.median(held))
+        return {name: None if np.isnan(value) else float(f"{value:.4g}") for name, value in values.items()}
+
+
+def validate(
+    mesh: ShellMesh,
+    alignment: Alignment,
+    views: Sequence[View],
+    points: SparsePoints,
+    picked: Sequence[PickedPoint] = (),
+) -> Validation:
+    """Measure an alignment.
+
+    Args:
+        mesh: the shell in its own frame.
+        alignment: where it stands.
+        views: all photographs.
+        points: the SfM points.
+        picked: residuals of picks, if there are any.
+    """
+    surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
+    survey_from_scene = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
+    caster = ShellCaster(mesh, alignment.shell_to_scene)
+    supports = [look(caster, view, points, survey_from_scene) for view in views]
+    seeing = [support for support in supports if len(support.hits)]
+    sight = _check("views", len(seeing) / max(len(views), 1), "Views that see the shell", "{:.0%}")
+    if not seeing:
+        return Validation(alignment, [sight])
+    distance = float(np.median([support.distance for support in seeing]))
+    key = "closeness" if distance < LIMITS["closeness"].good else "distance"
+    size = _check(key, distance, "Distance from cameras to shell, median (units)", "{:.3g} m")
+    if size.verdict == "refused":
+        return Validation(alignment, [sight, size], supports)
+    cameras = transformed(positions(views), survey_from_scene)
+    axes = _axes(seeing, survey_from_scene)
+    placed = transformed(points.positions, survey_from_scene)
+    signed = _signed_distances(surface, placed, cameras)
+    near = np.abs(signed) < NEAR
+    try:
+        test = refine(surface, points.positions, survey_from_scene, _REACH)
+    except SceneError:
+        test = None
+    measured = Validation(
+        alignment=alignment,
+        checks=[sight, size],
+        views=supports,
+        axes=axes,
+        signed=signed[near],
+        near=float(near.mean()),
+        scans=scan_shifts(surface, placed, axes),
+        test=test,
+        picked=picked,
+    )
+    return replace(measured, checks=[sight, size, *_judge(measured)])
+
+
+def _judge(measured: Validation) -> Iterator[Check]:
+    yield _check("points", len(measured.signed), "SfM points within 1 m of the shell", "{:.0f}")
+    yield _check("share", measured.share_within(0.10), "SfM points within 1 m, share within 10 cm", "{:.0%}")
+    yield _check("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
+    if measured.test is not None:
+        evidence = measured.test.evidence
+        yield _check("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
+        words = "; ".join(evidence.in_words(measured.axes))
+        yield _check("weak", int(evidence.weak.sum()), "Directions the points cannot tell", f"{{:.0f}} {words}".strip())
+    for scan in measured.scans if len(measured.signed) else ():
+        shift, fit = scan.elsewhere
+        yield _check("rival", fit, f"Fit {shift:+.1f} m {scan.name}, relative", "{:.2f}")
+    if held_out := [point.residual for point in measured.picked if point.pick.held_out]:
+        yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
+
+
+def _check(key: str, value: float, name: str, form: str) -> Check:
+    limit = LIMITS[key]
+    sign = "≤" if limit.good <= limit.refused else "≥"
+    percent = "%" in form
+    good, refused = (f"{value:.0%}" if percent else f"{value:g}" for value in (limit.good, limit.refused))
+    limits = f"good {sign} {good}, refused beyond {refused}"
+    return Check(name, form.format(value), limits, limit.judge(value), limit.why)
+
+
+def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.ndarray:
+    """Right, up and out of the facade that the views see most of."""
+    up = survey_from_scene[:3, :3] @ upwards([support.view for support in seeing])
+    normals = np.concatenate([support.normals for support in seeing])
+    return facade_axes(normals, up / np.linalg.norm(up))
+
+
+def _signed_distances(surface: ShellSurface, points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
+    """Distances of points from the shell, positive on the side of the nearest camera."""
+    closest = surface.closest(points)
+    towards = cameras[KDTree(cameras).query(closest.foot)[1]] - closest.foot
+    normal = closest.normal * np.sign(np.einsum("nd,nd->n", closest.normal, towards))[:, None]
+    offset = points - closest.foot
+    side = np.where(np.einsum("nd,nd->n", normal, offset) < 0, -1.0, 1.0)
+    return side * np.linalg.norm(offset, axis=1)

@@ -1,0 +1,553 @@
+"""Finding the shell's place, and judging it: closed forms, known truths, and the mistakes that are to be caught."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from dataparsers.camera import Camera
+from dataparsers.errors import SceneError
+from dataparsers.photograph import View, to_camera
+from dataparsers.sparse_points import SparsePoints
+from shellgs_method.cli import main
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
+from shellgs_method.shell.align import PROPOSAL, REPORT, place_by_guess
+from shellgs_method.shell.bays import facade_axes, scan_shifts
+from shellgs_method.shell.picks import Pick, align_picks, read_picks, triangulate
+from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.refinement import refine
+from shellgs_method.shell.report import shell_edges, write_report
+from shellgs_method.shell.surface import ShellSurface, fit_similarity, transformed
+from shellgs_method.shell.validation import LIMITS, Limit, validate
+from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera
+from shellgs_method.synthetic.path import walk
+
+TRUTH = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
+AXES = SHELL_FROM_BUILDING[:3, :3] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).T  # columns: right, up, out
+
+
+@pytest.fixture(scope="module")
+def mesh() -> ShellMesh:
+    """The shell of a facade of five bays and three storeys, in national coordinates."""
+    triangles = shell(Layout(5, 3))
+    return ShellMesh(transformed(triangles.vertices, SHELL_FROM_BUILDING), triangles.triangles)
+
+
+@pytest.fixture(scope="module")
+def surface(mesh: ShellMesh) -> ShellSurface:
+    return ShellSurface(mesh)
+
+
+@pytest.fixture(scope="module")
+def survey_from_scene(surface: ShellSurface) -> np.ndarray:
+    """The truth that every start is to come back to."""
+    return surface.survey_from_shell @ np.linalg.inv(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def points(mesh: ShellMesh, surface: ShellSurface, survey_from_scene: np.ndarray) -> SparsePoints:
+    """1500 points of the front with 1.5 cm of noise, and 150 of the street before it, in the scene's frame."""
+    random = np.random.default_rng(1)
+    samples, _ = surface.samples(20_000)
+    in_scene = transformed(samples, np.linalg.inv(survey_from_scene))
+    front = transformed(in_scene, np.linalg.inv(SCENE_FROM_BUILDING))
+    front = front[front[:, 1] < 0.26][:1500]
+    noisy = front + random.normal(0, 0.015, front.shape)
+    clutter = random.uniform([0, -9, -0.1], [15, -1, 3], (150, 3))
+    return SparsePoints(transformed(np.concatenate([noisy, clutter]), SCENE_FROM_BUILDING))
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    """Ten views of 96 x 64 pixels, without photographs."""
+    cameras = walk(15.0, 10, 96, 64, np.random.default_rng(0))
+    return [View(f"images/{k}.png", Path(f"{k}.png"), scene_camera(camera)) for k, camera in enumerate(cameras)]
+
+
+def displaced(metres: float, degrees: float, growth: float, seed: int) -> np.ndarray:
+    """A similarity by so much, in a random direction."""
+    random = np.random.default_rng(seed)
+    shift, turn = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
+    matrix = np.eye(4)
+    matrix[:3, :3] = (1 + growth) * Rotation.from_rotvec(np.radians(degrees) * turn).as_matrix()
+    matrix[:3, 3] = metres * shift
+    return matrix
+
+
+def error(surface: ShellSurface, found: np.ndarray, truth: np.ndarray) -> float:
+    """Mean displacement of the shell, in metres."""
+    moved = transformed(surface.vertices, found @ np.linalg.inv(truth))
+    return float(np.linalg.norm(moved - surface.vertices, axis=1).mean())
+
+
+def shifted(right: float = 0.0, up: float = 0.0, out: float = 0.0) -> Alignment:
+    """The true alignment, with the shell moved by metres."""
+    move = np.eye(4)
+    move[:3, 3] = AXES @ [right, up, out]
+    return Alignment(TRUTH @ move, "shell/facade.ply")
+
+
+# Similarities and refinement
+
+
+def test_a_similarity_is_found_from_exact_points():
+    random = np.random.default_rng(0)
+    points = random.normal(size=(4, 3))
+    truth = displaced(3.0, 70.0, 1.5, seed=3)
+    np.testing.assert_allclose(fit_similarity(points, transformed(points, truth)), truth, atol=1e-12)
+
+
+def test_mirrored_points_give_no_mirroring():
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    assert np.linalg.det(fit_similarity(points, points * [1, 1, -1])[:3, :3]) > 0
+
+
+@pytest.mark.parametrize("growth", [-0.01, 0.01])
+def test_refinement_returns_from_30_cm_1_degree_and_1_percent(surface, points, survey_from_scene, growth):
+    start = displaced(0.3, 1.0, growth, seed=5) @ survey_from_scene
+    assert error(surface, start, survey_from_scene) > 0.25
+    found = refine(surface, points.positions, start, reach=1.0)
+    assert error(surface, found.survey_from_scene, survey_from_scene) < 0.006  # 1.5 cm of noise in 1500 points
+    assert not found.evidence.weak.any()
+
+
+def test_a_bare_wall_tells_of_three_directions_and_leaves_the_other_four_alone():
+    corners = np.array([[-8.0, 0, -4], [8, 0, -4], [8, 0, 4], [-8, 0, 4]])
+    surface = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+    random = np.random.default_rng(0)
+    points = random.uniform([-6, 0, -3], [6, 0, 3], (500, 3)) + random.normal(0, 0.01, (500, 1)) * [0, 1, 0]
+    # 20 cm along the wall, which nothing tells, and 10 cm out of it, which the points mend.
+    start = np.eye(4)
+    start[:3, 3] = [0.2, 0.1, 0.0]
+    found = refine(surface, points, start, reach=0.5)
+    assert found.evidence.weak.sum() == 4
+    np.testing.assert_allclose(found.survey_from_scene[:3, 3], [0.2, 0, 0], atol=0.005)
+    assert np.cbrt(np.linalg.det(found.survey_from_scene[:3, :3])) == pytest.approx(1, abs=1e-4)
+    words = " ".join(found.evidence.in_words(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])))
+    assert all(word in words for word in ("along the facade", "upwards", "roll", "scale"))
+    assert all(word not in words for word in ("out of the facade", "tilt", "turn"))
+
+
+def test_points_of_something_else_are_refused(surface, survey_from_scene):
+    with pytest.raises(SceneError, match="only 0 SfM points are within 1 m"):
+        refine(surface, np.full((50, 3), 1000.0), survey_from_scene, reach=1.0)
+
+
+# The program's own proposal
+
+
+def test_a_proposal_is_right_where_the_ends_of_the_facade_are_seen(mesh, surface, views, points, survey_from_scene):
+    placement = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0)
+    found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
+    assert placement.proposed
+    assert error(surface, found, survey_from_scene) < 0.02
+
+
+def test_a_proposal_names_the_other_bays_where_the_points_are_of_a_part_without_ends(mesh, views):
+    layout = Layout(5, 3)
+    openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]
+    random = np.random.default_rng(0)
+    # Window edges of the two bays 1 and 3 alone, around the door, and wall between them.
+    corners = [(x, -0.0, z) for x0, x1, z0, z1 in openings for x in (x0, x1) for z in (z0, z1) if 3 < x0 < 12]
+    wall = random.uniform([3.0, 0, 0.3], [12.0, 0, 9.5], (1500, 3))
+    inside = np.zeros(len(wall), bool)
+    for x0, x1, z0, z1 in openings:
+        inside |= (wall[:, 0] > x0) & (wall[:, 0] < x1) & (wall[:, 2] > z0) & (wall[:, 2] < z1)
+    building = np.concatenate([wall[~inside], np.repeat(np.array(corners), 10, axis=0)])
+    building += random.normal(0, 0.01, building.shape)
+    points = SparsePoints(transformed(building, SCENE_FROM_BUILDING))
+    history = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0).history
+    assert any(sentence.startswith("Ambiguous: a place") for sentence in history)
+
+
+# Picks
+
+
+def rig(count: int = 3) -> tuple[list[View], np.ndarray]:
+    """Views that look along +z from a baseline, 1000 pixels wide, and their 3x4 projections."""
+    views = []
+    K = torch.tensor([[800.0, 0, 500], [0, 800, 400], [0, 0, 1]], dtype=torch.float64)
+    for k in range(count):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 10.0 * k - 10, degrees=True).as_matrix())
+        viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([2.0 * k - 2, 0.1 * k, 0.0], dtype=torch.float64)
+        views.append(View(f"images/{k}.png", Path(f"{k}.png"), Camera(viewmat, K, 1000, 800)))
+    return views, np.stack([(v.camera.K @ v.camera.viewmat[:3]).numpy() for v in views])
+
+
+def project(projections: np.ndarray, point: np.ndarray) -> np.ndarray:
+    homogeneous = projections @ np.append(point, 1.0)
+    return homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def test_exact_pixels_triangulate_to_their_point():
+    views, projections = rig()
+    point = np.array([0.3, -0.7, 9.0])
+    viewmats, Ks = (np.stack([getattr(v.camera, name).numpy() for v in views]) for name in ("viewmat", "K"))
+    found, errors = triangulate(viewmats, Ks, project(projections, point))
+    np.testing.assert_allclose(found, point, atol=1e-10)
+    np.testing.assert_allclose(errors, 0, atol=1e-8)
+
+
+def test_two_cameras_with_a_parallax_triangulate_as_in_the_textbook():
+    # Baseline 2, focal length 800, disparity 160 pixels: depth = 800 * 2 / 160 = 10.
+    views, _ = rig(2)
+    viewmats, Ks = np.stack([np.eye(4)] * 2), np.stack([v.camera.K.numpy() for v in views])
+    viewmats[1, 0, 3] = -2.0
+    found, _ = triangulate(viewmats, Ks, np.array([[580.0, 400.0], [420.0, 400.0]]))
+    np.testing.assert_allclose(found, [1.0, 0.0, 10.0], atol=1e-10)
+
+
+def test_noisy_pixels_are_triangulated_to_the_least_sum_of_squares():
+    from scipy.optimize import least_squares
+
+    views, projections = rig()
+    pixels = project(projections, np.array([0.3, -0.7, 9.0])) + np.array([[1.0, -2], [0, 1.5], [-1, 0.5]])
+    reference = least_squares(lambda x: (project(projections, x) - pixels).ravel(), [0.0, 0, 8], xtol=1e-15, gtol=1e-12)
+    viewmats, Ks = (np.stack([getattr(v.camera, name).numpy() for v in views]) for name in ("viewmat", "K"))
+    np.testing.assert_allclose(triangulate(viewmats, Ks, pixels)[0], reference.x, atol=1e-5)
+
+
+@pytest.fixture
+def rigged(tmp_path: Path) -> tuple[list[View], np.ndarray]:
+    """The rig with photographs on disk, whose size picks are counted in."""
+    views, projections = rig()
+    Image.new("RGB", (1000, 800)).save(tmp_path / "0.png")
+    return [replace(view, image=tmp_path / "0.png") for view in views], projections
+
+
+def picked(projections: np.ndarray, count: int = 8, noise: float = 0.2) -> tuple[list[Pick], np.ndarray]:
+    """Picks of a shell in national coordinates, and its true place."""
+    random = np.random.default_rng(2)
+    scene = random.uniform([-3, -2, 8], [3, 2, 11], (count, 3))
+    truth = displaced(1.0, 50.0, -0.6, seed=1)
+    truth[:3, 3] -= truth[:3, :3] @ [410_000.0, 5_413_000.0, 250.0]
+    on_shell = transformed(scene, np.linalg.inv(truth)) + random.normal(0, 0.005, scene.shape)
+    picks = []
+    for k, (point, image) in enumerate(zip(on_shell, scene, strict=True)):
+        pixels = project(projections, image) + random.normal(0, noise, (3, 2))
+        picks.append(Pick(f"p{k}", point, {f"images/{v}.png": (x, y) for v, (x, y) in enumerate(pixels.tolist())}))
+    return picks, truth
+
+
+def far_off(matrix: np.ndarray, truth: np.ndarray, picks: list[Pick]) -> float:
+    """Largest distance of the picks' images in the scene under two alignments, in shell units."""
+    points = np.stack([pick.shell for pick in picks])
+    scale = np.cbrt(np.linalg.det(truth[:3, :3]))
+    return float(np.linalg.norm(transformed(points, matrix) - transformed(points, truth), axis=1).max() / scale)
+
+
+def test_picks_with_noise_give_the_place(rigged):
+    views, projections = rigged
+    picks, truth = picked(projections)
+    matrix, points = align_picks(picks, views)
+    assert far_off(matrix, truth, picks) < 0.05
+    assert all(point.is_used for point in points)
+    assert all(point.left_out_residual > point.residual for point in points)  # a fit without it is freer to miss it
+
+
+def test_a_pick_that_is_2_m_off_is_left_out_and_comes_first(rigged):
+    views, projections = rigged
+    picks, truth = picked(projections)
+    picks[4] = replace(picks[4], shell=picks[4].shell + np.array([2.0, 0, 0]))
+    matrix, points = align_picks(picks, views)
+    assert far_off(matrix, truth, [p for p in picks if p.name != "p4"]) < 0.05
+    assert points[0].pick.name == "p4"
+    assert points[0].residual == pytest.approx(2.0, abs=0.1)
+    assert [point.pick.name for point in points if not point.is_used] == ["p4"]
+
+
+def test_a_pixel_that_disagrees_is_named_and_its_point_left_out(rigged):
+    views, projections = rigged
+    picks, truth = picked(projections)
+    x, y = picks[3].pixels["images/2.png"]
+    picks[3] = replace(picks[3], pixels={**picks[3].pixels, "images/2.png": (x, y + 60)})
+    matrix, points = align_picks(picks, views)
+    blurred = next(point for point in points if point.pick.name == "p3")
+    assert not blurred.is_sharp
+    assert not blurred.is_used
+    assert blurred.reprojection > 10
+    assert far_off(matrix, truth, picks) < 0.05
+
+
+def test_check_points_are_measured_and_not_fitted(rigged):
+    views, projections = rigged
+    picks, _ = picked(projections)
+    picks[0] = replace(picks[0], name="check-corner", shell=picks[0].shell + np.array([0.12, 0, 0]))
+    _, points = align_picks(picks, views)
+    check = next(point for point in points if point.pick.held_out)
+    assert not check.is_used
+    assert check.residual == pytest.approx(0.12, abs=0.05)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_too_few_picks_or_picks_on_a_line_are_refused(rigged, count):
+    views, projections = rigged
+    line = np.linspace([-2.0, 0, 9], [2, 0, 9], count)
+    picks = [
+        Pick(str(k), p, {f"images/{v}.png": tuple(xy) for v, xy in enumerate(project(projections, p).tolist())})
+        for k, p in enumerate(line)
+    ]
+    with pytest.raises(SceneError, match="at least 3 are needed" if count == 2 else "on one line"):
+        align_picks(picks, views)
+
+
+def test_a_picks_file_is_read_as_opendronemap_defines_it(rigged, tmp_path):
+    views, _ = rigged
+    views = [replace(view, image=Path(view.name).with_name(f"photo {k}.png")) for k, view in enumerate(views)]
+    file = tmp_path / "gcp_list.txt"
+    file.write_text(
+        "EPSG:25832\n"
+        '410000.5 5413000.25 251 10.5 20 "photo 0.png" door  # its left top corner\n'
+        "410000.5 5413000.25 251 30 40 images/1.png door\n\n"
+        "1 2 3 50 60 images/0.png\n1 2 3 70 80 images/1.png\n"
+    )
+    door, nameless = read_picks(file, views)
+    assert door.name == "door"
+    assert door.pixels == {"images/0.png": (10.5, 20), "images/1.png": (30, 40)}
+    np.testing.assert_array_equal(door.shell, [410000.5, 5413000.25, 251])
+    assert nameless.pixels["images/1.png"] == (70, 80)
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("1 2 3 4 5", "line 2: a pick is X Y Z"),
+        ("1 2 3 4 x images/0.png", "line 2: a pick is X Y Z"),
+        ("1 2 3 4 5 nowhere.png", "nowhere.png is no photograph of the scene"),
+        ("1 2 9 4 5 images/1.png a", "line 2: the point a had other coordinates"),
+        ("1 2 3 4 5 images/0.png a", "line 2: the point a is picked twice"),
+        ("1 2 3 4 5 images/1.png 'a", "line 2"),
+    ],
+)
+def test_a_line_that_is_no_pick_is_refused_by_its_number(rigged, tmp_path, line, sentence):
+    (tmp_path / "picks.txt").write_text(f"1 2 3 4 5 images/0.png a\n{line}\n")
+    with pytest.raises(SceneError, match=re.escape(sentence)):
+        read_picks(tmp_path / "picks.txt", rigged[0])
+
+
+def test_picks_are_pixels_of_the_photograph_as_it_lies_on_disk(tmp_path):
+    from nerfstudio.cameras.cameras import Cameras, CameraType
+
+    from dataparsers.photograph import undistort
+
+    # A pinhole ray through Brown's model with k1 = -0.1: x' = x (1 + k1 r²).
+    lens = Cameras(
+        torch.eye(4)[None, :3], 500.0, 500.0, 320.0, 240.0, 640, 480,
+        distortion_params=torch.tensor([-0.1, 0, 0, 0, 0, 0]), camera_type=CameraType.PERSPECTIVE,
+    )[0]  # fmt: skip
+    K, image = undistort(lens, np.zeros((480, 640, 3), np.uint8))
+    camera = Camera(torch.eye(4, dtype=torch.float64), torch.from_numpy(K).double(), image.shape[1], image.shape[0])
+    Image.new("RGB", (1280, 960)).save(tmp_path / "a.png")  # twice the size that was calibrated
+    view = View("a.png", tmp_path / "a.png", camera, lens)
+    x, y = 0.3, -0.2
+    factor = 1 - 0.1 * (x * x + y * y)
+    stored = 2 * np.array([[500 * factor * x + 320, 500 * factor * y + 240]])
+    expected = [camera.K[0, 0] * x + camera.K[0, 2], camera.K[1, 1] * y + camera.K[1, 2]]
+    np.testing.assert_allclose(to_camera(view, stored)[0], expected, atol=1e-3)
+
+
+# The bay test
+
+
+def test_bays_and_storeys_are_measured_off_the_shell(surface, points, survey_from_scene):
+    along, upwards = scan_shifts(surface, transformed(points.positions, survey_from_scene), AXES.T)
+    assert along.period in (pytest.approx(BAY, abs=0.1), pytest.approx(2 * BAY, abs=0.1))  # columns: every second bay
+    assert upwards.period == pytest.approx(STOREY, abs=0.1)
+
+
+def test_a_shift_by_a_bay_has_a_better_place_a_bay_back(surface, points, survey_from_scene):
+    placed = transformed(points.positions, survey_from_scene)
+    along, _ = scan_shifts(surface, placed, AXES.T)
+    assert along.elsewhere[1] < 0.9
+    along, _ = scan_shifts(surface, placed + BAY * AXES[:, 0], AXES.T)
+    shift, fit = along.elsewhere
+    assert shift == pytest.approx(BAY, abs=0.15)
+    assert fit > 1.1
+
+
+def test_the_axes_of_a_facade_are_upright_though_the_cameras_look_up():
+    normals = np.array([[0.0, -1, 0]] * 8 + [[1.0, 0, 0]] * 3 + [[0, 0, 1.0]] * 20)
+    axes = facade_axes(normals, np.array([0.0, 0.3, 0.95]))
+    np.testing.assert_allclose(axes, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+
+
+# The verdict
+
+
+@pytest.mark.parametrize(
+    ("alignment", "verdict", "reason"),
+    [
+        (shifted(), "good", None),
+        (shifted(out=-0.05), "doubtful", "Bias along the normal"),
+        (shifted(right=0.05), "doubtful", "Motion that would fit the points better"),
+        (shifted(right=BAY), "refused", "along the facade"),
+        (shifted(right=-2 * BAY), "refused", "along the facade"),
+        (shifted(up=STOREY), "refused", "upwards"),
+        (replace(shifted(), metres_per_shell_unit=1000.0), "refused", "units"),
+        (replace(shifted(), metres_per_shell_unit=0.001), "refused", "units"),
+        (
+            Alignment(TRUTH @ np.diag([1000.0, 1000, 1000, 1]), "shell/facade.ply"),
+            "refused",
+            "Views that see the shell",
+        ),
+    ],
+    ids=["true", "5 cm in", "5 cm aside", "a bay", "two bays", "a storey", "kilometres", "millimetres", "1000 x"],
+)
+def test_the_verdict_names_what_is_wrong(mesh, views, points, alignment, verdict, reason):
+    validation = validate(mesh, alignment, views, points)
+    assert validation.verdict == verdict, validation.reasons
+    assert reason is None or any(reason in sentence for sentence in validation.reasons)
+
+
+def test_limits_judge_from_both_sides_and_refuse_nan():
+    below, above = Limit(0.1, 0.5, ""), Limit(0.6, 0.3, "")
+    assert [below.judge(v) for v in (0.1, 0.2, 0.6, np.nan)] == ["good", "doubtful", "refused", "refused"]
+    assert [above.judge(v) for v in (0.6, 0.5, 0.2, np.nan)] == ["good", "doubtful", "refused", "refused"]
+    assert all(limit.why for limit in LIMITS.values())
+
+
+def test_the_bias_is_that_of_the_wall(mesh, views, points):
+    # The shell 5 cm deeper: points of the wall stand 5 cm before it, those of reveals and slabs' undersides on it.
+    assert 0.03 < validate(mesh, shifted(out=-0.05), views, points).bias < 0.05
+    assert validate(mesh, shifted(), views, points).bias == pytest.approx(0.0, abs=0.003)
+
+
+# Report and command
+
+
+def test_edges_are_where_the_shell_ends_steps_or_bends_and_nowhere_on_a_slanted_plane():
+    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 40, degrees=True).as_matrix())
+    plane = ShellMesh(
+        np.array([[-99.0, -99, 9], [99, -99, 9], [99, 99, 9], [-99, 99, 9]]), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    assert not shell_edges(ShellCaster(plane, np.eye(4)).cast(Camera(viewmat, K, 64, 48)), 1.0).any()
+    # A plate 10 cm before the plane, from -1 to 1: at 60 pixels of focal length and a depth of 9 it ends at 32 ± 6.7.
+    corners = np.array([[-1.0, -1, 8.9], [1, -1, 8.9], [1, 1, 8.9], [-1, 1, 8.9]])
+    both = ShellMesh(np.concatenate([plane.vertices, corners]), np.concatenate([plane.faces, plane.faces + 4]))
+    edges = shell_edges(ShellCaster(both, np.eye(4)).cast(Camera(torch.eye(4, dtype=torch.float64), K, 64, 48)), 1.0)
+    assert set(np.flatnonzero(edges[24])) == {24, 25, 38, 39}
+
+
+def command(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *words: object) -> str:
+    """What `shellgs` prints, or the sentence that it ends with."""
+    monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
+    try:
+        main()
+    except SystemExit as stop:
+        return f"refused: {stop}"
+    return capsys.readouterr().out.replace("\n", " ")
+
+
+@pytest.fixture
+def shellgs(capsys, monkeypatch):
+    return lambda *words: command(capsys, monkeypatch, *words)
+
+
+def test_a_matrix_is_judged_reported_and_written(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    shift = np.array([412_000.0, 5_123_000.0, 0.0])
+    unshifted = true.shell_to_scene.copy()
+    unshifted[:3, 3] += unshifted[:3, :3] @ shift  # of coordinates less the shift, as CloudCompare sees them
+    (scene / "matrix.txt").write_text("\n".join(" ".join(f"{value:.12f}" for value in row) for row in unshifted))
+    (scene / ALIGNMENT).unlink()
+    shell = scene / true.shell
+    output = shellgs("align", scene, shell, "--matrix", scene / "matrix.txt", "--global-shift", *(-shift))
+    assert "Verdict: good" in output or "Verdict: doubtful" in output
+    written = Alignment.load(scene / ALIGNMENT)
+    np.testing.assert_allclose(
+        written.apply(load_shell(shell).vertices), true.apply(load_shell(shell).vertices), atol=1e-4
+    )
+    assert written.verdict in output
+    assert (written.figures["within_10cm"] or 0) > 0.5
+    page = (scene / REPORT / "index.html").read_text()
+    assert f"Verdict: <b>{written.verdict}</b>" in page
+    assert re.findall(r'(?:src|href)="(?!data:)', page) == []
+    assert "http" not in page
+    assert len(list((scene / REPORT).glob("view_*.png"))) >= 6
+    assert json.loads((scene / REPORT / "validation.json").read_text())["verdict"] == written.verdict
+
+
+def test_picks_and_refinement_give_the_place_and_their_residuals(scene, shellgs):
+    from dataparsers.facade import FacadeDataParserConfig, read_views
+
+    true = Alignment.load(scene / ALIGNMENT)
+    corners = [(o.x0, 0.0, o.z0) for o in Layout(6, 3).openings] + [(o.x1, 0.0, o.z1) for o in Layout(6, 3).openings]
+    building = np.array(corners)
+    on_shell = transformed(building, SHELL_FROM_BUILDING)
+    lines = []
+    for view in read_views(FacadeDataParserConfig(data=scene)):
+        projection = (view.camera.K @ view.camera.viewmat[:3]).numpy()
+        for k, point in enumerate(transformed(building, SCENE_FROM_BUILDING)):
+            x, y, z = projection @ np.append(point, 1)
+            if z > 0 and 0 < x / z < view.camera.width and 0 < y / z < view.camera.height:
+                lines.append((k, f"{' '.join(map(str, on_shell[k]))} {x / z} {y / z} {view.name} p{k}"))
+    seen = [k for k, _ in lines]
+    picks = scene / "picks.txt"
+    picks.write_text("\n".join(line for k, line in lines if seen.count(k) >= 4))
+    (scene / ALIGNMENT).unlink()
+    output = shellgs("align", scene, scene / true.shell, "--picks", picks, "--refine", 0.3)
+    assert "picks decide" in output
+    assert "Refined against" in output
+    written = Alignment.load(scene / ALIGNMENT)
+    vertices = load_shell(scene / true.shell).vertices
+    moved = np.linalg.norm(written.apply(vertices) - true.apply(vertices), axis=1).mean() * true.metres_per_unit
+    assert moved < 0.03  # 300 SfM points, some of them on what the shell leaves out
+    assert "Picked points, worst first" in (scene / REPORT / "index.html").read_text()
+
+
+def test_a_refused_place_leaves_the_alignment_alone(scene, shellgs):
+    before = (scene / ALIGNMENT).read_bytes()
+    true = Alignment.load(scene / ALIGNMENT)
+    (scene / "off.json").write_text(json.dumps((true.shell_to_scene @ np.diag([1e3, 1e3, 1e3, 1])).tolist()))
+    output = shellgs("align", scene, scene / true.shell, "--matrix", scene / "off.json")
+    assert "the alignment is refused" in output
+    assert (scene / ALIGNMENT).read_bytes() == before
+    assert "Verdict: <b>refused</b>" in (scene / REPORT / "index.html").read_text()
+
+
+def test_a_proposal_becomes_the_alignment_only_when_it_is_accepted(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    (scene / ALIGNMENT).unlink()
+    assert "--accept" in shellgs("align", scene, scene / true.shell)
+    assert not (scene / ALIGNMENT).exists()
+    assert "Written" in shellgs("align", scene, "--accept")
+    assert Alignment.load(scene / ALIGNMENT).places_like(Alignment.load(scene / PROPOSAL))
+
+
+def test_judging_what_is_there_keeps_the_file_that_maps_are_bound_to(scene, shellgs):
+    before = (scene / ALIGNMENT).read_bytes()
+    assert "Verdict" in shellgs("align", scene)
+    assert (scene / ALIGNMENT).read_bytes() == before
+
+
+@pytest.mark.parametrize("words", [["--matrix", "m.txt"], ["shell.ply", "--matrix", "m", "--picks", "p"]])
+def test_starts_that_contradict_each_other_are_refused(scene, shellgs, words):
+    assert "give the shell with" in shellgs("align", scene, *words)
+
+
+def test_an_alignment_without_a_verdict_is_still_read(tmp_path):
+    fields = {"shell_to_scene": np.eye(4).tolist(), "shell": "a.ply", "metres_per_shell_unit": 1.0, "source": "matrix"}
+    (tmp_path / "alignment.json").write_text(json.dumps(fields))
+    assert Alignment.load(tmp_path / "alignment.json") == Alignment(np.eye(4), "a.ply")
+    judged = Alignment(np.eye(4), "a.ply", verdict="good", figures={"bias_m": 0.01, "pull_m": None})
+    judged.save(tmp_path / "alignment.json")
+    assert Alignment.load(tmp_path / "alignment.json") == judged
+
+
+def test_a_report_of_what_no_camera_sees_is_written_all_the_same(mesh, views, points, tmp_path):
+    validation = validate(mesh, Alignment(displaced(1e4, 0, 0, 1) @ TRUTH, "<shell>.ply"), views, points)
+    page = write_report(tmp_path / "report", mesh, validation).read_text()
+    assert "&lt;shell&gt;.ply: refused" in page
