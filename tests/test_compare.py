@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 import os
 import re
@@ -16,18 +15,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from rich.console import Console
 from runs import Method, trainer_of
 
+from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.compare import launch
 from shellgs_method.compare.launch import launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, write_figures
+from shellgs_method.compare.pictures import recorded_figures
 from shellgs_method.compare.results import compare, write_results
 from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
 from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
+from shellgs_method.pipeline import FacadePipeline
 
 COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("normal_deg", "Normal (°)", min, ".2f"))
 SEEDS = {"shellgs_&_all": {"psnr": [25.0, 27.0], "normal_deg": [9.0, 11.0]}, "photo-gs": {"psnr": [26.6, 27.0]}}
@@ -325,10 +329,9 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
 
 @pytest.mark.usefixtures("eager")
 def test_our_figures_are_those_of_ns_eval(measured):
-    from nerfstudio.utils.eval_utils import eval_setup
-
     _, pipeline, _, _ = eval_setup(measured[1].config)
-    theirs: dict[str, float] = pipeline.get_average_eval_image_metrics(get_std=True)  # pyright: ignore
+    assert isinstance(pipeline, FacadePipeline)
+    theirs = pipeline.get_average_eval_image_metrics(get_std=True)
     ours = json.loads(measured[1].figures().read_text())["results"]
     timing = {"fps", "fps_std", "num_rays_per_sec", "num_rays_per_sec_std"}
     assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})
@@ -342,17 +345,28 @@ def test_a_half_is_measured_of_a_run_that_knows_no_halves(measured):
     assert min(halves) > 0.1 * whole["supported"]
 
 
-def test_snapshots_keep_the_camera(measured):
-    """The shell's depth back-projected through the thinned picture's camera has the shell's own scale in metres."""
+def test_snapshots_are_pictures_of_the_views(measured):
     shot = Snapshot.load(sorted(measured[0].pictures.glob("*.npz"))[0])
     assert shot.rgb.shape == shot.photograph.shape == (32, 48, 3)
     assert shot.mask.any()
     assert shot.error[shot.mask].max() <= 90
 
 
+def test_a_thinned_picture_has_the_rays_of_the_pixels_it_keeps(measured, tmp_path, monkeypatch):
+    """Every third pixel: pixel (i, j) of the picture is pixel (3 i, 3 j) of the view."""
+    monkeypatch.setattr("shellgs_method.compare.measure.PICTURE_SIZE", 16)
+    measure(measured[0].config, pictures=tmp_path)
+    thin, full = (Snapshot.load(sorted(folder.glob("*.npz"))[0]) for folder in (tmp_path, measured[0].pictures))
+    cameras = [
+        Camera(torch.from_numpy(shot.viewmat), torch.from_numpy(shot.K), *shot.mask.shape[1::-1])
+        for shot in (thin, full)
+    ]
+    assert torch.allclose(cameras[0].rays(), cameras[1].rays()[::3, ::3])
+    assert (thin.shell_depth == full.shell_depth[::3, ::3]).all()
+
+
 def test_the_report_needs_no_other_file_and_shows_every_view(measured, tmp_path):
-    runs = [dataclasses.replace(run) for run in measured]
-    write_results(runs, tmp_path, {})
+    write_results(measured, tmp_path, {})
     report = (tmp_path / "report.html").read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", report)
     assert "http" not in report
@@ -366,8 +380,5 @@ def test_the_report_needs_no_other_file_and_shows_every_view(measured, tmp_path)
             assert np.asarray(image).std() > 5
 
 
-def test_curves_are_of_all_held_out_views(measured, tmp_path):
-    from shellgs_method.compare.pictures import _events
-
-    curves = _events(measured[1])
-    assert sorted(curves["normal_deg"]) == [2]
+def test_curves_are_of_all_held_out_views(measured):
+    assert sorted(recorded_figures(measured[1])["normal_deg"]) == [2]

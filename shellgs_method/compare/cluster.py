@@ -54,7 +54,7 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
         raise SceneError("the ray launcher needs Ray: pip install 'shellgs[ray]'") from error
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
-        ray.init(address or "local", log_to_driver=False)
+        ray.init(address or "local", include_dashboard=None if address else False, log_to_driver=False)
     except ConnectionError as error:
         raise SceneError(f"there is no Ray cluster at {address}: start one with `ray start --head`") from error
     try:

@@ -53,7 +53,7 @@ def curves(runs: Sequence[Run], path: Path) -> bool:
 
     They are in the tensorboard files of runs that were measured while they trained.
     """
-    recorded = {run: _events(run) for run in runs}
+    recorded = {run: recorded_figures(run) for run in runs}
     columns = [column for column in CURVES if any(column.key in curve for curve in recorded.values())]
     if not columns:
         return False
@@ -99,8 +99,8 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def _events(run: Run) -> dict[str, dict[int, float]]:
-    """Figures by name, by iteration; where a resumed run wrote one twice, the last."""
+def recorded_figures(run: Run) -> dict[str, dict[int, float]]:
+    """Figures of all held-out views by name, by iteration; where a resumed run wrote one twice, the last."""
     events = EventAccumulator(str(run.folder), size_guidance={"scalars": 0})
     events.Reload()
     found = (tag for tag in events.Tags()["scalars"] if tag.startswith(_EVENTS))
