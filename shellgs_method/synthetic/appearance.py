@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -79,9 +80,7 @@ class Daylight:
         """A room behind and the street in front of a pane, weighted by Schlick's approximation of Fresnel's law."""
         x, z = points[:, 0], points[:, 2]
         # Casements are never quite parallel, and their panes never quite flat; the geometry knows nothing of it.
-        i, j = np.floor(2 * x / BAY).astype(int), np.floor(z / STOREY).astype(int)
-        size = len(self.lattice)
-        tilt = np.stack([self.lattice[i % size, j % size], self.lattice[j % size, i % size]], axis=-1)
+        tilt = np.stack([self._chance(2 * x / BAY, z / STOREY, k) for k in range(2)], axis=-1)
         bow = np.stack([self._noise(x, z, 0.5), self._noise(z, x, 0.5)], axis=-1)
         optical = normal.copy()
         optical[:, [0, 2]] += 0.012 * tilt + 0.004 * bow
@@ -90,9 +89,33 @@ class Daylight:
         cosine = np.sum(optical * towards, axis=-1, keepdims=True)
         fresnel = _REFLECTANCE + (1 - _REFLECTANCE) * (1 - np.abs(cosine)) ** 5
         mirrored = towards - 2 * cosine * optical
-        return (1 - fresnel) * _room(points, towards) + fresnel * self.radiance(
+        return (1 - fresnel) * self._room(points, towards) + fresnel * self.radiance(
             points + 1e-3 * normal, mirrored, bounces
         )
+
+    def _room(self, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
+        """A dark room whose curtains and blind hang a hand behind the pane; no two windows are furnished alike.
+
+        Windows that match in every pixel would lead structure from motion astray by whole bays.
+        """
+        bay, storey = points[:, 0] / BAY, points[:, 2] / STOREY
+        chance = partial(self._chance, bay, storey)
+        hung = points + 0.3 * towards / np.maximum(towards[:, 1:2], 0.2)
+        x, z = hung[:, 0] / BAY - np.floor(bay) - 0.5, hung[:, 2] / STOREY - np.floor(storey)
+
+        cloth = 0.24 + 0.03 * np.sin(hung[:, 0] * 55.0) + 0.1 * chance(2)
+        cloth *= 1 + 0.4 * self._noise(hung[:, 0], hung[:, 2], 0.12)
+        slats = 0.3 + 0.06 * np.sin(hung[:, 2] * 120.0) + 0.1 * chance(3)
+        depth = 0.035 + 0.02 * np.sin(hung[:, 2] * 1.9)
+        drawn = (x < -0.17 + 0.12 * chance(4)) | (x > 0.17 + 0.12 * chance(5))
+        lowered = z > 0.7 + 0.2 * chance(6)
+        tint = np.array([1.0, 0.95, 0.88]) + 0.12 * np.stack([chance(7), 0 * bay, chance(8)], axis=-1)
+        return np.where(drawn, cloth, np.where(lowered, slats, depth))[:, None] * tint
+
+    def _chance(self, u: np.ndarray, v: np.ndarray, k: int) -> np.ndarray:
+        """The ``k``-th random number in [-1, 1] of the unit cell that (u, v) lies in."""
+        size = len(self.lattice)
+        return self.lattice[(np.floor(u).astype(int) + 31 * k) % size, (np.floor(v).astype(int) + 17 * k) % size]
 
     def _sky(self, directions: np.ndarray) -> np.ndarray:
         """Blue overhead, white at the horizon, with clouds on a flat ceiling."""
@@ -129,15 +152,6 @@ def rays(camera: Camera) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "he
     return camera.position.numpy().astype(np.float32), directions.astype(np.float32)
 
 
-def _room(points: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """A dark room whose curtains hang a hand behind the pane; the same behind every window."""
-    curtain = points + 0.3 * towards / np.maximum(towards[:, 1:2], 0.2)
-    across = np.abs(curtain[:, 0] / BAY - np.floor(curtain[:, 0] / BAY) - 0.5) * BAY
-    folds = 0.24 + 0.03 * np.sin(curtain[:, 0] * 55.0)
-    depth = 0.035 + 0.02 * np.sin(curtain[:, 2] * 1.9)
-    return np.where(across > 0.48, folds, depth)[:, None] * np.array([1.0, 0.95, 0.88], dtype=np.float32)
-
-
 Noise = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
@@ -150,19 +164,27 @@ def _plain(*colour: float) -> Callable[[np.ndarray, Noise], np.ndarray]:
 
 
 def _plaster(points: np.ndarray, noise: Noise) -> np.ndarray:
+    """Weakly textured, but weathered: grime at the foot, streaks of rain, cracks, and scrawls as high as a hand."""
     along, z = points[:, 0] + points[:, 1], points[:, 2]
     grime = 0.08 * np.exp(-z / 0.35)
-    return _tinted((0.74, 0.66, 0.53), 1 - grime + 0.025 * noise(along, z, 1.7) + 0.012 * noise(along, z, 0.07))
+    streaks = 0.1 * np.maximum(noise(along, z, 1.3), 0.0) * noise(12 * along, z, 0.7)
+    crack = (np.abs(noise(along, z, 0.9)) < 0.012) & (noise(z, along, 1.1) > 0)
+    scrawl = (np.abs(noise(along, z, 0.3)) < 0.06) & (np.abs(z - 1.3) < 0.6) & (noise(along, z, 2.1) > 0.2)
+    fine = 0.025 * noise(along, z, 1.7) + 0.02 * noise(along, z, 0.07)
+    return _tinted((0.74, 0.66, 0.53), 1 - grime + streaks - 0.25 * crack - 0.5 * scrawl + fine)
 
 
 def _stone(points: np.ndarray, noise: Noise) -> np.ndarray:
     along, z = points[:, 0] + points[:, 1], points[:, 2]
     joint = np.mod(z, 0.55) < 0.012
-    return _tinted((0.60, 0.54, 0.45), 1 - 0.12 * joint + 0.03 * noise(along, z, 0.3) + 0.02 * noise(along, z, 0.05))
+    return _tinted((0.60, 0.54, 0.45), 1 - 0.12 * joint + 0.09 * noise(along, z, 0.3) + 0.05 * noise(along, z, 0.05))
 
 
 def _concrete(points: np.ndarray, noise: Noise) -> np.ndarray:
-    return _tinted((0.58, 0.57, 0.54), 1 + 0.03 * noise(points[:, 0], points[:, 2], 0.4))
+    return _tinted(
+        (0.58, 0.57, 0.54),
+        1 + 0.05 * noise(points[:, 0], points[:, 2], 0.4) + 0.08 * noise(3 * points[:, 0], points[:, 2], 0.15),
+    )
 
 
 def _wood(points: np.ndarray, noise: Noise) -> np.ndarray:
