@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 
@@ -50,3 +52,14 @@ class Camera:
         v = torch.arange(self.height, dtype=self.K.dtype, device=self.K.device) + 0.5
         pixels = torch.stack([*torch.meshgrid(u, v, indexing="xy"), torch.ones_like(u).expand(self.height, -1)], dim=-1)
         return pixels @ torch.linalg.inv(self.K).T
+
+
+def positions(cameras: Iterable[Camera]) -> Float64[np.ndarray, "V 3"]:
+    """Where the cameras stand, in the world."""
+    return np.array([camera.position.detach().cpu().double().numpy() for camera in cameras]).reshape(-1, 3)
+
+
+def upwards(cameras: Iterable[Camera]) -> Float64[np.ndarray, " 3"]:
+    """Unit vector up in the world, as the cameras are held; tilted where they look up or down."""
+    up = -np.mean([camera.viewmat[1, :3].detach().cpu().double().numpy() for camera in cameras], axis=0)
+    return up / np.linalg.norm(up)

@@ -7,15 +7,12 @@ writing a view touches one file, and an interrupted set is a smaller set, never 
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
-import os
 import shlex
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import metadata
@@ -28,6 +25,7 @@ from torch import Tensor
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write, content_hash
 
 FORMAT = 1
 
@@ -269,34 +267,6 @@ class CueMaps:
             f"the {self.kind} map of view {name!r} ({self._path(name)}) cannot be used: {problem}; "
             f"run `{self._command}` to make it again"
         )
-
-
-@contextmanager
-def atomic_write(path: Path) -> Iterator[IO[bytes]]:
-    """A file opened for writing that takes the name ``path`` only once it is complete."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-        os.replace(temporary, path)
-    except OSError as error:  # a full disk does not say which file it was
-        error.filename = error.filename or str(path)
-        raise
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def content_hash(path: Path) -> str:
-    """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden ones do not count."""
-    digest = hashlib.sha256()
-    if path.is_dir():
-        for file in sorted(file for file in path.rglob("[!.]*") if file.is_file()):
-            digest.update(f"{file.relative_to(path).as_posix()}\0{content_hash(file)}\n".encode())
-        return digest.hexdigest()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 _UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error)

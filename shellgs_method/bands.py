@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dataparsers.camera import Camera
+from dataparsers.camera import Camera, upwards
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
@@ -75,8 +75,7 @@ def facade_bands(maps: CueMaps, views: Sequence[View], width: float, name: Liter
     Raises:
         SceneError: no view has a map, or the shell in the maps has no upright wall.
     """
-    up = -torch.stack([view.camera.viewmat[1, :3].double() for view in views]).mean(dim=0)
-    up = up / up.norm()
+    up = torch.from_numpy(upwards(view.camera for view in views))
     upright = torch.eye(3).double() - torch.outer(up, up)
     scatter, facing = torch.zeros(3, 3).double(), torch.zeros(3).double()
     for view in views[:: -(-len(views) // MAX_VIEWS)]:

@@ -26,7 +26,8 @@ from shellgs_method.shell.picks import Pick, align_picks, read_picks, triangulat
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.refinement import refine
 from shellgs_method.shell.report import shell_edges, write_report
-from shellgs_method.shell.surface import ShellSurface, fit_similarity, transformed
+from shellgs_method.shell.similarity import fit_similarity, transformed
+from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.shell.validation import LIMITS, Limit, validate
 from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera

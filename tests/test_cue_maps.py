@@ -14,8 +14,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMap, CueMaps, atomic_write
+from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write
 
 HEIGHT, WIDTH = 12, 16
 VIEW = "images/a.jpg"

@@ -17,11 +17,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from dataparsers.errors import SceneError
+from dataparsers.files import fingerprint
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import add_mask, add_photograph, find_masks, find_photographs, group_by_lens
 from shellgs_method.capture.process import run_step
-from shellgs_method.capture.work import Work, fingerprint, listing
+from shellgs_method.capture.work import Work, listing
 
 WORK = Path("capture")
 """Work folder, in the scene's."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+
+from dataparsers.files import atomic_write
 
 
 class Work:
@@ -55,14 +55,8 @@ class Work:
         self._keys.pop(product, None)
         if key is not None:
             self._keys[product] = key
-        unfinished = self._file.with_suffix(".tmp")
-        unfinished.write_text(json.dumps(self._keys, indent=1) + "\n")
-        os.replace(unfinished, self._file)
-
-
-def fingerprint(*parts: Any) -> str:
-    """A key that changes with any of the parts, which are such as JSON can hold."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        with atomic_write(self._file) as file:
+            file.write((json.dumps(self._keys, indent=1) + "\n").encode())
 
 
 def listing(files: Mapping[str, Path]) -> list[tuple[str, int, int]]:

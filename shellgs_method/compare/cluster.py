@@ -8,7 +8,6 @@ again: on the same node it goes on from its last checkpoint, on another from wha
 from __future__ import annotations
 
 import io
-import json
 import os
 import shutil
 import tarfile
@@ -24,8 +23,8 @@ import yaml
 from jaxtyping import UInt8
 from rich.console import Console
 
-from dataparsers.cue_maps import atomic_write
 from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write, fingerprint
 from shellgs_method.compare.launch import CommandError, finish
 from shellgs_method.compare.runs import Run
 
@@ -61,7 +60,12 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
         gpus = min(1, int(ray.cluster_resources().get("GPU", 0)))  # every method trains on one, where there is one
         task = ray.remote(num_gpus=gpus, max_retries=RETRIES)(_finish_on_node)
         scenes = {scene: ray.put(_packed(scene)) for scene in {run.scene for run in runs}}
-        pending = {task.remote(run, _key(run), scenes[run.scene], _packed(run.folder)): run for run in runs}
+        pending = {
+            task.remote(
+                run, fingerprint(str(run.output), run.label, run.settings), scenes[run.scene], _packed(run.folder)
+            ): run
+            for run in runs
+        }
         failures = {}
         while pending:
             (done, *_), _ = ray.wait(list(pending))
@@ -144,7 +148,3 @@ def _take_back(archive: Archive, run: Run) -> None:
     shutil.rmtree(run.folder)
     fresh.rename(run.folder)
     _point_to_its_folder(run)
-
-
-def _key(run: Run) -> str:
-    return sha256(json.dumps([str(run.output), run.label, run.settings]).encode()).hexdigest()

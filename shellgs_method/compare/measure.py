@@ -17,9 +17,9 @@ from rich.progress import track
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from dataparsers.cue_maps import atomic_write
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig
+from dataparsers.files import atomic_write
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
 from shellgs_method.evaluation import (

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib import colormaps
-from PIL import Image
 
-from dataparsers.cue_maps import atomic_write
+from dataparsers.files import atomic_write
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.runs import Run
 from shellgs_method.compare.tables import FiguresTable
 from shellgs_method.evaluation.colours import GREY, normal_colours
 from shellgs_method.evaluation.figures import MAX_ERROR
+from shellgs_method.html import data_uri, encoded
 
 _PAGE = """<!doctype html>
 <meta charset="utf-8">
@@ -79,7 +77,7 @@ def write_report(
     parts = [f"<p>Failed: {html.escape(run)}</p><pre>{html.escape(why)}</pre>" for run, why in failures.items()]
     parts += [f'<div class="scroll">{table.html}</div>' for table in tables]
     parts += [
-        f'<figure><img alt="" src="{_data_uri(file.read_bytes(), "png")}">'
+        f'<figure><img alt="" src="{data_uri(file.read_bytes())}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
         for caption, file in figures.items()
     ]
@@ -121,17 +119,7 @@ def _pictures(
     colours = colormaps["inferno"](np.clip(error[..., 0].astype(float) / MAX_ERROR, 0, 1))[..., :3]
     errors = np.where(mask, np.rint(255 * colours), GREY).astype(np.uint8)
     pictures = {"picture": rgb, "normals": normal_colours(normal, mask[..., 0]), "error": errors}
-    return {kind: _jpeg(picture) for kind, picture in pictures.items()}
-
-
-def _jpeg(picture: UInt8[np.ndarray, "H W 3"]) -> str:
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, "jpeg", quality=88)
-    return _data_uri(file.getvalue(), "jpeg")
-
-
-def _data_uri(content: bytes, kind: str) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return {kind: data_uri(encoded(picture, "JPEG")) for kind, picture in pictures.items()}
 
 
 def _select(label: str, options: Mapping[str, str], chosen: str = "") -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from dataparsers.cue_maps import atomic_write
+from dataparsers.files import atomic_write
 from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.pictures import common_views, curves, strip, surfaces
 from shellgs_method.compare.report import write_report

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shlex
@@ -14,9 +13,10 @@ from typing import Literal
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 
-from dataparsers.cue_maps import CueMaps, atomic_write, content_hash
+from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, find_cues, read_views
+from dataparsers.files import atomic_write, content_hash, fingerprint
 from shellgs_method.ablations import ABLATIONS
 from shellgs_method.trainer import FacadeTrainerConfig
 
@@ -235,11 +235,11 @@ def _scene_settings(scene: Path, cues: set[str]) -> dict[str, str]:
     """Hashes of a scene's cameras and of what its maps were made from."""
     colmap = FacadeDataParserConfig(data=scene).setup().colmap_folder()
     cameras = [scene / "transforms.json"] if colmap is None else sorted((scene / colmap).glob("*.*"))
-    hashes = {"cameras": _hash(*(content_hash(path) for path in cameras))}
+    hashes = {"cameras": fingerprint(*(content_hash(path) for path in cameras))}
     for kind in find_cues(scene):
         if kind in cues:
             manifest = CueMaps.open(scene, kind).manifest
-            hashes[f"{kind} maps"] = _hash(manifest.sources, manifest.metres_per_unit, manifest.max_image_size)
+            hashes[f"{kind} maps"] = fingerprint(manifest.sources, manifest.metres_per_unit, manifest.max_image_size)
     return hashes
 
 
@@ -252,10 +252,6 @@ def _refuse_photographs_that_change(scene: Path, method: str) -> None:
             f"{method} takes photographs as they are, and the cameras of {scene} are of undistorted or resized ones: "
             "bring the scene to pinhole cameras at the size of its maps (colmap image_undistorter), or leave it out"
         )
-
-
-def _hash(*parts: object) -> str:
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def _short(value: object) -> str:

@@ -10,7 +10,7 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 
-from dataparsers.cue_maps import atomic_write
+from dataparsers.files import atomic_write
 from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.runs import HALVES, Half, Run
 from shellgs_method.evaluation.tables import (

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from dataparsers.cue_maps import CueMap, CueMaps, atomic_write
+from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write
 from dataparsers.photograph import View
 from dataparsers.sparse_points import SparsePoints
 from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_disparity

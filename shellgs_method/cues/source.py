@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dataparsers.cue_maps import content_hash
+from dataparsers.files import content_hash
 from dataparsers.photograph import View
 from shellgs_method.cues.normals import Convention
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dataparsers.files import atomic_write
 from shellgs_method.evaluation.colours import GREY, normal_colours
 
 MAX_ERROR = 45.0
@@ -51,6 +51,5 @@ def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR
     figure.colorbar(scale, ax=axes[2], extend="max", label="normal error (°)")
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    figure.savefig(temporary, format="png", dpi=150)
-    os.replace(temporary, path)
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", dpi=150)

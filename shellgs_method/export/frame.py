@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float64
 
 from dataparsers.camera import Camera
-from dataparsers.cue_maps import atomic_write
+from dataparsers.files import atomic_write
 from shellgs_method.shell import Alignment, ShellMesh
 
 UpAxis = Literal["y", "z"]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dataparsers.cue_maps import atomic_write
 from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write
 from shellgs_method.export.frame import Frame
 
 if TYPE_CHECKING:
@@ -30,12 +30,7 @@ def check_mesh_format(path: Path) -> None:
     if path.suffix.lower() not in MESH_FORMATS:
         raise SceneError(f"{path}: a mesh is written as one of {', '.join(MESH_FORMATS)}")
     if path.suffix.lower() in USD_FORMATS:
-        try:
-            import pxr  # noqa: F401  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise SceneError(
-                f"{path}: USD needs a library that is not installed: pip install 'shellgs[usd]'"
-            ) from error
+        _usd_modules(path)
 
 
 def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | None = None) -> None:
@@ -58,11 +53,11 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
     frame.describe(path, about | mesh.metadata | (facts or {}))
 
 
-def _usd_modules() -> tuple[Any, ...]:
+def _usd_modules(path: Path) -> tuple[Any, ...]:
     try:
         from pxr import Usd, UsdGeom, UsdPhysics, Vt
     except ImportError as error:
-        raise SceneError("USD needs a library that is not installed: pip install usd-core") from error
+        raise SceneError(f"{path}: USD needs a library that is not installed: pip install 'shellgs[usd]'") from error
     return Usd, UsdGeom, UsdPhysics, Vt
 
 
@@ -71,7 +66,7 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
 
     A convex hull, which engines take where nothing is said, would close the windows and doors.
     """
-    Usd, UsdGeom, UsdPhysics, Vt = _usd_modules()
+    Usd, UsdGeom, UsdPhysics, Vt = _usd_modules(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         stage = Usd.Stage.CreateNew(str(temporary))

@@ -23,8 +23,8 @@ from shellgs_method.export.frame import Box, Frame, UpAxis, scene_frame, shell_f
 from shellgs_method.export.splats import Splats
 from shellgs_method.export.tsdf import DepthView
 from shellgs_method.model import FacadeModel, reference_errors
-from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, load_shell
-from shellgs_method.shell.raycast import import_open3d
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface, load_shell
+from shellgs_method.shell.similarity import transformed
 
 if TYPE_CHECKING:
     import trimesh
@@ -112,7 +112,7 @@ class TrainedRun:
             return Box.around(self.shell_in_frame.vertices, margin)
         assert self.model.seed_points is not None
         to_frame = np.linalg.inv(self.frame.to_scene) @ self.model_to_scene
-        points = _apply(to_frame, self.model.seed_points[0].double().cpu().numpy())
+        points = transformed(self.model.seed_points[0].double().cpu().numpy(), to_frame)
         box = Box.around(points, 0.0, SCENE_TRIM)
         widened = SCENE_MARGIN * box.size
         return replace(box, low=box.low - widened, high=box.high + widened)
@@ -161,12 +161,6 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
 
 def _area_near(mesh: trimesh.Trimesh, shell: ShellMesh) -> float:
     """Share of a mesh's area whose triangles' centres are near a shell in the same frame."""
-    o3d = import_open3d()
-    scene, tensor = o3d.t.geometry.RaycastingScene(), o3d.core.Tensor
-    scene.add_triangles(tensor(shell.vertices.astype(np.float32)), tensor(shell.faces.astype(np.uint32)))
-    distance = scene.compute_distance(tensor(mesh.triangles_center.astype(np.float32))).numpy()
+    surface = ShellSurface(shell)
+    distance = surface.distance(transformed(mesh.triangles_center, surface.survey_from_shell))
     return float(np.average(distance < NEAR, weights=mesh.area_faces))
-
-
-def _apply(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]

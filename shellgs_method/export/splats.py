@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dataparsers.cue_maps import atomic_write
+from dataparsers.files import atomic_write
 from shellgs_method.rasterizer import spherical_harmonics
 
 

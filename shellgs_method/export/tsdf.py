@@ -13,7 +13,7 @@ from torch import Tensor
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.export.frame import Box
-from shellgs_method.shell.raycast import import_open3d
+from shellgs_method.open3d import import_open3d
 
 if TYPE_CHECKING:
     import trimesh

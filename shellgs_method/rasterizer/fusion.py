@@ -49,7 +49,6 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor]) -> Any:
         return kernel(*args)
     # To dynamo the shape of a parameter is constant, but densification changes it; a view of it is any tensor.
     args = tuple(arg.view_as(arg) if isinstance(arg, torch.nn.Parameter) else arg for arg in args)
-    tensors = _flatten(args)
     with_grad = torch.is_grad_enabled()
     key = tuple((tensor.shape[0] > 1, with_grad and tensor.requires_grad) for tensor in tensors)
     try:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dataparsers.camera import positions, upwards
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.bays import facade_axes
@@ -17,7 +18,6 @@ from shellgs_method.shell.picks import PickedPoint, align_picks, measured_again,
 from shellgs_method.shell.proposal import propose
 from shellgs_method.shell.refinement import refine
 from shellgs_method.shell.report import write_report
-from shellgs_method.shell.support import positions, upwards
 from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.shell.validation import Validation, validate
 
@@ -73,7 +73,8 @@ def place_by_guess(
     """
     surface = ShellSurface(mesh, metres_per_shell_unit)
     up = np.array([0.0, 1.0, 0.0] if shell.lower().endswith((".glb", ".gltf")) else [0.0, 0.0, 1.0])
-    best, *rivals = propose(surface, points.positions, positions(views), upwards(views), up)
+    cameras = [view.camera for view in views]
+    best, *rivals = propose(surface, points.positions, positions(cameras), upwards(cameras), up)
     history = ["Proposed by the program from the outline of the main wall; nobody has confirmed it."]
     history += [
         f"Ambiguous: a place {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
@@ -95,7 +96,7 @@ def refined(
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
     result = refine(surface, points.positions, start, reach)
-    up = start[:3, :3] @ upwards(views)
+    up = start[:3, :3] @ upwards(view.camera for view in views)
     axes = facade_axes(surface.samples(5000)[1], up / np.linalg.norm(up))
     sentence = f"Refined against {result.evidence.points} SfM points, which moved them by {result.moved:.3f} m."
     if words := result.evidence.in_words(axes):

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from dataparsers.cue_maps import atomic_write
 from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write
+from shellgs_method.shell.similarity import transformed
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,7 @@ class Alignment:
 
     def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the shell in the scene's frame, in double precision."""
-        points = np.asarray(points, dtype=np.float64)
-        return points @ self.shell_to_scene[:3, :3].T + self.shell_to_scene[:3, 3]
+        return transformed(np.asarray(points, dtype=np.float64), self.shell_to_scene)
 
     def save(self, path: Path) -> None:
         """Write the alignment as json."""

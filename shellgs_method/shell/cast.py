@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from dataparsers.camera import Camera
+from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask
@@ -20,6 +20,7 @@ from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing
 from shellgs_method.shell.mesh import load_shell
 from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.similarity import transformed
 
 log = logging.getLogger(__name__)
 
@@ -79,11 +80,11 @@ def cast_views(
     """
     start = time.monotonic()
     shell = scene / alignment.shell
-    positions = np.array([view.camera.position.detach().cpu().double().numpy() for view in views]).reshape(-1, 3)
-    viewpoints = (positions - alignment.shell_to_scene[:3, 3]) @ np.linalg.inv(alignment.shell_to_scene[:3, :3]).T
+    cameras = [view.camera for view in views]
+    viewpoints = transformed(positions(cameras), np.linalg.inv(alignment.shell_to_scene))
     mesh = load_shell(shell, cache=scene / "shell", viewpoints=viewpoints, mesher=mesher)
     caster = ShellCaster(mesh, alignment.shell_to_scene)
-    _check_placement(caster, [view.camera for view in views], shell)
+    _check_placement(caster, cameras, shell)
     kept = scene / ALIGNMENT
     if not kept.is_file() or not Alignment.load(kept).places_like(alignment):  # else it keeps its verdict
         alignment.save(kept)
@@ -141,11 +142,11 @@ def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path
     """Refuse a shell that no camera sees, and warn of one whose size is out of all proportion to the camera path."""
     if not cameras:
         raise SceneError("there are no views to cast the shell into")
-    positions = np.stack([camera.position.detach().cpu().double().numpy() for camera in cameras])
-    span = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    path = positions(cameras)
+    span = float(np.linalg.norm(np.ptp(path, axis=0)))
     depth = _median_depth(caster, cameras)
     if depth is None:
-        distance = np.linalg.norm(positions - caster.origin, axis=1).min()
+        distance = np.linalg.norm(path - caster.origin, axis=1).min()
         raise SceneError(
             f"no camera sees the shell {shell}: it is {caster.extent:.3g} scene units wide and its centre is "
             f"{distance:.3g} from the nearest camera, while the cameras span {span:.3g}; check the alignment and the "

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from dataparsers.errors import SceneError
-from shellgs_method.shell._open3d import import_open3d
+from shellgs_method.open3d import import_open3d
 
 log = logging.getLogger(__name__)
 

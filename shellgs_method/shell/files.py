@@ -81,7 +81,7 @@ def _read_mesh(path: Path) -> Geometry:
 
 
 def _read_pcd(path: Path) -> Geometry:
-    from shellgs_method.shell._open3d import import_open3d
+    from shellgs_method.open3d import import_open3d
 
     cloud = import_open3d().t.io.read_point_cloud(str(path))
     if "positions" not in cloud.point:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from dataparsers.cue_maps import atomic_write, content_hash
 from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write, content_hash
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.files import read_geometry
 

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float64
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, to_camera
 from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.surface import fit_similarity, transformed
+from shellgs_method.shell.similarity import fit_similarity, transformed
 
 MAX_ERROR = 0.15
 """Metres between a pick on the shell and the triangulated one from which the pick counts as a mistake: five times

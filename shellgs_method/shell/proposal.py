@@ -18,9 +18,10 @@ from scipy.signal import fftconvolve
 from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
-from shellgs_method.shell.raycast import import_open3d
+from shellgs_method.open3d import import_open3d
 from shellgs_method.shell.refinement import refine
-from shellgs_method.shell.surface import ShellSurface, transformed
+from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.surface import ShellSurface
 
 AMBIGUOUS = 0.90
 """Share of the best score from which another place is named beside it."""

@@ -7,8 +7,9 @@ from jaxtyping import Float16, Float32, Float64
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
-from shellgs_method.shell._open3d import import_open3d
+from shellgs_method.open3d import import_open3d
 from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.similarity import transformed
 
 
 class ShellCaster:
@@ -29,7 +30,7 @@ class ShellCaster:
 
     def __init__(self, mesh: ShellMesh, shell_to_scene: Float64[np.ndarray, "4 4"]) -> None:
         self._o3d = import_open3d()
-        placed = mesh.vertices @ shell_to_scene[:3, :3].T + shell_to_scene[:3, 3]
+        placed = transformed(mesh.vertices, shell_to_scene)
         # Embree computes in float32, whose steps are 3 cm at 4e5: everything it sees is relative to the shell's centre.
         self.origin = (placed.min(0) + placed.max(0)) / 2
         self.extent = float(np.ptp(placed, axis=0).max())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,12 +10,13 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool
 from matplotlib.figure import Figure
-from PIL import Image
 
-from dataparsers.cue_maps import CueMap, atomic_write
+from dataparsers.cue_maps import CueMap
+from dataparsers.files import atomic_write
 from dataparsers.photograph import load_photograph
+from shellgs_method.html import data_uri, encoded
 from shellgs_method.shell.bays import RIVALRY
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
@@ -101,10 +101,10 @@ def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator
         composite = photograph.copy()
         composite[edges] = _EDGE
         name = f"view_{number}_{Path(view.name).stem}.png"
-        _write(folder / name, _encoded(composite))
+        _write(folder / name, encoded(composite))
         lines = np.zeros((*edges.shape, 4), np.uint8)
         lines[edges] = (*_EDGE, 255)
-        layers = _img(_encoded(photograph, "JPEG"), view.name) + _img(_encoded(lines), "the shell's edges")
+        layers = _img(encoded(photograph, "JPEG"), view.name) + _img(encoded(lines), "the shell's edges")
         caption = f"{escape(view.name)} <small>{support.supported:.0%} on the shell</small>"
         yield f"<figure><div>{layers}</div><figcaption>{caption}</figcaption></figure>"
 
@@ -213,15 +213,8 @@ def _png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _encoded(picture: UInt8[np.ndarray, "H W C"], form: str = "PNG") -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, form, quality=85)
-    return buffer.getvalue()
-
-
 def _img(data: bytes, text: str) -> str:
-    kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
-    return f'<img alt="{escape(text)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
+    return f'<img alt="{escape(text)}" src="{data_uri(data)}">'
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from dataparsers.photograph import View
 from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.surface import transformed
+from shellgs_method.shell.similarity import transformed
 
 if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints
@@ -60,17 +60,6 @@ class ViewSupport:
         """Where along an axis the part of the shell that it sees begins and ends, in metres."""
         along = self.hits @ axis
         return float(along.min()), float(along.max())
-
-
-def positions(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
-    """Where the cameras stand, in the scene's frame."""
-    return np.stack([view.camera.position.cpu().double().numpy() for view in views])
-
-
-def upwards(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
-    """Unit vector up in the scene's frame, as the cameras are held; tilted where they look up or down."""
-    up = -np.mean([view.camera.viewmat[1, :3].cpu().double().numpy() for view in views], axis=0)
-    return up / np.linalg.norm(up)
 
 
 def look(

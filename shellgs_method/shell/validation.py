@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import KDTree
 
+from dataparsers.camera import positions, upwards
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
@@ -21,8 +22,9 @@ from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.picks import PickedPoint
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.refinement import Refinement, refine
-from shellgs_method.shell.support import NEAR, OCCLUDING, ViewSupport, look, positions, upwards
-from shellgs_method.shell.surface import ShellSurface, transformed
+from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.support import NEAR, OCCLUDING, ViewSupport, look
+from shellgs_method.shell.surface import ShellSurface
 
 if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints
@@ -171,7 +173,7 @@ def validate(
     size = _check(key, distance, "Distance from cameras to shell, median (units)", "{:.3g} m")
     if size.verdict == "refused":
         return Validation(alignment, [sight, size], supports)
-    cameras = transformed(positions(views), survey_from_scene)
+    cameras = transformed(positions(view.camera for view in views), survey_from_scene)
     axes = _axes(seeing, survey_from_scene)
     placed = transformed(points.positions, survey_from_scene)
     signed = _signed_distances(surface, placed, cameras)
@@ -221,7 +223,7 @@ def _check(key: str, value: float, name: str, form: str) -> Check:
 
 def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.ndarray:
     """Right, up and out of the facade that the views see most of."""
-    up = survey_from_scene[:3, :3] @ upwards([support.view for support in seeing])
+    up = survey_from_scene[:3, :3] @ upwards(support.view.camera for support in seeing)
     normals = np.concatenate([support.normals for support in seeing])
     return facade_axes(normals, up / np.linalg.norm(up))
 

@@ -16,9 +16,9 @@ from scipy.ndimage import binary_dilation
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
+from shellgs_method.open3d import import_open3d
 from shellgs_method.shell import ALIGNMENT, MASKS, Alignment
-from shellgs_method.shell.raycast import import_open3d
-from shellgs_method.shell.surface import transformed
+from shellgs_method.shell.similarity import transformed
 from shellgs_method.synthetic.appearance import Daylight, photograph, rays
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.frames import (

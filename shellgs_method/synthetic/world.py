@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from shellgs_method.shell.raycast import import_open3d
+from shellgs_method.open3d import import_open3d
 from shellgs_method.synthetic.geometry import Mesh
 
 

@@ -1,0 +1,25 @@
+"""Similarities as 4x4 matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+
+
+def transformed(
+    points: Float64[np.ndarray, "*N 3"], similarity: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "*N 3"]:
+    """The points after the similarity."""
+    return points @ similarity[:3, :3].T + similarity[:3, 3]
+
+
+def fit_similarity(source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"]) -> np.ndarray:
+    """Least-squares similarity that carries points onto others (Umeyama 1991), as a 4x4 matrix."""
+    centre, goal = source.mean(0), target.mean(0)
+    source, target = source - centre, target - goal
+    u, s, vt = np.linalg.svd(target.T @ source)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    matrix = np.eye(4)
+    matrix[:3, :3] = (s @ signs) / (source**2).sum() * (u * signs) @ vt
+    matrix[:3, 3] = goal - matrix[:3, :3] @ centre
+    return matrix
