@@ -94,10 +94,7 @@ class Daylight:
         )
 
     def _room(self, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
-        """A dark room whose curtains and blind hang a hand behind the pane; no two windows are furnished alike.
-
-        Windows that match in every pixel would lead structure from motion astray by whole bays.
-        """
+        """A dark room whose curtains and blind hang a hand behind the pane, each window's its own."""
         bay, storey = points[:, 0] / BAY, points[:, 2] / STOREY
         chance = partial(self._chance, bay, storey)
         hung = points + 0.3 * towards / np.maximum(towards[:, 1:2], 0.2)
@@ -207,6 +204,13 @@ def _leaf(points: np.ndarray, noise: Noise) -> np.ndarray:
     return _tinted((0.16, 0.27, 0.08), 1 + 0.5 * noise(points[:, 0] + points[:, 1], points[:, 2], 0.2))
 
 
+def _flowers(points: np.ndarray, noise: Noise) -> np.ndarray:
+    along, z = points[:, 0] + points[:, 1], points[:, 2]
+    petals = noise(along, z, 0.05) > 0.25
+    colours = np.where(noise(along, z, 0.6)[:, None] > 0, (0.55, 0.08, 0.12), (0.65, 0.55, 0.60))
+    return np.where(petals[:, None], colours, _leaf(points, noise))
+
+
 def _house(points: np.ndarray, noise: Noise) -> np.ndarray:
     x, z = points[:, 0], points[:, 2]
     number = np.floor(x / HOUSE).astype(int)
@@ -236,6 +240,7 @@ _ALBEDO: dict[Material, Callable[[np.ndarray, Noise], np.ndarray]] = {
     Material.GLASS: _plain(0.05, 0.06, 0.07),
     Material.FRAME: _plain(0.78, 0.78, 0.76),
     Material.RAILING: _plain(0.05, 0.05, 0.06),
+    Material.FLOWERS: _flowers,
     Material.GROUND: _ground,
     Material.POLE: _plain(0.20, 0.24, 0.22),
     Material.TRUNK: _plain(0.20, 0.15, 0.10),

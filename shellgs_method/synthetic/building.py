@@ -148,6 +148,7 @@ def _detail(layout: Layout) -> Iterator[Mesh]:
             yield box(*sill, Material.SLAB)
         if opening.z0 > STOREY:
             yield from _railing(opening)
+            yield from _planter(opening)
     half, depth = _COLUMN
     for x in layout.columns:
         for z0, z1 in ((0.0, 0.5), (layout.height - 0.75, layout.height - 0.25)):
@@ -160,7 +161,7 @@ def _detail(layout: Layout) -> Iterator[Mesh]:
 def _frame(o: Opening) -> Iterator[Mesh]:
     """Outer frame, mullion and transom."""
     bar, front, back = 0.07, RECESS - 0.07, RECESS + 0.01
-    transom = o.z0 + 0.72 * (o.z1 - o.z0)
+    transom = o.z0 + _chance(o, "transom").uniform(0.6, 0.8) * (o.z1 - o.z0)
     for x in (o.x0, o.centre - bar / 2, o.x1 - bar):
         yield box((x, front, o.z0), (x + bar, back, o.z1), Material.FRAME)
     for z in (o.z0, transom, o.z1 - bar):
@@ -172,5 +173,19 @@ def _railing(o: Opening) -> Iterator[Mesh]:
     y, bar = -0.12, 0.025
     for z in (o.z0 + 0.06, o.z0 + 0.9):
         yield box((o.x0 - 0.05, y, z), (o.x1 + 0.05, y + 0.04, z + 0.04), Material.RAILING)
-    for x in np.linspace(o.x0, o.x1 - bar, 13):
+    for x in np.linspace(o.x0, o.x1 - bar, _chance(o, "bars").integers(8, 15)):
         yield box((x, y, o.z0 + 0.06), (x + bar, y + bar, o.z0 + 0.9), Material.RAILING)
+
+
+def _planter(o: Opening) -> Iterator[Mesh]:
+    """A box of flowers on the railing, at some windows."""
+    chance = _chance(o, "planter")
+    if chance.random() < 0.7:
+        width, height, z = chance.uniform(0.4, 1.0), chance.uniform(0.2, 0.4), o.z0 + chance.choice([0.1, 0.7])
+        x = chance.uniform(o.x0, o.x1 - width)
+        yield box((x, -0.26, z), (x + width, -0.12, z + height), Material.FLOWERS)
+
+
+def _chance(o: Opening, what: str) -> np.random.Generator:
+    """Each window's own source of chance: those that match in every pixel lead structure from motion astray."""
+    return np.random.default_rng([round(100 * o.x0), round(100 * o.z0), *what.encode()])

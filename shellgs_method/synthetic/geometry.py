@@ -20,13 +20,14 @@ class Material(IntEnum):
     DOOR = 3
     GLASS = 4
     FRAME = 5
-    RAILING = 6
-    GROUND = 7
-    POLE = 8
-    TRUNK = 9
-    LEAF = 10
-    HOUSE = 11
-    CAR = 12
+    FLOWERS = 6
+    RAILING = 7
+    GROUND = 8
+    POLE = 9
+    TRUNK = 10
+    LEAF = 11
+    HOUSE = 12
+    CAR = 13
 
 
 @dataclass(frozen=True)
