@@ -193,7 +193,7 @@ def fake_commands(tmp_path, monkeypatch) -> None:
 
 def finish_all(runs: list[Run], jobs: int = 1):
     console = Console(quiet=True)
-    return compare(runs, partial(launch_locally, jobs=jobs, console=console), runs[0].output, console)
+    return compare(runs, partial(launch_locally, jobs=jobs, console=console), runs[0].output, console).failures
 
 
 @pytest.mark.usefixtures("fake_commands")
