@@ -355,6 +355,7 @@ def compare(
     launcher: Literal["local", "ray"] = "local",
     jobs: int = 1,
     address: Optional[str] = None,
+    wandb: Optional[str] = None,
 ) -> None:
     """Train and evaluate methods on scenes; end with the paper's tables, its figures, and a report to look at.
 
@@ -371,13 +372,17 @@ def compare(
         launcher: local: on this machine; ray: on a Ray cluster.
         jobs: Runs at once, with the local launcher.
         address: Of a running Ray cluster, say auto. If not set: one is started on this machine.
+        wandb: Project of Weights & Biases that gets the tables and figures as a run. If not set: none.
     """
     from functools import partial
 
     from shellgs_method.compare.launch import launch_locally
     from shellgs_method.compare.results import compare as compare_runs
     from shellgs_method.compare.runs import grid
+    from shellgs_method.compare.wandb_report import log_comparison, log_in
 
+    if wandb:
+        log_in()
     runs = grid(scenes, methods, seeds, iterations, output, curve_points)
     if launcher == "ray":
         from shellgs_method.compare.cluster import launch_on_ray
@@ -385,9 +390,11 @@ def compare(
         launch = partial(launch_on_ray, address=address, console=console)
     else:
         launch = partial(launch_locally, jobs=jobs, console=console)
-    failures = compare_runs(runs, launch, output, console)
+    comparison = compare_runs(runs, launch, output, console)
     console.print(f"Tables: {output / 'results.md'}, {output / 'tables'}. Report: {output / 'report.html'}.")
-    if failures:
+    if wandb:
+        log_comparison(wandb, comparison, runs)
+    if failures := comparison.failures:
         sys.exit(f"shellgs: {len(failures)} of {len(runs)} runs failed: {', '.join(run.label for run in failures)}")
 
 

@@ -29,7 +29,7 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
     runs = grid([scene], METHODS, [0], iterations, folder)
-    if compare(runs, partial(launch_locally, jobs=1, console=console), folder, console):
+    if compare(runs, partial(launch_locally, jobs=1, console=console), folder, console).failures:
         raise SystemExit("shellgs: a run of the demo failed; its last lines are above.")
     console.print(
         f"Pictures: {folder / 'strip.png'}, {scene / 'cues/shell/panel.png'}. Tables: {folder / 'results.md'}. "

@@ -33,6 +33,7 @@ from shellgs_method.evaluation import (
     Rendering,
     colours_to_normals,
     geometry_errors,
+    geometry_pictures,
     image_errors,
     normals_to_colours,
 )
@@ -328,10 +329,12 @@ class FacadeModel(SplatfactoModel):
         figures = image_errors(rendering.rgb, target)
         figures |= reference_errors(rendering, camera, batch, self.metres_per_unit)
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}
+        if "shell_depth" not in batch:
+            images |= geometry_pictures(rendering)
         for kind, prefix in REFERENCES.items():
             if f"{kind}_depth" in batch:
-                expected = normals_to_colours(reference_maps(batch, kind, self.device).normal)
-                images[f"{prefix}normal"] = torch.cat([expected, outputs["normal"]], dim=1)
+                pictures = geometry_pictures(rendering, reference_maps(batch, kind, self.device))
+                images |= {prefix + name: picture for name, picture in pictures.items()}
         return figures, images
 
 

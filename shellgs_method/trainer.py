@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,6 +24,25 @@ from dataparsers.errors import SceneError, refusals_end_the_program
 # (https://github.com/nerfstudio-project/nerfstudio/issues/3683). Ours writes float; this lets older files load.
 _REBUILD_SCALAR: Any = np.float64(0).__reduce__()[0]
 torch.serialization.add_safe_globals([_REBUILD_SCALAR, np.dtype, type(np.dtype(np.float64))])
+
+
+@contextmanager
+def wandb_refusals() -> Iterator[None]:
+    """Turn what wandb cannot do here (no key, no network) into one sentence.
+
+    Raises:
+        SceneError: with that sentence.
+    """
+    try:
+        from wandb.errors import Error  # slow to import
+    except ImportError as error:
+        raise SceneError(f"wandb cannot be imported ({error}): pip install wandb") from error
+    try:
+        yield
+    except Error as error:
+        raise SceneError(
+            f"wandb says: {error} To log without an account or a network, set WANDB_MODE=offline"
+        ) from error
 
 
 @dataclass
@@ -61,6 +82,11 @@ class FacadeTrainer(Trainer):
     """
 
     config: FacadeTrainerConfig
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Everything that training needs."""
+        with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
+            super().setup(test_mode)
 
     def setup_optimizers(self) -> Optimizers:
         """Optimizers whose learning rates decay over the run."""

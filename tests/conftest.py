@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -46,3 +47,14 @@ def compiler(monkeypatch) -> None:
 def eager(monkeypatch) -> None:
     """Tests pay for compilation only where it matters."""
     monkeypatch.setenv("SHELLGS_COMPILE", "0")
+
+
+@pytest.fixture
+def offline_wandb(monkeypatch) -> Iterator[None]:
+    """Weights & Biases without an account, a network or words on the terminal."""
+    for name, value in {"MODE": "offline", "SILENT": "true", "CONSOLE": "off"}.items():
+        monkeypatch.setenv(f"WANDB_{name}", value)
+    import wandb  # slow
+
+    yield
+    wandb.finish()

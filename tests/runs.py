@@ -9,6 +9,7 @@ from typing import Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils import writer
 from torch import Tensor
 
 import method_configs
@@ -36,6 +37,8 @@ def trainer_of(
     config.logging.local_writer.enable = False
     change(config)
     torch.manual_seed(0)
+    for leftovers in (writer.EVENT_WRITERS, writer.EVENT_STORAGE):  # of other runs: a process of ns-train has one
+        leftovers.clear()
     trainer = config.setup()
     trainer.setup()
     return trainer

@@ -27,9 +27,10 @@ from shellgs_method.compare import launch
 from shellgs_method.compare.launch import launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, write_figures
 from shellgs_method.compare.pictures import recorded_figures
-from shellgs_method.compare.results import compare, write_results
+from shellgs_method.compare.results import Comparison, compare, write_results
 from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
+from shellgs_method.compare.wandb_report import log_comparison
 from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
 from shellgs_method.pipeline import FacadePipeline
 
@@ -146,6 +147,25 @@ def test_a_name_that_leaves_its_folder_is_refused(pristine_scene, tmp_path):
         fake_grid([pristine_scene], ["../mine=shellgs"], tmp_path)
 
 
+@pytest.mark.usefixtures("offline_wandb")
+def test_wandb_gets_each_table_with_mean_and_deviation_and_each_figure(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["photo-gs", "shellgs"], tmp_path / "comparison", seeds=(0, 1))
+    for run in runs:
+        fabricate(run, psnr=20.0 + 2 * run.seed, chamfer_m=0.1)
+    picture = tmp_path / "strip.png"
+    Image.new("RGB", (4, 3)).save(picture)
+    log_comparison("facades", Comparison(list(tables(runs)), {"a caption": picture}, {}), runs)
+    (files,) = (tmp_path / "comparison" / "wandb").glob("offline-run-*/files/media")
+    (main,) = files.glob("table/tables/main_*.json")
+    table = json.loads(main.read_text())
+    rows = [dict(zip(table["columns"], row, strict=True)) for row in table["data"]]
+    assert [row["method"] for row in rows] == ["photo-gs", "shellgs"]
+    assert (rows[0]["psnr"], rows[0]["psnr_std"], rows[0]["seeds"]) == (21.0, pytest.approx(2**0.5), 2)
+    assert rows[0]["ssim"] is None
+    assert len(list(files.glob("table/tables/surface_*.json"))) == 1
+    assert len(list(files.glob("images/figures/strip_*.png"))) == 1
+
+
 # runs are kept
 
 FAKE_TRAIN = """
@@ -193,7 +213,7 @@ def fake_commands(tmp_path, monkeypatch) -> None:
 
 def finish_all(runs: list[Run], jobs: int = 1):
     console = Console(quiet=True)
-    return compare(runs, partial(launch_locally, jobs=jobs, console=console), runs[0].output, console)
+    return compare(runs, partial(launch_locally, jobs=jobs, console=console), runs[0].output, console).failures
 
 
 @pytest.mark.usefixtures("fake_commands")

@@ -24,6 +24,7 @@ from shellgs_method.evaluation import (
     compare_surfaces,
     depth_mae,
     evaluate_view,
+    geometry_pictures,
     image,
     image_errors,
     mean_over_views,
@@ -378,3 +379,31 @@ def test_strip_is_written_whole_and_grey_outside_the_mask(tmp_path):
     grey = (picture == GREY).all(axis=-1)
     # Two of three rows of the panels, which fill most of the picture.
     assert grey.mean() > 0.2
+
+
+def test_error_picture_is_black_where_exact_yellow_where_nothing_is_rendered_and_grey_off_the_reference():
+    rendering, _, reference = seen()
+    alpha, mask = rendering.alpha.clone(), EVERYWHERE.clone()
+    alpha[:10], mask[-10:] = 0.2, False
+    error = geometry_pictures(rendering._replace(alpha=alpha), reference._replace(mask=mask))["normal_error"]
+    rows = [(255 * error[row]).round().unique(dim=0).tolist() for row in (5, 20, HEIGHT - 5)]
+    assert rows == [[[252, 255, 164]], [[0, 0, 4]], [[GREY] * 3]]  # both ends of inferno, and grey
+
+
+def test_depth_and_normal_pictures_put_a_perfect_rendering_beside_the_same():
+    rendering, _, reference = seen()
+    pictures = geometry_pictures(rendering, reference)
+    for name in ("depth", "normal"):
+        assert pictures[name].shape == (HEIGHT, 2 * WIDTH, 3)
+        assert torch.equal(pictures[name][:, :WIDTH], pictures[name][:, WIDTH:])
+
+
+def test_pictures_stay_in_range_for_normals_that_half_precision_made_longer_than_one():
+    rendering, _, reference = seen((0, 0, -1))
+    pictures = geometry_pictures(rendering, reference._replace(normal=1.001 * reference.normal))
+    assert all(picture.min() >= 0 and picture.max() <= 1 for picture in pictures.values())
+
+
+def test_a_view_without_reference_has_pictures_of_what_was_rendered_alone():
+    shapes = {name: tuple(picture.shape) for name, picture in geometry_pictures(seen()[0]).items()}
+    assert shapes == {"depth": (HEIGHT, WIDTH, 3), "normal": (HEIGHT, WIDTH, 3)}

@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib import colormaps
 
 from dataparsers.files import atomic_write
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.runs import Run
 from shellgs_method.compare.tables import FiguresTable
-from shellgs_method.evaluation.colours import GREY, normal_colours
-from shellgs_method.evaluation.figures import MAX_ERROR
+from shellgs_method.evaluation.colours import error_colours, normal_colours
 from shellgs_method.html import data_uri, encoded
 
 _PAGE = """<!doctype html>
@@ -116,9 +114,8 @@ def _slider(scene: str, runs: Sequence[Run]) -> str:
 def _pictures(
     rgb: UInt8[np.ndarray, "H W 3"], normal: np.ndarray, error: np.ndarray, mask: np.ndarray
 ) -> dict[str, str]:
-    colours = colormaps["inferno"](np.clip(error[..., 0].astype(float) / MAX_ERROR, 0, 1))[..., :3]
-    errors = np.where(mask, np.rint(255 * colours), GREY).astype(np.uint8)
-    pictures = {"picture": rgb, "normals": normal_colours(normal, mask[..., 0]), "error": errors}
+    mask = mask[..., 0]
+    pictures = {"picture": rgb, "normals": normal_colours(normal, mask), "error": error_colours(error[..., 0], mask)}
     return {kind: data_uri(encoded(picture, "JPEG")) for kind, picture in pictures.items()}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
@@ -20,8 +21,18 @@ Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finishes runs; returns those that failed, with the reason."""
 
 
-def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Console) -> Mapping[Run, str]:
-    """Finish the runs that are not, write all results, and show the tables; the runs that failed, with the reason.
+class Comparison(NamedTuple):
+    """What came of a grid of runs."""
+
+    tables: Sequence[FiguresTable]
+    figures: Mapping[str, Path]
+    """Captions and PNG files."""
+    failures: Mapping[Run, str]
+    """Runs that failed, with the reason."""
+
+
+def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Console) -> Comparison:
+    """Finish the runs that are not, write all results, and show the tables.
 
     Raises:
         SceneError: a run was made with other settings. Nothing is started then.
@@ -31,15 +42,16 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
     unfinished = [run for run in runs if not run.finished]
     console.print(f"{len(runs) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
     failures = launch(unfinished) if unfinished else {}
-    for table in write_results(runs, output, {run.label: why for run, why in failures.items()}):
+    comparison = write_results(runs, output, failures)
+    for table in comparison.tables:
         console.print(rich_table(table.rows, table.columns, table.title))
     for run, why in failures.items():
         console.print(f"[red]{run.label} failed.[/red] {run.folder / 'log.txt'} has all of its output.")
         console.print(why, markup=False, highlight=False)
-    return failures
+    return comparison
 
 
-def write_results(runs: Sequence[Run], output: Path, failures: Mapping[str, str]) -> list[FiguresTable]:
+def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]) -> Comparison:
     """Write results.md, tables/, the pictures and report.html of what is measured so far."""
     made = list(tables(runs))
     for table in made:
@@ -53,8 +65,8 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[str, str]
         of_scene = [run for run in runs if run.scene == scene]
         shown[scene.name] = _shown(of_scene)
         figures |= _figures(of_scene, shown[scene.name], output, suffix)
-    write_report(output / "report.html", made, figures, shown, failures)
-    return made
+    write_report(output / "report.html", made, figures, shown, {run.label: why for run, why in failures.items()})
+    return Comparison(made, figures, failures)
 
 
 def _shown(runs: Sequence[Run]) -> list[Run]:

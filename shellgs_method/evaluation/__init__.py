@@ -7,6 +7,7 @@ from shellgs_method.evaluation.colours import colours_to_normals, normal_colours
 from shellgs_method.evaluation.geometry import NormalErrors, angular_error, depth_mae, normal_errors
 from shellgs_method.evaluation.image import image_errors, lpips_network
 from shellgs_method.evaluation.normals import normals_from_depth
+from shellgs_method.evaluation.pictures import geometry_pictures
 from shellgs_method.evaluation.surface import SurfaceComparison, back_project, compare_surfaces, voxel_means
 from shellgs_method.evaluation.view import Reference, Rendering, evaluate_view, geometry_errors, mean_over_views
 
@@ -22,6 +23,7 @@ __all__ = [
     "depth_mae",
     "evaluate_view",
     "geometry_errors",
+    "geometry_pictures",
     "image_errors",
     "lpips_network",
     "mean_over_views",

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
+from matplotlib import colormaps
 from torch import Tensor
 
 GREY = 153  # where there is nothing to show
+MAX_ERROR = 45.0
+"""Angle in degrees from which errors have the last colour of the scale."""
 
 
 def normals_to_colours(normal: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
@@ -32,3 +35,24 @@ def normal_colours(
     if mask is not None:
         colours[~mask] = GREY
     return colours
+
+
+def error_colours(
+    error: Shaped[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"], max_error: float = MAX_ERROR
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Angles in degrees, black where exact and yellow from a limit on, in 8 bits; grey outside the mask."""
+    return _scale_colours("inferno", error.astype(float) / max_error, mask)
+
+
+def depth_colours(
+    depth: Shaped[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"], near: float, far: float
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Depths from near (dark) to far (light) in 8 bits; grey outside the mask."""
+    return _scale_colours("viridis", (depth.astype(float) - near) / max(far - near, 1e-6), mask)
+
+
+def _scale_colours(
+    name: str, share: Float[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    colours = np.rint(255 * colormaps[name](share.clip(0, 1))[..., :3])
+    return np.where(mask[..., None], colours, GREY).astype(np.uint8)

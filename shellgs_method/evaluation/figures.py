@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
@@ -15,10 +14,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dataparsers.files import atomic_write
-from shellgs_method.evaluation.colours import GREY, normal_colours
-
-MAX_ERROR = 45.0
-"""Angle in degrees from which errors have the last colour of the scale."""
+from shellgs_method.evaluation.colours import MAX_ERROR, error_colours, normal_colours
 
 
 class Panel(NamedTuple):
@@ -41,9 +37,9 @@ def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR
     axes = figure.subplots(3, len(panels), squeeze=False)
     scale = ScalarMappable(Normalize(0, max_error), colormaps["inferno"])
     for column, panel in zip(axes.T, panels, strict=True):
-        mask, normal = panel.mask.cpu().numpy(), panel.normal.detach().cpu().numpy()
-        error = np.where(mask, scale.to_rgba(panel.error.cpu().numpy()[..., 0])[..., :3], GREY / 255)
-        pictures = (panel.rgb.detach().clamp(0, 1).cpu().numpy(), normal_colours(normal, mask[..., 0]), error)
+        mask, normal = panel.mask[..., 0].cpu().numpy(), panel.normal.detach().cpu().numpy()
+        error = error_colours(panel.error[..., 0].cpu().numpy(), mask, max_error)
+        pictures = (panel.rgb.detach().clamp(0, 1).cpu().numpy(), normal_colours(normal, mask), error)
         for axis, picture in zip(column, pictures, strict=True):
             axis.imshow(picture)
             axis.set_axis_off()

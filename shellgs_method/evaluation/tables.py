@@ -96,16 +96,22 @@ def html_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None
 
 
 def csv_table(rows: Rows, columns: Sequence[Column]) -> str:
-    """All digits, for programs: mean and sample deviation of each column's figure, and the number of seeds."""
+    """All digits, for programs: the head and the lines of :func:`plain_table`."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["method", *(key for column in columns for key in (column.key, f"{column.key}_std")), "seeds"])
+    head, lines = plain_table(rows, columns)
+    csv.writer(text, lineterminator="\n").writerows([head, *lines])
+    return text.getvalue()
+
+
+def plain_table(rows: Rows, columns: Sequence[Column]) -> tuple[list[str], list[list[str | float | None]]]:
+    """Head and lines: mean and sample deviation of each column's figure (None: there is none), number of seeds."""
+    head = ["method", *(key for column in columns for key in (column.key, f"{column.key}_std")), "seeds"]
+    lines: list[list[str | float | None]] = []
     for method, figures in rows.items():
         samples = [figures.get(column.key, ()) for column in columns]
-        spread = [(_mean(values), _deviation(values)) for values in samples]
-        cells = ["" if value is None else value for pair in spread for value in pair]
-        writer.writerow([method, *cells, max((np.size(values) for values in samples), default=0)])
-    return text.getvalue()
+        spread = [statistic(values) for values in samples for statistic in (_mean, _deviation)]
+        lines.append([method, *spread, max((np.size(values) for values in samples), default=0)])
+    return head, lines
 
 
 def rich_table(rows: Rows, columns: Sequence[Column], title: str | None = None) -> Table:

@@ -1,0 +1,47 @@
+"""A comparison as one run of Weights & Biases."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from shellgs_method.compare.results import Comparison
+from shellgs_method.compare.runs import Run
+from shellgs_method.evaluation.tables import plain_table
+from shellgs_method.trainer import wandb_refusals
+
+
+def log_in() -> None:
+    """Make sure, before hours of training, that the comparison can be logged.
+
+    Raises:
+        SceneError: wandb has no key, and nobody can be asked for one.
+    """
+    with wandb_refusals():
+        import wandb  # slow to import
+
+        wandb.login()
+
+
+def log_comparison(project: str, comparison: Comparison, runs: Sequence[Run]) -> None:
+    """Log each table as a ``wandb.Table`` (a row a method; mean and deviation of each figure), and the pictures.
+
+    Args:
+        project: of wandb.
+        comparison: what is logged.
+        runs: what it compares. Their settings become the wandb run's config, their folder names it and gets its files.
+
+    Raises:
+        SceneError: wandb cannot be used.
+    """
+    with wandb_refusals():
+        import wandb
+
+        shown: dict[str, object] = {}
+        for table in comparison.tables:
+            head, lines = plain_table(table.rows, table.columns)
+            shown[f"tables/{table.name}"] = wandb.Table(columns=head, data=lines)
+        for caption, path in comparison.figures.items():
+            shown[f"figures/{path.stem}"] = wandb.Image(str(path), caption=caption)
+        folder, config = runs[0].output, {run.label: run.settings for run in runs}
+        with wandb.init(project=project, name=folder.name, job_type="compare", dir=folder, config=config) as logged:
+            logged.log(shown)
