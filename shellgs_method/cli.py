@@ -299,7 +299,7 @@ def mesh(
         output: The mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
         voxel: Size of a voxel in metres. If not set: a pixel's size on the facade.
         faces: Number of triangles that the mesh is thinned to.
-        margin: What is farther than this from the shell's box, in metres, is left out.
+        margin: What is farther than this from the shell, in metres, is left out.
         up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
@@ -309,7 +309,7 @@ def mesh(
     output = output or config.with_name("mesh.ply")
     check_mesh_format(output)
     run = TrainedRun.load(config, up)
-    made = decimate(fuse(run.views(), run.box(margin), voxel), faces)
+    made = decimate(run.facade(fuse(run.views(), run.box(margin), voxel), margin), faces)
     figures = mesh_errors(run, made)
     write_mesh(output, made, run.frame, figures)
     truth = {name.removeprefix("truth_"): value for name, value in figures.items() if name.startswith("truth_")}

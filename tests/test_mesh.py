@@ -214,6 +214,16 @@ def test_the_mesh_of_the_truth_is_near_truth_and_shell(run, facade):
     assert mesh_errors(run, both)["area_near_shell"] == pytest.approx(figures["area_near_shell"] / 2, abs=1e-3)
 
 
+def test_what_is_far_from_the_shell_is_no_part_of_the_facade(run, facade):
+    lifted = trimesh.Trimesh(np.add(facade.vertices, [0, 0, 30]), facade.faces, process=False)
+    both = trimesh.util.concatenate([facade, lifted])
+    kept = run.facade(both, 0.5)
+    assert len(kept.faces) == len(run.facade(facade, 0.5).faces) > 0.9 * len(facade.faces)
+    np.testing.assert_array_equal(kept.bounds, kept.bounds.clip(*facade.bounds))
+    with pytest.raises(SceneError, match=r"within 0\.5 m of the shell"):
+        run.facade(lifted, 0.5)
+
+
 def test_a_scene_without_alignment_is_meshed_in_its_own_frame(run, pristine_scene, monkeypatch):
     alone = TrainedRun(run.model, run.datamanager)
     monkeypatch.setitem(vars(alone), "shell", None)

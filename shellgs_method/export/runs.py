@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from nerfstudio.utils.eval_utils import eval_setup
 from rich.progress import track
 
@@ -117,6 +117,23 @@ class TrainedRun:
         widened = SCENE_MARGIN * box.size
         return replace(box, low=box.low - widened, high=box.high + widened)
 
+    def facade(self, mesh: trimesh.Trimesh, margin: float) -> trimesh.Trimesh:
+        """What of a mesh in the frame is within ``margin`` metres of the shell; all of it where there is none.
+
+        Views from one side leave flaps where a depth falls from the building's edge to what is behind it.
+
+        Raises:
+            SceneError: nothing is.
+        """
+        if self.shell is None:
+            return mesh
+        mesh = mesh.copy()
+        mesh.update_faces(_distances(mesh, self.shell_in_frame) < margin)
+        mesh.remove_unreferenced_vertices()
+        if len(mesh.faces) == 0:
+            raise SceneError(f"there is no mesh: nothing that is rendered is within {margin:g} m of the shell")
+        return mesh
+
     @torch.no_grad()
     def views(self) -> Iterator[DepthView]:
         """All views, rendered, in the frame: depth of what is at least half opaque and not masked out."""
@@ -155,12 +172,14 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
         rendering = Rendering(torch.zeros_like(normal), depth, mask.float(), normal)
         camera = view.camera.to(dtype=torch.float32)
         figures.append(reference_errors(rendering, camera, batch, metres_per_unit))
-    near = {} if run.shell is None else {"area_near_shell": _area_near(mesh, run.shell_in_frame)}
-    return mean_over_views(figures) | near
+    errors = mean_over_views(figures)
+    if run.shell is not None:
+        near = _distances(mesh, run.shell_in_frame) < NEAR
+        errors["area_near_shell"] = float(np.average(near, weights=mesh.area_faces))
+    return errors
 
 
-def _area_near(mesh: trimesh.Trimesh, shell: ShellMesh) -> float:
-    """Share of a mesh's area whose triangles' centres are near a shell in the same frame."""
+def _distances(mesh: trimesh.Trimesh, shell: ShellMesh) -> Float32[np.ndarray, " F"]:
+    """Metres from the centre of each of a mesh's triangles to a shell in the same frame."""
     surface = ShellSurface(shell)
-    distance = surface.distance(transformed(mesh.triangles_center, surface.survey_from_shell))
-    return float(np.average(distance < NEAR, weights=mesh.area_faces))
+    return surface.distance(transformed(mesh.triangles_center, surface.survey_from_shell))
