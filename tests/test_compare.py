@@ -400,5 +400,13 @@ def test_the_report_needs_no_other_file_and_shows_every_view(measured, tmp_path)
             assert np.asarray(image).std() > 5
 
 
+def test_ablations_without_their_method_have_a_report(measured, tmp_path):
+    (run,) = fake_grid([measured[0].scene], ["photo-gs-flat"], tmp_path)
+    shutil.copytree(measured[0].folder, run.folder)
+    comparison = write_results([run], tmp_path, {})
+    assert "ablation" in {table.name for table in comparison.tables}
+    assert '<option value="photo-gs-flat"' in (tmp_path / "report.html").read_text()
+
+
 def test_curves_are_of_all_held_out_views(measured):
     assert sorted(recorded_figures(measured[1])["normal_deg"]) == [2]

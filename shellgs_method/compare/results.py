@@ -64,27 +64,28 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
         suffix = "" if index == 0 else f"-{scene.name}"
         of_scene = [run for run in runs if run.scene == scene]
         shown[scene.name] = _shown(of_scene)
-        figures |= _figures(of_scene, shown[scene.name], output, suffix)
+        figures |= _figures(scene, [run for run in of_scene if run.variant.name not in ABLATIONS], output, suffix)
     write_report(output / "report.html", made, figures, shown, {run.label: why for run, why in failures.items()})
     return Comparison(made, figures, failures)
 
 
 def _shown(runs: Sequence[Run]) -> list[Run]:
-    """The runs that pictures show: the first of each method that is measured, ablations aside."""
+    """The runs that pictures show: the first of each variant that is measured."""
     first: dict[str, Run] = {}
     for run in runs:
-        if run.variant.name not in ABLATIONS and run.figures().exists() and any(run.pictures.glob("*.npz")):
+        if run.figures().exists() and any(run.pictures.glob("*.npz")):
             first.setdefault(run.variant.name, run)
     return list(first.values())
 
 
-def _figures(runs: Sequence[Run], shown: Sequence[Run], output: Path, suffix: str) -> dict[str, Path]:
-    """Draw what can be drawn of one scene; captions and files."""
-    scene, figures = runs[0].scene, {}
+def _figures(scene: Path, runs: Sequence[Run], output: Path, suffix: str) -> dict[str, Path]:
+    """Draw what can be drawn of one scene's methods; captions and files."""
+    figures: dict[str, Path] = {}
     panel = output / f"supervision{suffix}.png"
     if (scene / "cues" / "shell" / "panel.png").exists():
         shutil.copyfile(scene / "cues" / "shell" / "panel.png", panel)
         figures[f"{scene.name}: what supervises a view."] = panel
+    shown = _shown(runs)
     if views := common_views(shown):
         path = output / f"strip{suffix}.png"
         strip(shown, views[0], path)
@@ -93,6 +94,6 @@ def _figures(runs: Sequence[Run], shown: Sequence[Run], output: Path, suffix: st
         surfaces(shown, path)
         figures[f"{scene.name}: visible points, coloured by the distance from the shell's, from three sides."] = path
     path = output / f"curves{suffix}.png"
-    if curves([run for run in runs if run.variant.name not in ABLATIONS], path):
+    if curves(runs, path):
         figures[f"{scene.name}: figures of all held-out views while training."] = path
     return figures

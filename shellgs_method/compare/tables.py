@@ -27,6 +27,7 @@ from shellgs_method.evaluation.tables import (
 _BY_KEY = {column.key: column for column in (*MAIN_COLUMNS, *SURFACE_COLUMNS)}
 _GEOMETRY = ("depth_mae_m", "normal_deg", "normal_below_10deg", "normal_below_20deg", "depth_normal_deg", "chamfer_m")
 GEOMETRY_COLUMNS = tuple(_BY_KEY[key] for key in _GEOMETRY)
+ABLATION_COLUMNS = (_BY_KEY["psnr"], *GEOMETRY_COLUMNS)
 TRUTH_COLUMNS = tuple(
     replace(column, key=f"truth_{column.key}") for column in (*GEOMETRY_COLUMNS, *SURFACE_COLUMNS[3:])
 )
@@ -94,11 +95,11 @@ def _scene_tables(runs: Sequence[Run], prefix: str) -> Iterator[FiguresTable]:
     found = [
         FiguresTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
         FiguresTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
-        FiguresTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, _rows(methods)),
+        FiguresTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, _rows(whole)),
     ]
     if any(run.variant.name in ABLATIONS for run in whole):
         ordered = [run for run in whole if run.variant.name in ("photo-gs", "shellgs", *ABLATIONS)]
-        found.append(FiguresTable("ablation", f"{scene}: ablations", GEOMETRY_COLUMNS, _rows(ordered)))
+        found.append(FiguresTable("ablation", f"{scene}: ablations", ABLATION_COLUMNS, _rows(ordered)))
     for half in HALVES:
         apart = [run for run in runs if run.variant.held_out == half]
         if apart:
