@@ -98,7 +98,8 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
             image_errors(rendering.rgb, photograph) | reference_errors(rendering, camera, batch, metres_per_unit)
         )
         if pictures and "shell_mask" in batch and batch["shell_mask"].any():
-            _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(pictures / f"{index:04d}.npz")
+            name = f"{index:04d}-{Path(datamanager.eval_dataset.views[index].name).stem}.npz"
+            _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(pictures / name)
     return {
         "experiment_name": config.experiment_name,
         "method_name": config.method_name,

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 
 from dataparsers.files import atomic_write
 from shellgs_method.compare.measure import Snapshot
+from shellgs_method.compare.pictures import common_views
 from shellgs_method.compare.runs import Run
 from shellgs_method.compare.tables import FiguresTable
 from shellgs_method.evaluation.colours import error_colours, normal_colours
@@ -69,7 +70,7 @@ def write_report(
         path: the HTML file, which needs no other.
         tables: in order.
         figures: captions and PNG files.
-        views: for the name of each scene, the runs that its slider shows, all with the same snapshots.
+        views: for the name of each scene, the runs that its slider shows in the views they have in common.
         failures: what went wrong, by run.
     """
     parts = [f"<p>Failed: {html.escape(run)}</p><pre>{html.escape(why)}</pre>" for run, why in failures.items()]
@@ -79,15 +80,14 @@ def write_report(
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
         for caption, file in figures.items()
     ]
-    parts += [_slider(scene, runs) for scene, runs in views.items() if runs]
+    parts += [_slider(scene, runs) for scene, runs in views.items() if common_views(runs)]
     with atomic_write(path) as file:
         file.write(_PAGE.format(title="Comparison", body="\n".join(parts)).encode())
 
 
 def _slider(scene: str, runs: Sequence[Run]) -> str:
-    names = sorted(path.name for path in runs[0].pictures.glob("*.npz"))
     shots = {}
-    for name in names:
+    for name in common_views(runs):
         loaded = {run.variant.name: Snapshot.load(run.pictures / name) for run in runs}
         first = next(iter(loaded.values()))
         exact = np.zeros_like(first.error)
