@@ -154,6 +154,14 @@ def test_a_proposal_is_right_where_the_ends_of_the_facade_are_seen(mesh, surface
     assert error(surface, found, survey_from_scene) < 0.02
 
 
+def test_a_proposal_is_right_for_a_shell_that_lies_askew_in_its_file(mesh, surface, views, points, survey_from_scene):
+    turned = displaced(0.0, 50.0, 0.0, seed=7)
+    askew = ShellMesh(transformed(mesh.vertices, turned), mesh.faces)
+    alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
+    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ turned)
+    assert error(surface, found, survey_from_scene) < 0.02
+
+
 def test_a_proposal_names_the_other_bays_where_the_points_are_of_a_part_without_ends(mesh, views):
     layout = Layout(5, 3)
     openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]

@@ -66,7 +66,8 @@ def place_by_guess(
 ) -> Placement:
     """A proposal for the place, from the outline of the main wall.
 
-    Up in the shell is taken to be y in glTF, as that format has it, and z in all others.
+    Up in the shell is taken to be y in glTF, as that format has it, and z in all others, unless its walls are askew to
+    that.
 
     Raises:
         SceneError: the points show no wall, or it fits nowhere.
