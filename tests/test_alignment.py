@@ -450,6 +450,25 @@ def test_edges_are_where_the_shell_ends_steps_or_bends_and_nowhere_on_a_slanted_
     assert set(np.flatnonzero(edges[24])) == {24, 25, 38, 39}
 
 
+def test_a_crease_is_drawn_and_the_noise_of_the_triangles_beside_it_is_not():
+    # Two walls of 2 x 2 m that meet at a right angle in the middle of the picture, in triangles of 4 cm, 3 pixels.
+    u, v = np.meshgrid(np.linspace(-2, 2, 101), np.linspace(-2, 2, 101))
+    noise = np.random.default_rng(0).normal(0, 0.01, u.shape)
+    vertices = np.stack([u / np.sqrt(2), v, 8 - np.abs(u) / np.sqrt(2) + noise], axis=-1).reshape(-1, 3)
+    corner = np.arange(101 * 100).reshape(100, 101)[:, :-1].ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 101], corner[:, None] + [1, 102, 101]])
+    K = torch.tensor([[600.0, 0, 80], [0, 600, 60], [0, 0, 1]], dtype=torch.float64)
+    cue = ShellCaster(ShellMesh(vertices, faces), np.eye(4)).cast(
+        Camera(torch.eye(4, dtype=torch.float64), K, 160, 120)
+    )
+    edges = shell_edges(cue, 1.0)
+    neighbours = np.einsum("hwc,hwc->hw", cue.normal[:, 1:].astype(float), cue.normal[:, :-1].astype(float))
+    beside = np.abs(np.arange(160) - 79.5) > 8
+    assert (neighbours < np.cos(np.radians(25)))[:, beside[1:]].mean() > 0.1  # what a threshold alone would draw
+    assert edges[:, beside].mean() < 0.02
+    assert edges[1:-1, 76:84].any(axis=1).mean() > 0.7
+
+
 def command(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *words: object) -> str:
     """What `shellgs` prints, or the sentence that it ends with."""
     monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
