@@ -19,7 +19,9 @@ from dataparsers.files import atomic_write
 from dataparsers.photograph import load_photograph
 from shellgs_method.html import data_uri, encoded
 from shellgs_method.shell.bays import RIVALRY
+from shellgs_method.shell.correspondences import Correspondence
 from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.picks import PickedPoint
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.support import representative
 from shellgs_method.shell.validation import Validation
@@ -161,8 +163,9 @@ def _page(
         yield f"<h2>What the points can tell</h2><p>Condition number of the fit {evidence.condition:.3g} over "
         yield f"{evidence.points} points; strengths of its seven directions: "
         yield ", ".join(f"{strength:.2g}" for strength in evidence.strengths) + ".</p>"
-    if validation.picked:
-        yield "<h2>Picked points, worst first</h2>" + _table(PICK_COLUMNS, map(_escaped, pick_rows(validation)))
+    if validation.correspondences:
+        head, *rows = residual_table(validation.correspondences)
+        yield "<h2>Points known in both frames, worst first</h2>" + _table(head, map(_escaped, rows))
     yield "<h2>All views</h2>"
     rows = (
         (escape(s.view.name), f"{s.supported:.0%}", len(s.errors), f"{100 * s.error:.1f} cm", f"{s.occluded:.0%}")
@@ -171,18 +174,19 @@ def _page(
     yield _table(("view", "on the shell", "SfM points there", "median depth error", "hidden by things before it"), rows)
 
 
-PICK_COLUMNS = ("point", "residual", "without it", "in the picture", "worst photograph", "")
-
-
-def pick_rows(validation: Validation) -> Iterator[tuple[str, ...]]:
-    """A row for each picked point, worst first, for tables with :data:`PICK_COLUMNS`."""
-    for point in validation.picked:
-        remark = "check point" if point.pick.held_out else "" if point.is_used else "left out"
-        if not point.is_sharp:
-            remark += ": its pixels disagree"
+def residual_table(points: Sequence[Correspondence]) -> list[tuple[str, ...]]:
+    """The head of a table and a row for each point: what is left of it, and of a pick how the photographs agree."""
+    picked = [point for point in points if isinstance(point, PickedPoint)]
+    table = [("point", "residual", "without it", *(("in the picture", "worst photograph") if picked else ()), "")]
+    for point in points:
+        remark = "check point" if point.held_out else "" if point.is_used else "left out"
         without = "–" if np.isnan(point.left_out_residual) else f"{point.left_out_residual:.3f} m"
-        pixels = f"{point.reprojection:.1f} px"
-        yield point.pick.name, f"{point.residual:.3f} m", without, pixels, point.worst_view, remark
+        pixels: tuple[str, ...] = ()
+        if isinstance(point, PickedPoint):
+            pixels = (f"{point.reprojection:.1f} px", point.worst_view)
+            remark += "" if point.is_sharp else ": its pixels disagree"
+        table.append((point.name, f"{point.residual:.3f} m", without, *pixels, remark))
+    return table
 
 
 def _escaped(row: tuple[str, ...]) -> tuple[str, ...]:
