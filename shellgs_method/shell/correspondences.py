@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -14,7 +16,7 @@ from jaxtyping import Bool, Float64
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.surface import fit_similarity, transformed
+from shellgs_method.shell.similarity import fit_similarity, transformed
 
 MAX_ERROR = 0.15
 """Metres between a point on the shell and the same one in the scene from which it counts as a mistake: five times the
@@ -115,9 +117,41 @@ def worst_first(points: Sequence[Point]) -> list[Point]:
     return sorted(points, key=lambda point: -point.residual)
 
 
-def views_named(name: str, views: Sequence[View]) -> list[View]:
-    """The views of an image given by its path in the scene or by its file name alone."""
-    return [view for view in views if name in (view.name, view.image.name)]
+def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
+    """The words of each line of a text file, and where it is, for messages.
+
+    What follows a # is skipped. Words with spaces stand in quotes.
+
+    Args:
+        path: the file.
+        contents: what is in it, for messages.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        SceneError: a quote is not closed.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"the file of {contents} {path} does not exist")
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+        where = f"{path}, line {number}"
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError as error:
+            raise SceneError(f"{where}: {error}") from error
+        if words:
+            yield where, words
+
+
+def view_named(name: str, views: Sequence[View], where: str) -> View | None:
+    """The view of an image given by its path in the scene or by its file name alone; None if it is not there.
+
+    Raises:
+        SceneError: the file name is that of several.
+    """
+    matches = [view for view in views if name in (view.name, view.image.name)]
+    if len(matches) > 1:
+        raise SceneError(f"{where}: {name} is the name of several photographs: add folders")
+    return matches[0] if matches else None
 
 
 def are_numbers(words: Sequence[str]) -> bool:

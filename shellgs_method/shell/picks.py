@@ -9,7 +9,6 @@ images with spaces stand in quotes. Points whose name begins with "check" are no
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,14 @@ from jaxtyping import Bool, Float64
 
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, to_camera
-from shellgs_method.shell.correspondences import Correspondence, are_numbers, fit_robustly, views_named, worst_first
+from shellgs_method.shell.correspondences import (
+    Correspondence,
+    are_numbers,
+    fit_robustly,
+    read_lines,
+    view_named,
+    worst_first,
+)
 
 MAX_REPROJECTION = 4.0
 """Pixels, of a photograph 1000 wide, between a picked pixel and the point triangulated from all: more is a mistake."""
@@ -68,22 +74,17 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
         FileNotFoundError: there is no such file.
         SceneError: a line cannot be read, names no photograph of the scene, or contradicts another.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"the file of picks {path} does not exist")
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
-        where = f"{path}, line {number}"
-        try:
-            words = shlex.split(line, comments=True)
-        except ValueError as error:
-            raise SceneError(f"{where}: {error}") from error
-        if not words or (number == 1 and not are_numbers(words[:1])):
+    for number, (where, words) in enumerate(read_lines(path, "picks")):
+        if number == 0 and not are_numbers(words[:1]):
             continue
         if len(words) < 6 or not are_numbers(words[:5]):
             raise SceneError(f"{where}: a pick is X Y Z of the shell, x y in the photograph, the image, and a name")
         point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
-        view = _view_named(words[5], views, where)
+        view = view_named(words[5], views, where)
+        if view is None:
+            raise SceneError(f"{where}: {words[5]} is no photograph of the scene")
         name = words[6] if len(words) > 6 else " ".join(words[:3])
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} had other coordinates before: give it another name")
@@ -186,11 +187,3 @@ def _triangulate_all(
         worst_view.append(seen[int(error.argmax())].name)
         sharp.append(bool((error <= limits).all()))
     return np.stack(scene), reprojection, worst_view, np.array(sharp)
-
-
-def _view_named(name: str, views: Sequence[View], where: str) -> View:
-    matches = views_named(name, views)
-    if len(matches) != 1:
-        problem = "is no photograph of the scene" if not matches else "is the name of several photographs: add folders"
-        raise SceneError(f"{where}: {name} {problem}")
-    return matches[0]

@@ -8,7 +8,6 @@ quotes.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from dataparsers.camera import positions
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.correspondences import (
@@ -23,10 +23,10 @@ from shellgs_method.shell.correspondences import (
     Correspondence,
     are_numbers,
     fit_robustly,
-    views_named,
+    read_lines,
+    view_named,
     worst_first,
 )
-from shellgs_method.shell.support import positions
 
 _DEGREES = ("epsg:4326", "epsg:4979", "+proj=longlat", "+proj=latlong")
 _REMEDY = "add photographs from higher or lower, nearer or farther, or pick points and use --picks"
@@ -54,32 +54,23 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
         FileNotFoundError: there is no such file.
         SceneError: the file is in degrees, or a line cannot be read or contradicts another.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"the file of camera positions {path} does not exist")
     found: dict[str, tuple[View, list[float]]] = {}
     strangers: list[str] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
-        where = f"{path}, line {number}"
-        try:
-            words = shlex.split(line, comments=True)
-        except ValueError as error:
-            raise SceneError(f"{where}: {error}") from error
+    for number, (where, words) in enumerate(read_lines(path, "camera positions")):
         is_position = len(words) >= 4 and are_numbers(words[1:4])
-        if number == 1 and any(word.lower() in _DEGREES for word in words):
-            raise SceneError(f"{path} is in degrees ({line.strip()}): convert it to the shell's coordinates")
-        if not words or (number == 1 and not is_position):
+        if number == 0 and not is_position:
+            if any(word.lower() in _DEGREES for word in words):
+                raise SceneError(f"{path} is in degrees ({' '.join(words)}): convert it to the shell's coordinates")
             continue
         if not is_position:
             raise SceneError(f"{where}: a camera's position is the image, then X Y Z in the shell's coordinates")
-        named = views_named(words[0], views)
-        if len(named) > 1:
-            raise SceneError(f"{where}: {words[0]} is the name of several photographs: add folders")
-        if not named:
+        view = view_named(words[0], views, where)
+        if view is None:
             strangers.append(words[0])
-        elif named[0].name in found:
+        elif view.name in found:
             raise SceneError(f"{where}: {words[0]} has a position already")
         else:
-            found[named[0].name] = named[0], [float(word) for word in words[1:4]]
+            found[view.name] = view, [float(word) for word in words[1:4]]
     shell = np.array([position for _, position in found.values()]).reshape(-1, 3)
     return SurveyedPositions([view for view, _ in found.values()], shell, strangers)
 
@@ -99,7 +90,7 @@ def align_positions(
         known = f" ({', '.join(surveyed.strangers[:3])} … are none of its photographs)" if surveyed.strangers else ""
         raise SceneError(f"{len(views)} photographs of the scene have a position{known}: at least 3 are needed")
     everyone = np.ones(len(views), bool)
-    scene = positions(views)
+    scene = positions(view.camera for view in views)
     fit = fit_robustly(surveyed.shell, scene, everyone, metres_per_shell_unit, "camera positions", _REMEDY)
     if 2 * fit.used.sum() < len(views):
         raise SceneError(
