@@ -107,6 +107,7 @@ def align(
     shell: Annotated[Optional[Path], tyro.conf.Positional] = None,
     matrix: Optional[Path] = None,
     picks: Optional[Path] = None,
+    positions: Optional[Path] = None,
     refine: Optional[float] = None,
     accept: bool = False,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -115,14 +116,15 @@ def align(
     """Find the shell's place in the scene, judge it, and write scene/shell/alignment.json unless it is refused.
 
     The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
-    verdict. Without --matrix and --picks, a place is proposed, for you to look at and to take with --accept. Without a
-    shell, the alignment that is there is judged again, or refined.
+    verdict. Without --matrix, --picks and --positions, a place is proposed, for you to look at and to take with
+    --accept. Without a shell, the alignment that is there is judged again, or refined.
 
     Args:
         scene: Scene folder.
         shell: The shell's file.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare's text, json or npy).
         picks: Text file of picked points, a line each: X Y Z of the shell, x y in the photograph, image, name.
+        positions: Text file of camera positions by RTK, a line each: image, X Y Z in the shell's coordinates.
         refine: Then fit the SfM points to the shell, from a start that is off by up to this many metres.
         accept: Take the proposal made before.
         global_shift: CloudCompare's global shift, with --matrix.
@@ -132,10 +134,21 @@ def align(
     from dataparsers.facade import FacadeDataParserConfig, read_views
     from dataparsers.sparse_points import read_sparse_points
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
-    from shellgs_method.shell.align import PROPOSAL, Placement, judge, place_by_guess, place_by_picks, refined
+    from shellgs_method.shell.align import (
+        PROPOSAL,
+        Placement,
+        judge,
+        place_by_guess,
+        place_by_picks,
+        place_by_positions,
+        refined,
+    )
 
-    if (shell is None and (matrix or picks)) or (matrix and picks) or (accept and (shell or matrix or picks)):
-        raise SceneError("give the shell with --matrix, with --picks or alone, or no shell to judge what is there")
+    starts = [start for start in (matrix, picks, positions) if start]
+    if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
+        raise SceneError(
+            "give the shell with --matrix, --picks or --positions, or alone, or no shell to judge what is there"
+        )
     config = FacadeDataParserConfig(data=scene)
     views, points = read_views(config), read_sparse_points(config)
     name = relative_path(shell, scene) if shell else ""
@@ -145,6 +158,8 @@ def align(
         placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
     elif picks:
         placement = place_by_picks(picks, views, name, metres_per_shell_unit)
+    elif positions:
+        placement = place_by_positions(positions, views, name, metres_per_shell_unit)
     else:
         placement = place_by_guess(load_shell(shell, cache=scene / "shell"), views, points, name, metres_per_shell_unit)
     mesh = load_shell(scene / placement.alignment.shell, cache=scene / "shell")
@@ -157,13 +172,14 @@ def align(
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
     """What the user needs to know of a judged alignment; a refused one ends the program."""
     from shellgs_method.shell.align import REPORT
-    from shellgs_method.shell.report import PICK_COLUMNS, pick_rows
+    from shellgs_method.shell.report import residual_table
 
     for sentence in placement.history:
         console.print(sentence, highlight=False)
-    if placement.picked:
-        table = Table(*PICK_COLUMNS)
-        for row in pick_rows(validation):
+    if placement.correspondences:
+        head, *rows = residual_table(placement.correspondences)
+        table = Table(*head)
+        for row in rows:
             table.add_row(*row)
         console.print(table)
     for reason in validation.reasons:

@@ -23,6 +23,7 @@ from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
 from shellgs_method.shell.align import PROPOSAL, REPORT, place_by_guess
 from shellgs_method.shell.bays import facade_axes, scan_shifts
 from shellgs_method.shell.picks import Pick, align_picks, read_picks, triangulate
+from shellgs_method.shell.positions import SurveyedPositions, align_positions, read_positions
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.refinement import refine
 from shellgs_method.shell.report import shell_edges, write_report
@@ -154,6 +155,14 @@ def test_a_proposal_is_right_where_the_ends_of_the_facade_are_seen(mesh, surface
     assert error(surface, found, survey_from_scene) < 0.02
 
 
+def test_a_proposal_is_right_for_a_shell_that_lies_askew_in_its_file(mesh, surface, views, points, survey_from_scene):
+    turned = displaced(0.0, 50.0, 0.0, seed=7)
+    askew = ShellMesh(transformed(mesh.vertices, turned), mesh.faces)
+    alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
+    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ turned)
+    assert error(surface, found, survey_from_scene) < 0.02
+
+
 def test_a_proposal_names_the_other_bays_where_the_points_are_of_a_part_without_ends(mesh, views):
     layout = Layout(5, 3)
     openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]
@@ -263,9 +272,9 @@ def test_a_pick_that_is_2_m_off_is_left_out_and_comes_first(rigged):
     picks[4] = replace(picks[4], shell=picks[4].shell + np.array([2.0, 0, 0]))
     matrix, points = align_picks(picks, views)
     assert far_off(matrix, truth, [p for p in picks if p.name != "p4"]) < 0.05
-    assert points[0].pick.name == "p4"
+    assert points[0].name == "p4"
     assert points[0].residual == pytest.approx(2.0, abs=0.1)
-    assert [point.pick.name for point in points if not point.is_used] == ["p4"]
+    assert [point.name for point in points if not point.is_used] == ["p4"]
 
 
 def test_a_pixel_that_disagrees_is_named_and_its_point_left_out(rigged):
@@ -274,7 +283,7 @@ def test_a_pixel_that_disagrees_is_named_and_its_point_left_out(rigged):
     x, y = picks[3].pixels["images/2.png"]
     picks[3] = replace(picks[3], pixels={**picks[3].pixels, "images/2.png": (x, y + 60)})
     matrix, points = align_picks(picks, views)
-    blurred = next(point for point in points if point.pick.name == "p3")
+    blurred = next(point for point in points if point.name == "p3")
     assert not blurred.is_sharp
     assert not blurred.is_used
     assert blurred.reprojection > 10
@@ -286,7 +295,7 @@ def test_check_points_are_measured_and_not_fitted(rigged):
     picks, _ = picked(projections)
     picks[0] = replace(picks[0], name="check-corner", shell=picks[0].shell + np.array([0.12, 0, 0]))
     _, points = align_picks(picks, views)
-    check = next(point for point in points if point.pick.held_out)
+    check = next(point for point in points if point.held_out)
     assert not check.is_used
     assert check.residual == pytest.approx(0.12, abs=0.05)
 
@@ -356,6 +365,118 @@ def test_picks_are_pixels_of_the_photograph_as_it_lies_on_disk(tmp_path):
     stored = 2 * np.array([[500 * factor * x + 320, 500 * factor * y + 240]])
     expected = [camera.K[0, 0] * x + camera.K[0, 2], camera.K[1, 1] * y + camera.K[1, 2]]
     np.testing.assert_allclose(to_camera(view, stored)[0], expected, atol=1e-3)
+
+
+# Camera positions
+
+
+ORIGIN = np.array([410_000.0, 5_413_000.0, 250.0])
+
+
+def surveyed(count: int = 20, noise: float = 0.02, bow: float = 2.0) -> tuple[SurveyedPositions, np.ndarray]:
+    """Cameras on a walk of 24 m that leaves the straight line by ``bow`` metres, in national coordinates; the truth."""
+    random = np.random.default_rng(4)
+    along = np.linspace(-1, 1, count)
+    walk = np.stack([12 * along, bow * along**2, 0.1 * bow * np.sin(7 * along)], axis=1)
+    truth = displaced(1.0, 50.0, -0.6, seed=1)
+    truth[:3, 3] -= truth[:3, :3] @ ORIGIN
+    views = []
+    for k, position in enumerate(transformed(walk + ORIGIN, truth)):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, 3] = torch.from_numpy(-position)
+        views.append(View(f"images/{k}.jpg", Path(f"{k}.jpg"), Camera(viewmat, torch.eye(3), 8, 8)))
+    shell = walk + ORIGIN + random.normal(0, noise, walk.shape)
+    return SurveyedPositions(views, shell, ()), truth
+
+
+def at_the_wall(found: np.ndarray, truth: np.ndarray) -> float:
+    """Largest displacement of a wall of 20 x 10 m, 12 m from the walk, in shell units."""
+    wall = np.array([[x, 12.0, z] for x in (-10.0, 10.0) for z in (0.0, 10.0)]) + ORIGIN
+    scale = np.cbrt(np.linalg.det(truth[:3, :3]))
+    return float(np.linalg.norm(transformed(wall, found) - transformed(wall, truth), axis=1).max() / scale)
+
+
+def test_exact_camera_positions_give_the_place_to_a_tenth_of_a_millimetre():
+    positions, truth = surveyed(noise=0.0)
+    found, cameras, play = align_positions(positions)
+    assert at_the_wall(found, truth) < 1e-4  # doubles in national coordinates are good to a nanometre
+    assert cameras[0].residual < 1e-6
+    assert play < 1e-5
+
+
+def test_camera_positions_by_rtk_give_the_place_within_their_play():
+    positions, truth = surveyed(noise=0.02)
+    found, cameras, play = align_positions(positions)
+    assert all(camera.is_used for camera in cameras)
+    # 2 cm over a breadth of 0.6 m (root mean square) and 20 cameras: 0.02 / (0.6 √20) = 0.4°.
+    assert play == pytest.approx(0.4, rel=0.3)
+    assert at_the_wall(found, truth) < 2.5 * np.radians(play) * np.hypot(12, 10)
+
+
+def test_the_play_is_the_scatter_of_the_turn_about_the_path():
+    turns, plays = [], []
+    for seed in range(40):
+        positions, truth = surveyed(count=10, noise=0.0)
+        noise = np.random.default_rng(seed).normal(0, 0.02, positions.shell.shape)
+        found, _, play = align_positions(replace(positions, shell=positions.shell + noise))
+        both = np.linalg.inv(found)[:3, :3] @ truth[:3, :3]
+        turns.append(Rotation.from_matrix(both / np.cbrt(np.linalg.det(both))).as_rotvec(degrees=True)[0])
+        plays.append(play)
+    assert np.std(turns) == pytest.approx(np.mean(plays), rel=0.35)  # of 40: 11 % standard error
+
+
+def test_a_camera_that_lost_its_fix_is_left_out_and_comes_first():
+    positions, truth = surveyed()
+    positions.shell[7] += [3.0, -1.0, 0.5]
+    found, cameras, play = align_positions(positions)
+    assert [camera.name for camera in cameras if not camera.is_used] == ["images/7.jpg"]
+    assert cameras[0].name == "images/7.jpg"
+    assert cameras[0].residual == pytest.approx(np.linalg.norm([3.0, -1.0, 0.5]), abs=0.1)
+    assert at_the_wall(found, truth) < 2.5 * np.radians(play) * np.hypot(12, 10)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"bow": 0.0}, "camera positions lie on one line, about which the shell can turn: add photographs"),
+        ({"bow": 0.0, "noise": 0.3}, "lie on one line"),  # the photographs know how straight they were taken
+        ({"count": 2}, "2 photographs of the scene have a position: at least 3 are needed"),
+        ({"noise": 2.0}, "of 20 camera positions agree with the photographs within 0.15 m: they need RTK"),
+    ],
+    ids=["a straight walk", "a straight walk and a poor survey", "two", "a telephone"],
+)
+def test_camera_positions_that_leave_the_shell_free_are_refused(settings, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        align_positions(surveyed(**settings)[0])
+
+
+@pytest.mark.parametrize("first", ["EPSG:25832\n", "WGS84 UTM 32N\n", "+proj=utm +zone=32 +units=m +no_defs\n", ""])
+def test_a_file_of_positions_is_read_as_opendronemap_defines_it(tmp_path, first):
+    views = [replace(view, image=Path(view.name).with_name(f"photo {k}.jpg")) for k, view in enumerate(rig()[0])]
+    (tmp_path / "geo.txt").write_text(
+        first + '"photo 0.jpg" 410000.125 5413000.25 251 0 0 0 0.02 0.03\n\n'
+        "images/2.png 410001 5413000 251  # the last one\nlost.jpg 1 2 3\n"
+    )
+    positions = read_positions(tmp_path / "geo.txt", views)
+    assert [view.name for view in positions.views] == ["images/0.png", "images/2.png"]
+    np.testing.assert_array_equal(positions.shell, [[410000.125, 5413000.25, 251], [410001, 5413000, 251]])
+    assert positions.strangers == ["lost.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("EPSG:4326", "is in degrees (EPSG:4326): convert it"),
+        ("EPSG:25832\nimages/0.png 1 2", "line 2: a camera's position is the image, then X Y Z"),
+        ("EPSG:25832\nimages/0.png 1 2 nan", "line 2: a camera's position is"),
+        ("images/0.png 1 2 3\nimages/0.png 1 2 3", "line 2: images/0.png has a position already"),
+        ("images/0.png 1 2 3\n'images/1.png 1 2 3", "line 2"),
+    ],
+)
+def test_a_line_that_is_no_position_is_refused_by_its_number(rigged, tmp_path, line, sentence):
+    (tmp_path / "geo.txt").write_text(line)
+    with pytest.raises(SceneError, match=re.escape(sentence)):
+        read_positions(tmp_path / "geo.txt", rigged[0])
 
 
 # The bay test
@@ -442,6 +563,25 @@ def test_edges_are_where_the_shell_ends_steps_or_bends_and_nowhere_on_a_slanted_
     assert set(np.flatnonzero(edges[24])) == {24, 25, 38, 39}
 
 
+def test_a_crease_is_drawn_and_the_noise_of_the_triangles_beside_it_is_not():
+    # Two walls of 2 x 2 m that meet at a right angle in the middle of the picture, in triangles of 4 cm, 3 pixels.
+    u, v = np.meshgrid(np.linspace(-2, 2, 101), np.linspace(-2, 2, 101))
+    noise = np.random.default_rng(0).normal(0, 0.01, u.shape)
+    vertices = np.stack([u / np.sqrt(2), v, 8 - np.abs(u) / np.sqrt(2) + noise], axis=-1).reshape(-1, 3)
+    corner = np.arange(101 * 100).reshape(100, 101)[:, :-1].ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 101], corner[:, None] + [1, 102, 101]])
+    K = torch.tensor([[600.0, 0, 80], [0, 600, 60], [0, 0, 1]], dtype=torch.float64)
+    cue = ShellCaster(ShellMesh(vertices, faces), np.eye(4)).cast(
+        Camera(torch.eye(4, dtype=torch.float64), K, 160, 120)
+    )
+    edges = shell_edges(cue, 1.0)
+    neighbours = np.einsum("hwc,hwc->hw", cue.normal[:, 1:].astype(float), cue.normal[:, :-1].astype(float))
+    beside = np.abs(np.arange(160) - 79.5) > 8
+    assert (neighbours < np.cos(np.radians(25)))[:, beside[1:]].mean() > 0.1  # what a threshold alone would draw
+    assert edges[:, beside].mean() < 0.02
+    assert edges[1:-1, 76:84].any(axis=1).mean() > 0.7
+
+
 def command(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *words: object) -> str:
     """What `shellgs` prints, or the sentence that it ends with."""
     monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
@@ -506,7 +646,28 @@ def test_picks_and_refinement_give_the_place_and_their_residuals(scene, shellgs)
     vertices = load_shell(scene / true.shell).vertices
     moved = np.linalg.norm(written.apply(vertices) - true.apply(vertices), axis=1).mean() * true.metres_per_unit
     assert moved < 0.03  # 300 SfM points, some of them on what the shell leaves out
-    assert "Picked points, worst first" in (scene / REPORT / "index.html").read_text()
+    assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
+
+
+def test_camera_positions_give_the_place_and_name_who_was_not_there(scene, shellgs):
+    from dataparsers.facade import FacadeDataParserConfig, read_views
+
+    true = Alignment.load(scene / ALIGNMENT)
+    lines = ["EPSG:25832", "IMG_0001.jpg 0 0 0"]
+    for k, view in enumerate(read_views(FacadeDataParserConfig(data=scene))):
+        position = transformed(view.camera.position.double().numpy(), np.linalg.inv(true.shell_to_scene))
+        position[0] += 2.0 if k == 3 else 0.0
+        lines.append(f"{Path(view.name).name} {' '.join(map(str, position))}")
+    (scene / "geo.txt").write_text("\n".join(lines))
+    (scene / ALIGNMENT).unlink()
+    output = shellgs("align", scene, scene / true.shell, "--positions", scene / "geo.txt")
+    assert "9 of 10 camera positions decide" in output
+    assert "In geo.txt but not in the scene: IMG_0001.jpg" in output
+    assert "left out" in output
+    written = Alignment.load(scene / ALIGNMENT)
+    np.testing.assert_allclose(written.shell_to_scene, true.shell_to_scene, rtol=1e-6)
+    assert written.source == "camera positions in geo.txt"
+    assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
 
 
 def test_a_refused_place_leaves_the_alignment_alone(scene, shellgs):
@@ -534,7 +695,9 @@ def test_judging_what_is_there_keeps_the_file_that_maps_are_bound_to(scene, shel
     assert (scene / ALIGNMENT).read_bytes() == before
 
 
-@pytest.mark.parametrize("words", [["--matrix", "m.txt"], ["shell.ply", "--matrix", "m", "--picks", "p"]])
+@pytest.mark.parametrize(
+    "words", [["--matrix", "m.txt"], ["shell.ply", "--matrix", "m", "--picks", "p"], ["--positions", "g"]]
+)
 def test_starts_that_contradict_each_other_are_refused(scene, shellgs, words):
     assert "give the shell with" in shellgs("align", scene, *words)
 

@@ -13,8 +13,10 @@ from dataparsers.camera import positions, upwards
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.bays import facade_axes
+from shellgs_method.shell.correspondences import Correspondence, measured_again
 from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.picks import PickedPoint, align_picks, measured_again, read_picks
+from shellgs_method.shell.picks import align_picks, read_picks
+from shellgs_method.shell.positions import align_positions, read_positions
 from shellgs_method.shell.proposal import propose
 from shellgs_method.shell.refinement import refine
 from shellgs_method.shell.report import write_report
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 PROPOSAL = Path("shell/proposal.json")
 REPORT = Path("shell/report")
 
+_PLAY = 0.1  # degrees: 2 cm on a wall 10 m away
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -36,13 +40,13 @@ class Placement:
     Attributes:
         alignment: the shell's place.
         history: a sentence for each step, for the report.
-        picked: the picks with their residuals, where there are any.
+        correspondences: picks or camera positions with their residuals, where there are any.
         proposed: whether nobody but the program has said so.
     """
 
     alignment: Alignment
     history: Sequence[str] = ()
-    picked: Sequence[PickedPoint] = ()
+    correspondences: Sequence[Correspondence] = ()
     proposed: bool = False
 
 
@@ -54,11 +58,32 @@ def place_by_picks(path: Path, views: Sequence[View], shell: str, metres_per_she
         SceneError: the picks cannot be read, triangulated or trusted.
     """
     matrix, picked = align_picks(read_picks(path, views), views, metres_per_shell_unit)
-    used = [point.residual for point in picked if point.is_used]
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
+    return Placement(alignment, [_what_decided(picked, "picks")], picked)
+
+
+def place_by_positions(path: Path, views: Sequence[View], shell: str, metres_per_shell_unit: float) -> Placement:
+    """The place that a file of the cameras' surveyed positions tells.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        SceneError: the positions cannot be read or trusted.
+    """
+    surveyed = read_positions(path, views)
+    matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
+    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
+    history = [_what_decided(cameras, "camera positions")]
+    if surveyed.strangers:
+        history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.strangers)}.")
+    if play > _PLAY:
+        history.append(f"The shell can still turn about the cameras' path, by some {play:.1f}°: --refine settles that.")
+    return Placement(alignment, history, cameras)
+
+
+def _what_decided(points: Sequence[Correspondence], called: str) -> str:
+    used = [point.residual for point in points if point.is_used]
     mean = np.sqrt(np.mean(np.square(used)))
-    history = f"{len(used)} of {len(picked)} picks decide; they are {mean:.3f} m off (root mean square)."
-    return Placement(alignment, [history], picked)
+    return f"{len(used)} of {len(points)} {called} decide; they are {mean:.3f} m off (root mean square)."
 
 
 def place_by_guess(
@@ -66,7 +91,8 @@ def place_by_guess(
 ) -> Placement:
     """A proposal for the place, from the outline of the main wall.
 
-    Up in the shell is taken to be y in glTF, as that format has it, and z in all others.
+    Up in the shell is taken to be y in glTF, as that format has it, and z in all others, unless its walls are askew to
+    that.
 
     Raises:
         SceneError: the points show no wall, or it fits nowhere.
@@ -107,7 +133,7 @@ def refined(
         placement,
         alignment=moved,
         history=[*placement.history, sentence],
-        picked=measured_again(placement.picked, moved),
+        correspondences=measured_again(placement.correspondences, moved),
     )
 
 
@@ -118,7 +144,7 @@ def judge(
 
     A file there that names the same place is left alone: cue maps are bound to its content.
     """
-    validation = validate(mesh, placement.alignment, views, points, placement.picked)
+    validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
     write_report(scene / REPORT, mesh, validation, placement.history)
     kept = Alignment.load(target) if target.is_file() else None
     if validation.verdict != "refused" and not (kept and kept.places_like(placement.alignment)):

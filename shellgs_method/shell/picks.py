@@ -9,10 +9,8 @@ images with spaces stand in quotes. Points whose name begins with "check" are no
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +18,18 @@ from jaxtyping import Bool, Float64
 
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, to_camera
-from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.similarity import fit_similarity, transformed
+from shellgs_method.shell.correspondences import (
+    Correspondence,
+    are_numbers,
+    fit_robustly,
+    read_lines,
+    view_named,
+    worst_first,
+)
 
-MAX_ERROR = 0.15
-"""Metres between a pick on the shell and the triangulated one from which the pick counts as a mistake: five times
-the scatter of careful picks (1 cm on a scan, 3 cm from photographs)."""
 MAX_REPROJECTION = 4.0
 """Pixels, of a photograph 1000 wide, between a picked pixel and the point triangulated from all: more is a mistake."""
-_THIN = 0.02  # breadth over length below which points are on one line
 _MIN_ANGLE = 1.0  # degrees between two rays, for a point to have a depth
-_MAX_TRIPLES = 2000
 
 
 @dataclass(frozen=True)
@@ -54,28 +53,18 @@ class Pick:
 
 
 @dataclass(frozen=True)
-class PickedPoint:
-    """What became of a pick.
+class PickedPoint(Correspondence):
+    """What became of a pick; its place in the scene is triangulated from the photographs.
 
     Attributes:
-        pick: the pick.
-        scene: the point triangulated from the photographs, in the scene's frame.
         reprojection: largest distance of a picked pixel from that point's image, in pixels.
         worst_view: the view of that pixel.
         is_sharp: whether the picked pixels agree on one point.
-        is_used: whether the fit follows it; mistakes and check points are left out.
-        residual: distance from the pick on the shell, in metres.
-        left_out_residual: the same for a fit without this point; NaN where the others determine none.
     """
 
-    pick: Pick
-    scene: Float64[np.ndarray, " 3"]
     reprojection: float
     worst_view: str
     is_sharp: bool
-    is_used: bool
-    residual: float
-    left_out_residual: float
 
 
 def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
@@ -85,22 +74,17 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
         FileNotFoundError: there is no such file.
         SceneError: a line cannot be read, names no photograph of the scene, or contradicts another.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"the file of picks {path} does not exist")
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
-        where = f"{path}, line {number}"
-        try:
-            words = shlex.split(line, comments=True)
-        except ValueError as error:
-            raise SceneError(f"{where}: {error}") from error
-        if not words or (number == 1 and not _is_number(words[0])):
+    for number, (where, words) in enumerate(read_lines(path, "picks")):
+        if number == 0 and not are_numbers(words[:1]):
             continue
-        if len(words) < 6 or not all(map(_is_number, words[:5])):
+        if len(words) < 6 or not are_numbers(words[:5]):
             raise SceneError(f"{where}: a pick is X Y Z of the shell, x y in the photograph, the image, and a name")
         point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
-        view = _view_named(words[5], views, where)
+        view = view_named(words[5], views, where)
+        if view is None:
+            raise SceneError(f"{where}: {words[5]} is no photograph of the scene")
         name = words[6] if len(words) > 6 else " ".join(words[:3])
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} had other coordinates before: give it another name")
@@ -159,40 +143,25 @@ def align_picks(
         SceneError: a point cannot be triangulated, or fewer than 3 points off one line can be trusted.
     """
     scene, reprojection, worst_view, sharp = _triangulate_all(picks, views)
-    centre = np.mean([pick.shell for pick in picks], axis=0)
-    shell = metres_per_shell_unit * (np.stack([pick.shell for pick in picks]) - centre)
     candidates = sharp & ~np.array([pick.held_out for pick in picks])
-    _refuse_a_line(shell[candidates])
-    used = _consensus(scene, shell, candidates)
-    _refuse_a_line(shell[used])
-    survey_from_scene = fit_similarity(scene[used], shell[used])
-    residual = np.linalg.norm(transformed(scene, survey_from_scene) - shell, axis=1)
+    shell = np.stack([pick.shell for pick in picks])
+    fit = fit_robustly(shell, scene, candidates, metres_per_shell_unit, "picks", "pick a point beside it")
     points = [
         PickedPoint(
-            pick,
+            pick.name,
+            pick.shell,
             scene[k],
+            pick.held_out,
+            bool(fit.used[k]),
+            float(fit.residuals[k]),
+            float(fit.left_out[k]),
             reprojection[k],
             worst_view[k],
-            sharp[k],
-            used[k],
-            residual[k],
-            _left_out(k, scene, shell, used),
+            bool(sharp[k]),
         )
         for k, pick in enumerate(picks)
     ]
-    survey_from_shell = np.diag([metres_per_shell_unit] * 3 + [1.0])
-    survey_from_shell[:3, 3] = -metres_per_shell_unit * centre
-    matrix = np.linalg.inv(survey_from_scene) @ survey_from_shell
-    return matrix, sorted(points, key=lambda point: -point.residual)
-
-
-def measured_again(points: Sequence[PickedPoint], alignment: Alignment) -> list[PickedPoint]:
-    """The points with their residuals under another alignment, worst first."""
-    again = []
-    for point in points:
-        offset = alignment.apply(point.pick.shell[None])[0] - point.scene
-        again.append(replace(point, residual=alignment.metres_per_unit * float(np.linalg.norm(offset))))
-    return sorted(again, key=lambda point: -point.residual)
+    return fit.shell_to_scene, worst_first(points)
 
 
 def _triangulate_all(
@@ -218,58 +187,3 @@ def _triangulate_all(
         worst_view.append(seen[int(error.argmax())].name)
         sharp.append(bool((error <= limits).all()))
     return np.stack(scene), reprojection, worst_view, np.array(sharp)
-
-
-def _consensus(scene: np.ndarray, shell: np.ndarray, candidates: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
-    """The points that the best triple agrees with (MSAC, Torr and Zisserman 2000), over all triples if they are few."""
-    indices = np.flatnonzero(candidates)
-    triples = np.array(list(combinations(indices, 3)))
-    if len(triples) > _MAX_TRIPLES:
-        triples = np.random.default_rng(0).permutation(triples)[:_MAX_TRIPLES]
-    best, cost = candidates, np.inf
-    for triple in triples:
-        if _thinness(shell[triple]) < 0.1:
-            continue
-        residual = np.linalg.norm(transformed(scene, fit_similarity(scene[triple], shell[triple])) - shell, axis=1)
-        total = np.minimum(residual[indices], MAX_ERROR) ** 2
-        if total.sum() < cost:
-            best, cost = candidates & (residual < MAX_ERROR), total.sum()
-    return best
-
-
-def _left_out(k: int, scene: np.ndarray, shell: np.ndarray, used: np.ndarray) -> float:
-    others = used.copy()
-    others[k] = False
-    if others.sum() < 3 or _thinness(shell[others]) < _THIN:
-        return float("nan")
-    similarity = fit_similarity(scene[others], shell[others])
-    return float(np.linalg.norm(transformed(scene[k : k + 1], similarity) - shell[k]))
-
-
-def _thinness(points: np.ndarray) -> float:
-    """Breadth over length of some points: 0 on a line."""
-    extents = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    return float(extents[1] / max(extents[0], 1e-30))
-
-
-def _refuse_a_line(points: np.ndarray) -> None:
-    if len(points) < 3:
-        raise SceneError(f"{len(points)} picks can be trusted, at least 3 are needed (6 or more are better)")
-    if _thinness(points) < _THIN:
-        raise SceneError("the picks lie on one line, about which the shell can turn: pick a point beside it")
-
-
-def _view_named(name: str, views: Sequence[View], where: str) -> View:
-    """The view of an image given by its path in the scene or by its file name alone."""
-    matches = [view for view in views if name in (view.name, view.image.name)]
-    if len(matches) != 1:
-        problem = "is no photograph of the scene" if not matches else "is the name of several photographs: add folders"
-        raise SceneError(f"{where}: {name} {problem}")
-    return matches[0]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False

@@ -12,13 +12,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
 
 from dataparsers.cue_maps import CueMap
 from dataparsers.files import atomic_write
 from dataparsers.photograph import load_photograph
 from shellgs_method.html import data_uri, encoded
 from shellgs_method.shell.bays import RIVALRY
+from shellgs_method.shell.correspondences import Correspondence
 from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.picks import PickedPoint
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.support import representative
 from shellgs_method.shell.validation import Validation
@@ -26,6 +29,7 @@ from shellgs_method.shell.validation import Validation
 COLOURS = {"good": "#1a7f37", "doubtful": "#9a6700", "refused": "#cf222e"}
 _EDGE = (255, 0, 140)
 _OVERLAY = 1280  # pixels of the longer side
+_BLUR = 2  # pixels
 _STYLE = """
 :root { color-scheme: light }
 body { font: 16px/1.5 system-ui, sans-serif; color: #1f2328; max-width: 68rem; margin: 2rem auto; padding: 0 1rem }
@@ -44,23 +48,34 @@ figure img + img { position: absolute; inset: 0 } figure div:hover img + img { o
 
 
 def shell_edges(cue: CueMap, metres_per_unit: float) -> Bool[np.ndarray, "H W"]:
-    """Where the cast shell ends, steps by more than 3 cm, or bends by more than 25°, two pixels wide."""
+    """Where the cast shell ends, steps by more than 3 cm, or bends by more than 25°, two pixels wide.
+
+    A bend counts if it is there in the normals blurred over a few pixels as well: the triangles of a photogrammetric
+    shell turn by as much from one to the next, but this way and that.
+    """
     with np.errstate(divide="ignore"):
         inverse = np.where(cue.mask, 1 / cue.depth, 0.0)
     edges = np.zeros_like(cue.mask)
     normal = cue.normal.astype(np.float32)
+    blurred = gaussian_filter(normal, (_BLUR, _BLUR, 0))
+    blurred /= np.maximum(np.linalg.norm(blurred, axis=2, keepdims=True), 1e-9)
     for axis in (0, 1):
-        back, here, ahead = (np.roll(np.arange(cue.mask.shape[axis]), k) for k in (1, 0, -1))
+        index = np.arange(cue.mask.shape[axis])
+        back, here, ahead = (np.roll(index, k) for k in (1, 0, -1))
         before, after = inverse.take(back, axis), inverse.take(ahead, axis)
         # The inverse depth of a plane is linear in the image; a step of h metres bends it by h / z².
         bend = np.abs(before - 2 * inverse.take(here, axis) + after) * cue.depth**2 * metres_per_unit
-        turn = np.einsum("hwc,hwc->hw", normal, normal.take(ahead, axis)) < np.cos(np.radians(25))
+        turn = _turns(normal, here, ahead, axis) & _turns(blurred, np.roll(index, _BLUR), np.roll(index, -_BLUR), axis)
         both = cue.mask & cue.mask.take(ahead, axis) & cue.mask.take(back, axis)
         found = (cue.mask != cue.mask.take(ahead, axis)) | (both & ((bend > 0.03) | turn))
-        inside = np.arange(cue.mask.shape[axis])
-        inside = (inside > 0) & (inside < len(inside) - 1)
+        inside = (index > 0) & (index < len(index) - 1)
         edges |= found & (inside[:, None] if axis == 0 else inside)
     return edges
+
+
+def _turns(normal: np.ndarray, one: np.ndarray, other: np.ndarray, axis: int) -> Bool[np.ndarray, "H W"]:
+    """Where normals at two places along an axis differ by more than 25°."""
+    return np.einsum("hwc,hwc->hw", normal.take(one, axis), normal.take(other, axis)) < np.cos(np.radians(25))
 
 
 def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history: Sequence[str] = ()) -> Path:
@@ -148,8 +163,9 @@ def _page(
         yield f"<h2>What the points can tell</h2><p>Condition number of the fit {evidence.condition:.3g} over "
         yield f"{evidence.points} points; strengths of its seven directions: "
         yield ", ".join(f"{strength:.2g}" for strength in evidence.strengths) + ".</p>"
-    if validation.picked:
-        yield "<h2>Picked points, worst first</h2>" + _table(PICK_COLUMNS, map(_escaped, pick_rows(validation)))
+    if validation.correspondences:
+        head, *rows = residual_table(validation.correspondences)
+        yield "<h2>Points known in both frames, worst first</h2>" + _table(head, map(_escaped, rows))
     yield "<h2>All views</h2>"
     rows = (
         (escape(s.view.name), f"{s.supported:.0%}", len(s.errors), f"{100 * s.error:.1f} cm", f"{s.occluded:.0%}")
@@ -158,18 +174,19 @@ def _page(
     yield _table(("view", "on the shell", "SfM points there", "median depth error", "hidden by things before it"), rows)
 
 
-PICK_COLUMNS = ("point", "residual", "without it", "in the picture", "worst photograph", "")
-
-
-def pick_rows(validation: Validation) -> Iterator[tuple[str, ...]]:
-    """A row for each picked point, worst first, for tables with :data:`PICK_COLUMNS`."""
-    for point in validation.picked:
-        remark = "check point" if point.pick.held_out else "" if point.is_used else "left out"
-        if not point.is_sharp:
-            remark += ": its pixels disagree"
+def residual_table(points: Sequence[Correspondence]) -> list[tuple[str, ...]]:
+    """The head of a table and a row for each point: what is left of it, and of a pick how the photographs agree."""
+    picked = [point for point in points if isinstance(point, PickedPoint)]
+    table = [("point", "residual", "without it", *(("in the picture", "worst photograph") if picked else ()), "")]
+    for point in points:
+        remark = "check point" if point.held_out else "" if point.is_used else "left out"
         without = "–" if np.isnan(point.left_out_residual) else f"{point.left_out_residual:.3f} m"
-        pixels = f"{point.reprojection:.1f} px"
-        yield point.pick.name, f"{point.residual:.3f} m", without, pixels, point.worst_view, remark
+        pixels: tuple[str, ...] = ()
+        if isinstance(point, PickedPoint):
+            pixels = (f"{point.reprojection:.1f} px", point.worst_view)
+            remark += "" if point.is_sharp else ": its pixels disagree"
+        table.append((point.name, f"{point.residual:.3f} m", without, *pixels, remark))
+    return table
 
 
 def _escaped(row: tuple[str, ...]) -> tuple[str, ...]:

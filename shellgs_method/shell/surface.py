@@ -11,6 +11,9 @@ from shellgs_method.open3d import import_open3d
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.similarity import transformed
 
+_FEW = 2000
+"""Points below which waking other threads costs more than it saves, manyfold where other programs hold the cores."""
+
 
 @dataclass(frozen=True)
 class Closest:
@@ -52,7 +55,8 @@ class ShellSurface:
 
     def closest(self, points: Float64[np.ndarray, "N 3"]) -> Closest:
         """The surface's nearest point to each of the points, all in the survey frame."""
-        answer = self._scene.compute_closest_points(self._o3d.core.Tensor(points.astype(np.float32)))
+        threads = 1 if len(points) < _FEW else 0  # 0: all there are
+        answer = self._scene.compute_closest_points(self._o3d.core.Tensor(points.astype(np.float32)), threads)
         foot, normal = answer["points"].numpy(), answer["primitive_normals"].numpy()
         return Closest(foot.astype(np.float64), normal.astype(np.float64))
 

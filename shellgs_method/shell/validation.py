@@ -18,8 +18,8 @@ from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.bays import BETTER, RIVALRY, ShiftScan, facade_axes, scan_shifts
+from shellgs_method.shell.correspondences import Correspondence
 from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.picks import PickedPoint
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.refinement import Refinement, refine
 from shellgs_method.shell.similarity import transformed
@@ -98,7 +98,7 @@ class Validation:
         near: share of all SfM points that these are.
         scans: the shell moved along the facade and upwards.
         test: where refinement would take the alignment; None where too few points are near.
-        picked: the picks and their residuals, where there are any.
+        correspondences: picks or camera positions and their residuals, where there are any.
     """
 
     alignment: Alignment
@@ -109,7 +109,7 @@ class Validation:
     near: float = 0.0
     scans: Sequence[ShiftScan] = ()
     test: Refinement | None = None
-    picked: Sequence[PickedPoint] = ()
+    correspondences: Sequence[Correspondence] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -139,7 +139,7 @@ class Validation:
         if self.test is not None:
             values |= {"pull_m": self.test.moved, "condition": self.test.evidence.condition}
         values |= {f"best_elsewhere_{scan.name.replace(' ', '_')}": scan.elsewhere[1] for scan in self.scans}
-        if held := [p.residual for p in self.picked if p.pick.held_out]:
+        if held := [p.residual for p in self.correspondences if p.held_out]:
             values["check_points_m"] = float(np.median(held))
         return {name: None if np.isnan(value) else float(f"{value:.4g}") for name, value in values.items()}
 
@@ -149,7 +149,7 @@ def validate(
     alignment: Alignment,
     views: Sequence[View],
     points: SparsePoints,
-    picked: Sequence[PickedPoint] = (),
+    correspondences: Sequence[Correspondence] = (),
 ) -> Validation:
     """Measure an alignment.
 
@@ -158,7 +158,7 @@ def validate(
         alignment: where it stands.
         views: all photographs.
         points: the SfM points.
-        picked: residuals of picks, if there are any.
+        correspondences: residuals of picks or camera positions, if there are any.
     """
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     survey_from_scene = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
@@ -191,7 +191,7 @@ def validate(
         near=float(near.mean()),
         scans=scan_shifts(surface, placed, axes),
         test=test,
-        picked=picked,
+        correspondences=correspondences,
     )
     return replace(measured, checks=[sight, size, *_judge(measured)])
 
@@ -208,7 +208,7 @@ def _judge(measured: Validation) -> Iterator[Check]:
     for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
         yield _check("rival", fit, f"Fit {shift:+.1f} m {scan.name}, relative", "{:.2f}")
-    if held_out := [point.residual for point in measured.picked if point.pick.held_out]:
+    if held_out := [p.residual for p in measured.correspondences if p.held_out]:
         yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
 
 

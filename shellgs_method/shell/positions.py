@@ -1,0 +1,113 @@
+"""Where the cameras stood, by RTK or another survey: a text file, and the place of the shell that it tells.
+
+The file is a `geo.txt` as OpenDroneMap defines it: the coordinate system in the first line, then a line for each
+photograph, ``image X Y Z``; what follows these (angles, accuracies) and what follows a # is skipped. X Y Z are the
+camera's coordinates in the shell's frame and units, so that degrees will not do. Names of images with spaces stand in
+quotes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from dataparsers.camera import positions
+from dataparsers.errors import SceneError
+from dataparsers.photograph import View
+from shellgs_method.shell.correspondences import (
+    MAX_ERROR,
+    Correspondence,
+    are_numbers,
+    fit_robustly,
+    read_lines,
+    view_named,
+    worst_first,
+)
+
+_DEGREES = ("epsg:4326", "epsg:4979", "+proj=longlat", "+proj=latlong")
+_REMEDY = "add photographs from higher or lower, nearer or farther, or pick points and use --picks"
+
+
+@dataclass(frozen=True)
+class SurveyedPositions:
+    """What a file of positions says.
+
+    Attributes:
+        views: photographs of the scene that it names.
+        shell: where each was taken, in the shell's own frame.
+        strangers: names in the file that are no photographs of the scene.
+    """
+
+    views: Sequence[View]
+    shell: Float64[np.ndarray, "N 3"]
+    strangers: Sequence[str]
+
+
+def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
+    """Read a file of camera positions.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        SceneError: the file is in degrees, or a line cannot be read or contradicts another.
+    """
+    found: dict[str, tuple[View, list[float]]] = {}
+    strangers: list[str] = []
+    for number, (where, words) in enumerate(read_lines(path, "camera positions")):
+        is_position = len(words) >= 4 and are_numbers(words[1:4])
+        if number == 0 and not is_position:
+            if any(word.lower() in _DEGREES for word in words):
+                raise SceneError(f"{path} is in degrees ({' '.join(words)}): convert it to the shell's coordinates")
+            continue
+        if not is_position:
+            raise SceneError(f"{where}: a camera's position is the image, then X Y Z in the shell's coordinates")
+        view = view_named(words[0], views, where)
+        if view is None:
+            strangers.append(words[0])
+        elif view.name in found:
+            raise SceneError(f"{where}: {words[0]} has a position already")
+        else:
+            found[view.name] = view, [float(word) for word in words[1:4]]
+    shell = np.array([position for _, position in found.values()]).reshape(-1, 3)
+    return SurveyedPositions([view for view, _ in found.values()], shell, strangers)
+
+
+def align_positions(
+    surveyed: SurveyedPositions, metres_per_shell_unit: float = 1.0
+) -> tuple[Float64[np.ndarray, "4 4"], list[Correspondence], float]:
+    """The similarity from the shell to the scene, each camera's residual, worst first, and the play.
+
+    The play is the standard error, in degrees, of the turn about the line that the cameras follow most.
+
+    Raises:
+        SceneError: fewer than 3 positions off one line can be trusted, or less than half agree.
+    """
+    views = surveyed.views
+    if len(views) < 3:
+        known = f" ({', '.join(surveyed.strangers[:3])} … are none of its photographs)" if surveyed.strangers else ""
+        raise SceneError(f"{len(views)} photographs of the scene have a position{known}: at least 3 are needed")
+    everyone = np.ones(len(views), bool)
+    scene = positions(view.camera for view in views)
+    fit = fit_robustly(surveyed.shell, scene, everyone, metres_per_shell_unit, "camera positions", _REMEDY)
+    if 2 * fit.used.sum() < len(views):
+        raise SceneError(
+            f"only {fit.used.sum()} of {len(views)} camera positions agree with the photographs within {MAX_ERROR} m: "
+            "they need RTK's precision, and the shell's coordinates and units"
+        )
+    cameras = [
+        Correspondence(view.name, *known)
+        for view, *known in zip(
+            views, surveyed.shell, scene, ~everyone, fit.used, fit.residuals, fit.left_out, strict=True
+        )
+    ]
+    placed = metres_per_shell_unit * (surveyed.shell - surveyed.shell.mean(axis=0))
+    return fit.shell_to_scene, worst_first(cameras), _play(placed[fit.used], fit.residuals[fit.used])
+
+
+def _play(points: np.ndarray, residuals: np.ndarray) -> float:
+    deviation = np.sqrt((residuals**2).sum() / (3 * len(points) - 7))  # along each axis; a similarity has 7 unknowns
+    breadth = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1:]
+    return float(np.degrees(deviation / np.linalg.norm(breadth)))
