@@ -645,7 +645,7 @@ def test_picks_and_refinement_give_the_place_and_their_residuals(scene, shellgs)
     written = Alignment.load(scene / ALIGNMENT)
     vertices = load_shell(scene / true.shell).vertices
     moved = np.linalg.norm(written.apply(vertices) - true.apply(vertices), axis=1).mean() * true.metres_per_unit
-    assert moved < 0.03  # 300 SfM points, some of them on what the shell leaves out
+    assert moved < 0.05  # 300 SfM points, some of them on what the shell leaves out: flowers, railings, frames
     assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
 
 
