@@ -9,6 +9,7 @@ def _off(*terms: str) -> tuple[str, ...]:
 
 _FLATTENED = ("--pipeline.model.extra.flattening", "100")
 _DISCS = ("--pipeline.model.primitive", "2d", "--pipeline.model.cull-alpha-thresh", "0.05")
+_METRIC = ("--pipeline.model.extra.point-to-plane", "1")
 
 ABLATIONS: dict[str, tuple[str, ...]] = {
     # The paper's: which terms (table of the ablation), and what the baseline has beside them.
@@ -19,11 +20,12 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "shellgs-flat": ("shellgs", *_FLATTENED),
     "mono-gs-flat": ("mono-gs", *_FLATTENED),
     "photo-gs-flat": ("photo-gs", *_FLATTENED),
-    # Beyond the paper, one at a time.
+    # Beyond the paper, one at a time, and the two that do most for geometry together.
     "shellgs-2d": ("shellgs", *_DISCS),
     "shellgs-plane": ("shellgs", "--pipeline.model.depth", "plane"),
     "shellgs-normals-of-depth": ("shellgs", "--pipeline.model.extra.depth-normal", "0.1"),
-    "shellgs-point-to-plane": ("shellgs", "--pipeline.model.extra.point-to-plane", "1"),
+    "shellgs-point-to-plane": ("shellgs", *_METRIC),
+    "shellgs-2d-point-to-plane": ("shellgs", *_DISCS, *_METRIC),
     "shellgs-occlusion-gate": ("shellgs", "--pipeline.model.extra.occlusion-gate", "0.5"),
     "shellgs-mcmc": ("shellgs", "--pipeline.model.densification", "mcmc"),
     # Supervised in half of the facade's bands, measured in the other half.
