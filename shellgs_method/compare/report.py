@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dataparsers.files import atomic_write
+from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.pictures import common_views
 from shellgs_method.compare.runs import Run
@@ -96,11 +97,12 @@ def _slider(scene: str, runs: Sequence[Run]) -> str:
             method: _pictures(shot.rgb, shot.normal, shot.error, shot.mask) for method, shot in loaded.items()
         }
     methods = [_REFERENCE, *(run.variant.name for run in runs)]
+    last_method = next((name for name in reversed(methods) if name not in ABLATIONS), methods[-1])
     selects = [
         _select("view", {view: view for view in shots}),
         _select("show", _KINDS),
         _select("left", {method: method for method in methods}, methods[1]),
-        _select("right", {method: method for method in methods}, methods[-1]),
+        _select("right", {method: method for method in methods}, last_method),
     ]
     data = json.dumps(shots).replace("</", "<\\/")
     return (
