@@ -283,6 +283,7 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
 def _save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
     """The picture of the view whose map supports most pixels, among some spread over the scene."""
     from dataparsers.photograph import load_photograph
+    from shellgs_method.evaluation.figures import save_figure
     from shellgs_method.shell import supervision_panel
 
     mapped = [view for view in views if maps.record(view.name)]
@@ -294,7 +295,7 @@ def _save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
     view, cue = max(((v, cue) for v, cue in cues if cue is not None), key=lambda pair: pair[1].mask.mean())
     panel = maps.folder / "panel.png"
     figure = supervision_panel(load_photograph(view)[..., :3], cue, maps.manifest.metres_per_unit, maps.kind)
-    figure.savefig(panel)
+    save_figure(panel, figure)
     return panel
 
 

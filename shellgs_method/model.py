@@ -331,10 +331,9 @@ class FacadeModel(SplatfactoModel):
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}
         if "shell_depth" not in batch:
             images |= geometry_pictures(rendering)
-        for kind, prefix in REFERENCES.items():
-            if f"{kind}_depth" in batch:
-                pictures = geometry_pictures(rendering, reference_maps(batch, kind, self.device))
-                images |= {prefix + name: picture for name, picture in pictures.items()}
+        for prefix, reference in references(batch, self.device).items():
+            pictures = geometry_pictures(rendering, reference)
+            images |= {prefix + name: picture for name, picture in pictures.items()}
         return figures, images
 
 
@@ -343,12 +342,17 @@ def reference_errors(
 ) -> dict[str, float]:
     """Figures of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``."""
     figures = {}
-    for kind, prefix in REFERENCES.items():
-        if f"{kind}_depth" in batch:
-            reference = reference_maps(batch, kind, rendering.depth.device)
-            errors = geometry_errors(rendering, camera, reference, metres_per_unit)
-            figures |= {prefix + name: value for name, value in errors.items()}
+    for prefix, reference in references(batch, rendering.depth.device).items():
+        errors = geometry_errors(rendering, camera, reference, metres_per_unit)
+        figures |= {prefix + name: value for name, value in errors.items()}
     return figures
+
+
+def references(batch: dict, device: torch.device) -> dict[str, Reference]:
+    """The maps that a batch has to measure against, by what the names of their figures begin with."""
+    return {
+        prefix: reference_maps(batch, kind, device) for kind, prefix in REFERENCES.items() if f"{kind}_depth" in batch
+    }
 
 
 def reference_maps(batch: dict, kind: str, device: torch.device) -> Reference:

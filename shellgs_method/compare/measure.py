@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Float16, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.splatfacto import SplatfactoModel
-from nerfstudio.utils.eval_utils import eval_setup
 from rich.progress import track
 from torch import Tensor
 
@@ -32,6 +31,7 @@ from shellgs_method.evaluation import (
 )
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.model import FacadeModel, pinhole_camera, reference_errors, reference_maps
+from shellgs_method.trained import load_run
 
 PICTURE_SIZE = 640
 """Most pixels along the longer side of a picture in a report."""
@@ -58,6 +58,12 @@ class Snapshot:
     metres_per_unit: Float[np.ndarray, ""]
     """NaN where unknown."""
 
+    @property
+    def camera(self) -> Camera:
+        """Of the picture, in the rescaled world."""
+        height, width = self.mask.shape[:2]
+        return Camera(torch.from_numpy(self.viewmat), torch.from_numpy(self.K), width, height)
+
     def save(self, path: Path) -> None:
         """Write an npz."""
         with atomic_write(path) as file:
@@ -83,9 +89,7 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
         FileNotFoundError: there is no such config.
         SceneError: the run renders no depth, or was not trained on a facade of undistorted photographs.
     """
-    if not config_path.is_file():
-        raise FileNotFoundError(f"{config_path} does not exist: name the config.yml of a trained run")
-    config, pipeline, checkpoint, _ = eval_setup(config_path, test_mode="test")
+    config, pipeline, checkpoint = load_run(config_path, "test")
     model, datamanager = pipeline.model, _held_out_views(config.pipeline.datamanager, half, pipeline.device)
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
     figures = []

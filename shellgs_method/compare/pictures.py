@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from dataparsers.camera import Camera
+from dataparsers.camera import upwards
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.runs import Run
 from shellgs_method.evaluation import back_project, voxel_means
-from shellgs_method.evaluation.figures import Panel, save_strip
+from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
 
@@ -29,6 +29,8 @@ CURVES = tuple(
 _EVENTS = "Eval Images Metrics Dict (all images)/"
 AZIMUTHS = (-60, 0, 60)
 """Degrees that the orbit of the point clouds stops at, from the front of the facade."""
+REFERENCE = "photograph, shell"
+"""What stands beside the methods."""
 FAR = 10
 """Voxels from which a point's colour is the last of the scale: 20 cm."""
 
@@ -42,7 +44,7 @@ def strip(runs: Sequence[Run], view: str, path: Path) -> None:
         if not panels:
             shell = torch.from_numpy(shot.shell_normal.astype(np.float32))
             photograph = torch.from_numpy(shot.photograph) / 255
-            panels.append(Panel("photograph, shell", photograph, shell, torch.zeros_like(shell[..., :1]), mask))
+            panels.append(Panel(REFERENCE, photograph, shell, torch.zeros_like(shell[..., :1]), mask))
         normal, error = (torch.from_numpy(values.astype(np.float32)) for values in (shot.normal, shot.error))
         panels.append(Panel(run.variant.name, torch.from_numpy(shot.rgb) / 255, normal, error, mask))
     save_strip(path, panels)
@@ -67,7 +69,7 @@ def curves(runs: Sequence[Run], path: Path) -> bool:
         axis.set(title=column.heading, xlabel="iteration")
         axis.grid(alpha=0.3)
     figure.axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=130)
+    save_figure(path, figure, dpi=130)
     return True
 
 
@@ -96,7 +98,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
             axis.set_axis_off()
         column[0].set_title(name, fontsize=9)
     figure.colorbar(colours, ax=axes, extend="max", label=f"distance from the shell's points ({unit})", shrink=0.6)
-    figure.savefig(path, dpi=130)
+    save_figure(path, figure, dpi=130)
 
 
 def recorded_figures(run: Run) -> dict[str, dict[int, float]]:
@@ -116,17 +118,15 @@ def _resolution(shot: Snapshot) -> tuple[str, float]:
 
 def _facade_frame(shots: Sequence[Snapshot]) -> Float[np.ndarray, "3 3"]:
     """The facade's right, up and front, as rows: front is the mean normal of the shell, up that of the cameras."""
-    up = -np.mean([shot.viewmat[1, :3] for shot in shots], axis=0)
+    up = upwards(shot.camera for shot in shots)
     facing = [shot.shell_normal[shot.mask[..., 0]].astype(float).mean(axis=0) @ shot.viewmat[:3, :3] for shot in shots]
     right = np.cross(up, np.mean(facing, axis=0))
-    up, right = up / np.linalg.norm(up), right / np.linalg.norm(right)
+    right /= np.linalg.norm(right)
     return np.stack([right, up, np.cross(right, up)])
 
 
 def _world(shot: Snapshot, depth: Float[np.ndarray, "H W 1"]) -> Float[np.ndarray, "N 3"]:
-    height, width = depth.shape[:2]
-    camera = Camera(torch.from_numpy(shot.viewmat), torch.from_numpy(shot.K), width, height)
-    points = back_project(torch.from_numpy(depth), camera, torch.from_numpy(shot.mask & (depth > 0)))
+    points = back_project(torch.from_numpy(depth), shot.camera, torch.from_numpy(shot.mask & (depth > 0)))
     scale = shot.metres_per_unit if np.isfinite(shot.metres_per_unit) else 1.0
     return scale * (points - shot.viewmat[:3, 3]) @ shot.viewmat[:3, :3]
 

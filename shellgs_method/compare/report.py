@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dataparsers.files import atomic_write
-from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.measure import Snapshot
-from shellgs_method.compare.pictures import common_views
+from shellgs_method.compare.pictures import REFERENCE, common_views
 from shellgs_method.compare.runs import Run
 from shellgs_method.compare.tables import FiguresTable
 from shellgs_method.evaluation.colours import error_colours, normal_colours
@@ -55,7 +54,6 @@ for (const box of document.querySelectorAll(".slider")) {{
 </script>
 """
 _KINDS = {"picture": "picture", "normals": "normals", "error": "angular error of the normals"}
-_REFERENCE = "photograph, shell"
 
 
 def write_report(
@@ -81,23 +79,23 @@ def write_report(
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
         for caption, file in figures.items()
     ]
-    parts += [_slider(scene, runs) for scene, runs in views.items() if common_views(runs)]
+    parts += [_slider(scene, runs, names) for scene, runs in views.items() if (names := common_views(runs))]
     with atomic_write(path) as file:
         file.write(_PAGE.format(title="Comparison", body="\n".join(parts)).encode())
 
 
-def _slider(scene: str, runs: Sequence[Run]) -> str:
+def _slider(scene: str, runs: Sequence[Run], names: Sequence[str]) -> str:
     shots = {}
-    for name in common_views(runs):
+    for name in names:
         loaded = {run.variant.name: Snapshot.load(run.pictures / name) for run in runs}
         first = next(iter(loaded.values()))
         exact = np.zeros_like(first.error)
         reference = _pictures(first.photograph, first.shell_normal, exact, first.mask)
-        shots[Path(name).stem] = {_REFERENCE: reference} | {
+        shots[Path(name).stem] = {REFERENCE: reference} | {
             method: _pictures(shot.rgb, shot.normal, shot.error, shot.mask) for method, shot in loaded.items()
         }
-    methods = [_REFERENCE, *(run.variant.name for run in runs)]
-    last_method = next((name for name in reversed(methods) if name not in ABLATIONS), methods[-1])
+    methods = [REFERENCE, *(run.variant.name for run in runs)]
+    last_method = next((run for run in reversed(runs) if not run.variant.is_ablation), runs[-1]).variant.name
     selects = [
         _select("view", {view: view for view in shots}),
         _select("show", _KINDS),

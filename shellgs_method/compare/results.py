@@ -10,7 +10,6 @@ from typing import NamedTuple
 from rich.console import Console
 
 from dataparsers.files import atomic_write
-from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.pictures import common_views, curves, strip, surfaces
 from shellgs_method.compare.report import write_report
 from shellgs_method.compare.runs import Run
@@ -64,7 +63,7 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
         suffix = "" if index == 0 else f"-{scene.name}"
         of_scene = [run for run in runs if run.scene == scene]
         shown[scene.name] = _shown(of_scene)
-        figures |= _figures(scene, [run for run in of_scene if run.variant.name not in ABLATIONS], output, suffix)
+        figures |= _figures(scene, [run for run in of_scene if not run.variant.is_ablation], output, suffix)
     write_report(output / "report.html", made, figures, shown, {run.label: why for run, why in failures.items()})
     return Comparison(made, figures, failures)
 

@@ -62,6 +62,11 @@ class Variant:
         return isinstance(all_methods[self.method], FacadeTrainerConfig)
 
     @property
+    def is_ablation(self) -> bool:
+        """Whether its name is that of an ablation."""
+        return self.name in ABLATIONS
+
+    @property
     def held_out(self) -> Half | None:
         """The half of the facade that no cue supervises."""
         pairs = list(zip(self.flags, self.flags[1:], strict=False))

@@ -11,7 +11,6 @@ from importlib import resources
 from pathlib import Path
 
 from dataparsers.files import atomic_write
-from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.runs import HALVES, Half, Run
 from shellgs_method.evaluation.tables import (
     MAIN_COLUMNS,
@@ -90,15 +89,15 @@ def tables(runs: Sequence[Run]) -> Iterator[FiguresTable]:
 
 def _scene_tables(runs: Sequence[Run], prefix: str) -> Iterator[FiguresTable]:
     whole = [run for run in runs if run.variant.held_out is None]
-    methods = [run for run in whole if run.variant.name not in ABLATIONS]
+    methods = [run for run in whole if not run.variant.is_ablation]
     scene = runs[0].scene.name
     found = [
         FiguresTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
         FiguresTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
         FiguresTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, _rows(whole)),
     ]
-    if any(run.variant.name in ABLATIONS for run in whole):
-        ordered = [run for run in whole if run.variant.name in ("photo-gs", "shellgs", *ABLATIONS)]
+    if any(run.variant.is_ablation for run in whole):
+        ordered = [run for run in whole if run.variant.is_ablation or run.variant.name in ("photo-gs", "shellgs")]
         found.append(FiguresTable("ablation", f"{scene}: ablations", ABLATION_COLUMNS, _rows(ordered)))
     for half in HALVES:
         apart = [run for run in runs if run.variant.held_out == half]

@@ -45,7 +45,11 @@ def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR
             axis.set_axis_off()
         column[0].set_title(panel.title, fontsize=9)
     figure.colorbar(scale, ax=axes[2], extend="max", label="normal error (°)")
+    save_figure(path, figure, dpi=150)
 
+
+def save_figure(path: Path, figure: Figure, dpi: float | None = None) -> None:
+    """Write a PNG, at the figure's own resolution if none is given."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
-        figure.savefig(file, format="png", dpi=150)
+        figure.savefig(file, format="png", dpi=dpi or "figure")

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
-from nerfstudio.utils.eval_utils import eval_setup
 from rich.progress import track
 
 from dataparsers.errors import SceneError
@@ -25,6 +24,7 @@ from shellgs_method.export.tsdf import DepthView
 from shellgs_method.model import FacadeModel, reference_errors
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface, load_shell
 from shellgs_method.shell.similarity import transformed
+from shellgs_method.trained import load_run
 
 if TYPE_CHECKING:
     import trimesh
@@ -54,9 +54,7 @@ class TrainedRun:
             FileNotFoundError: there is no such file.
             SceneError: the run is of a method that is not ours.
         """
-        if not config.is_file():
-            raise FileNotFoundError(f"{config} does not exist: name the config.yml of a trained run")
-        _, pipeline, _, _ = eval_setup(config, test_mode="inference")
+        _, pipeline, _ = load_run(config, "inference")
         model, datamanager = pipeline.model, pipeline.datamanager
         if not isinstance(model, FacadeModel) or not isinstance(datamanager, FacadeDataManager):
             raise SceneError(f"{config} is of another method: only those of ShellGS render the depth that is needed")

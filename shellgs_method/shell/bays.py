@@ -75,7 +75,11 @@ def facade_axes(normals: Float64[np.ndarray, "N 3"], up: Float64[np.ndarray, " 3
     upright = upright[:: max(1, len(upright) // 2000)]
     alike = upright @ upright.T > np.cos(np.radians(10))
     out = upright[alike[alike.sum(axis=1).argmax()]].mean(axis=0)
-    out /= np.linalg.norm(out)
+    return wall_axes(out / np.linalg.norm(out), up)
+
+
+def wall_axes(out: Float64[np.ndarray, " 3"], up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Right, up and out of a wall, as rows; ``up`` need only be rough."""
     up = up - (up @ out) * out  # cameras look up at a building: what that tilts, the wall sets right
     up /= np.linalg.norm(up)
     return np.stack([np.cross(up, out), up, out])

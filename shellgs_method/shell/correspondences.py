@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.similarity import fit_similarity, transformed
+from shellgs_method.shell.similarity import centred, fit_similarity, transformed
 
 MAX_ERROR = 0.15
 """Metres between a point on the shell and the same one in the scene from which it counts as a mistake: five times the
@@ -89,16 +89,14 @@ def fit_robustly(
     Raises:
         SceneError: fewer than 3 points, or only points on one line, can be trusted.
     """
-    centre = shell.mean(axis=0)
-    shell = metres_per_shell_unit * (shell - centre)
+    survey_from_shell = centred(shell.mean(axis=0), metres_per_shell_unit)
+    shell = transformed(shell, survey_from_shell)
     _refuse_a_line(scene[candidates], shell[candidates], called, remedy)
     used = _consensus(scene, shell, candidates)
     _refuse_a_line(scene[used], shell[used], called, remedy)
     survey_from_scene = fit_similarity(scene[used], shell[used])
     residuals = np.linalg.norm(transformed(scene, survey_from_scene) - shell, axis=1)
     left_out = np.array([_left_out(k, scene, shell, used) for k in range(len(shell))])
-    survey_from_shell = np.diag([metres_per_shell_unit] * 3 + [1.0])
-    survey_from_shell[:3, 3] = -metres_per_shell_unit * centre
     matrix = np.linalg.inv(survey_from_scene) @ survey_from_shell
     return RobustFit(matrix, used, residuals, left_out)
 

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
 from shellgs_method.open3d import import_open3d
+from shellgs_method.shell.bays import wall_axes
 from shellgs_method.shell.refinement import FINAL_GATE, refine
 from shellgs_method.shell.similarity import transformed
 from shellgs_method.shell.surface import ShellSurface
@@ -117,16 +118,9 @@ def _main_wall(points: np.ndarray, cameras: np.ndarray, up: np.ndarray) -> _Clou
             centre = left[inliers].mean(0)
             out = out * np.sign((cameras.mean(0) - centre) @ out)
             near = np.abs((points - centre) @ out) < _FLAT * size
-            return _Cloud(points, points[near], _wall_axes(out, up))
+            return _Cloud(points, points[near], wall_axes(out, up))
         left = np.delete(left, inliers, axis=0)
     raise SceneError("the SfM points have no upright wall to start from: pick points and use --picks")
-
-
-def _wall_axes(out: np.ndarray, up: np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """Right, up and out of a wall, as rows; ``up`` need only be rough."""
-    up = up - (up @ out) * out
-    up /= np.linalg.norm(up)
-    return np.stack([np.cross(up, out), up, out])
 
 
 def _upwards(normals: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
@@ -135,7 +129,7 @@ def _upwards(normals: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
     across = normals[np.abs(normals @ first) < 0.2]
     if len(across) < 100:
         return [up]
-    axes = _wall_axes(first, _commonest(across))
+    axes = wall_axes(first, _commonest(across))
     return [up] if np.abs(axes @ up).max() > 0.97 else [*axes, *-axes]
 
 
@@ -163,7 +157,7 @@ def _shell_walls(samples: np.ndarray, normals: np.ndarray, up: np.ndarray) -> It
         level = edges[peak.argmax()] + 0.25
         wall = np.abs(height - level) < 1.0
         for side in (out, -out):
-            yield _wall_axes(side, up), samples[wall]
+            yield wall_axes(side, up), samples[wall]
         samples, normals = samples[~(wall & alike)], normals[~(wall & alike)]
 
 

@@ -23,3 +23,10 @@ def fit_similarity(source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarra
     matrix[:3, :3] = (s @ signs) / (source**2).sum() * (u * signs) @ vt
     matrix[:3, 3] = goal - matrix[:3, :3] @ centre
     return matrix
+
+
+def centred(centre: Float64[np.ndarray, " 3"], scale: float) -> Float64[np.ndarray, "4 4"]:
+    """The similarity that makes a point the origin and scales, without a turn."""
+    matrix = np.diag([scale] * 3 + [1.0])
+    matrix[:3, 3] = -scale * centre
+    return matrix

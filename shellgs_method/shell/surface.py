@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from shellgs_method.open3d import import_open3d
 from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.similarity import centred, transformed
 
 _FEW = 2000
 """Points below which waking other threads costs more than it saves, manyfold where other programs hold the cores."""
@@ -44,8 +44,7 @@ class ShellSurface:
 
     def __init__(self, mesh: ShellMesh, metres_per_shell_unit: float = 1.0) -> None:
         self._o3d = import_open3d()
-        self.survey_from_shell = np.diag([metres_per_shell_unit] * 3 + [1.0])
-        self.survey_from_shell[:3, 3] = -metres_per_shell_unit * mesh.bounds.mean(axis=0)
+        self.survey_from_shell = centred(mesh.bounds.mean(axis=0), metres_per_shell_unit)
         self.vertices = transformed(mesh.vertices, self.survey_from_shell)
         self.faces: Int64[np.ndarray, "F 3"] = mesh.faces
         self.bounds = np.stack([self.vertices.min(0), self.vertices.max(0)])
