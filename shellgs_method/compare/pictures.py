@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -33,6 +33,10 @@ REFERENCE = "photograph, shell"
 """What stands beside the methods."""
 FAR = 10
 """Voxels from which a point's colour is the last of the scale: 20 cm."""
+PANEL = (550, 880)
+"""Rows and columns of the picture of one point cloud, about twice what the page shows of it."""
+DOT = 3
+"""Side of a point in that picture in pixels."""
 
 
 def strip(runs: Sequence[Run], view: str, path: Path) -> None:
@@ -83,22 +87,35 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
     unit, voxel = _resolution(seen[0])
     reference = voxel_means(np.concatenate([_world(shot, shot.shell_depth) for shot in seen]), voxel)
     tree, centre, frame = KDTree(reference), np.median(reference, axis=0), _facade_frame(seen)
-    extent = 0.5 * np.linalg.norm(np.percentile(reference, 99, axis=0) - np.percentile(reference, 1, axis=0))
+    pixel = np.linalg.norm(np.percentile(reference, 99, axis=0) - np.percentile(reference, 1, axis=0)) / PANEL[1]
     figure = Figure(figsize=(3.4 * len(shots) + 0.8, 2.2 * len(AZIMUTHS)), layout="constrained")
     axes = figure.subplots(len(AZIMUTHS), len(shots), squeeze=False)
     colours = ScalarMappable(Normalize(0, FAR * voxel), colormaps["turbo"])
     for column, (name, views) in zip(axes.T, shots.items(), strict=True):
         points = voxel_means(np.concatenate([_world(shot, shot.depth) for shot in views]), voxel)
-        distance = tree.query(points)[0]
+        # Of points farther than the scale goes nothing more is asked: the search for their nearest would take minutes.
+        distance = tree.query(points, distance_upper_bound=FAR * voxel, workers=-1)[0]
+        dots = colours.to_rgba(distance, bytes=True)[:, :3]
         for axis, azimuth in zip(column, AZIMUTHS, strict=True):
-            right, up, towards = _seen_from(frame, azimuth) @ (points - centre).T
-            order = np.argsort(towards)
-            axis.scatter(right[order], up[order], c=colours.to_rgba(distance[order]), s=0.4, linewidths=0)
-            axis.set(aspect="equal", xlim=(-extent, extent), ylim=(-extent / 1.6, extent / 1.6))
+            axis.imshow(_dotted((points - centre) @ _seen_from(frame, azimuth).T / pixel, dots))
             axis.set_axis_off()
         column[0].set_title(name, fontsize=9)
     figure.colorbar(colours, ax=axes, extend="max", label=f"distance from the shell's points ({unit})", shrink=0.6)
     save_figure(path, figure, dpi=130)
+
+
+def _dotted(points: Float[np.ndarray, "N 3"], colours: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A square dot a point on white, the nearest before the others; right, up and towards the eye, in pixels."""
+    height, width = PANEL
+    picture = np.full((height, width, 3), 255, np.uint8)
+    points, colours = (values[np.argsort(points[:, 2])] for values in (points, colours))
+    column, row = np.floor([width / 2 + points[:, 0], height / 2 - points[:, 1]]).astype(int)
+    across, down = np.divmod(np.arange(DOT * DOT), DOT) - np.array(DOT // 2)
+    column, row = column[:, None] + across, row[:, None] + down
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    # Of a pixel that is painted more than once, the last colour stays.
+    picture[row[inside], column[inside]] = np.broadcast_to(colours[:, None], (*inside.shape, 3))[inside]
+    return picture
 
 
 def recorded_figures(run: Run) -> dict[str, dict[int, float]]:
