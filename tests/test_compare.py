@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import re
@@ -26,8 +27,8 @@ from dataparsers.errors import SceneError
 from shellgs_method.compare import launch
 from shellgs_method.compare.launch import launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, write_figures
-from shellgs_method.compare.pictures import recorded_figures
-from shellgs_method.compare.results import Comparison, compare, write_results
+from shellgs_method.compare.pictures import DOT, dotted, recorded_figures
+from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
 from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
 from shellgs_method.compare.wandb_report import log_comparison
@@ -228,6 +229,16 @@ def test_one_failure_stops_no_other_run(pristine_scene, tmp_path, jobs):
 
 
 @pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("terminal", [False, True])
+def test_the_console_says_that_results_are_written(pristine_scene, tmp_path, terminal):
+    said = io.StringIO()
+    console = Console(file=said, force_terminal=terminal)
+    runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
+    compare(runs, partial(launch_locally, jobs=1, console=console), tmp_path / "out", console)
+    assert WRITING in said.getvalue()
+
+
+@pytest.mark.usefixtures("fake_commands")
 def test_a_finished_run_is_not_touched_again(pristine_scene, tmp_path):
     runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
     finish_all(runs)
@@ -398,6 +409,14 @@ def test_the_report_needs_no_other_file_and_shows_every_view(measured, tmp_path)
     for picture in ("strip.png", "surfaces.png", "curves.png"):
         with Image.open(tmp_path / picture) as image:
             assert np.asarray(image).std() > 5
+
+
+def test_of_two_points_the_nearer_is_seen():
+    red, green = np.array([[255, 0, 0], [0, 255, 0]], np.uint8)
+    picture = dotted(np.array([[0.0, 0, 2], [0, 0, 1], [1e9, 0, 3]]), np.stack([red, green, green]))
+    painted = (picture != 255).any(axis=-1)
+    assert painted.sum() == DOT**2
+    assert (picture[painted] == red).all()
 
 
 def test_ablations_without_their_method_have_a_report(measured, tmp_path):

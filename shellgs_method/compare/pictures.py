@@ -97,14 +97,14 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
         distance = tree.query(points, distance_upper_bound=FAR * voxel, workers=-1)[0]
         dots = colours.to_rgba(distance, bytes=True)[:, :3]
         for axis, azimuth in zip(column, AZIMUTHS, strict=True):
-            axis.imshow(_dotted((points - centre) @ _seen_from(frame, azimuth).T / pixel, dots))
+            axis.imshow(dotted((points - centre) @ _seen_from(frame, azimuth).T / pixel, dots))
             axis.set_axis_off()
         column[0].set_title(name, fontsize=9)
     figure.colorbar(colours, ax=axes, extend="max", label=f"distance from the shell's points ({unit})", shrink=0.6)
     save_figure(path, figure, dpi=130)
 
 
-def _dotted(points: Float[np.ndarray, "N 3"], colours: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def dotted(points: Float[np.ndarray, "N 3"], colours: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """A square dot a point on white, the nearest before the others; right, up and towards the eye, in pixels."""
     height, width = PANEL
     picture = np.full((height, width, 3), 255, np.uint8)

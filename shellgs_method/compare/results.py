@@ -18,6 +18,7 @@ from shellgs_method.evaluation.tables import rich_table
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finishes runs; returns those that failed, with the reason."""
+WRITING = "Writing tables, pictures and report ..."
 
 
 class Comparison(NamedTuple):
@@ -41,7 +42,10 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
     unfinished = [run for run in runs if not run.finished]
     console.print(f"{len(runs) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
     failures = launch(unfinished) if unfinished else {}
-    comparison = write_results(runs, output, failures)
+    if not console.is_terminal:  # where a status shows nothing
+        console.print(WRITING)
+    with console.status(WRITING):
+        comparison = write_results(runs, output, failures)
     for table in comparison.tables:
         console.print(rich_table(table.rows, table.columns, table.title))
     for run, why in failures.items():
