@@ -8,14 +8,15 @@ import threading
 import urllib.request
 from contextlib import suppress
 from functools import cache
+from typing import TYPE_CHECKING
 
 import torch
 import torchvision
 from jaxtyping import Float
 from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
-from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+if TYPE_CHECKING:
+    from torchmetrics import Metric
 
 SMALLEST_LPIPS_IMAGE = 31
 """Side in pixels below which AlexNet's strides leave nothing of an image."""
@@ -28,13 +29,16 @@ def image_errors(rgb: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) ->
 
     Colours are in [0, 1]. SSIM has a Gaussian window of 11 pixels and sigma 1.5, LPIPS the AlexNet backbone.
     """
+    # Slow to import, and nothing to a process that measures no picture.
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
     rgb, target = rgb.detach().clamp(0, 1).permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
     figures = {
         "psnr": min(peak_signal_noise_ratio(rgb, target, data_range=1.0).item(), 100.0),
         "ssim": structural_similarity_index_measure(rgb, target, data_range=1.0).item(),  # pyright: ignore
     }
     network = lpips_network()
-    if isinstance(network, Metric) and min(rgb.shape[-2:]) >= SMALLEST_LPIPS_IMAGE:
+    if not isinstance(network, str) and min(rgb.shape[-2:]) >= SMALLEST_LPIPS_IMAGE:
         with torch.no_grad():
             figures["lpips"] = network.to(rgb.device)(rgb, target).item()
     return figures
@@ -51,6 +55,8 @@ def lpips_network() -> Metric | str:
         obstacle = f"the weights of AlexNet are not at {cached}, and {url} cannot be reached"
     else:
         try:
+            from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
             return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
         except Exception as error:  # a cut download, a damaged file, a full disk: the run goes on without LPIPS
             obstacle = f"the weights of AlexNet cannot be loaded from {cached}: {error}"
