@@ -11,7 +11,7 @@ from torch._inductor.cpp_builder import get_cpp_compiler
 from torch._inductor.exc import InvalidCxxCompiler
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method.rasterizer import fusion
+from shellgs_method import fusion
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 

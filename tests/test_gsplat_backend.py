@@ -60,12 +60,15 @@ def steep_discs(n: int, n_features: int, seed: int) -> list[Tensor]:
 @pytest.mark.parametrize(
     ("primitive", "make", "maps"), [("3d", make_splats, ()), ("2d", make_discs, DISC_MAPS), ("2d", steep_discs, ())]
 )
-def test_gsplat_gives_the_picture_and_gradients_of_the_torch_backend(primitive, make, maps):
+@pytest.mark.parametrize("n_densifying", [None, 3])
+def test_gsplat_gives_the_picture_and_gradients_of_the_torch_backend(primitive, make, maps, n_densifying):
     cameras = orbit(make_camera(45, 37), 2)
     splats = [splat.requires_grad_() for splat in make(80, 5, seed=2)]
     results = []
     for backend in ("torch", "gsplat"):
-        composited, alpha, info = rasterize(*splats, camera=cameras, primitive=primitive, backend=backend)
+        composited, alpha, info = rasterize(
+            *splats, camera=cameras, primitive=primitive, backend=backend, n_densifying=n_densifying
+        )
         pictures = [composited, alpha, *(info[name] for name in maps)]
         results.append([*pictures, *gradients(splats, pictures, info["means2d"])])
     torch.testing.assert_close(*results, rtol=1e-8, atol=1e-10)

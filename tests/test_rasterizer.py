@@ -13,7 +13,8 @@ from random_splats import NAMES, make_camera, make_splats, orbit
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.rasterizer import compositing, fusion, rasterize
+from shellgs_method import fusion
+from shellgs_method.rasterizer import compositing, rasterize
 
 pytestmark = pytest.mark.usefixtures("eager")
 
@@ -102,7 +103,7 @@ def test_a_failure_to_compile_is_said_once_and_the_picture_is_made_all_the_same(
     for _ in range(2):
         torch.testing.assert_close(render(50, 33, 21), expected, atol=1e-4, rtol=0)
     assert [record.getMessage() for record in caplog.records] == [
-        "The rasterizer runs without torch.compile, slower: RuntimeError: no C++ compiler"
+        "Rasterizer and losses run without torch.compile, slower: RuntimeError: no C++ compiler"
     ]
 
 
@@ -307,3 +308,36 @@ def test_gsplats_default_strategy_densifies_unchanged():
     assert sizes[9] > sizes[0]
     assert sizes[-1] < sizes[9]
     assert all(torch.tensor(losses).isfinite())
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_the_gradient_to_densify_by_is_that_of_the_first_features_alone(primitive):
+    splats = [splat.requires_grad_() for splat in make_splats(90, 5, seed=0)]
+    camera = make_camera(37, 29)
+    slope = torch.randn(29, 37, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    of_first = slope.clone()
+    of_first[..., 3:] = 0
+
+    def gradients(slope: Tensor, n_densifying: int | None) -> list[Tensor]:
+        composited, alpha, info = rasterize(*splats, camera=camera, primitive=primitive, n_densifying=n_densifying)
+        output = (torch.cat([composited, alpha], dim=-1) * slope).sum()
+        return list(torch.autograd.grad(output, [*splats, info["means2d"]]))
+
+    *of_splats, to_densify = gradients(slope, n_densifying=3)
+    torch.testing.assert_close(of_splats, gradients(slope, None)[:-1])  # all that moves a splat stays
+    torch.testing.assert_close(to_densify, gradients(of_first, None)[-1])
+
+
+def test_the_gradient_to_densify_by_is_the_same_where_it_is_compiled(compiler):
+    splats = [splat.float().requires_grad_() for splat in make_splats(100, 5, seed=0)]
+
+    def gradients() -> list[Tensor]:
+        composited, alpha, info = rasterize(*splats, camera=make_camera(37, 29), n_densifying=3)
+        output = composited.square().sum() + alpha.square().sum()
+        return list(torch.autograd.grad(output, [*splats, info["means2d"]]))
+
+    compiled = gradients()
+    assert not fusion._failed
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SHELLGS_COMPILE", "0")
+        torch.testing.assert_close(compiled, gradients(), rtol=1e-3, atol=1e-3)

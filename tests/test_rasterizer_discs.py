@@ -12,7 +12,8 @@ from random_splats import NAMES, make_camera, make_splats, orbit
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.rasterizer import fusion, quats_to_rotations, rasterize
+from shellgs_method import fusion
+from shellgs_method.rasterizer import quats_to_rotations, rasterize
 
 pytestmark = pytest.mark.usefixtures("eager")
 

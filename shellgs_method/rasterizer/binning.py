@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from shellgs_method.rasterizer.fusion import run_fused
+from shellgs_method.fusion import run_fused
 
 TILE = 8  # pixels along the side of a tile
 

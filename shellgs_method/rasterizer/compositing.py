@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer.binning import TILE, Bins, stable_order
-from shellgs_method.rasterizer.fusion import run_fused
 from shellgs_method.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 
 CHUNK = 8  # splats a kernel takes at once
@@ -32,6 +32,8 @@ def composite(
     order: Int[Tensor, "n"],
     bins: Bins,
     kernels: Kernels,
+    probed: Float[Tensor, "N 2+k"] | None = None,
+    n_probed: int = 0,
 ) -> Float[Tensor, "height width C+1+maps"]:
     """Composite splats over the image of ``bins``: features, alpha, and the primitive's maps.
 
@@ -42,8 +44,11 @@ def composite(
         order: the splats in the bins, front to back.
         bins: of the splats in this order.
         kernels: of the primitive.
+        probed: the means2d and first k of the shapes once more, to get the gradient of the first ``n_probed`` features
+            alone; k is the primitive's.
+        n_probed: number of these features.
     """
-    return _Composite.apply(means2d, shapes, features, order, bins, kernels)
+    return _Composite.apply(means2d, shapes, features, probed, order, bins, kernels, n_probed)
 
 
 @dataclass(frozen=True)
@@ -80,26 +85,28 @@ class _Plan:
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, shapes, features, order, bins, kernels):
+    def forward(ctx, means2d, shapes, features, probed, order, bins, kernels, n_probed):
         columns = [each.index_select(0, order) for each in (means2d, shapes, features)]
         table = F.pad(torch.cat([*columns, features.new_ones(len(order), 1)], dim=1), (0, 0, 0, 1))
         table[-1, : kernels.n_shape] = table.new_tensor(kernels.null_shape)  # fills up a tile's last chunk
         canvas, plans = _paint(table, bins, kernels)
         ctx.save_for_backward(table, order)
         ctx.n, ctx.bins, ctx.plans, ctx.kernels = len(means2d), bins, plans, kernels
+        ctx.n_probed = None if probed is None else n_probed
         return _untile(canvas[:-1], bins)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradients):
         table, order = ctx.saved_tensors
-        by_row = _gradients(_tile(gradients, ctx.bins), table, ctx.plans, ctx.kernels)
-        widths = [2, ctx.kernels.n_shape - 2, table.shape[1] - ctx.kernels.n_shape - 1]
-        by_input = (
+        by_row = _gradients(_tile(gradients, ctx.bins), table, ctx.plans, ctx.kernels, ctx.n_probed)
+        n_shape, n_params = ctx.kernels.n_shape, table.shape[1]
+        widths = [2, n_shape - 2, n_params - n_shape - 1, 1, by_row.shape[1] - n_params]
+        means2d, shapes, features, _, probed = (
             table.new_zeros(ctx.n, each.shape[1]).index_copy_(0, order, each)
-            for each in by_row[:-1, :-1].split(widths, dim=1)
+            for each in by_row[:-1].split(widths, dim=1)
         )
-        return *by_input, None, None, None
+        return means2d, shapes, features, None if ctx.n_probed is None else probed, None, None, None, None
 
 
 def _paint(
@@ -156,16 +163,20 @@ def _follow(
 
 
 def _gradients(
-    gradients: Float[Tensor, "tiles+1 C P"], table: Float[Tensor, "N+1 K"], plans: list[_Plan], kernels: Kernels
-) -> Float[Tensor, "N+1 K"]:
-    """Gradients of the table's rows from those of the composited totals."""
-    by_params = torch.zeros_like(table)
-    behind = table.new_zeros(len(gradients), 1, TILE * TILE)
-    for group in _in_groups(plans[::-1], MAX_SUMMED // (CHUNK * LANES * table[0].nbytes)):
+    gradients: Float[Tensor, "tiles+1 C P"],
+    table: Float[Tensor, "N+1 K"],
+    plans: list[_Plan],
+    kernels: Kernels,
+    n_probed: int | None,
+) -> Float[Tensor, "N+1 K+probed"]:
+    """Gradients of the table's rows from those of the composited totals; behind them, what is probed."""
+    by_params = table.new_zeros(len(table), table.shape[1] + (0 if n_probed is None else kernels.n_probed))
+    behind = table.new_zeros(len(gradients), 1 if n_probed is None else 2, TILE * TILE)
+    for group in _in_groups(plans[::-1], MAX_SUMMED // (CHUNK * LANES * by_params[0].nbytes)):
         splats = torch.cat([plan.splats[: plan.n_met] for plan in group])
-        by_row = table.new_empty(*splats.shape, table.shape[1])
+        by_row = table.new_empty(*splats.shape, by_params.shape[1])
         for plan, by_row_of_plan in zip(group, by_row.split([plan.n_met for plan in group]), strict=True):
-            _walk_back(plan, by_row_of_plan, gradients, behind, table, kernels)
+            _walk_back(plan, by_row_of_plan, gradients, behind, table, kernels, n_probed)
         by_params += _sum_by_splat(by_row.flatten(0, 2), splats.flatten(), len(table))
     return by_params
 
@@ -174,21 +185,24 @@ def _walk_back(
     plan: _Plan,
     by_row: Float[Tensor, "rows L V K"],
     gradients: Float[Tensor, "tiles+1 C P"],
-    behind: Float[Tensor, "tiles+1 1 P"],
+    behind: Float[Tensor, "tiles+1 groups P"],
     table: Float[Tensor, "N+1 K"],
     kernels: Kernels,
+    n_probed: int | None,
 ) -> None:
     """Fill in the gradients of the splats a plan has met, and bring ``behind`` to before them."""
     pixels, stop = _pixels(table), _stop(plan, table)
-    gradients_here, (behind_here,) = _gather(gradients, plan.tiles), _gather(behind, plan.tiles)
+    gradients_here, behind_here = _gather(gradients, plan.tiles), _gather(behind, plan.tiles)
     for i, transmittance in reversed([*enumerate(plan.transmittances)]):
         rows, n = plan.chunk(i), len(transmittance)
+        totals = [gradient[:n] for gradient in gradients_here]
+        groups = (totals, []) if n_probed is None else (totals[:n_probed], totals[n_probed:])
         run_fused(
             kernels.backward,
-            *(transmittance, behind_here[:n], [gradient[:n] for gradient in gradients_here]),
+            *(transmittance, [each[:n] for each in behind_here], *groups),
             *(by_row[rows], table, plan.splats[rows], plan.centres[:n], *pixels, stop[:n]),
         )
-    behind.index_copy_(0, plan.tiles.flatten(), behind_here.transpose(1, 2).reshape(-1, *behind.shape[1:]))
+    behind.index_copy_(0, plan.tiles.flatten(), torch.stack(behind_here, -1).permute(0, 2, 3, 1).flatten(0, 1))
 
 
 def _sum_by_splat(rows: Float[Tensor, "n K"], splats: Int[Tensor, "n"], n_splats: int) -> Float[Tensor, "n_splats K"]:

@@ -21,12 +21,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from shellgs_method.rasterizer.kernels import Kernels, attenuate, look_up, walk_back
+from shellgs_method.rasterizer.kernels import Kernels, attenuate, look_up, walk_back_groups
 from shellgs_method.rasterizer.projection import NEAR_PLANE
 
 _LOW_PASS = 1 / math.log(2)  # exponent over squared distance in pixels: rho = 2 |x - c|², alpha ~ exp(-rho / 2)
 _NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, math.inf)
 _N_SHAPE, _N_MAPS = len(_NULL_SHAPE), 3
+_N_PROBED = _N_SHAPE - 1  # all but n
 
 
 def _forward(
@@ -55,8 +56,9 @@ def _forward(
 
 def _backward(
     transmittance: Float[Tensor, "G P V"],
-    behind: Float[Tensor, "G P V"],
+    behinds: list[Float[Tensor, "G P V"]],
     gradients: list[Float[Tensor, "G P V"]],
+    others: list[Float[Tensor, "G P V"]],
     by_params: Float[Tensor, "G L V K"],
     table: Float[Tensor, "N K"],
     splats: Int[Tensor, "G L V"],
@@ -67,8 +69,9 @@ def _backward(
 ) -> None:
     params = look_up(table, splats, centres)
     chunk = params[:, :, None].unbind(3)
-    *gradients, by_median = gradients
-    by_inverse, by_square = gradients[-2:]
+    *groups, (*last, by_median) = [gradients, others] if others else [gradients]
+    groups = [*groups, last]
+    by_inverse, by_square = last[-2:]
     met = []
     for splat in chunk:
         intersection = _intersect(splat, x, y)
@@ -76,23 +79,21 @@ def _backward(
         alpha, weight, transmittance = attenuate(intersection[0], before, stop)
         met.append((intersection, alpha, weight, torch.where(_halves(before, transmittance), by_median, 0.0)))
 
-    before_chunk, by_z = behind, []
+    befores, by_z = list(behinds), []
     for splat, (intersection, alpha, weight, _) in zip(reversed(chunk), reversed(met), strict=True):
         z, *_, inverse_depth, _ = intersection
         values = [*splat[:, _N_SHAPE:].unbind(1), inverse_depth, inverse_depth * inverse_depth]
-        before_chunk, gradient = walk_back(before_chunk, z, alpha, weight, gradients, values)
-        by_z.append(gradient)
-    behind.copy_(before_chunk)
+        by_z.append(walk_back_groups(befores, z, alpha, weight, groups, values))
+    for behind, before in zip(behinds, befores, strict=True):
+        behind.copy_(before)
 
     # All splats at once, [L, G, P, V]. Meeting them again is cheaper than storing what was met.
-    by_z, w = torch.stack(by_z[::-1]), torch.stack([weight for _, _, weight, _ in met])
+    probed_by_z = torch.stack([of_groups[0] for of_groups in by_z[::-1]])
+    by_z = torch.stack([sum(of_groups[1:], start=of_groups[0]) for of_groups in by_z[::-1]])
+    w = torch.stack([weight for _, _, weight, _ in met])
     by_median = torch.stack([each for *_, each in met])
     _, ahead, s, t, depth, inverse_depth, hits = _intersect(params.permute(2, 0, 1, 3)[:, :, :, None], x, y)
-    # by the numerators of s and t, by inverse depth, and by the exponent where the low-pass decides
-    by_radius = torch.where(ahead > 0, 2 * by_z * depth, 0.0)
-    by_s, by_t, by_screen = by_radius * s, by_radius * t, torch.where(ahead > 0, 0.0, by_z)
     by_i = hits * (w * (by_inverse + 2 * inverse_depth * by_square) - depth * depth * by_median)
-    by_i = by_i - (by_s * s + by_t * t)
     u, v, a, b, c, d, _, q, r = params[:, : _N_SHAPE - 1].permute(1, 2, 0, 3)
 
     def moments(gradient: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -100,12 +101,21 @@ def _backward(
         total = gradient.sum(2)
         return total, (gradient * x).sum(2) - u * total, (gradient * y).sum(2) - v * total
 
-    (s, sx, sy), (t, tx, ty), (i, ix, iy), (_, nx, ny) = (moments(each) for each in (by_s, by_t, by_i, by_screen))
-    by_u = -(a * s + c * t + q * i + 2 * _LOW_PASS * nx)
-    by_v = -(b * s + d * t + r * i + 2 * _LOW_PASS * ny)
-    shape = [by_u, by_v, sx, sy, tx, ty, i, ix, iy, by_z.sum(2)]
-    by_features = [(w * gradient).sum(2) for gradient in gradients[:-2]]
-    by_params.copy_(torch.stack([*shape, *by_features]).permute(2, 1, 3, 0))
+    def by_shape(by_z: Tensor, by_i: Tensor | float) -> list[Tensor]:
+        # by the numerators of s and t, by inverse depth, and by the exponent where the low-pass decides
+        by_radius = torch.where(ahead > 0, 2 * by_z * depth, 0.0)
+        by_s, by_t, by_screen = by_radius * s, by_radius * t, torch.where(ahead > 0, 0.0, by_z)
+        by_i = by_i - (by_s * s + by_t * t)
+        of_s, of_t, of_i, (_, nx, ny) = (moments(each) for each in (by_s, by_t, by_i, by_screen))
+        by_u = -(a * of_s[0] + c * of_t[0] + q * of_i[0] + 2 * _LOW_PASS * nx)
+        by_v = -(b * of_s[0] + d * of_t[0] + r * of_i[0] + 2 * _LOW_PASS * ny)
+        return [by_u, by_v, *of_s[1:], *of_t[1:], *of_i, by_z.sum(2)]
+
+    columns = by_shape(by_z, by_i)
+    columns += [(w * gradient).sum(2) for gradient in [each for group in groups for each in group][:-2]]
+    if others:
+        columns += by_shape(probed_by_z, 0.0)[:_N_PROBED]
+    by_params.copy_(torch.stack(columns).permute(2, 1, 3, 0))
 
 
 def _intersect(
@@ -134,4 +144,4 @@ def _halves(before: Tensor, behind: Tensor) -> Tensor:
     return (before > 0.5) & (behind <= 0.5)
 
 
-DISCS = Kernels(_NULL_SHAPE, _N_MAPS, _forward, _backward)
+DISCS = Kernels(_NULL_SHAPE, _N_MAPS, _forward, _backward, _N_PROBED)

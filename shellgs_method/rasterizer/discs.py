@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer.binning import touches
-from shellgs_method.rasterizer.fusion import run_fused
 from shellgs_method.rasterizer.projection import (
     NEAR_PLANE,
     Projection,
@@ -33,6 +34,7 @@ def project_discs(
     scales: Float[Tensor, "N 3"],
     opacities: Float[Tensor, "N"],
     cameras: Sequence[Camera],
+    with_probe: bool = False,
 ) -> Projection:
     """Project discs with the half-axes s_u t_u and s_v t_v, the first two; differentiable in the means2d and shapes.
 
@@ -47,7 +49,13 @@ def project_discs(
     views = stack_cameras(cameras)
     means2d, depths, in_front = run_fused(_project_centres, means, *views)
     shapes, outlines, covars2d, visible = run_fused(_project, means2d, depths, quats, scales, opacities, *views)
-    return Projection(means2d, shapes, depths.detach(), outlines, covars2d, visible & in_front)
+    projection = Projection(means2d, shapes, depths.detach(), outlines, covars2d, visible & in_front)
+    if not with_probe:
+        return projection
+    probe = means2d.detach().requires_grad_()
+    fixed = (each.detach() for each in (depths, quats, scales, opacities))
+    shapes = run_fused(_project, probe, *fixed, *views)[0]
+    return replace(projection, probe=probe, probed=torch.cat([probe, shapes[..., :-1]], dim=-1))  # all but n
 
 
 def _project_centres(

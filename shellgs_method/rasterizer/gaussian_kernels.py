@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from shellgs_method.rasterizer.kernels import Kernels, attenuate, look_up, walk_back
+from shellgs_method.rasterizer.kernels import Kernels, attenuate, look_up, walk_back_groups
 
 _NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, math.inf)
 _FEATURES = slice(len(_NULL_SHAPE), None)
@@ -40,8 +40,9 @@ def _forward(
 
 def _backward(
     transmittance: Float[Tensor, "G P V"],
-    behind: Float[Tensor, "G P V"],
+    behinds: list[Float[Tensor, "G P V"]],
     gradients: list[Float[Tensor, "G P V"]],
+    others: list[Float[Tensor, "G P V"]],
     by_params: Float[Tensor, "G L V K"],
     table: Float[Tensor, "N K"],
     splats: Int[Tensor, "G L V"],
@@ -58,22 +59,31 @@ def _backward(
         alpha, weight, transmittance = attenuate(z, transmittance, stop)
         met.append((z, alpha, weight))
 
-    before, grad_z = behind, []
+    befores, by_z = list(behinds), []
     for splat, (z, alpha, weight) in zip(reversed(chunk), reversed(met), strict=True):
-        before, gradient = walk_back(before, z, alpha, weight, gradients, splat[:, _FEATURES].unbind(1))
-        grad_z.append(gradient)
-    behind.copy_(before)
+        groups = [gradients, others] if others else [gradients]
+        by_z.append(walk_back_groups(befores, z, alpha, weight, groups, splat[:, _FEATURES].unbind(1)))
+    for behind, before in zip(behinds, befores, strict=True):
+        behind.copy_(before)
 
-    # u, v, a, b, c and n take the moments of grad_z about the splat's centre, shifted there from the tile's.
-    q, w = torch.stack(grad_z[::-1]), torch.stack([weight for _, _, weight in met])  # [L, G, P, V]
+    # u, v, a, b, c and n take the moments of the gradient by z about the splat's centre, shifted there from the tile's.
+    q, w = (
+        torch.stack([sum(groups[1:], start=groups[0]) for groups in by_z[::-1]]),
+        torch.stack([weight for *_, weight in met]),
+    )  # [L G P V]
     qx, qy = q * x, q * y
     q, sx, sy, sxx, sxy, syy = (moment.sum(2) for moment in (q, qx, qy, qx * x, qx * y, qy * y))
     u, v, a, b, c = params[:, :5].permute(1, 2, 0, 3)
     mx, my = sx - u * q, sy - v * q
     mxx, mxy, myy = sxx - u * (sx + mx), sxy - u * sy - v * mx, syy - v * (sy + my)
     shape = [-2 * a * mx - b * my, -b * mx - 2 * c * my, mxx, mxy, myy, q]
-    by_features = [(w * gradient).sum(2) for gradient in gradients]
-    by_params.copy_(torch.stack([*shape, *by_features]).permute(2, 1, 3, 0))
+    columns = [*shape, *((w * gradient).sum(2) for gradient in [*gradients, *others])]
+    if others:
+        q = torch.stack([groups[0] for groups in by_z[::-1]])
+        sq = q.sum(2)
+        mx, my = (q * x).sum(2) - u * sq, (q * y).sum(2) - v * sq
+        columns += [-2 * a * mx - b * my, -b * mx - 2 * c * my]
+    by_params.copy_(torch.stack(columns).permute(2, 1, 3, 0))
 
 
 def _exponent(splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]) -> Tensor:
@@ -82,4 +92,4 @@ def _exponent(splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Flo
     return (a * dx + b * dy) * dx + c * dy * dy + n
 
 
-GAUSSIANS = Kernels(_NULL_SHAPE, 0, _forward, _backward)
+GAUSSIANS = Kernels(_NULL_SHAPE, 0, _forward, _backward, n_probed=2)

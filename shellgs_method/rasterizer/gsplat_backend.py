@@ -9,7 +9,7 @@ import functools
 import importlib
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -63,6 +63,7 @@ def rasterize_3d(
     opacities: Float[Tensor, "N"],
     features: Float[Tensor, "N C"],
     cameras: Sequence[Camera],
+    n_densifying: int | None = None,
 ) -> Picture:
     """Rasterize Gaussians on cameras of one size; float32 on a CUDA device, like all tensors here.
 
@@ -77,11 +78,16 @@ def rasterize_3d(
     # or the picture would break off at their borders; or, of a faint splat, not so far, which saves time.
     reach = (cutoffs(opacities).sqrt() / 3).view(-1, *[1] * (radii.dim() - 2))
     bins = _bin(means2d, radii * reach, depths, width, height)
-    composited, alpha = rasterize_to_pixels(
-        *(means2d, conics, features.expand(len(cameras), -1, -1), opacities.expand(len(cameras), -1)),
-        *(width, height, TILE, *bins),
-    )
-    return Picture(composited, alpha, composited[..., :0], means2d, radii)
+    probe, groups = _probed(means2d, features, n_densifying)
+    pictures = [
+        rasterize_to_pixels(
+            *(centres, conics, group.expand(len(cameras), -1, -1), opacities.expand(len(cameras), -1)),
+            *(width, height, TILE, *bins),
+        )
+        for centres, group in groups
+    ]
+    composited, alpha = torch.cat([picture for picture, _ in pictures], dim=-1), pictures[-1][1]
+    return Picture(composited, alpha, composited[..., :0], probe, radii)
 
 
 def rasterize_2d(
@@ -91,6 +97,7 @@ def rasterize_2d(
     opacities: Float[Tensor, "N"],
     features: Float[Tensor, "N C"],
     cameras: Sequence[Camera],
+    n_densifying: int | None = None,
 ) -> Picture:
     """Rasterize the discs of 2DGS (Huang et al. 2024).
 
@@ -102,13 +109,40 @@ def rasterize_2d(
     that its maps have the depth of the centre for all of a disc that is as good as edge-on.
     """
     discs = _project_discs(means, quats, scales, opacities, cameras)
-    # One camera at a time: gsplat 1.4 writes the normals of a batch over those of its first (its issue #425).
-    views = [_composite_discs(discs, i, opacities, features, camera) for i, camera in enumerate(cameras)]
-    composited, alpha, maps = (torch.cat(view) for view in zip(*views, strict=True))
-    return Picture(composited, alpha, maps, discs.means2d, discs.radii)
+    probe, groups = _probed(discs.means2d, features, n_densifying)
+    pictures = []
+    for means2d, group in groups:
+        moved = replace(discs, means2d=means2d, ray_transforms=_centred(discs.ray_transforms, means2d))
+        # One camera at a time: gsplat 1.4 writes the normals of a batch over those of its first (its issue #425).
+        views = [_composite_discs(moved, i, opacities, group, camera) for i, camera in enumerate(cameras)]
+        pictures.append([torch.cat(view) for view in zip(*views, strict=True)])
+    composited = torch.cat([picture[0] for picture in pictures], dim=-1)
+    _, alpha, maps = pictures[-1]
+    return Picture(composited, alpha, maps, probe, discs.radii)
 
 
 RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
+
+
+def _probed(
+    means2d: Float[Tensor, "B N 2"], features: Float[Tensor, "N C"], n_densifying: int | None
+) -> tuple[Float[Tensor, "B N 2"], list[tuple[Float[Tensor, "B N 2"], Float[Tensor, "N c"]]]]:
+    """The means2d whose gradient is to drive densification, and groups of features, each with means2d to composite at.
+
+    The kernels tell the gradients of features apart only if they are composited apart; alpha belongs to the last group.
+    """
+    if n_densifying is None:
+        return means2d, [(means2d, features)]
+    probe = means2d.detach().requires_grad_()
+    first, rest = features[:, :n_densifying], features[:, n_densifying:]
+    return probe, [(means2d + (probe - probe.detach()), first), (means2d, rest)]
+
+
+def _centred(ray_transforms: Float[Tensor, "B N 3 3"], means2d: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N 3 3"]:
+    """The ray transforms of discs with their centres, the last column, taken from the means2d and their depths."""
+    depths = ray_transforms[..., 2:, 2]
+    centres = torch.cat([means2d * depths, depths], dim=-1)
+    return torch.cat([ray_transforms[..., :2], centres[..., None]], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -150,10 +184,9 @@ def _project_discs(
     # boxes there, unlike the torch backend, and in 1.4 their gradient lacks the mixed terms of a tilted disc.
     depths = ray_transforms[..., 2:, 2]
     means2d = ray_transforms[..., :2, 2] / depths
-    centres = torch.cat([means2d * depths, depths], dim=-1)
-    ray_transforms = torch.cat([ray_transforms[..., :2], centres[..., None]], dim=-1)
+    ray_transforms = _centred(ray_transforms, means2d)
 
-    centres = centres @ torch.linalg.inv(Ks).mT
+    centres = ray_transforms[..., 2] @ torch.linalg.inv(Ks).mT
     planes = (normals * centres).sum(-1, keepdim=True)
     shows = visible & (planes[..., 0].detach().abs() > EDGE_ON * centres.detach().norm(dim=-1))
     # The low-pass shows a steep disc even where the ray meets its plane behind the camera; the depth of the centre is

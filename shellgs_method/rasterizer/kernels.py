@@ -39,15 +39,19 @@ class Kernels:
         forward: from the transmittance before a chunk (0 once the pixel has stopped) [G P V], a list of totals [G P V],
             to which it adds those of the chunk, and the rest as above: the transmittance behind the chunk, and its
             maximum over each tile's pixels [G V].
-        backward: walks a chunk back to front. From the transmittance before it, ``behind`` [G P V] (see
+        backward: walks a chunk back to front. From the transmittance before it, a list of ``behind`` [G P V] (see
             :func:`walk_back`), which it brings to before the chunk, the list of the totals' gradients, the gradients of
-            the parameters [G L V K], which it fills, summed over a tile's pixels, and the rest as above.
+            the parameters [G L V K], which it fills, summed over a tile's pixels, and the rest as above. The totals'
+            gradients are in two lists, each with a ``behind`` of its own: where the second is not empty, the first
+            ``n_probed`` parameters have columns once more at the end, for their gradients by the first list alone.
+        n_probed: number of the parameters, from u and v, that follow from where the splat is on the screen.
     """
 
     null_shape: tuple[float, ...]
     n_maps: int
     forward: Callable[..., tuple[Tensor, Tensor]]
     backward: Callable[..., None]
+    n_probed: int
 
     @property
     def n_shape(self) -> int:
@@ -93,6 +97,24 @@ def walk_back(
         excess = excess + gradient * value
     # d alpha / dz = -ln 2 alpha, and 0 where alpha is at its limit
     return behind + alpha * excess, torch.where(z > 0, (-math.log(2)) * weight * excess, 0.0)
+
+
+def walk_back_groups(
+    behinds: list[Float[Tensor, "G P V"]],
+    z: Float[Tensor, "G P V"],
+    alpha: Float[Tensor, "G P V"],
+    weight: Float[Tensor, "G P V"],
+    groups: Sequence[Sequence[Tensor]],
+    values: Sequence[Tensor],
+) -> list[Float[Tensor, "G P V"]]:
+    """:func:`walk_back` for groups of totals apart, in place in the list: the gradients by z of each."""
+    by_z, first = [], 0
+    for i, gradients in enumerate(groups):
+        of_group = values[first : first + len(gradients)]
+        behinds[i], gradient = walk_back(behinds[i], z, alpha, weight, gradients, of_group)
+        by_z.append(gradient)
+        first += len(gradients)
+    return by_z
 
 
 def _halve(z: Tensor) -> Tensor:

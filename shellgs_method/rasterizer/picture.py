@@ -16,7 +16,8 @@ class Picture:
         composited: sums of weight times feature.
         alpha: sums of the weights.
         maps: of discs, the sums of weight over z and over z², and the median depth; of Gaussians none.
-        means2d: projected centres in pixels, through which all gradient by them goes.
+        means2d: projected centres in pixels, through which all gradient by them goes; where some features are to drive
+            densification, a leaf that gets the gradient of these alone.
         radii: in pixels, as the installed gsplat has them: one, or from 1.5 one each along x and y; 0 where invisible.
     """
 

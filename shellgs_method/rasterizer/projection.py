@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer.binning import touches
-from shellgs_method.rasterizer.fusion import run_fused
 
 NEAR_PLANE = 0.01
 LOW_PASS = 0.3  # variance in px² added to every splat
@@ -33,6 +33,8 @@ class Projection:
         outlines: O ellipses (see :mod:`~.binning`) that together cover the pixels where alpha reaches 1/255.
         covars2d: covariances (xx, xy, yy) in px², low-pass included.
         visible: in front of the near plane, and an outline touches the image.
+        probe: if asked for, a leaf of the values of ``means2d`` that leads to ``probed`` alone.
+        probed: the centres and shapes (as far as these follow from the centres) as they follow from the probe.
     """
 
     means2d: Float[Tensor, "B N 2"]
@@ -41,12 +43,15 @@ class Projection:
     outlines: Float[Tensor, "B N O 7"]
     covars2d: Float[Tensor, "B N 3"]
     visible: Bool[Tensor, "B N"]
+    probe: Float[Tensor, "B N 2"] | None = None
+    probed: Float[Tensor, "B N 2+k"] | None = None
 
     def views(self) -> Iterator[View]:
         """What each camera sees of them."""
         parts = (self.means2d, self.shapes, self.depths, self.outlines, self.visible)
         # unbind, whose gradient is a stack, where indexing would fill a whole batch for each view.
-        return (View(*view) for view in zip(*(part.unbind(0) for part in parts), strict=True))
+        probed = [None] * len(self.means2d) if self.probed is None else self.probed.unbind(0)
+        return (View(*view) for view in zip(*(part.unbind(0) for part in parts), probed, strict=True))
 
 
 class View(NamedTuple):
@@ -57,6 +62,7 @@ class View(NamedTuple):
     depths: Float[Tensor, "N"]
     outlines: Float[Tensor, "N O 7"]
     visible: Bool[Tensor, "N"]
+    probed: Float[Tensor, "N 2+k"] | None
 
 
 def project_gaussians(
@@ -65,12 +71,16 @@ def project_gaussians(
     scales: Float[Tensor, "N 3"],
     opacities: Float[Tensor, "N"],
     cameras: Sequence[Camera],
+    with_probe: bool = False,
 ) -> Projection:
     """Project Gaussians (EWA splatting, Zwicker et al. 2001); differentiable in the means2d and shapes.
 
-    Their shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`.
+    Their shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`; none follows from
+    where the centre is on the screen.
     """
-    return Projection(*run_fused(_project, means, quats, scales, opacities, *stack_cameras(cameras)))
+    projected = run_fused(_project, means, quats, scales, opacities, *stack_cameras(cameras))
+    probe = projected[0].detach().requires_grad_() if with_probe else None
+    return Projection(*projected, probe=probe, probed=probe)
 
 
 def _project(

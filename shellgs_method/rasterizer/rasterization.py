@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer import gsplat_backend
 from shellgs_method.rasterizer.binning import bin_splats, stable_order
 from shellgs_method.rasterizer.compositing import composite
 from shellgs_method.rasterizer.disc_kernels import DISCS
 from shellgs_method.rasterizer.discs import disc_maps, project_discs
-from shellgs_method.rasterizer.fusion import run_fused
 from shellgs_method.rasterizer.gaussian_kernels import GAUSSIANS
 from shellgs_method.rasterizer.kernels import Kernels
 from shellgs_method.rasterizer.picture import Picture
@@ -33,6 +33,7 @@ def rasterize(
     camera: Camera | Sequence[Camera],
     primitive: Literal["3d", "2d"] = "3d",
     backend: gsplat_backend.Backend = "auto",
+    n_densifying: int | None = None,
 ) -> tuple[Float[Tensor, "*B height width C"], Float[Tensor, "*B height width 1"], dict[str, Any]]:
     """Composite the features of 3D Gaussians or 2D discs front to back, by the depth of their centres.
 
@@ -52,6 +53,8 @@ def rasterize(
         primitive: "3d" for Gaussians, "2d" for discs.
         backend: ``torch`` runs everywhere; ``gsplat`` takes float32 tensors on a CUDA device where its kernels load;
             ``auto`` is gsplat where it runs.
+        n_densifying: if given, the gradient of ``info["means2d"]``, by which gsplat's strategies densify, is that of
+            the first so many features alone. All others act as ever, but drive no densification.
 
     Returns:
         The sums of weight times feature (not divided by alpha, no background), the sums of the weights, and what
@@ -77,7 +80,7 @@ def rasterize(
     cameras = [each.to(means) for each in cameras]
     on_gsplat = gsplat_backend.runs_on_gsplat(backend, means)
     render = (gsplat_backend.RASTERIZE if on_gsplat else _RASTERIZE)[primitive]
-    picture = render(means, quats, scales, opacities, features, cameras)
+    picture = render(means, quats, scales, opacities, features, cameras, n_densifying)
     info = {
         "means2d": picture.means2d,
         "radii": picture.radii,
@@ -102,14 +105,15 @@ def _rasterize(
     opacities: Float[Tensor, "N"],
     features: Float[Tensor, "N C"],
     cameras: Sequence[Camera],
+    n_densifying: int | None,
 ) -> Picture:
     """Rasterize in torch the primitive of a projection and kernels."""
-    projection = project(means, quats, scales, opacities, cameras)
-    size = cameras[0].width, cameras[0].height
-    views = torch.stack([_render(view, kernels, features, *size) for view in projection.views()])
-    composited, alpha, maps = views.split([features.shape[1], 1, kernels.n_maps], dim=-1)
+    projection = project(means, quats, scales, opacities, cameras, with_probe=n_densifying is not None)
+    views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
+    composited, alpha, maps = torch.stack(views).split([features.shape[1], 1, kernels.n_maps], dim=-1)
     radii = run_fused(_RADII, projection.outlines, projection.covars2d, projection.visible)
-    return Picture(composited, alpha, maps, projection.means2d, radii)
+    centres = projection.means2d if projection.probe is None else projection.probe
+    return Picture(composited, alpha, maps, centres, radii)
 
 
 _RASTERIZE = {
@@ -119,7 +123,7 @@ _RASTERIZE = {
 
 
 def _render(
-    view: View, kernels: Kernels, features: Float[Tensor, "N C"], width: int, height: int
+    view: View, kernels: Kernels, features: Float[Tensor, "N C"], camera: Camera, n_probed: int
 ) -> Float[Tensor, "height width C+1+maps"]:
     """Features, alpha and the primitive's maps as one camera sees them."""
     visible = view.visible.nonzero().squeeze(1)
@@ -127,8 +131,8 @@ def _render(
     # The bits of positive numbers are integers of the same order, which are sorted several times as fast.
     depths = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
     order = visible.index_select(0, stable_order(depths))
-    bins = bin_splats(view.outlines.index_select(0, order), width, height)
-    return composite(view.means2d, view.shapes, features, order, bins, kernels)
+    bins = bin_splats(view.outlines.index_select(0, order), camera.width, camera.height)
+    return composite(view.means2d, view.shapes, features, order, bins, kernels, view.probed, n_probed)
 
 
 def _three_sigmas(outlines: Tensor, covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Tensor:

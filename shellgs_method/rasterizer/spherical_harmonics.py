@@ -9,32 +9,39 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from shellgs_method.rasterizer.fusion import run_fused
+from shellgs_method.fusion import run_fused
 
 
 def spherical_harmonics(
-    degree: int, directions: Float[Tensor, "N 3"], coefficients: Float[Tensor, "N K 3"]
+    degree: int, directions: Float[Tensor, "N 3"], *coefficients: Float[Tensor, "N k 3"]
 ) -> Float[Tensor, "N 3"]:
     """Sum of the harmonics up to ``degree``, as it is: 3DGS adds 0.5 to it and clamps at 0 to get a colour.
 
     Args:
         degree: highest degree that counts; coefficients of higher degrees are left out.
         directions: from the camera to the splats, of any length.
-        coefficients: of Y(l, m) at index l² + l + m.
+        coefficients: of Y(l, m) at index l² + l + m, in one tensor or, one after the other, in several.
 
     Raises:
         ValueError: if there are fewer coefficients than the degree needs.
     """
     n_harmonics = (degree + 1) ** 2
-    if coefficients.shape[1] < n_harmonics:
-        raise ValueError(f"SH degree {degree} needs {n_harmonics} coefficients, not {coefficients.shape[1]}.")
-    return run_fused(_sum, directions, coefficients[:, :n_harmonics])
+    if (n_given := sum(part.shape[1] for part in coefficients)) < n_harmonics:
+        raise ValueError(f"SH degree {degree} needs {n_harmonics} coefficients, not {n_given}.")
+    # All are summed, times 1 or 0: a kernel for each degree would be four to compile.
+    counts = (torch.arange(n_given, device=directions.device) < n_harmonics).to(directions)[None]
+    return run_fused(_sum, directions, list(coefficients), counts)
 
 
-def _sum(directions: Float[Tensor, "N 3"], coefficients: Float[Tensor, "N K 3"]) -> Float[Tensor, "N 3"]:
-    terms = coefficients.unbind(1)
+def _sum(
+    directions: Float[Tensor, "N 3"], coefficients: list[Float[Tensor, "N k 3"]], counts: Float[Tensor, "1 K"]
+) -> Float[Tensor, "N 3"]:
+    terms = [term for part in coefficients for term in part.unbind(1)]
     harmonics = _harmonics(math.isqrt(len(terms)) - 1, F.normalize(directions, dim=-1))
-    weighted = (harmonic[:, None] * term for harmonic, term in zip(harmonics, terms, strict=True))
+    weighted = (
+        (count * harmonic)[:, None] * term
+        for count, harmonic, term in zip(counts.unbind(1), harmonics, terms, strict=True)
+    )
     return sum(weighted, start=torch.zeros_like(terms[0]))
 
 
