@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import subprocess
@@ -17,8 +16,6 @@ from rich.progress import Progress
 
 from shellgs_method.compare.runs import Run
 
-# OpenMP's threads spin while they wait, which slows shared and virtual machines down many times.
-ENVIRONMENT = {"OMP_WAIT_POLICY": "passive"}
 BIN = Path(sys.executable).parent
 LAST_LINES = 30
 _STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
@@ -75,7 +72,6 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
     output: list[str] = []
     with subprocess.Popen(
         [BIN / command[0], *command[1:]],
-        env=ENVIRONMENT | os.environ,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -1,0 +1,65 @@
+"""The number of threads against loads of a machine of four cores."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from shellgs_method import threads
+from shellgs_method.threads import Load, ThreadsByLoad
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """A process with four threads on a machine whose load the test decides."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    before, measured = torch.get_num_threads(), [Load(0.0, 0.0, 0.0)]
+    monkeypatch.setattr(Load, "now", classmethod(lambda cls: measured[-1]))
+    monkeypatch.setattr(threads.time, "monotonic", lambda: measured[-1].passed)
+    torch.set_num_threads(4)
+    yield measured
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("idle", "own", "expected"),
+    [
+        (0.0, 4.0, 4),  # alone, at work on all cores
+        (3.0, 1.0, 4),  # alone, while one core had something to do
+        (0.0, 2.0, 2),  # beside another like it: each has half of the cores
+        (1.5, 1.0, 2),  # something else takes one and a half
+        (0.7, 2.95, 4),  # something else takes a third of a core
+        (0.0, 0.4, 1),  # hardly anything is left
+    ],
+)
+def test_torch_gets_a_thread_for_each_core_that_nothing_else_uses(machine, idle, own, expected):
+    process = ThreadsByLoad()
+    machine.append(Load(10.0, 10 * idle, 10 * own))
+    process.follow()
+    assert torch.get_num_threads() == expected
+
+
+def test_cores_that_come_free_are_used_again(machine):
+    process = ThreadsByLoad()
+    counts = []
+    for load in [Load(10.0, 0.0, 10.0), Load(20.0, 30.0, 20.0), Load(20.5, 30.0, 20.0)]:
+        machine.append(load)
+        process.follow()
+        counts.append(torch.get_num_threads())
+    assert counts == [1, 4, 4]  # the last look came too soon to tell
+
+
+def test_the_users_number_of_threads_is_left_alone(machine, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "4")
+    process = ThreadsByLoad()
+    machine.append(Load(10.0, 0.0, 1.0))
+    process.follow()
+    assert torch.get_num_threads() == 4
+
+
+def test_the_load_of_this_machine_can_be_read():
+    start = Load.now()
+    while (later := Load.now()).passed - start.passed < 0.2:
+        sum(range(10_000))
+    assert later.own > start.own
+    assert later.cores_since(start) > 0.1
