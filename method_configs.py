@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from dataparsers.facade import FacadeDataParserConfig
@@ -12,12 +11,12 @@ from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.model import FacadeModelConfig
 from shellgs_method.pipeline import FacadePipelineConfig
 from shellgs_method.supervision import ExtraLossConfig
-from shellgs_method.trainer import FacadeTrainerConfig, RunLengthDecayConfig
+from shellgs_method.trainer import FacadeTrainerConfig, FusedAdamConfig, RunLengthDecayConfig
 
 
 def _adam(lr: float, lr_final: float | None = None) -> dict:
     decay = None if lr_final is None else RunLengthDecayConfig(lr_final=lr_final)
-    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
+    return {"optimizer": FusedAdamConfig(lr=lr, eps=1e-15), "scheduler": decay}
 
 
 def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpecification:

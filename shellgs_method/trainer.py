@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -43,6 +43,14 @@ def wandb_refusals() -> Iterator[None]:
         raise SceneError(
             f"wandb says: {error} To log without an account or a network, set WANDB_MODE=offline"
         ) from error
+
+
+@dataclass
+class FusedAdamConfig(AdamOptimizerConfig):
+    """Adam whose step is one loop over the parameters, on the CPU too."""
+
+    fused: bool = True
+    """One kernel; off: torch's default."""
 
 
 @dataclass
