@@ -17,7 +17,9 @@ from torch import Tensor
 
 from dataparsers.camera import Camera
 from shellgs_method.evaluation import normals_from_depth
+from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer import quats_to_rotations
+from shellgs_method.rasterizer.projection import to_camera, turn
 
 Primitive = Literal["3d", "2d"]
 DepthKind = Literal["expected", "median", "plane"]
@@ -57,14 +59,25 @@ def geometry_channels(
     The normal is the shortest axis, facing the camera. The other is n·m, which is negative, for plane depth (m the
     centre), else the forward depth of the centre.
     """
-    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    centres = gaussians["means"] @ rotation.T + translation
-    shortest = gaussians["scales"].argmin(dim=-1)
-    axes = quats_to_rotations(gaussians["quats"])
-    normals = axes[torch.arange(len(axes), device=axes.device), :, shortest] @ rotation.T
-    along = (normals * centres).sum(dim=-1, keepdim=True)
-    normals = torch.where(along > 0, -normals, normals)
-    return normals, -along.abs() if depth == "plane" else centres[:, 2:]
+    splats = (gaussians[name] for name in ("means", "quats", "scales"))
+    normals, along, depths = run_fused(_normals_and_depths, *splats, camera.viewmat[None])
+    return normals, along if depth == "plane" else depths
+
+
+def _normals_and_depths(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    viewmat: Float[Tensor, "1 4 4"],
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"], Float[Tensor, "N 1"]]:
+    """Normals, n·m, and depths of the centres."""
+    centres = torch.stack(to_camera(means, viewmat), dim=-1)[0]
+    axes = torch.stack(turn(quats_to_rotations(quats), viewmat), dim=-2)[0]
+    x, y, z = scales.detach().unbind(-1)
+    first, second = (x <= y) & (x <= z), y <= z
+    shortest = torch.where(first[:, None], axes[..., 0], torch.where(second[:, None], axes[..., 1], axes[..., 2]))
+    along = (shortest * centres).sum(dim=-1, keepdim=True)
+    return torch.where(along > 0, -shortest, shortest), -along.abs(), centres[:, 2:]
 
 
 def rendered_geometry(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal, Optional, cast
+from typing import Literal, NamedTuple, Optional, cast
 
 import numpy as np
 import torch
@@ -45,14 +45,24 @@ from shellgs_method.geometry import (
     geometry_channels,
     rendered_geometry,
 )
-from shellgs_method.losses import PAPER_ITERATIONS, flattening_loss, photometric_loss
+from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
-from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses, self_losses
+from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
+from shellgs_method.threads import ThreadsByLoad
 
 REFERENCES = {"shell": "", "truth": "truth_"}
 """Kinds of maps that geometry is measured against, and what the names of their figures begin with."""
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in any."""
+MAX_KEPT_PIXELS = 3_000_000
+"""Pixels of training views whose losses keep what depends on the view alone, of which each takes some 80 bytes."""
+
+
+class ViewLosses(NamedTuple):
+    """The losses that compare renderings of one view with its photograph and its cue."""
+
+    photometric: PhotometricLoss
+    cue: CueLosses | None
 
 
 @dataclass
@@ -142,6 +152,8 @@ class FacadeModel(SplatfactoModel):
         )
         self.crop_box = None
         self.geometry: Geometry | None = None
+        self._views: dict[int, ViewLosses] = {}
+        self._threads = ThreadsByLoad()
         self.metres_per_unit: float | None = self.kwargs["metadata"].get("metres_per_unit")
         self.step = 0
         self.plan(PAPER_ITERATIONS)
@@ -180,7 +192,8 @@ class FacadeModel(SplatfactoModel):
         every = config.refine_every
         if config.densification == "mcmc":
             return MCMCStrategy(config.mcmc.cap_max, start, stop, every, config.mcmc.noise)
-        reset_every = config.reset_alpha_every * config.refine_every
+        reset_every = config.reset_alpha_every * every
+        reset_every = max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every))
         return DefaultStrategy(
             refine_start_iter=start,
             refine_stop_iter=stop,
@@ -192,7 +205,7 @@ class FacadeModel(SplatfactoModel):
             prune_scale3d=config.cull_scale_thresh,
             prune_scale2d=config.cull_screen_size,
             refine_scale2d_stop_iter=round(config.stop_screen_size_at * shrink),
-            reset_every=max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every)),
+            reset_every=reset_every,
             absgrad=config.use_absgrad,
             key_for_gradient="gradient_2dgs" if config.primitive == "2d" else "means2d",
         )
@@ -206,10 +219,20 @@ class FacadeModel(SplatfactoModel):
 
     def step_post_backward(self, step: int) -> None:
         """Densify and prune. gsplat 1.4 would reset the opacities at step 0 already."""
+        if isinstance(self.strategy, DefaultStrategy):
+            self.strategy.pause_refine_after_reset = self._pause_of_refinement(step, self.strategy.reset_every)
         if step > 0:
             super().step_post_backward(step)
         if self.config.primitive == "2d":  # a split takes its share of all scales
             self.scales.data[:, 2] = DISC_LOG_THICKNESS
+
+    def _pause_of_refinement(self, step: int, reset_every: int) -> int:
+        """As splatfacto's: until each photograph was seen since a reset, the gradients tell of the reset.
+
+        But only after a reset, where gsplat would also wait at the start; and no longer than half of the time between
+        two, where splatfacto would never densify a scene of many photographs.
+        """
+        return min(self.num_train_data + self.config.refine_every, reset_every // 2) if step >= reset_every else 0
 
     def load_state_dict(self, dict, **kwargs):
         """Load in place: the optimizers, built before, must go on holding the same parameters."""
@@ -221,15 +244,19 @@ class FacadeModel(SplatfactoModel):
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         """Render one camera; the geometry is left out where neither a loss nor a viewer asks for it."""
+        self._threads.follow()
         pinhole = pinhole_camera(camera)
         background = self._get_background_color()
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:
             return cast(dict[str, Tensor], self.get_empty_outputs(pinhole.width, pinhole.height, background))
         with_geometry = not self.training or self._supervises_geometry
-        features = [self._colours(gaussians, pinhole)]
+        # Colours over the background, so that what the photograph says of alpha comes through the colours too.
+        features = [self._colours(gaussians, pinhole) - background]
         if with_geometry:
             features += geometry_channels(gaussians, pinhole, self.config.depth)
+        # Gradients of the colours are reasons to densify, those of the geometry are not.
+        n_densifying = 3 if with_geometry and self.training and self.config.densification == "default" else None
         composited, alpha, self.info = rasterize(
             gaussians["means"],
             gaussians["quats"],
@@ -238,13 +265,14 @@ class FacadeModel(SplatfactoModel):
             torch.cat(features, dim=-1),
             pinhole,
             self.config.primitive,
+            n_densifying=n_densifying,
         )
         if self.training:
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
         outputs = {
-            "rgb": (composited[..., :3] + (1 - alpha) * background).clamp(0, 1),
+            "rgb": (composited[..., :3] + background).clamp(0, 1),
             "accumulation": alpha,
             "background": background if self.training else background.expand(pinhole.height, pinhole.width, 3),
         }
@@ -282,27 +310,44 @@ class FacadeModel(SplatfactoModel):
         interval = self.config.sh_degree_interval * self.num_iterations / PAPER_ITERATIONS
         degree = min(int(self.step / interval), self.config.sh_degree)
         directions = nn.functional.normalize(gaussians["means"] - camera.position, dim=-1)
-        coefficients = torch.cat([gaussians["features_dc"][:, None], gaussians["features_rest"]], dim=1)
-        return (spherical_harmonics(degree, directions, coefficients) + 0.5).clamp_min(0)
+        coefficients = gaussians["features_dc"][:, None], gaussians["features_rest"]
+        return (spherical_harmonics(degree, directions, *coefficients) + 0.5).clamp_min(0)
 
     def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
         """Figures of a training view."""
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        target = self._view_losses(batch, outputs["background"]).photometric.target
         psnr = -10 * (outputs["rgb"].detach() - target).square().mean().log10()
         return {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """R, and the terms of the geometry last rendered: those of a cue where the view has its map."""
         config, progress = self.config, self.step / self.num_iterations
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        kept = batch["mask"].to(self.device) if "mask" in batch else None
-        losses = {"photometric": photometric_loss(outputs["rgb"], target, kept, config.ssim_lambda)}
+        view = self._view_losses(batch, outputs["background"])
+        losses = {"photometric": view.photometric(outputs["rgb"])}
         if self.geometry is not None:
             losses |= self_losses(self.geometry, config.extra, progress)
-            if f"{config.cues}_depth" in batch:
-                cue = reference_maps(batch, config.cues, self.device)
-                losses |= cue_losses(self.geometry, cue, config.geometry, config.extra, progress, self.metres_per_unit)
+            if view.cue is not None:
+                losses |= view.cue(self.geometry, progress)
         return losses | self._shape_losses()
+
+    def _view_losses(self, batch: dict, background: Tensor) -> ViewLosses:
+        """The losses of a batch's view; those of training views are kept as far as there is room."""
+        index = batch["image_idx"]
+        if self.training and index in self._views:
+            return self._views[index]
+        config = self.config
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), background)
+        kept = batch["mask"].to(self.device) if "mask" in batch else None
+        cue = None
+        if f"{config.cues}_depth" in batch:
+            maps = reference_maps(batch, config.cues, self.device)
+            cue = CueLosses(maps, config.geometry, config.extra, self.metres_per_unit)
+        view = ViewLosses(PhotometricLoss(target, kept, config.ssim_lambda), cue)
+        changes = config.background_color == "random" and batch["image"].shape[-1] == 4
+        room = MAX_KEPT_PIXELS // target[..., 0].numel()
+        if self.training and not changes and len(self._views) < room:
+            self._views[index] = view
+        return view
 
     def _shape_losses(self) -> dict[str, Tensor]:
         """Terms of the Gaussians themselves, wherever they are seen from."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -14,12 +15,13 @@ from shellgs_method.evaluation import Reference
 from shellgs_method.geometry import Geometry
 from shellgs_method.losses import (
     PAPER_ITERATIONS,
+    ConsistencyLoss,
     ExponentialDecay,
+    NccLoss,
+    NormalLoss,
+    PointToPlaneLoss,
     agreement_loss,
-    consistency_loss,
-    ncc_loss,
     normal_loss,
-    point_to_plane_loss,
     vid2sim_ncc_loss,
 )
 
@@ -68,6 +70,66 @@ class ExtraLossConfig:
     """Weight of the mean smallest scale of visible Gaussians, in units of the rescaled world (Vid2Sim: 100)."""
 
 
+class CueLosses:
+    """:func:`cue_losses` for many renderings of one view; what depends on its maps alone is computed once."""
+
+    def __init__(
+        self, cue: Reference, paper: GeometryLossConfig, extra: ExtraLossConfig, metres_per_unit: float | None
+    ):
+        self.cue, self.paper, self.extra, self.metres = cue, paper, extra, metres_per_unit or 1.0
+        self._from_plane: PointToPlaneLoss | None = None
+
+    def __call__(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
+        """The weighted terms of one rendering, at the share ``progress`` of the run."""
+        paper, extra = self.paper, self.extra
+        if extra.occlusion_gate > 0:
+            return self._gated(geometry, progress)
+        terms = {
+            "depth": (paper.depth(progress), lambda: self._ncc(1 / geometry.depth.clamp_min(1e-6))),
+            "normal": (paper.normal(progress), lambda: self._normal(geometry.normal)),
+            "consistency": (paper.consistency(progress), lambda: self._consistency(geometry.normal)),
+            "depth_normal": (
+                extra.depth_normal,
+                lambda: normal_loss(geometry.depth_normal, self.cue.normal, self.cue.mask & _known(geometry)),
+            ),
+            "point_to_plane": (extra.point_to_plane, lambda: self._point_to_plane(geometry)(geometry.depth)),
+        }
+        return {name: weight * term() for name, (weight, term) in terms.items() if weight > 0}
+
+    def _gated(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
+        """The terms where nothing that is rendered stands before the cue."""
+        gate = self.extra.occlusion_gate
+        if progress < self.extra.occlusion_gate_from / PAPER_ITERATIONS:
+            return {}
+        near = self.metres * (self.cue.depth - geometry.depth.detach()) < gate
+        open_to_all = replace(self.extra, occlusion_gate=0.0)
+        seen = self.cue._replace(mask=self.cue.mask & near)
+        return CueLosses(seen, self.paper, open_to_all, self.metres)(geometry, progress)
+
+    @cached_property
+    def _ncc(self) -> Callable[[Tensor], Tensor]:
+        mask = self.cue.mask
+        inverse_depth = torch.where(mask, 1 / self.cue.depth, 0.0)
+        if self.paper.ncc == "vid2sim":
+            return lambda x: vid2sim_ncc_loss(x, inverse_depth, mask)
+        return NccLoss(inverse_depth, mask, self.paper.ncc_window, eps=self.paper.ncc_eps)
+
+    @cached_property
+    def _normal(self) -> NormalLoss:
+        return NormalLoss(self.cue.normal, self.cue.mask)
+
+    @cached_property
+    def _consistency(self) -> ConsistencyLoss:
+        return ConsistencyLoss(self.cue.depth, self.cue.mask)
+
+    def _point_to_plane(self, geometry: Geometry) -> PointToPlaneLoss:
+        if self._from_plane is None:
+            depth, normal, mask = self.cue
+            rays = geometry.camera.rays()
+            self._from_plane = PointToPlaneLoss(depth, normal, rays, mask, self.metres, self.extra.tolerance)
+        return self._from_plane
+
+
 def cue_losses(
     geometry: Geometry,
     cue: Reference,
@@ -80,33 +142,7 @@ def cue_losses(
 
     Where metres are unknown, ``extra``'s lengths are in units of nerfstudio's rescaled world.
     """
-    metres = metres_per_unit or 1.0
-    mask = cue.mask
-    if extra.occlusion_gate > 0:
-        if progress < extra.occlusion_gate_from / PAPER_ITERATIONS:
-            return {}
-        mask = mask & (metres * (cue.depth - geometry.depth.detach()) < extra.occlusion_gate)
-    ncc = {"local": partial(ncc_loss, window=paper.ncc_window, eps=paper.ncc_eps), "vid2sim": vid2sim_ncc_loss}
-    inverse_depth = 1 / geometry.depth.clamp_min(1e-6)
-    terms = {
-        "depth": (
-            paper.depth(progress),
-            lambda: ncc[paper.ncc](inverse_depth, torch.where(mask, 1 / cue.depth, 0.0), mask),
-        ),
-        "normal": (paper.normal(progress), lambda: normal_loss(geometry.normal, cue.normal, mask)),
-        "consistency": (paper.consistency(progress), lambda: consistency_loss(geometry.normal, cue.depth, mask)),
-        "depth_normal": (
-            extra.depth_normal,
-            lambda: normal_loss(geometry.depth_normal, cue.normal, mask & _known(geometry)),
-        ),
-        "point_to_plane": (
-            extra.point_to_plane,
-            lambda: point_to_plane_loss(
-                geometry.depth, cue.depth, cue.normal, geometry.camera.rays(), mask, metres, extra.tolerance
-            ),
-        ),
-    }
-    return {name: weight * term() for name, (weight, term) in terms.items() if weight > 0}
+    return CueLosses(cue, paper, extra, metres_per_unit)(geometry, progress)
 
 
 def self_losses(geometry: Geometry, extra: ExtraLossConfig, progress: float) -> dict[str, Tensor]:

@@ -7,12 +7,19 @@ import math
 import numpy as np
 import pytest
 import torch
+from kornia.metrics import ssim as kornia_ssim
 from scipy.ndimage import gaussian_filter, sobel
 from torch.autograd import gradcheck
 
 from dataparsers.camera import Camera
+from shellgs_method import fusion
 from shellgs_method.losses import (
+    ConsistencyLoss,
     ExponentialDecay,
+    NccLoss,
+    NormalLoss,
+    PhotometricLoss,
+    PointToPlaneLoss,
     agreement_loss,
     consistency_loss,
     flattening_loss,
@@ -22,6 +29,7 @@ from shellgs_method.losses import (
     point_to_plane_loss,
     vid2sim_ncc_loss,
 )
+from shellgs_method.losses.ssim import SsimTarget, ssim
 
 HEIGHT, WIDTH = 14, 17
 
@@ -263,6 +271,16 @@ def test_photometric_loss_is_l1_and_one_minus_ssim(random):
     assert photometric_loss(a, b).item() == pytest.approx(0.8 * l1 + 0.2 * (1 - ssim), abs=1e-9)
 
 
+def test_ssim_and_its_gradient_are_those_of_kornia(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    slope = torch.randn(HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    ours = ssim(a.requires_grad_(), SsimTarget.of(b))
+    theirs = kornia_ssim(a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None], window_size=11)[0].permute(1, 2, 0)
+    torch.testing.assert_close(ours, theirs)
+    gradients = [torch.autograd.grad((slope * each).sum(), a)[0] for each in (ours, theirs)]
+    torch.testing.assert_close(*gradients)
+
+
 def test_photometric_loss_averages_over_kept_pixels_only(random):
     a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
     mask = some_mask(random)
@@ -345,6 +363,43 @@ def test_flattening_shrinks_the_thinnest_axis_of_visible_gaussians_alone():
     assert loss.item() == 2.5
     (gradient,) = torch.autograd.grad(loss, scales)
     assert gradient.tolist() == [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0]]
+
+
+def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[str, tuple]:
+    """Each loss that is compiled, for a view of some size, and a rendering."""
+    mask = torch.rand(height, width, 1, generator=random) < 0.9
+    x, y = 0.125 + 0.001 * torch.randn(2, height, width, 1, generator=random)
+    a, b, normal, target = torch.rand(4, height, width, 3, generator=random) - 0.5
+    rays = torch.ones(height, width, 3)
+    return {
+        "photometric": (PhotometricLoss(b + 0.5), a + 0.5),
+        "photometric, masked": (PhotometricLoss(b + 0.5, mask), a + 0.5),
+        "ncc": (NccLoss(x, mask), y),
+        "normal": (NormalLoss(target, mask), normal),
+        "consistency": (ConsistencyLoss(x, mask), normal),
+        "point to plane": (PointToPlaneLoss(x, target, rays, mask), y),
+    }
+
+
+def test_compiled_losses_are_the_plain_ones_at_every_size_of_image(compiler):
+    fusion._compiled.cache_clear()
+    for size in [(30, 40), (37, 61), (52, 33)]:
+        losses = losses_of_a_view(*size, torch.Generator().manual_seed(1))
+        n_kernels = fusion._compiled.cache_info().currsize
+        for name, (loss, rendered) in losses.items():
+            rendered.requires_grad_()
+            value = loss(rendered)
+            (gradient,) = torch.autograd.grad(value, rendered)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv("SHELLGS_COMPILE", "0")
+                again = losses_of_a_view(*size, torch.Generator().manual_seed(1))[name][0]
+                plain = again(rendered)
+                torch.testing.assert_close(value, plain, rtol=1e-5, atol=1e-6, msg=name)
+                expected = torch.autograd.grad(plain, rendered)[0]
+                torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+        assert not fusion._failed
+        assert size == (30, 40) or fusion._compiled.cache_info().currsize == n_kernels
+    assert n_kernels == 7
 
 
 @pytest.mark.parametrize(

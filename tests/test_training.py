@@ -52,6 +52,29 @@ def test_rendered_normals_are_unit_and_face_the_camera(trained):
     assert ((normal * rays).sum(dim=-1) < 0).float().mean() > 0.98
 
 
+def test_what_depends_on_a_training_view_alone_is_computed_once_where_there_is_room(trained, monkeypatch):
+    model, (_, batch), outputs = model_of(trained), held_out(trained), render(trained)
+    assert len(model._views) == 8  # of 10, two are held out
+    monkeypatch.setattr(model, "_views", {})
+    held_out_view = model._view_losses(batch, outputs["background"])
+    assert model._view_losses(batch, outputs["background"]) is not held_out_view  # it has the number of another view
+    monkeypatch.setattr(model, "training", True)
+    kept = model._view_losses(batch, outputs["background"])
+    assert model._view_losses(batch, outputs["background"]) is kept
+    full = batch | {"image_idx": 7}
+    monkeypatch.setattr("shellgs_method.model.MAX_KEPT_PIXELS", 48 * 32)
+    assert model._view_losses(full, outputs["background"]) is not model._view_losses(full, outputs["background"])
+
+
+@pytest.mark.parametrize(("step", "pause"), [(0, 0), (999, 0), (1000, 108), (2500, 108)])
+def test_densification_pauses_after_a_reset_until_each_photograph_was_seen(trained, step, pause):
+    assert model_of(trained)._pause_of_refinement(step, reset_every=1000) == pause
+
+
+def test_densification_does_not_pause_from_one_reset_to_the_next(trained):
+    assert model_of(trained)._pause_of_refinement(300, reset_every=100) == 50
+
+
 def test_training_makes_the_picture_and_the_normals_better(trained, pristine_scene, tmp_path):
     untrained = trainer_of(pristine_scene, tmp_path)
     untrained.pipeline.eval()

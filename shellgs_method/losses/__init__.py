@@ -2,19 +2,27 @@
 
 L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C consistency; the others are off in the paper's
 setting. Masks are true where a pixel counts; an empty one gives a zero that can be back-propagated.
+
+A class ``…Loss`` is its function ``…_loss`` for many renderings of one view: what depends on the view alone is computed
+once. On a CPU both run as fused loops, see :mod:`shellgs_method.fusion`.
 """
 
 from shellgs_method.losses.agreement import agreement_loss, flattening_loss
-from shellgs_method.losses.consistency import consistency_loss
-from shellgs_method.losses.depth import ncc_loss, vid2sim_ncc_loss
-from shellgs_method.losses.normal import normal_loss
-from shellgs_method.losses.photometric import photometric_loss
+from shellgs_method.losses.consistency import ConsistencyLoss, consistency_loss
+from shellgs_method.losses.depth import NccLoss, ncc_loss, vid2sim_ncc_loss
+from shellgs_method.losses.normal import NormalLoss, normal_loss
+from shellgs_method.losses.photometric import PhotometricLoss, photometric_loss
 from shellgs_method.losses.schedules import PAPER_ITERATIONS, ExponentialDecay
-from shellgs_method.losses.surface import point_to_plane_loss
+from shellgs_method.losses.surface import PointToPlaneLoss, point_to_plane_loss
 
 __all__ = [
     "PAPER_ITERATIONS",
+    "ConsistencyLoss",
     "ExponentialDecay",
+    "NccLoss",
+    "NormalLoss",
+    "PhotometricLoss",
+    "PointToPlaneLoss",
     "agreement_loss",
     "consistency_loss",
     "flattening_loss",

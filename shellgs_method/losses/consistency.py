@@ -8,8 +8,21 @@ from kornia.filters import spatial_gradient
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
+from shellgs_method.fusion import run_fused
 from shellgs_method.losses.normal import unit
-from shellgs_method.losses.reduction import weighted_mean
+
+
+class ConsistencyLoss:
+    """:func:`consistency_loss` for many renderings of one view."""
+
+    def __init__(self, target_depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]):
+        smoothness = _smoothness(target_depth, mask)
+        total = smoothness.sum()
+        self._weights = (smoothness / total.where(total > 0, 1.0))[1:, 1:]
+
+    def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+        """The loss of one rendering."""
+        return run_fused(_roughness, normal, self._weights, varying=2)
 
 
 def consistency_loss(
@@ -25,10 +38,14 @@ def consistency_loss(
         target_depth: the cue's z-depth.
         mask: true where the target is valid.
     """
+    return ConsistencyLoss(target_depth, mask)(normal)
+
+
+def _roughness(normal: Float[Tensor, "H W 3"], weights: Float[Tensor, "H-1 W-1 1"]) -> Float[Tensor, ""]:
     normal = unit(normal)
     left = (normal[1:, 1:] * normal[1:, :-1]).sum(dim=-1, keepdim=True)
     above = (normal[1:, 1:] * normal[:-1, 1:]).sum(dim=-1, keepdim=True)
-    return weighted_mean(1 - (left + above) / 2, _smoothness(target_depth, mask)[1:, 1:])
+    return (weights * (1 - (left + above) / 2)).sum()
 
 
 @torch.no_grad()

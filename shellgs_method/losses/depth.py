@@ -3,11 +3,53 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, unfold
+from torch.autograd.function import once_differentiable
+from torch.nn.functional import unfold
 
-from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.fusion import run_fused
+from shellgs_method.losses.windows import shifted, window_sums
+
+
+class NccLoss:
+    """:func:`ncc_loss` for many renderings of one view."""
+
+    def __init__(
+        self,
+        target: Float[Tensor, "H W 1"],
+        mask: Bool[Tensor, "H W 1"],
+        window: int = 9,
+        min_valid: float = 0.5,
+        eps: float = 1e-3,
+    ):
+        self._around, self._window = (window // 2,) * 4, target.new_ones(1, 1, window)
+        mask, ones = mask[..., 0], [1.0] * window
+        y = target[..., 0].where(mask, 0.0)
+        self._valid = F.pad(mask.to(y), self._around)
+        n = window_sums(self._valid, ones)
+        per_pixel = 1 / n.clamp_min(0.5)
+        # Outside of the mask stands a value to centre patches on that is near those inside.
+        self._target = F.pad(y.where(mask, window_sums(F.pad(y, self._around), ones) * per_pixel), self._around)
+        mean, _, variance, _ = _moments(self._target, self._target, self._valid, per_pixel, window)
+        floor = (eps * mean).square()
+        used = mask & (n > min_valid * window**2 - 0.5) & (variance > floor)
+        self._patches = per_pixel, variance, floor, used / used.sum().clamp_min(1).to(y)
+
+    def __call__(self, inverse_depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
+        """The loss of one rendering."""
+        return _Ncc.apply(inverse_depth[..., 0], self)
+
+    def correlate(self, x: Float[Tensor, "H W"]) -> list[Tensor]:
+        """The loss of an inverse depth, its filled-up values, and what :meth:`gradient` needs besides."""
+        x = F.pad(x, self._around).where(self._valid > 0, self._target)
+        return [x, *run_fused(_correlate, x, self._target, self._valid, *self._patches, self._window, varying=2)]
+
+    def gradient(self, x: Float[Tensor, "H+2r W+2r"], *by_patch: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+        """Gradient of the loss by the inverse depth."""
+        padded = [F.pad(each, self._around) for each in by_patch]
+        return run_fused(_by_inverse_depth, x, self._target, self._valid, *padded, self._window, varying=2)
 
 
 def ncc_loss(
@@ -35,19 +77,101 @@ def ncc_loss(
             shells and alignments are good for. Below it the target counts as flat, and a flatter rendering is treated
             as if it had this much contrast, which bounds the gradient.
     """
-    # E[x²] - E[x]² of nearly equal inverse depths loses all digits in float32, hence the moments in float64.
-    m, x, y = mask.double(), inverse_depth.double().where(mask, 0.0), target.double().where(mask, 0.0)
-    moments = _box_mean(torch.cat([m, x, y, x * x, y * y, x * y], dim=-1), window)
-    valid, *moments = moments.split(1, dim=-1)
-    count = valid.clamp_min(0.5 / window**2)
-    mean_x, mean_y, mean_xx, mean_yy, mean_xy = (moment / count for moment in moments)
+    return NccLoss(target, mask, window, min_valid, eps)(inverse_depth)
 
-    floor = (eps * mean_y).square()
-    variance_x, variance_y = mean_xx - mean_x.square(), mean_yy - mean_y.square()
-    used = mask & (valid > min_valid - 1e-6) & (variance_y > floor)
+
+class _Ncc(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, view):
+        filled, loss, *by_patch = view.correlate(x.detach())
+        ctx.view = view
+        ctx.save_for_backward(filled, *by_patch)
+        return loss
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient):
+        return gradient * ctx.view.gradient(*ctx.saved_tensors), None
+
+
+def _correlate(
+    x: Float[Tensor, "H+2r W+2r"],
+    y: Float[Tensor, "H+2r W+2r"],
+    valid: Float[Tensor, "H+2r W+2r"],
+    per_pixel: Float[Tensor, "H W"],
+    variance_y: Float[Tensor, "H W"],
+    floor: Float[Tensor, "H W"],
+    weights: Float[Tensor, "H W"],
+    window: Float[Tensor, "1 1 w"],
+) -> tuple[Tensor, ...]:
+    """The loss, and by patch a, a E[y], b and b E[x] of the gradient Σ a (y - E[y]) + b (x - E[x]) over the patches.
+
+    Args:
+        x: rendered inverse depth.
+        y: target.
+        valid: 1 where a pixel counts, else 0.
+        per_pixel: one over the number of pixels that count, by patch, like what follows.
+        variance_y: of the target.
+        floor: smallest variance that counts as contrast.
+        weights: of sum 1; 0 of a patch that is left out.
+        window: of the width of a patch.
+    """
+    mean_x, mean_y, variance_x, covariance = _moments(x, y, valid, per_pixel, window.shape[2])
     # Clamped rather than floor added: a perfect match is exactly 1 and scale does not matter above the floor.
-    scale = (variance_x.maximum(floor) * variance_y).where(used, 1.0).sqrt()
-    return weighted_mean(1 - (mean_xy - mean_x * mean_y) / scale, used).to(inverse_depth.dtype)
+    product = torch.where(weights > 0, torch.maximum(variance_x, floor) * variance_y, 1.0)
+    ncc = covariance / product.sqrt()
+    a = -weights * per_pixel / product.sqrt()
+    b = torch.where((weights > 0) & (variance_x > floor), weights * per_pixel * ncc / variance_x, 0.0)
+    return (weights * (1 - ncc)).sum(), a, a * mean_y, b, b * mean_x
+
+
+def _moments(
+    x: Float[Tensor, "H+2r W+2r"],
+    y: Float[Tensor, "H+2r W+2r"],
+    valid: Float[Tensor, "H+2r W+2r"],
+    per_pixel: Float[Tensor, "H W"],
+    size: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Means of x and y, variance of x, and covariance, of the valid pixels of each patch.
+
+    E[x²] - E[x]² of nearly equal values loses all digits in float32. So a row of a patch is summed about the value in
+    its middle, and the rows about that in the middle of the patch: what is summed is small.
+    """
+    half = size // 2
+    x0, y0 = (shifted(each, size, dim=1)[half] for each in (x, y))
+    n = sum_x = sum_y = sum_xx = sum_xy = torch.zeros(())
+    for xi, yi, mi in zip(*(shifted(each, size, dim=1) for each in (x, y, valid)), strict=True):
+        dx, dy = xi - x0, mi * (yi - y0)
+        n, sum_x, sum_y = n + mi, sum_x + mi * dx, sum_y + dy
+        sum_xx, sum_xy = sum_xx + mi * dx * dx, sum_xy + dx * dy
+    rows = zip(*(shifted(each, size, dim=0) for each in (x0, y0, n, sum_x, sum_y, sum_xx, sum_xy)), strict=True)
+    x0, y0 = (shifted(each, size, dim=0)[half] for each in (x0, y0))
+    sum_x = sum_y = sum_xx = sum_xy = torch.zeros(())
+    for xi, yi, ni, xs, ys, xxs, xys in rows:
+        dx, dy = xi - x0, yi - y0
+        moved_x, moved_y = xs + ni * dx, ys + ni * dy
+        sum_x, sum_y = sum_x + moved_x, sum_y + moved_y
+        sum_xx, sum_xy = sum_xx + xxs + dx * (xs + moved_x), sum_xy + xys + dx * ys + dy * moved_x
+    mean_x, mean_y = sum_x * per_pixel, sum_y * per_pixel
+    covariance = sum_xy * per_pixel - mean_x * mean_y
+    return x0 + mean_x, y0 + mean_y, sum_xx * per_pixel - mean_x * mean_x, covariance
+
+
+def _by_inverse_depth(
+    x: Float[Tensor, "H+2r W+2r"],
+    y: Float[Tensor, "H+2r W+2r"],
+    valid: Float[Tensor, "H+2r W+2r"],
+    a: Float[Tensor, "H+2r W+2r"],
+    a_mean_y: Float[Tensor, "H+2r W+2r"],
+    b: Float[Tensor, "H+2r W+2r"],
+    b_mean_x: Float[Tensor, "H+2r W+2r"],
+    window: Float[Tensor, "1 1 w"],
+) -> Float[Tensor, "H W"]:
+    """The gradient from what :func:`_correlate` returns."""
+    size = window.shape[2]
+    x, y, valid = (shifted(shifted(each, size, 0)[size // 2], size, 1)[size // 2] for each in (x, y, valid))
+    a, a_mean_y, b, b_mean_x = (window_sums(each, [1.0] * size) for each in (a, a_mean_y, b, b_mean_x))
+    return valid * (y * a - a_mean_y + x * b - b_mean_x)
 
 
 def vid2sim_ncc_loss(
@@ -65,10 +189,3 @@ def vid2sim_ncc_loss(
     deviation_x, deviation_y = patches.square().mean(dim=1).clamp_min(1e-24).sqrt()
     ncc = (patches[0] * patches[1]).mean(dim=0) / (deviation_x * deviation_y + 1e-5)
     return (1 - ncc).mean() * mask.any()
-
-
-def _box_mean(maps: Float[Tensor, "H W C"], window: int) -> Float[Tensor, "H W C"]:
-    """Mean over a square window around each pixel, zeros outside the image."""
-    half = window // 2
-    rows = avg_pool2d(maps.permute(2, 0, 1), (1, window), stride=1, padding=(0, half))
-    return avg_pool2d(rows, (window, 1), stride=1, padding=(half, 0)).permute(1, 2, 0)

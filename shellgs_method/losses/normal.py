@@ -6,7 +6,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.fusion import run_fused
+from shellgs_method.losses.reduction import mean_weights
 
 
 def unit(normal: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
@@ -15,6 +16,18 @@ def unit(normal: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     The bound is also the gradient's: a thousand times the incoming one at most.
     """
     return normalize(normal, dim=-1, eps=1e-3)
+
+
+class NormalLoss:
+    """:func:`normal_loss` for many renderings of one view."""
+
+    def __init__(self, target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"]):
+        weights = mean_weights(mask, like=target)
+        self._target, self._total = unit(target).where(mask, 0.0) * weights, weights.sum()
+
+    def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+        """The loss of one rendering."""
+        return self._total - run_fused(_cosines, normal, self._target, varying=2)
 
 
 def normal_loss(
@@ -29,4 +42,8 @@ def normal_loss(
         target: the cue's normals.
         mask: true where the target is valid.
     """
-    return weighted_mean(1 - (unit(normal) * unit(target)).sum(dim=-1, keepdim=True), mask)
+    return NormalLoss(target, mask)(normal)
+
+
+def _cosines(normal: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+    return (unit(normal) * target).sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -15,3 +15,8 @@ def weighted_mean(values: Float[Tensor, "*shape"], weights: Tensor) -> Float[Ten
     weights = weights.to(values.dtype).expand_as(values)
     total = weights.sum()
     return (weights * values.where(weights > 0, 0.0)).sum() / total.where(total > 0, 1.0)
+
+
+def mean_weights(mask: Bool[Tensor, "*shape"], like: Tensor) -> Float[Tensor, "*shape"]:
+    """Weights of sum 1 that make a mean over a mask of a sum; all 0 where it is empty. In the dtype of ``like``."""
+    return mask.to(like) / mask.sum().clamp_min(1)

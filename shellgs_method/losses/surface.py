@@ -5,8 +5,31 @@ from __future__ import annotations
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from shellgs_method.fusion import run_fused
 from shellgs_method.losses.normal import unit
-from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.losses.reduction import mean_weights
+
+
+class PointToPlaneLoss:
+    """:func:`point_to_plane_loss` for many renderings of one view."""
+
+    def __init__(
+        self,
+        target_depth: Float[Tensor, "H W 1"],
+        target_normal: Float[Tensor, "H W 3"],
+        rays: Float[Tensor, "H W 3"],
+        mask: Bool[Tensor, "H W 1"],
+        metres_per_unit: float = 1.0,
+        tolerance: float = 0.0,
+    ):
+        slope = (unit(target_normal) * rays).sum(dim=-1, keepdim=True).abs()
+        self._target, self._slope = target_depth.where(mask, 0.0), (metres_per_unit * slope).where(mask, 0.0)
+        self._weights = mean_weights(mask, like=target_depth)
+        self._tolerance = target_depth.new_full((1, 1, 1), tolerance)
+
+    def __call__(self, depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
+        """The loss of one rendering."""
+        return run_fused(_beyond, depth, self._target, self._slope, self._weights, self._tolerance, varying=2)
 
 
 def point_to_plane_loss(
@@ -33,6 +56,14 @@ def point_to_plane_loss(
         metres_per_unit: of the depths.
         tolerance: metres that the shell's alignment may be off, which cost nothing.
     """
-    slope = (unit(target_normal) * rays).sum(dim=-1, keepdim=True).abs()
-    distance = metres_per_unit * slope * (depth - target_depth).abs()
-    return weighted_mean((distance - tolerance).clamp_min(0).log1p(), mask)
+    return PointToPlaneLoss(target_depth, target_normal, rays, mask, metres_per_unit, tolerance)(depth)
+
+
+def _beyond(
+    depth: Float[Tensor, "H W 1"],
+    target: Float[Tensor, "H W 1"],
+    slope: Float[Tensor, "H W 1"],
+    weights: Float[Tensor, "H W 1"],
+    tolerance: Float[Tensor, "1 1 1"],
+) -> Float[Tensor, ""]:
+    return (weights * (slope * (depth - target).abs() - tolerance).relu().log1p()).sum()
