@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import logging
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 import torchvision
+from kornia.geometry.depth import depth_to_normals
 from PIL import Image
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
@@ -81,6 +83,18 @@ def test_normals_of_any_depth_face_the_camera():
     depth = torch.rand(HEIGHT, WIDTH, 1, generator=torch.Generator().manual_seed(0)) * 10 + 0.1
     towards = (normals_from_depth(depth, CAMERA) * CAMERA.rays()).sum(dim=-1)[1:-1, 1:-1]
     assert (towards < 0).all()
+
+
+def test_normals_of_a_smooth_surface_are_those_of_kornia():
+    """Whose gradient is Sobel's, from pixels a column apart too, and whose pixels have their centres at integers."""
+    rays = CAMERA.rays().double()
+    depth = (6 + 0.5 * torch.sin(2 * rays[..., :1]) + 0.3 * rays[..., 1:2].square()).double()
+    K = CAMERA.K.double().clone()
+    K[:2, 2] -= 0.5
+    theirs = depth_to_normals(depth.permute(2, 0, 1)[None], K[None])[0].permute(1, 2, 0)
+    ours = normals_from_depth(depth, replace(CAMERA, K=CAMERA.K.double()))
+    cosines = (ours * theirs).sum(dim=-1)[2:-2, 2:-2]
+    assert cosines.abs().min() > math.cos(math.radians(0.5))
 
 
 def test_normals_are_zero_on_the_border_and_beside_missing_depth():
