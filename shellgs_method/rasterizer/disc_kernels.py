@@ -88,8 +88,8 @@ def _backward(
         behind.copy_(before)
 
     # All splats at once, [L, G, P, V]. Meeting them again is cheaper than storing what was met.
-    probed_by_z = torch.stack([of_groups[0] for of_groups in by_z[::-1]])
-    by_z = torch.stack([sum(of_groups[1:], start=of_groups[0]) for of_groups in by_z[::-1]])
+    probed_by_z = torch.stack([of_first for _, of_first in by_z[::-1]])
+    by_z = torch.stack([of_all for of_all, _ in by_z[::-1]])
     w = torch.stack([weight for _, _, weight, _ in met])
     by_median = torch.stack([each for *_, each in met])
     _, ahead, s, t, depth, inverse_depth, hits = _intersect(params.permute(2, 0, 1, 3)[:, :, :, None], x, y)

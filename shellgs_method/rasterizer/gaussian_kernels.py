@@ -67,10 +67,7 @@ def _backward(
         behind.copy_(before)
 
     # u, v, a, b, c and n take the moments of the gradient by z about the splat's centre, shifted there from the tile's.
-    q, w = (
-        torch.stack([sum(groups[1:], start=groups[0]) for groups in by_z[::-1]]),
-        torch.stack([weight for *_, weight in met]),
-    )  # [L G P V]
+    q, w = torch.stack([of_all for of_all, _ in by_z[::-1]]), torch.stack([weight for *_, weight in met])  # [L G P V]
     qx, qy = q * x, q * y
     q, sx, sy, sxx, sxy, syy = (moment.sum(2) for moment in (q, qx, qy, qx * x, qx * y, qy * y))
     u, v, a, b, c = params[:, :5].permute(1, 2, 0, 3)
@@ -79,7 +76,7 @@ def _backward(
     shape = [-2 * a * mx - b * my, -b * mx - 2 * c * my, mxx, mxy, myy, q]
     columns = [*shape, *((w * gradient).sum(2) for gradient in [*gradients, *others])]
     if others:
-        q = torch.stack([groups[0] for groups in by_z[::-1]])
+        q = torch.stack([of_first for _, of_first in by_z[::-1]])
         sq = q.sum(2)
         mx, my = (q * x).sum(2) - u * sq, (q * y).sum(2) - v * sq
         columns += [-2 * a * mx - b * my, -b * mx - 2 * c * my]

@@ -15,6 +15,7 @@ merge the loops over pixels and lanes wherever nothing else tells them apart, an
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -106,15 +107,15 @@ def walk_back_groups(
     weight: Float[Tensor, "G P V"],
     groups: Sequence[Sequence[Tensor]],
     values: Sequence[Tensor],
-) -> list[Float[Tensor, "G P V"]]:
-    """:func:`walk_back` for groups of totals apart, in place in the list: the gradients by z of each."""
-    by_z, first = [], 0
+) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G P V"]]:
+    """:func:`walk_back` for groups of totals apart, in place in the list: gradients by z of all and of the first."""
+    by_z, done = [], 0
     for i, gradients in enumerate(groups):
-        of_group = values[first : first + len(gradients)]
+        of_group = values[done : done + len(gradients)]
         behinds[i], gradient = walk_back(behinds[i], z, alpha, weight, gradients, of_group)
         by_z.append(gradient)
-        first += len(gradients)
-    return by_z
+        done += len(gradients)
+    return functools.reduce(torch.add, by_z), by_z[0]
 
 
 def _halve(z: Tensor) -> Tensor:
