@@ -24,7 +24,8 @@ from rich.table import Table
 from torch import Tensor
 
 from benchmarks import naive
-from benchmarks.scenes import make_camera, make_scene
+from benchmarks.scenes import Scene, make_camera, make_scene
+from dataparsers.camera import Camera
 from shellgs_method.rasterizer import rasterize
 
 BACKWARD_UP_TO = 960 * 540  # pixels; larger pictures are only looked at
@@ -45,6 +46,8 @@ class Benchmark:
         threads: of torch.
         memory: also measure it, in a fresh process for each row.
         save_scene: write the scene of the first number and size here (npz), for other programs, and stop.
+        scenes: files (npz) of scenes to time instead of the seeded ones, as ``benchmarks.step --save`` writes them of a
+            trained run; they have a camera of their own.
         figure: draw time against (splat, pixel) pairs here.
     """
 
@@ -57,6 +60,7 @@ class Benchmark:
     threads: int = 2
     memory: bool = True
     save_scene: Path | None = None
+    scenes: tuple[Path, ...] = ()
     figure: Path | None = None
 
 
@@ -69,6 +73,14 @@ class Case:
     height: int
     primitive: Literal["3d", "2d"]
     n_features: int
+    file: Path | None = None
+    """Of the scene, if it is not a seeded one."""
+
+    @functools.cached_property
+    def scene(self) -> tuple[Scene, Camera]:
+        if self.file is not None:
+            return Scene.load(self.file)
+        return make_scene(self.n), make_camera(self.width, self.height)
 
     @property
     def backward(self) -> bool:
@@ -91,15 +103,21 @@ def main(benchmark: Benchmark) -> None:
         make_scene(benchmark.splats[0]).save(benchmark.save_scene, make_camera(*sizes[0]))
         return
     console, timings = Console(width=110), {}
-    for n in benchmark.splats:
-        for width, height in sizes:
-            cases = [Case(n, width, height, p, c) for p in benchmark.primitives for c in benchmark.channels]
-            own, twins = time_in_turns(cases, benchmark.rounds, with_twins=n <= benchmark.twin_up_to)
-            memory = {case: peak_memory(case, benchmark.threads) for case in cases if benchmark.memory}
-            console.print(tabulate(own, twins, memory))
-            timings |= own
+    seeded = [(n, *size, None) for n in benchmark.splats for size in sizes]
+    for n, width, height, file in [measured(file) for file in benchmark.scenes] or seeded:
+        cases = [Case(n, width, height, p, c, file) for p in benchmark.primitives for c in benchmark.channels]
+        own, twins = time_in_turns(cases, benchmark.rounds, with_twins=n <= benchmark.twin_up_to)
+        memory = {case: peak_memory(case, benchmark.threads) for case in cases if benchmark.memory}
+        console.print(tabulate(own, twins, memory))
+        timings |= own
     if benchmark.figure is not None:
         draw(timings, benchmark.figure)
+
+
+def measured(file: Path) -> tuple[int, int, int, Path]:
+    """Number of splats and size of the image of a saved scene."""
+    scene, camera = Scene.load(file)
+    return len(scene.means), camera.width, camera.height, file
 
 
 def time_in_turns(cases: list[Case], rounds: int, with_twins: bool) -> tuple[dict[Case, Timing], dict[Case, Timing]]:
@@ -119,8 +137,8 @@ def time_in_turns(cases: list[Case], rounds: int, with_twins: bool) -> tuple[dic
 
 def prepare(case: Case, renderer: Callable[..., tuple[Tensor, Tensor, dict]]) -> Callable[[], tuple[float, float]]:
     """A function that renders a case, backward too, and returns the seconds."""
-    camera = make_camera(case.width, case.height)
-    splats = [each.requires_grad_(case.backward) for each in make_scene(case.n).splats(case.n_features)]
+    scene, camera = case.scene
+    splats = [each.requires_grad_(case.backward) for each in scene.splats(case.n_features)]
     generator = torch.Generator().manual_seed(7)
     slope = torch.randn(case.height, case.width, case.n_features + 1, generator=generator) / (case.width * case.height)
 
@@ -165,11 +183,11 @@ def _resident(field: str) -> float:
 
 
 @functools.cache
-def pairs(n: int, width: int, height: int, primitive: Literal["3d", "2d"]) -> int:
+def pairs(case: Case) -> int:
     """(splat, pixel) pairs inside the footprints of a scene."""
-    means, quats, scales, opacities, _ = make_scene(n).splats(0)
-    projection = naive.PROJECT[primitive](means, quats, scales, opacities, [make_camera(width, height)])
-    return naive.count_pairs(projection, primitive, width, height)
+    scene, camera = case.scene
+    projection = naive.PROJECT[case.primitive](*scene.splats(0)[:4], [camera])
+    return naive.count_pairs(projection, case.primitive, case.width, case.height)
 
 
 def tabulate(own: dict[Case, Timing], twins: dict[Case, Timing], memory: dict[Case, float]) -> Table:
@@ -186,7 +204,7 @@ def tabulate(own: dict[Case, Timing], twins: dict[Case, Timing], memory: dict[Ca
             _both(timing, lambda seconds: 1e3 * float(np.median(seconds))),
             _ratios(twins[case], timing) if case in twins else "",
             _ratios(timing, own[first]),
-            f"{pairs(case.n, case.width, case.height, case.primitive) / 1e6:.2f}",
+            f"{pairs(case) / 1e6:.2f}",
             f"{memory[case]:.1f}" if case in memory else "",
         )
     return table
@@ -206,7 +224,7 @@ def draw(timings: dict[Case, Timing], path: Path) -> None:
     forward, both = figure.subplots(1, 2, sharey=True)
     for primitive, n_features in dict.fromkeys((case.primitive, case.n_features) for case in timings):
         of_kind = [case for case in timings if (case.primitive, case.n_features) == (primitive, n_features)]
-        n_pairs = [pairs(case.n, case.width, case.height, primitive) for case in of_kind]
+        n_pairs = [pairs(case) for case in of_kind]
         for axes, seconds in ((forward, "forward"), (both, "both")):
             least = [1e3 * min(getattr(timings[case], seconds)) for case in of_kind]
             axes.loglog(n_pairs, least, "o", label=f"{primitive}, {n_features} channels")

@@ -41,6 +41,14 @@ class Scene:
         with path.open("wb") as file:
             np.savez(file, **arrays, **view)
 
+    @classmethod
+    def load(cls, path: Path) -> tuple[Scene, Camera]:
+        """Read what :meth:`save` wrote."""
+        with np.load(path, allow_pickle=False) as arrays:
+            scene = cls(*(torch.from_numpy(arrays[field.name]) for field in fields(cls)))
+            width, height = arrays["size"].tolist()
+            return scene, Camera(torch.from_numpy(arrays["viewmat"]), torch.from_numpy(arrays["K"]), width, height)
+
 
 def make_scene(n: int, seed: int = 0) -> Scene:
     """A scene of n splats, 70 % of them on the facade; between the tabled numbers footprints are interpolated."""

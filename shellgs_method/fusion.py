@@ -12,6 +12,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -65,6 +66,13 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying:
         reason = next(iter(str(error).strip().splitlines()), "")
         logger.warning("Rasterizer and losses run without torch.compile, slower: %s: %s", type(error).__name__, reason)
         return kernel(*args)
+
+
+def nothing_compiled_yet() -> bool:
+    """Whether the first kernels that are used will be compiled: inductor's cache on this machine is empty."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir  # slow
+
+    return os.environ.get("SHELLGS_COMPILE") != "0" and not any(Path(cache_dir()).glob("*"))
 
 
 @functools.cache

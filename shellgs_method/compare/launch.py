@@ -10,11 +10,13 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
 from shellgs_method.compare.runs import Run
+from shellgs_method.fusion import nothing_compiled_yet
 
 BIN = Path(sys.executable).parent
 LAST_LINES = 30
@@ -29,6 +31,8 @@ def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run
     """Finish all runs, ``jobs`` at once; those that failed, with their last lines. One's failure stops no other."""
     runs = list(runs)
     failures: dict[Run, str] = {}
+    if runs and not torch.cuda.is_available() and nothing_compiled_yet():
+        console.print("The first run compiles the kernels, which takes a minute or two; all others load them.")
     with Progress(console=console, transient=True) as progress, ThreadPoolExecutor(max(jobs, 1)) as pool:
         futures = {pool.submit(_finish_visibly, run, console, progress): run for run in runs}
         try:
