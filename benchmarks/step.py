@@ -78,7 +78,9 @@ def main(benchmark: Benchmark) -> None:
         whole = {config: [] for config in trainers}
         parts = {config: defaultdict(list) for config in trainers}
         bare = {config: [] for config in trainers}
-        for round_ in range(-5, benchmark.steps):
+        # What is kept of a view is made when it is first seen: each is, before anything counts.
+        warm_up = max(len(_cameras(trainer)) for trainer in trainers.values()) + 5
+        for round_ in range(-warm_up, benchmark.steps):
             for config, trainer in trainers.items():
                 with timed_parts() as seconds:
                     start = time.perf_counter()
