@@ -15,7 +15,8 @@ def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[T
 
     They face the camera without being flipped: whatever the four (positive) depths around a pixel, right minus left
     crossed with top minus bottom points against the pixel's ray. Zero on the image's border and where the pixel or
-    one of its four neighbours has no depth.
+    one of its four neighbours has no depth, which the Sobel windows of kornia's ``depth_to_normals`` would take for a
+    surface.
     """
     points = depth * camera.rays().to(depth)
     horizontal = points[1:-1, 2:] - points[1:-1, :-2]
