@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
 from shellgs_method.compare.launch import CommandError, follow, launch_locally
@@ -29,7 +30,9 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
     runs = grid([scene], METHODS, [0], iterations, folder)
-    if compare(runs, partial(launch_locally, jobs=1, console=console), folder, console).failures:
+    # On a CPU runs side by side get more done than one after the other: much of each is a single thread's work.
+    jobs = 1 if torch.cuda.is_available() else len(METHODS)
+    if compare(runs, partial(launch_locally, jobs=jobs, console=console), folder, console).failures:
         raise SystemExit("shellgs: a run of the demo failed; its last lines are above.")
     console.print(
         f"Pictures: {folder / 'strip.png'}, {scene / 'cues/shell/panel.png'}. Tables: {folder / 'results.md'}. "

@@ -68,6 +68,13 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying:
         return kernel(*args)
 
 
+def detached(tensor: Tensor) -> Tensor:
+    """An output of a kernel without its history; its second dimension varies for the next kernel as before."""
+    leaf = tensor.detach()
+    torch._dynamo.maybe_mark_dynamic(leaf, 1)
+    return leaf
+
+
 def nothing_compiled_yet() -> bool:
     """Whether the first kernels that are used will be compiled: inductor's cache on this machine is empty."""
     from torch._inductor.runtime.cache_dir_utils import cache_dir  # slow

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.fusion import run_fused
+from shellgs_method.fusion import detached, run_fused
 from shellgs_method.rasterizer.binning import touches
 from shellgs_method.rasterizer.projection import (
     NEAR_PLANE,
@@ -52,9 +52,9 @@ def project_discs(
     projection = Projection(means2d, shapes, depths.detach(), outlines, covars2d, visible & in_front)
     if not with_probe:
         return projection
-    probe = means2d.detach().requires_grad_()
-    fixed = (each.detach() for each in (depths, quats, scales, opacities))
-    shapes = run_fused(_project, probe, *fixed, *views)[0]
+    probe = detached(means2d).requires_grad_()
+    fixed = (each.detach() for each in (quats, scales, opacities))
+    shapes = run_fused(_project, probe, detached(depths), *fixed, *views)[0]
     return replace(projection, probe=probe, probed=torch.cat([probe, shapes[..., :-1]], dim=-1))  # all but n
 
 
