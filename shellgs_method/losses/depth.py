@@ -35,19 +35,19 @@ class NccLoss:
         mean, _, variance, _ = _moments(self._target, self._target, self._valid, per_pixel, window)
         floor = (eps * mean).square()
         used = mask & (n > min_valid * window**2 - 0.5) & (variance > floor)
-        self._patches = per_pixel, variance, floor, used / used.sum().clamp_min(1).to(y)
+        self._patches, self._share = (per_pixel, variance, floor, used.to(y)), 1 / used.sum().clamp_min(1).to(y)
 
     def __call__(self, inverse_depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
         """The loss of one rendering."""
-        return _Ncc.apply(inverse_depth[..., 0], self)
+        return self._share * _Ncc.apply(inverse_depth[..., 0], self)
 
     def correlate(self, x: Float[Tensor, "H W"]) -> list[Tensor]:
-        """The loss of an inverse depth, its filled-up values, and what :meth:`gradient` needs besides."""
+        """An inverse depth filled up, the sum of the patches' losses, and what :meth:`gradient` needs besides."""
         x = F.pad(x, self._around).where(self._valid > 0, self._target)
         return [x, *run_fused(_correlate, x, self._target, self._valid, *self._patches, self._window, varying=2)]
 
     def gradient(self, x: Float[Tensor, "H+2r W+2r"], *by_patch: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Gradient of the loss by the inverse depth."""
+        """Gradient of the sum by the inverse depth."""
         padded = [F.pad(each, self._around) for each in by_patch]
         return run_fused(_by_inverse_depth, x, self._target, self._valid, *padded, self._window, varying=2)
 
@@ -104,7 +104,9 @@ def _correlate(
     weights: Float[Tensor, "H W"],
     window: Float[Tensor, "1 1 w"],
 ) -> tuple[Tensor, ...]:
-    """The loss, and by patch a, a E[y], b and b E[x] of the gradient Σ a (y - E[y]) + b (x - E[x]) over the patches.
+    """The sum of the patches' losses; and by patch a, a E[y], b and b E[x] of the gradient.
+
+    That is the sum of a (y - E[y]) + b (x - E[x]) over the patches a pixel is in.
 
     Args:
         x: rendered inverse depth.
@@ -113,7 +115,7 @@ def _correlate(
         per_pixel: one over the number of pixels that count, by patch, like what follows.
         variance_y: of the target.
         floor: smallest variance that counts as contrast.
-        weights: of sum 1; 0 of a patch that is left out.
+        weights: 1, or 0 of a patch that is left out.
         window: of the width of a patch.
     """
     mean_x, mean_y, variance_x, covariance = _moments(x, y, valid, per_pixel, window.shape[2])
