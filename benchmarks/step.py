@@ -3,7 +3,7 @@
     python -m benchmarks.step outputs/scene/shellgs/TIME/config.yml
 
 goes on from the last checkpoint for some steps and prints the median milliseconds of each part; the run is left alone.
-With ``--save scene.npz`` it writes the Gaussians and a camera for ``benchmarks.rasterizer --scene`` instead.
+With ``--save scene.npz`` it writes the Gaussians and a camera for ``benchmarks.rasterizer --scenes`` instead.
 """
 
 from __future__ import annotations

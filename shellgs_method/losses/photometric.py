@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -16,13 +18,16 @@ class PhotometricLoss:
         self, target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"] | None = None, ssim_weight: float = 0.2
     ):
         self.target, self.mask, self.ssim_weight = target, mask, ssim_weight
-        self.ssim_target = SsimTarget.of(target)
+
+    @cached_property
+    def _ssim_target(self) -> SsimTarget:
+        return SsimTarget.of(self.target)
 
     def __call__(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """The loss of one rendering."""
         if self.mask is not None:
             rgb = rgb.where(self.mask, self.target)
-        l1, dissimilarity = (rgb - self.target).abs(), 1 - ssim(rgb, self.ssim_target)
+        l1, dissimilarity = (rgb - self.target).abs(), 1 - ssim(rgb, self._ssim_target)
         errors = (1 - self.ssim_weight) * l1 + self.ssim_weight * dissimilarity
         return errors.mean() if self.mask is None else weighted_mean(errors, self.mask)
 

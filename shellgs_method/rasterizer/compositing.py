@@ -33,7 +33,7 @@ def composite(
     bins: Bins,
     kernels: Kernels,
     probed: Float[Tensor, "N 2+k"] | None = None,
-    n_probed: int = 0,
+    n_densifying: int = 0,
 ) -> Float[Tensor, "height width C+1+maps"]:
     """Composite splats over the image of ``bins``: features, alpha, and the primitive's maps.
 
@@ -44,11 +44,11 @@ def composite(
         order: the splats in the bins, front to back.
         bins: of the splats in this order.
         kernels: of the primitive.
-        probed: the means2d and first k of the shapes once more, to get the gradient of the first ``n_probed`` features
-            alone; k is the primitive's.
-        n_probed: number of these features.
+        probed: the means2d and first k of the shapes once more, to get the gradient of the first ``n_densifying``
+            features alone; k is the primitive's.
+        n_densifying: number of these features.
     """
-    return _Composite.apply(means2d, shapes, features, probed, order, bins, kernels, n_probed)
+    return _Composite.apply(means2d, shapes, features, probed, order, bins, kernels, n_densifying)
 
 
 @dataclass(frozen=True)
@@ -85,28 +85,28 @@ class _Plan:
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means2d, shapes, features, probed, order, bins, kernels, n_probed):
+    def forward(ctx, means2d, shapes, features, probed, order, bins, kernels, n_densifying):
         columns = [each.index_select(0, order) for each in (means2d, shapes, features)]
         table = F.pad(torch.cat([*columns, features.new_ones(len(order), 1)], dim=1), (0, 0, 0, 1))
         table[-1, : kernels.n_shape] = table.new_tensor(kernels.null_shape)  # fills up a tile's last chunk
         canvas, plans = _paint(table, bins, kernels)
         ctx.save_for_backward(table, order)
         ctx.n, ctx.bins, ctx.plans, ctx.kernels = len(means2d), bins, plans, kernels
-        ctx.n_probed = None if probed is None else n_probed
+        ctx.n_densifying = None if probed is None else n_densifying
         return _untile(canvas[:-1], bins)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradients):
         table, order = ctx.saved_tensors
-        by_row = _gradients(_tile(gradients, ctx.bins), table, ctx.plans, ctx.kernels, ctx.n_probed)
+        by_row = _gradients(_tile(gradients, ctx.bins), table, ctx.plans, ctx.kernels, ctx.n_densifying)
         n_shape, n_params = ctx.kernels.n_shape, table.shape[1]
         widths = [2, n_shape - 2, n_params - n_shape - 1, 1, by_row.shape[1] - n_params]
         means2d, shapes, features, _, probed = (
             table.new_zeros(ctx.n, each.shape[1]).index_copy_(0, order, each)
             for each in by_row[:-1].split(widths, dim=1)
         )
-        return means2d, shapes, features, None if ctx.n_probed is None else probed, None, None, None, None
+        return means2d, shapes, features, None if ctx.n_densifying is None else probed, None, None, None, None
 
 
 def _paint(
@@ -167,16 +167,16 @@ def _gradients(
     table: Float[Tensor, "N+1 K"],
     plans: list[_Plan],
     kernels: Kernels,
-    n_probed: int | None,
+    n_densifying: int | None,
 ) -> Float[Tensor, "N+1 K+probed"]:
     """Gradients of the table's rows from those of the composited totals; behind them, what is probed."""
-    by_params = table.new_zeros(len(table), table.shape[1] + (0 if n_probed is None else kernels.n_probed))
-    behind = table.new_zeros(len(gradients), 1 if n_probed is None else 2, TILE * TILE)
+    by_params = table.new_zeros(len(table), table.shape[1] + (0 if n_densifying is None else kernels.n_probed))
+    behind = table.new_zeros(len(gradients), 1 if n_densifying is None else 2, TILE * TILE)
     for group in _in_groups(plans[::-1], MAX_SUMMED // (CHUNK * LANES * by_params[0].nbytes)):
         splats = torch.cat([plan.splats[: plan.n_met] for plan in group])
         by_row = table.new_empty(*splats.shape, by_params.shape[1])
         for plan, by_row_of_plan in zip(group, by_row.split([plan.n_met for plan in group]), strict=True):
-            _walk_back(plan, by_row_of_plan, gradients, behind, table, kernels, n_probed)
+            _walk_back(plan, by_row_of_plan, gradients, behind, table, kernels, n_densifying)
         by_params += _sum_by_splat(by_row.flatten(0, 2), splats.flatten(), len(table))
     return by_params
 
@@ -188,7 +188,7 @@ def _walk_back(
     behind: Float[Tensor, "tiles+1 groups P"],
     table: Float[Tensor, "N+1 K"],
     kernels: Kernels,
-    n_probed: int | None,
+    n_densifying: int | None,
 ) -> None:
     """Fill in the gradients of the splats a plan has met, and bring ``behind`` to before them."""
     pixels, stop = _pixels(table), _stop(plan, table)
@@ -196,7 +196,7 @@ def _walk_back(
     for i, transmittance in reversed([*enumerate(plan.transmittances)]):
         rows, n = plan.chunk(i), len(transmittance)
         totals = [gradient[:n] for gradient in gradients_here]
-        groups = (totals, []) if n_probed is None else (totals[:n_probed], totals[n_probed:])
+        groups = (totals, []) if n_densifying is None else (totals[:n_densifying], totals[n_densifying:])
         run_fused(
             kernels.backward,
             *(transmittance, [each[:n] for each in behind_here], *groups),

@@ -88,8 +88,8 @@ def _backward(
         behind.copy_(before)
 
     # All splats at once, [L, G, P, V]. Meeting them again is cheaper than storing what was met.
-    probed_by_z = torch.stack([of_first for _, of_first in by_z[::-1]])
-    by_z = torch.stack([of_all for of_all, _ in by_z[::-1]])
+    of_all, of_first = zip(*by_z[::-1], strict=True)
+    by_z = torch.stack(of_all)
     w = torch.stack([weight for _, _, weight, _ in met])
     by_median = torch.stack([each for *_, each in met])
     _, ahead, s, t, depth, inverse_depth, hits = _intersect(params.permute(2, 0, 1, 3)[:, :, :, None], x, y)
@@ -114,7 +114,7 @@ def _backward(
     columns = by_shape(by_z, by_i)
     columns += [(w * gradient).sum(2) for gradient in [each for group in groups for each in group][:-2]]
     if others:
-        columns += by_shape(probed_by_z, 0.0)[:_N_PROBED]
+        columns += by_shape(torch.stack(of_first), 0.0)[:_N_PROBED]
     by_params.copy_(torch.stack(columns).permute(2, 1, 3, 0))
 
 

@@ -123,7 +123,7 @@ _RASTERIZE = {
 
 
 def _render(
-    view: View, kernels: Kernels, features: Float[Tensor, "N C"], camera: Camera, n_probed: int
+    view: View, kernels: Kernels, features: Float[Tensor, "N C"], camera: Camera, n_densifying: int
 ) -> Float[Tensor, "height width C+1+maps"]:
     """Features, alpha and the primitive's maps as one camera sees them."""
     visible = view.visible.nonzero().squeeze(1)
@@ -132,7 +132,7 @@ def _render(
     depths = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
     order = visible.index_select(0, stable_order(depths))
     bins = bin_splats(view.outlines.index_select(0, order), camera.width, camera.height)
-    return composite(view.means2d, view.shapes, features, order, bins, kernels, view.probed, n_probed)
+    return composite(view.means2d, view.shapes, features, order, bins, kernels, view.probed, n_densifying)
 
 
 def _three_sigmas(outlines: Tensor, covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Tensor:
