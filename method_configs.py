@@ -51,10 +51,19 @@ def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpec
 # with this threshold the methods with cues end with about as many Gaussians as photo-gs, whose is 0.0002.
 THRESHOLD_WITH_CUES = 0.00014
 
+THRESHOLD_METRIC = 0.0003  # its seeds resolve the wall already
+
 shellgs = _method(
     "shellgs",
     "3D Gaussians supervised by an aligned exterior facade shell",
     FacadeModelConfig(cues="shell", densify_grad_thresh=THRESHOLD_WITH_CUES),
+)
+shellgs_metric = _method(
+    "shellgs-metric",
+    "3D Gaussians that begin on an aligned facade shell and stay within its tolerance: the method to use",
+    FacadeModelConfig(
+        cues="shell", seeds="shell", densify_grad_thresh=THRESHOLD_METRIC, extra=ExtraLossConfig(empty_space=1.0)
+    ),
 )
 mono_gs = _method(
     "mono-gs",

@@ -30,7 +30,8 @@ from rich.table import Table
 from benchmarks.scenes import Scene
 from dataparsers.camera import Camera
 from shellgs_method import model as model_module
-from shellgs_method.model import FacadeModel, pinhole_camera
+from shellgs_method.batches import pinhole_camera
+from shellgs_method.model import FacadeModel
 from shellgs_method.rasterizer import rasterize
 from shellgs_method.trainer import FacadeTrainer, FacadeTrainerConfig
 

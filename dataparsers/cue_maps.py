@@ -65,6 +65,7 @@ class Manifest:
         metres_per_unit: metres in one scene unit, None where unknown.
         max_image_size: longer side the photographs are resized to for these maps, None for full size.
         licence: of the network's weights, for maps that a network made.
+        error: metres that the surface may be off as a whole, None where unknown.
     """
 
     command: str
@@ -72,6 +73,7 @@ class Manifest:
     metres_per_unit: float | None = None
     max_image_size: int | None = None
     licence: str | None = None
+    error: float | None = None
     shellgs: str = field(default_factory=lambda: _version())
     format: int = FORMAT
 
@@ -111,13 +113,14 @@ class CueMaps:
         metres_per_unit: float | None = None,
         max_image_size: int | None = None,
         licence: str | None = None,
+        error: float | None = None,
     ) -> CueMaps:
         """Write the manifest of a set made from the files and folders ``sources`` and from what ``revisions`` names.
 
         Maps already there stay, and count while they match it.
         """
         hashes = {relative_path(path, scene): content_hash(path) for path in sources} | dict(revisions or {})
-        manifest = Manifest(command, hashes, metres_per_unit, max_image_size, licence)
+        manifest = Manifest(command, hashes, metres_per_unit, max_image_size, licence, error)
         maps = cls(scene, kind, manifest)
         maps.folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(maps.folder / "manifest.json") as file:

@@ -51,8 +51,9 @@ class FacadeDataParser(DataParser):
     """Reads a scene through nerfstudio's own COLMAP and transforms.json parsers and attaches the cue maps.
 
     The outputs' cameras are pinhole cameras. Their metadata holds, in the order of the images, ``views`` (their
-    :class:`~dataparsers.photograph.View`), and for the whole scene ``cues`` (the :class:`CueMaps` found, by kind) and
-    ``metres_per_unit`` (of nerfstudio's rescaled world; None where no shell alignment tells).
+    :class:`~dataparsers.photograph.View`), and for the whole scene ``cues`` (the :class:`CueMaps` found, by kind),
+    ``metres_per_unit`` (of nerfstudio's rescaled world) and ``shell_error`` (metres that the shell may be off as a
+    whole), both None where no shell alignment tells.
     """
 
     config: FacadeDataParserConfig
@@ -70,6 +71,7 @@ class FacadeDataParser(DataParser):
             "views": views,
             "cues": cues,
             "metres_per_unit": metres_per_unit / outputs.dataparser_scale if metres_per_unit else None,
+            "shell_error": shell.error if shell else None,
         }
         return outputs
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -12,19 +13,25 @@ from jaxtyping import UInt8
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
+from dataparsers.camera import Camera
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
+from shellgs_method.batches import pinhole_camera, reference_maps
+from shellgs_method.covisibility import SeenBy, thinning
+from shellgs_method.seeding import SeededView, Seeds, shell_seeds
 
 
 class FacadeDataset(InputDataset):
     """Photographs at the size of their cameras, with ``K``, ``{cue}_depth``, ``{cue}_normal`` and ``{cue}_mask``.
 
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
-    kind lacks that kind's keys. With ``bands``, all masks are those of pixels whose wall lies in them.
+    kind lacks that kind's keys. With ``bands``, all masks are those of pixels whose wall lies in them. ``seen_by``
+    tells of the training views: then ``seen`` is true where these have seen what a pixel shows.
     """
 
     bands: Bands | None = None
+    seen_by: Callable[[], SeenBy] | None = None
 
     @property
     def views(self) -> list[View]:
@@ -59,7 +66,15 @@ class FacadeDataset(InputDataset):
             maps[f"{kind}_depth"] = torch.from_numpy(cue.depth)[..., None] * self._dataparser_outputs.dataparser_scale
             maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
             maps[f"{kind}_mask"] = torch.from_numpy(cue.mask & inside)[..., None]
+        if self.seen_by is not None:
+            camera = self.camera(data["image_idx"])
+            no_depth = torch.zeros(camera.height, camera.width, 1)
+            maps["seen"] = self.seen_by().mask(camera, maps.get("shell_depth", no_depth))
         return maps
+
+    def camera(self, image_idx: int) -> Camera:
+        """The camera of a view in nerfstudio's rescaled world."""
+        return pinhole_camera(self.cameras[image_idx : image_idx + 1])
 
 
 @dataclass
@@ -89,7 +104,21 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         """The held-out views, whose maps are left in the bands held out."""
         dataset = super().create_eval_dataset()
         dataset.bands = self._held_out
+        dataset.seen_by = lambda: self._seen_by
         return dataset
+
+    @cached_property
+    def _seen_by(self) -> SeenBy:
+        """What the training views see."""
+        dataset, cameras, depths = self.train_dataset, [], []
+        for index in range(len(dataset)):
+            camera = dataset.camera(index)
+            depth = dataset.get_metadata({"image_idx": index}).get("shell_depth", torch.zeros(1, 1, 1))
+            step = thinning(camera)
+            cameras.append(camera)
+            depths.append(depth[::step, ::step, 0].contiguous())
+        points = self.train_dataparser_outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
+        return SeenBy(cameras, depths, points.float())
 
     @cached_property
     def _held_out(self) -> Bands | None:
@@ -99,6 +128,22 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         if "shell" not in metadata["cues"]:
             raise SceneError("a holdout of bands needs the shell maps of the scene: run `shellgs cast SCENE` first")
         return facade_bands(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
+
+    def shell_seeds(self, spacing: float, most: int) -> Seeds:
+        """Seeds on the shell as the training views see it, in nerfstudio's rescaled world.
+
+        Args:
+            spacing: in pixels of the closest view.
+            most: number of seeds beyond which they are spread more widely.
+        """
+        batches = [batch for batch in self.cached_train if "shell_depth" in batch]
+        num_pixels = sum(batch["shell_mask"].numel() for batch in batches)
+        return shell_seeds(map(self._seeded_view, batches), num_pixels, spacing, most)
+
+    def _seeded_view(self, batch: dict) -> SeededView:
+        index, cpu = batch["image_idx"], torch.device("cpu")
+        image = batch["image"][..., :3].to(cpu) / (255 if batch["image"].dtype == torch.uint8 else 1)
+        return SeededView(self.train_dataset.camera(index), image, reference_maps(batch, "shell", cpu))
 
     def _load_images(self, split, cache_images_device):
         # "cpu" pins memory, which needs CUDA, and nerfstudio switches to it by itself above 500 images; "gpu" means

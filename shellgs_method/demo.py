@@ -13,7 +13,7 @@ from shellgs_method.compare.results import compare
 from shellgs_method.compare.runs import grid
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
-METHODS = ("photo-gs", "shellgs")
+METHODS = ("photo-gs", "shellgs", "shellgs-metric")
 
 
 def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Console) -> None:
@@ -31,7 +31,7 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
         raise SystemExit(f"shellgs: {error}") from error
     runs = grid([scene], METHODS, [0], iterations, folder)
     # On a CPU runs side by side get more done than one after the other: much of each is a single thread's work.
-    jobs = 1 if torch.cuda.is_available() else len(METHODS)
+    jobs = 1 if torch.cuda.is_available() else 2
     if compare(runs, partial(launch_locally, jobs=jobs, console=console), folder, console).failures:
         raise SystemExit("shellgs: a run of the demo failed; its last lines are above.")
     console.print(

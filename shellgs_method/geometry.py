@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -31,6 +31,22 @@ GRAZING = 0.01
 """Least cosine of normal and ray at which a plane depth is taken: a plane seen edge-on is met nowhere near."""
 
 
+class DepthMoments(NamedTuple):
+    """Composited powers of the centres' depths."""
+
+    origin: Float[Tensor, ""]
+    """Depth they are about, a constant, so that little is lost in float32."""
+    first: Float[Tensor, "H W 1"]
+    """Σ w (z - origin)."""
+    second: Float[Tensor, "H W 1"]
+    """Σ w (z - origin)²."""
+
+    def about(self, depth: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "H W 1"]:
+        """Σ w (z - depth)²: how far all that is rendered in a pixel is from a depth, which their mean may well have."""
+        d = depth - self.origin
+        return self.second - 2 * d * self.first + d.square() * alpha
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Differentiable maps of one rendered view, in the camera frame."""
@@ -44,6 +60,8 @@ class Geometry:
     camera: Camera
     distortion: Float[Tensor, "H W 1"] | None = None
     """Spread of the splats along each ray, of discs only."""
+    moments: DepthMoments | None = None
+    """Of the centres' depths, where they were asked for."""
 
     @cached_property
     def depth_normal(self) -> Float[Tensor, "H W 3"]:
@@ -62,6 +80,12 @@ def geometry_channels(
     splats = (gaussians[name] for name in ("means", "quats", "scales"))
     normals, along, depths = run_fused(_normals_and_depths, *splats, camera.viewmat[None])
     return normals, along if depth == "plane" else depths
+
+
+def squared_depths(depths: Float[Tensor, "N 1"]) -> tuple[Float[Tensor, "N 1"], Float[Tensor, ""]]:
+    """The channel that :class:`DepthMoments` are made of besides the centres' depths, and its origin, their median."""
+    origin = depths.detach().median()
+    return (depths - origin).square(), origin
 
 
 def _normals_and_depths(
@@ -86,6 +110,7 @@ def rendered_geometry(
     info: Mapping[str, Any],
     camera: Camera,
     depth: DepthKind,
+    origin: Float[Tensor, ""] | None = None,
 ) -> Geometry:
     """Depth and normals of a view from the composite of :func:`geometry_channels`.
 
@@ -94,13 +119,14 @@ def rendered_geometry(
     * ``plane``: Σ w n·m / (Σ w n · ray), the ray's intersection with the composited plane (PGSR, Chen et al. 2024).
 
     Args:
-        composited: normals and the depth channel.
+        composited: normals and the depth channel; with ``origin`` also that of :func:`squared_depths`.
         alpha: accumulated opacity.
         info: what the rasterizer returned beside them.
         camera: of the view.
         depth: which depth; the channel must have been made for it.
+        origin: of the squared depths.
     """
-    normal, channel = composited.split([3, 1], dim=-1)
+    normal, channel = composited[..., :3], composited[..., 3:4]
     solid = alpha.clamp_min(1e-6)
     if depth == "plane":
         facing = (normal * camera.rays()).sum(dim=-1, keepdim=True)
@@ -112,4 +138,5 @@ def rendered_geometry(
     else:
         z = channel / solid
     z = torch.where(alpha > 0, z, z.detach().max())
-    return Geometry(z, normal, alpha, camera, info.get("distortion"))
+    moments = None if origin is None else DepthMoments(origin, channel - origin * alpha, composited[..., 4:])
+    return Geometry(z, normal, alpha, camera, info.get("distortion"), moments)

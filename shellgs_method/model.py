@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Optional, cast
 
-import numpy as np
 import torch
 from gsplat.strategy import DefaultStrategy
 from jaxtyping import Float
@@ -27,12 +26,11 @@ from tyro.conf import Suppress
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+from shellgs_method.batches import pinhole_camera, reference_errors, reference_maps, references, regions
 from shellgs_method.densification import MCMCConfig, MCMCStrategy
 from shellgs_method.evaluation import (
-    Reference,
     Rendering,
     colours_to_normals,
-    geometry_errors,
     geometry_pictures,
     image_errors,
     normals_to_colours,
@@ -44,14 +42,14 @@ from shellgs_method.geometry import (
     Primitive,
     geometry_channels,
     rendered_geometry,
+    squared_depths,
 )
 from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
+from shellgs_method.seeding import Seeds
 from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
 from shellgs_method.threads import ThreadsByLoad
 
-REFERENCES = {"shell": "", "truth": "truth_"}
-"""Kinds of maps that geometry is measured against, and what the names of their figures begin with."""
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in any."""
 MAX_KEPT_PIXELS = 3_000_000
@@ -85,6 +83,12 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """default: clone, split and prune by the gradient; mcmc: move and add by opacity, up to a cap."""
     mcmc: MCMCConfig = MCMCConfig()  # noqa: RUF009
     """Settings of mcmc."""
+    seeds: Literal["none", "shell"] = "none"
+    """Gaussians to begin with, beside those at the SfM points: none, or spread over the shell."""
+    seed_spacing: float = 4.0
+    """Pixels between seeds, in the closest view."""
+    max_seeds: int = 200_000
+    """Most seeds; where the spacing gives more, they are spread more widely."""
 
     background_color: Literal["random", "black", "white"] = "black"
     cull_alpha_thresh: float = 0.005
@@ -133,19 +137,9 @@ class FacadeModel(SplatfactoModel):
         self._refuse_what_cannot_be()
         points, colours = self._seed_points()
         spacing = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))[0][:, 1:].mean(axis=1)
-        scales = torch.from_numpy(np.log(spacing.clip(min=1e-6))).float()[:, None].repeat(1, 3)
-        if self.config.primitive == "2d":
-            scales[:, 2] = DISC_LOG_THICKNESS
-        self.gauss_params = nn.ParameterDict(
-            {
-                "means": nn.Parameter(points),
-                "scales": nn.Parameter(scales),
-                "quats": nn.Parameter(random_quat_tensor(len(points))),
-                "features_dc": nn.Parameter(RGB2SH(colours)),
-                "features_rest": nn.Parameter(torch.zeros(len(points), num_sh_bases(self.config.sh_degree) - 1, 3)),
-                "opacities": nn.Parameter(torch.full((len(points), 1), math.log(0.1 / 0.9))),
-            }
-        )
+        scales = torch.from_numpy(spacing).float()[:, None].repeat(1, 3)
+        self.gauss_params = nn.ParameterDict()
+        self._add_gaussians(points, colours, scales, random_quat_tensor(len(points)))
         self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.background_color = get_color(
             "black" if self.config.background_color == "random" else self.config.background_color
@@ -162,6 +156,8 @@ class FacadeModel(SplatfactoModel):
         config = self.config
         if config.primitive == "3d" and (config.depth == "median" or config.extra.distortion > 0):
             raise SceneError("median depth and distortion are those of discs: set pipeline.model.primitive to 2d")
+        if config.depth == "plane" and config.extra.empty_space > 0:
+            raise SceneError("empty_space is made of the centres' depths: set pipeline.model.depth to expected")
         if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
             method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
             raise SceneError(
@@ -177,6 +173,38 @@ class FacadeModel(SplatfactoModel):
             kept = torch.randperm(len(points))[: self.config.mcmc.cap_max]
             points, colours = points[kept], colours[kept]
         return points, colours
+
+    def add_seeds(self, seeds: Seeds) -> None:
+        """Begin with Gaussians that lie on the shell, too."""
+        points, normals, colours, spacing = (torch.from_numpy(each).float() for each in seeds)
+        scales = spacing[:, None] * spacing.new_tensor([0.5, 0.5, 0.05])
+        x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(dim=-1)
+        quats = torch.stack([1 + z, -y, x, 0 * z], dim=-1)  # from the third axis to the normal, or its opposite
+        self._add_gaussians(points, colours, scales, quats)
+
+    def _add_gaussians(
+        self,
+        means: Float[Tensor, "N 3"],
+        colours: Float[Tensor, "N 3"],
+        scales: Float[Tensor, "N 3"],
+        quats: Float[Tensor, "N 4"],
+    ) -> None:
+        scales = scales.clamp_min(1e-6).log()
+        if self.config.primitive == "2d":
+            scales[:, 2] = DISC_LOG_THICKNESS
+        added = {
+            "means": means,
+            "scales": scales,
+            "quats": quats,
+            "features_dc": RGB2SH(colours),
+            "features_rest": torch.zeros(len(means), num_sh_bases(self.config.sh_degree) - 1, 3),
+            "opacities": torch.full((len(means), 1), math.log(0.1 / 0.9)),
+        }
+        for name, new in added.items():
+            if name in self.gauss_params:
+                old = self.gauss_params[name].data
+                new = torch.cat([old, new.to(old)])
+            self.gauss_params[name] = nn.Parameter(new)
 
     def plan(self, num_iterations: int) -> None:
         """Fit every schedule to a run of ``num_iterations``."""
@@ -255,6 +283,10 @@ class FacadeModel(SplatfactoModel):
         features = [self._colours(gaussians, pinhole) - background]
         if with_geometry:
             features += geometry_channels(gaussians, pinhole, self.config.depth)
+        origin = None
+        if with_geometry and self.config.extra.empty_space > 0:
+            squares, origin = squared_depths(features[-1])
+            features.append(squares)
         # Gradients of the colours are reasons to densify, those of the geometry are not.
         n_densifying = 3 if with_geometry and self.training and self.config.densification == "default" else None
         composited, alpha, self.info = rasterize(
@@ -278,7 +310,7 @@ class FacadeModel(SplatfactoModel):
         }
         self.geometry = None
         if with_geometry:
-            self.geometry = rendered_geometry(composited[..., 3:], alpha, self.info, pinhole, self.config.depth)
+            self.geometry = rendered_geometry(composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin)
             outputs["depth"] = self.geometry.depth
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
         return outputs
@@ -341,7 +373,8 @@ class FacadeModel(SplatfactoModel):
         cue = None
         if f"{config.cues}_depth" in batch:
             maps = reference_maps(batch, config.cues, self.device)
-            cue = CueLosses(maps, config.geometry, config.extra, self.metres_per_unit)
+            shell_error = self.kwargs["metadata"].get("shell_error")
+            cue = CueLosses(maps, config.geometry, config.extra, self.metres_per_unit, shell_error)
         view = ViewLosses(PhotometricLoss(target, kept, config.ssim_lambda), cue)
         changes = config.background_color == "random" and batch["image"].shape[-1] == 4
         room = MAX_KEPT_PIXELS // target[..., 0].numel()
@@ -371,7 +404,7 @@ class FacadeModel(SplatfactoModel):
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
         rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
-        figures = image_errors(rendering.rgb, target)
+        figures = image_errors(rendering.rgb, target, regions(batch, self.metres_per_unit, self.device))
         figures |= reference_errors(rendering, camera, batch, self.metres_per_unit)
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}
         if "shell_depth" not in batch:
@@ -380,40 +413,3 @@ class FacadeModel(SplatfactoModel):
             pictures = geometry_pictures(rendering, reference)
             images |= {prefix + name: picture for name, picture in pictures.items()}
         return figures, images
-
-
-def reference_errors(
-    rendering: Rendering, camera: Camera, batch: dict, metres_per_unit: float | None
-) -> dict[str, float]:
-    """Figures of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``."""
-    figures = {}
-    for prefix, reference in references(batch, rendering.depth.device).items():
-        errors = geometry_errors(rendering, camera, reference, metres_per_unit)
-        figures |= {prefix + name: value for name, value in errors.items()}
-    return figures
-
-
-def references(batch: dict, device: torch.device) -> dict[str, Reference]:
-    """The maps that a batch has to measure against, by what the names of their figures begin with."""
-    return {
-        prefix: reference_maps(batch, kind, device) for kind, prefix in REFERENCES.items() if f"{kind}_depth" in batch
-    }
-
-
-def reference_maps(batch: dict, kind: str, device: torch.device) -> Reference:
-    """The maps of one kind in a batch; what the user masked out is not supported."""
-    depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
-    if "mask" in batch:
-        mask = mask & batch["mask"].to(device)
-    return Reference(depth, normal.float(), mask)
-
-
-def pinhole_camera(camera: Cameras) -> Camera:
-    """The one camera of a nerfstudio ``Cameras``, which is OpenGL and has its centres at 0.5 as ours."""
-    pose = camera.camera_to_worlds[0]
-    rotation = (pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])).T
-    viewmat = torch.eye(4, dtype=pose.dtype, device=pose.device)
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ pose[:, 3]
-    K = camera.get_intrinsics_matrices()[0].to(pose.device)
-    return Camera(viewmat, K, int(camera.width[0]), int(camera.height[0]))

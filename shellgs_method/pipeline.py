@@ -11,7 +11,9 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from rich.progress import track
 
 from dataparsers.errors import refusals_end_the_program
+from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import mean_over_views
+from shellgs_method.model import FacadeModel
 
 
 @dataclass
@@ -32,6 +34,11 @@ class FacadePipeline(VanillaPipeline):
     def __init__(self, config: FacadePipelineConfig, *args, **kwargs):
         with refusals_end_the_program():
             super().__init__(config, *args, **kwargs)
+            model, datamanager = self.model, self.datamanager
+            assert isinstance(model, FacadeModel)
+            assert isinstance(datamanager, FacadeDataManager)
+            if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run brings all its Gaussians
+                model.add_seeds(datamanager.shell_seeds(model.config.seed_spacing, model.config.max_seeds))
 
     def get_average_image_metrics(
         self, data_loader, image_prefix: str, step: int | None = None, output_path: Path | None = None, get_std=False

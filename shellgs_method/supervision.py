@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Optional
 
 import torch
 from jaxtyping import Bool
@@ -24,6 +24,11 @@ from shellgs_method.losses import (
     normal_loss,
     vid2sim_ncc_loss,
 )
+
+TOLERANCES = (0.02, 0.10)
+"""Least and largest tolerance in metres that is taken from the figures of an alignment."""
+UNVALIDATED = 0.05
+"""Tolerance in metres of a shell whose alignment was not validated."""
 
 
 @dataclass
@@ -60,8 +65,12 @@ class ExtraLossConfig:
     """Weight of the normal loss on normals of the rendered depth, which moves Gaussians where N turns them."""
     point_to_plane: float = 0.0
     """Weight of the distance from the cue's tangent plane, in metres, under a logarithm."""
-    tolerance: float = 0.05
-    """Distance from the plane that costs nothing, in metres: how far the alignment may be off."""
+    empty_space: float = 0.0
+    """Weight of the same loss on all that a pixel shows, where ``point_to_plane`` takes the mean: what lies before and
+    behind the shell may have the right mean."""
+    tolerance: Optional[float] = None
+    """Distance from the plane that costs nothing, in metres. If not set: how far the shell may be off by the figures of
+    its alignment, from 2 to 10 cm; 5 cm where it was not validated."""
     occlusion_gate: float = 0.0
     """Metres that a pixel's rendered depth may be in front of the cue before it is taken for an occluder's."""
     occlusion_gate_from: int = 3000
@@ -69,14 +78,27 @@ class ExtraLossConfig:
     flattening: float = 0.0
     """Weight of the mean smallest scale of visible Gaussians, in units of the rescaled world (Vid2Sim: 100)."""
 
+    def tolerance_beside(self, shell_error: float | None) -> float:
+        """The tolerance for a shell that may be off by so many metres, None where unknown."""
+        if self.tolerance is not None:
+            return self.tolerance
+        low, high = TOLERANCES
+        return UNVALIDATED if shell_error is None else min(max(shell_error, low), high)
+
 
 class CueLosses:
     """:func:`cue_losses` for many renderings of one view; what depends on its maps alone is computed once."""
 
     def __init__(
-        self, cue: Reference, paper: GeometryLossConfig, extra: ExtraLossConfig, metres_per_unit: float | None
+        self,
+        cue: Reference,
+        paper: GeometryLossConfig,
+        extra: ExtraLossConfig,
+        metres_per_unit: float | None,
+        shell_error: float | None = None,
     ):
         self.cue, self.paper, self.extra, self.metres = cue, paper, extra, metres_per_unit or 1.0
+        self.shell_error = shell_error
         self._from_plane: PointToPlaneLoss | None = None
 
     def __call__(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
@@ -93,6 +115,10 @@ class CueLosses:
                 lambda: normal_loss(geometry.depth_normal, self.cue.normal, self.cue.mask & _known(geometry)),
             ),
             "point_to_plane": (extra.point_to_plane, lambda: self._point_to_plane(geometry)(geometry.depth)),
+            "empty_space": (
+                extra.empty_space,
+                lambda: self._point_to_plane(geometry).of_all(self._squares(geometry), geometry.alpha),
+            ),
         }
         return {name: weight * term() for name, (weight, term) in terms.items() if weight > 0}
 
@@ -104,7 +130,7 @@ class CueLosses:
         near = self.metres * (self.cue.depth - geometry.depth.detach()) < gate
         open_to_all = replace(self.extra, occlusion_gate=0.0)
         seen = self.cue._replace(mask=self.cue.mask & near)
-        return CueLosses(seen, self.paper, open_to_all, self.metres)(geometry, progress)
+        return CueLosses(seen, self.paper, open_to_all, self.metres, self.shell_error)(geometry, progress)
 
     @cached_property
     def _ncc(self) -> Callable[[Tensor], Tensor]:
@@ -122,11 +148,15 @@ class CueLosses:
     def _consistency(self) -> ConsistencyLoss:
         return ConsistencyLoss(self.cue.depth, self.cue.mask)
 
+    def _squares(self, geometry: Geometry) -> Tensor:
+        assert geometry.moments is not None
+        return geometry.moments.about(self.cue.depth, geometry.alpha)
+
     def _point_to_plane(self, geometry: Geometry) -> PointToPlaneLoss:
         if self._from_plane is None:
             depth, normal, mask = self.cue
-            rays = geometry.camera.rays()
-            self._from_plane = PointToPlaneLoss(depth, normal, rays, mask, self.metres, self.extra.tolerance)
+            rays, tolerance = geometry.camera.rays(), self.extra.tolerance_beside(self.shell_error)
+            self._from_plane = PointToPlaneLoss(depth, normal, rays, mask, self.metres, tolerance)
         return self._from_plane
 
 

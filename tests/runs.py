@@ -17,7 +17,7 @@ from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.model import FacadeModel
 from shellgs_method.trainer import FacadeTrainer, FacadeTrainerConfig
 
-Method = Literal["shellgs", "mono_gs", "photo_gs", "two_dgs"]
+Method = Literal["shellgs", "shellgs_metric", "mono_gs", "photo_gs", "two_dgs"]
 
 
 def trainer_of(

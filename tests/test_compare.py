@@ -26,7 +26,7 @@ from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.compare import launch
 from shellgs_method.compare.launch import launch_locally
-from shellgs_method.compare.measure import Snapshot, measure, write_figures
+from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_figures
 from shellgs_method.compare.pictures import DOT, dotted, recorded_figures
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
 from shellgs_method.compare.runs import Run, Variant, grid
@@ -117,6 +117,17 @@ def test_the_paper_stands_beside_scenes_of_the_same_part(pristine_scene, tmp_pat
     assert not found["copy-ablation"].paper
     assert list(found["main"].rows) == ["photo-gs", "shellgs"]
     assert list(found["ablation"].rows) == ["photo-gs", "shellgs", "shellgs-depth"]
+
+
+def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
+    """Of a shell in the place of the truth it lacks only what the shell lacks."""
+    shell = measure_shell(pristine_scene)
+    assert 0 < shell["truth_normal_deg"] < 15
+    assert 0 < shell["truth_chamfer_m"] < 0.1
+    runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path)
+    fabricate(runs[0], truth_normal_deg=40.0)
+    (truth,) = (table for table in tables(runs, {runs[0].scene: shell}) if table.name == "truth")
+    assert list(truth.rows) == ["photo-gs", "the shell itself"]
 
 
 def test_a_holdout_is_compared_with_all_methods_in_the_same_half(pristine_scene, tmp_path):

@@ -12,6 +12,7 @@ import pytest
 import torch
 import torchvision
 from kornia.geometry.depth import depth_to_normals
+from kornia.metrics import ssim
 from PIL import Image
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
@@ -232,6 +233,20 @@ def test_psnr_of_a_constant_error_is_its_closed_form():
 def test_figures_of_an_exact_picture_are_finite():
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
     assert image_errors(target, target) == {"psnr": 100.0, "ssim": pytest.approx(1.0)}
+
+
+def test_pictures_are_measured_in_regions_as_if_there_were_nothing_else():
+    random = torch.Generator().manual_seed(0)
+    target, noise = torch.rand(2, HEIGHT, WIDTH, 3, generator=random)
+    rgb = (target + 0.2 * noise - 0.1).clamp(0, 1)
+    left = torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    left[:, :7] = True
+    figures = image_errors(rgb, target, {"left": left, "nowhere": ~left & left})
+    mse = (rgb - target)[:, :7].square().mean().item()
+    assert figures["psnr_left"] == pytest.approx(-10 * np.log10(mse), abs=1e-3)
+    similarity = ssim(rgb.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], 11)[0, :, :, :7]
+    assert figures["ssim_left"] == pytest.approx(similarity.mean().item(), abs=1e-5)
+    assert figures.keys() == {"psnr", "ssim", "psnr_left", "ssim_left"}
 
 
 def test_ssim_equals_the_formula_on_constant_pictures():

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from dataparsers.camera import Camera
 from shellgs_method import cli
+from shellgs_method.batches import pinhole_camera
 from shellgs_method.environment import examine
 from shellgs_method.evaluation import lpips_network
 from shellgs_method.export import Splats, write_splats
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import turned_harmonics
 from shellgs_method.geometry import Primitive
-from shellgs_method.model import pinhole_camera
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.trainer import FacadeTrainer
 

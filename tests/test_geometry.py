@@ -16,6 +16,7 @@ from shellgs_method.geometry import (
     Primitive,
     geometry_channels,
     rendered_geometry,
+    squared_depths,
 )
 from shellgs_method.rasterizer import rasterize
 
@@ -45,6 +46,27 @@ def render(
     means, quats, scales = (gaussians[name] for name in ("means", "quats", "scales"))
     composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, CAMERA, primitive)
     return rendered_geometry(composited, alpha, info, CAMERA, depth)
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_moments_are_of_each_splats_own_distance(eager, primitive):
+    """Against the splats' weights, which features that are one for one splat each composite to."""
+    random = torch.Generator().manual_seed(0)
+    gaussians = {
+        "means": torch.randn(6, 3, generator=random) * torch.tensor([1.0, 1.0, 2.0]) + torch.tensor([0.0, 0.0, 9.0]),
+        "quats": torch.randn(6, 4, generator=random),
+        "scales": torch.full((6, 3), 1.5).log(),
+    }
+    normals, depths = geometry_channels(gaussians, CAMERA, "expected")
+    squares, origin = squared_depths(depths)
+    features = torch.cat([normals, depths, squares, torch.eye(6)], dim=-1)
+    means, quats, scales = (gaussians[name] for name in ("means", "quats", "scales"))
+    composited, alpha, info = rasterize(means, quats, scales.exp(), torch.full((6,), 0.6), features, CAMERA, primitive)
+    geometry = rendered_geometry(composited[..., :5], alpha, info, CAMERA, "expected", origin)
+    assert geometry.moments is not None
+    target = 8 + torch.rand(30, 40, 1, generator=random)
+    expected = (composited[..., 5:] * (depths[:, 0] - target).square()).sum(dim=-1, keepdim=True)
+    torch.testing.assert_close(geometry.moments.about(target, alpha), expected, rtol=1e-4, atol=1e-4)
 
 
 def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:

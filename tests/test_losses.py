@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -341,6 +342,26 @@ def test_point_to_plane_costs_nothing_within_the_tolerance_and_pulls_less_the_fa
     assert middle > 3 * far > 0
 
 
+def test_the_distance_of_all_that_a_pixel_shows_is_no_less_for_the_right_mean():
+    """Half of the light 0.3 before the wall and half 0.3 behind: the mean depth is the wall's."""
+    target, normal, rays = slanted_wall(8.0, 0.5)
+    loss = PointToPlaneLoss(target, normal, rays, torch.ones_like(target).bool(), metres_per_unit=2.0, tolerance=0.05)
+    offset, alpha = 0.3 / (rays * normal).sum(-1, keepdim=True).abs(), torch.ones_like(target)
+    assert float(loss(target)) == 0
+    assert float(loss.of_all(offset.square(), alpha)) == pytest.approx(math.log(1 + 0.6 - 0.05))
+    # Half of it on the wall, the rest through it: as half of it a metre behind.
+    assert float(loss.of_all(0 * target, alpha / 2)) == pytest.approx(math.log(1 + 0.5**0.5 - 0.05))
+
+
+def test_the_gradient_of_the_distance_of_all_is_right_and_finite_on_the_wall(random):
+    target, normal, rays = slanted_wall(8.0, 0.5)
+    loss = PointToPlaneLoss(target, normal, rays, some_mask(random), tolerance=0.05)
+    squares, alpha = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    assert torch.autograd.gradcheck(loss.of_all, (squares.requires_grad_(), alpha.requires_grad_()))
+    zero = torch.zeros_like(target, requires_grad=True)
+    assert torch.autograd.grad(loss.of_all(zero, torch.ones_like(target)), zero)[0].isfinite().all()
+
+
 def test_agreement_equals_its_formula_pixel_by_pixel(random):
     normal, depth_normal = some_normals(random), some_normals(random)
     alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
@@ -378,6 +399,7 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
         "normal": (NormalLoss(target, mask), normal),
         "consistency": (ConsistencyLoss(x, mask), normal),
         "point to plane": (PointToPlaneLoss(x, target, rays, mask), y),
+        "empty space": (partial(PointToPlaneLoss(x, target, rays, mask).of_all, alpha=b[..., :1] + 0.5), y),
     }
 
 
@@ -399,7 +421,7 @@ def test_compiled_losses_are_the_plain_ones_at_every_size_of_image(compiler):
                 torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
         assert not fusion._failed
         assert size == (30, 40) or fusion._compiled.cache_info().currsize == n_kernels
-    assert n_kernels == 7
+    assert n_kernels == 8
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method import cli
+from shellgs_method.batches import pinhole_camera
 from shellgs_method.export import Box, DepthView, Frame, decimate, fuse, scene_frame, shell_frame, write_mesh
 from shellgs_method.export.runs import TrainedRun, mesh_errors
-from shellgs_method.model import pinhole_camera
 from shellgs_method.shell import Alignment, ShellCaster, ShellMesh, load_shell
 from shellgs_method.shell.similarity import transformed
 from shellgs_method.synthetic.building import Layout, building

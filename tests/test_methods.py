@@ -20,6 +20,7 @@ import method_configs
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.ablations import ABLATIONS
+from shellgs_method.compare.runs import PAPER
 from shellgs_method.evaluation import Reference
 from shellgs_method.geometry import DISC_LOG_THICKNESS
 from shellgs_method.losses import ExponentialDecay
@@ -28,7 +29,13 @@ from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_
 
 pytestmark = pytest.mark.usefixtures("eager")
 
-METHODS = {"shellgs": "shellgs", "mono-gs": "mono_gs", "photo-gs": "photo_gs", "2dgs": "two_dgs"}
+METHODS = {
+    "shellgs": "shellgs",
+    "shellgs-metric": "shellgs_metric",
+    "mono-gs": "mono_gs",
+    "photo-gs": "photo_gs",
+    "2dgs": "two_dgs",
+}
 
 
 @pytest.fixture
@@ -47,7 +54,7 @@ def mono_scene(scene: Path) -> Path:
 # The registry
 
 
-def test_the_four_methods_are_registered_by_their_names():
+def test_the_methods_are_registered_by_their_names():
     toml = pytest.importorskip("tomllib", reason="Python 3.11")
     project = toml.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
     entries = project["entry-points"]["nerfstudio.method_configs"]
@@ -61,10 +68,18 @@ def test_the_methods_are_points_of_primitive_and_cues():
     models = {name: getattr(method_configs, attribute).config.pipeline.model for name, attribute in METHODS.items()}
     assert {name: (model.primitive, model.cues) for name, model in models.items()} == {
         "shellgs": ("3d", "shell"),
+        "shellgs-metric": ("3d", "shell"),
         "mono-gs": ("3d", "mono"),
         "photo-gs": ("3d", "none"),
         "2dgs": ("2d", "none"),
     }
+
+
+def test_the_papers_methods_begin_at_the_sfm_points_alone():
+    """Supervision rather than initialization: one start for all."""
+    models = {name: getattr(method_configs, attribute).config.pipeline.model for name, attribute in METHODS.items()}
+    assert {name for name, model in models.items() if model.seeds != "none"} == {"shellgs-metric"}
+    assert "shellgs-metric" not in PAPER
 
 
 def parsed(words: tuple[str, ...]):
@@ -280,6 +295,33 @@ def test_point_to_plane_is_in_metres(untrained):
     expected = (2.0 * 0.5 * slope - 0.1).clamp_min(0).log1p().mean()
     (loss,) = terms(geometry, shifted, point_to_plane=1.0, tolerance=0.1).values()
     torch.testing.assert_close(loss, expected)
+
+
+@pytest.mark.parametrize(("error", "expected"), [(None, 0.05), (0.003, 0.02), (0.04, 0.04), (0.5, 0.1)])
+def test_the_tolerance_is_what_the_alignment_may_be_off(error, expected):
+    assert ExtraLossConfig().tolerance_beside(error) == expected
+    assert ExtraLossConfig(tolerance=0.3).tolerance_beside(error) == 0.3
+
+
+def test_empty_space_needs_depths_of_centres(pristine_scene, tmp_path):
+    def choose(config):
+        config.pipeline.model.depth = "plane"
+
+    with pytest.raises(SystemExit, match="empty_space"):
+        trainer_of(pristine_scene, tmp_path, "shellgs_metric", change=choose)
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_shellgs_metric_brings_the_surface_to_the_shell(pristine_scene, tmp_path, primitive):
+    def choose(config):
+        config.pipeline.model.primitive = primitive
+
+    def distance(method) -> float:
+        trainer = trainer_of(pristine_scene, tmp_path / method, method, iterations=60, change=choose)
+        trainer.train()
+        return trainer.pipeline.get_average_eval_image_metrics()["chamfer_m"]
+
+    assert distance("shellgs_metric") < 0.8 * distance("shellgs")
 
 
 def test_the_occlusion_gate_waits_and_then_spares_what_stands_before_the_shell(untrained):

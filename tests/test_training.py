@@ -14,9 +14,9 @@ from runs import held_out, model_of, render, trainer_of
 from scipy.spatial.transform import Rotation
 
 from dataparsers.camera import Camera
+from shellgs_method.batches import pinhole_camera
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry import geometry_channels
-from shellgs_method.model import pinhole_camera
 from shellgs_method.trainer import FacadeTrainer
 
 

@@ -17,20 +17,22 @@ from torch import Tensor
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
-from dataparsers.facade import FacadeDataParserConfig
+from dataparsers.facade import FacadeDataParserConfig, find_cues
 from dataparsers.files import atomic_write
+from shellgs_method.batches import pinhole_camera, reference_errors, reference_maps, regions
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
 from shellgs_method.evaluation import (
     Rendering,
     angular_error,
     colours_to_normals,
+    geometry_errors,
     image_errors,
     mean_over_views,
     normals_from_depth,
 )
 from shellgs_method.evaluation.view import OPAQUE
-from shellgs_method.model import FacadeModel, pinhole_camera, reference_errors, reference_maps
+from shellgs_method.model import FacadeModel
 from shellgs_method.trained import load_run
 
 PICTURE_SIZE = 640
@@ -99,7 +101,8 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
         camera = pinhole_camera(cameras)
         rendering, photograph = _render(model, cameras, camera), _photograph(model, batch)
         figures.append(
-            image_errors(rendering.rgb, photograph) | reference_errors(rendering, camera, batch, metres_per_unit)
+            image_errors(rendering.rgb, photograph, regions(batch, metres_per_unit, rendering.rgb.device))
+            | reference_errors(rendering, camera, batch, metres_per_unit)
         )
         if pictures and "shell_mask" in batch and batch["shell_mask"].any():
             name = f"{index:04d}-{Path(datamanager.eval_dataset.views[index].name).stem}.npz"
@@ -110,6 +113,24 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
         "checkpoint": str(checkpoint),
         "results": mean_over_views(figures, deviation=True),
     }
+
+
+def measure_shell(scene: Path) -> dict[str, float]:
+    """Figures of the shell itself against the truth, in held-out views and where both are; empty without a truth."""
+    if not {"shell", "truth"} <= {*find_cues(scene)}:
+        return {}
+    dataparser, cpu = FacadeDataParserConfig(data=scene), torch.device("cpu")
+    datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=scene), None, cpu)
+    dataset, figures = datamanager.eval_dataset, []
+    metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
+    for index in range(len(dataset)):
+        batch = dataset.get_metadata({"image_idx": index})
+        if {"shell_depth", "truth_depth"} <= batch.keys():
+            shell, truth = (reference_maps(batch, kind, cpu) for kind in ("shell", "truth"))
+            both = truth._replace(mask=truth.mask & shell.mask)
+            rendering = Rendering(shell.depth, shell.depth, shell.mask.float(), shell.normal)
+            figures.append(geometry_errors(rendering, dataset.camera(index), both, metres_per_unit))
+    return {f"truth_{name}": value for name, value in mean_over_views(figures).items()}
 
 
 def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDataManager:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from dataparsers.files import atomic_write
+from shellgs_method.compare.measure import measure_shell
 from shellgs_method.compare.pictures import common_views, curves, strip, surfaces
 from shellgs_method.compare.report import write_report
 from shellgs_method.compare.runs import Run
@@ -56,7 +57,7 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
 
 def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]) -> Comparison:
     """Write results.md, tables/, the pictures and report.html of what is measured so far."""
-    made = list(tables(runs))
+    made = list(tables(runs, {scene: measure_shell(scene) for scene in {run.scene for run in runs}}))
     for table in made:
         table.save(output / "tables")
     with atomic_write(output / "results.md") as file:

@@ -21,6 +21,8 @@ from shellgs_method.ablations import ABLATIONS
 from shellgs_method.trainer import FacadeTrainerConfig
 
 METHODS = ("photo-gs", "mono-gs", "2dgs", "shellgs")
+ALL = (*METHODS, "shellgs-metric")
+"""All registered methods."""
 PAPER = (*METHODS, "shellgs-depth", "shellgs-normal", "shellgs-depth-normal", "shellgs-without-b")
 """All that the paper's tables compare."""
 SAVES = 10
@@ -50,7 +52,7 @@ class Variant:
             raise SceneError(f"{name!r} is to name a folder: take letters, digits, dots and dashes")
         method, *flags = shlex.split(words) or ABLATIONS.get(name, (name,))
         if method not in all_methods:
-            ours = ", ".join([*METHODS, *ABLATIONS])
+            ours = ", ".join([*ALL, *ABLATIONS])
             raise SceneError(
                 f"there is no method {method!r}: take {ours}, another that ns-train lists, or NAME=METHOD FLAGS"
             )
@@ -217,7 +219,7 @@ def grid(
     scenes = [scene.resolve() for scene in scenes]
     if len({scene.name for scene in scenes}) < len(scenes):
         raise SceneError("two scenes have the same folder name, which names their results: rename one")
-    words = [word for name in names for word in (PAPER if name == "paper" else [name])]
+    words = [word for name in names for word in {"paper": PAPER, "all": ALL}.get(name, (name,))]
     variants = [Variant.parse(word) for word in dict.fromkeys(words)]
     halves: tuple[Half, ...] = tuple(half for half in HALVES if any(variant.held_out == half for variant in variants))
     return [

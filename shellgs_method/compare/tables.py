@@ -9,11 +9,13 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 
 from dataparsers.files import atomic_write
 from shellgs_method.compare.runs import HALVES, Half, Run
 from shellgs_method.evaluation.tables import (
     MAIN_COLUMNS,
+    REGION_COLUMNS,
     SURFACE_COLUMNS,
     Column,
     Rows,
@@ -30,6 +32,10 @@ ABLATION_COLUMNS = (_BY_KEY["psnr"], *GEOMETRY_COLUMNS)
 TRUTH_COLUMNS = tuple(
     replace(column, key=f"truth_{column.key}") for column in (*GEOMETRY_COLUMNS, *SURFACE_COLUMNS[3:])
 )
+
+
+SHELL = "the shell itself"
+"""Row of a scene's shell, whose figures are those of the pixels where it is."""
 
 
 @dataclass(frozen=True)
@@ -81,20 +87,31 @@ def read_figures(path: Path) -> dict[str, float]:
     return {key: value for key, value in results.items() if key not in spread}
 
 
-def tables(runs: Sequence[Run]) -> Iterator[FiguresTable]:
-    """All tables that the figures there are make; the first scene has the paper's primary role, others its second."""
+def tables(
+    runs: Sequence[Run], shells: Mapping[Path, Mapping[str, float]] = MappingProxyType({})
+) -> Iterator[FiguresTable]:
+    """All tables that the figures there are make; the first scene has the paper's primary role, others its second.
+
+    Args:
+        runs: of all scenes.
+        shells: figures of each scene's shell itself, from :func:`.measure.measure_shell`.
+    """
     for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):
-        yield from _scene_tables([run for run in runs if run.scene == scene], "" if index == 0 else f"{scene.name}-")
+        of_scene = [run for run in runs if run.scene == scene]
+        yield from _scene_tables(of_scene, shells.get(scene, {}), "" if index == 0 else f"{scene.name}-")
 
 
-def _scene_tables(runs: Sequence[Run], prefix: str) -> Iterator[FiguresTable]:
+def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) -> Iterator[FiguresTable]:
     whole = [run for run in runs if run.variant.held_out is None]
     methods = [run for run in whole if not run.variant.is_ablation]
     scene = runs[0].scene.name
     found = [
         FiguresTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
+        FiguresTable(
+            "regions", f"{scene}: held-out views, where training views saw them", REGION_COLUMNS, _rows(whole)
+        ),
         FiguresTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
-        FiguresTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, _rows(whole)),
+        FiguresTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, {**_rows(whole), SHELL: shell}),
     ]
     if any(run.variant.is_ablation for run in whole):
         ordered = [run for run in whole if run.variant.is_ablation or run.variant.name in ("photo-gs", "shellgs")]

@@ -8,7 +8,14 @@ from shellgs_method.evaluation.geometry import NormalErrors, angular_error, dept
 from shellgs_method.evaluation.image import image_errors, lpips_network
 from shellgs_method.evaluation.normals import normals_from_depth
 from shellgs_method.evaluation.pictures import geometry_pictures
-from shellgs_method.evaluation.surface import SurfaceComparison, back_project, compare_surfaces, voxel_means
+from shellgs_method.evaluation.surface import (
+    SurfaceComparison,
+    back_project,
+    cell_means,
+    compare_surfaces,
+    voxel_cells,
+    voxel_means,
+)
 from shellgs_method.evaluation.view import Reference, Rendering, evaluate_view, geometry_errors, mean_over_views
 
 __all__ = [
@@ -18,6 +25,7 @@ __all__ = [
     "SurfaceComparison",
     "angular_error",
     "back_project",
+    "cell_means",
     "colours_to_normals",
     "compare_surfaces",
     "depth_mae",
@@ -31,5 +39,6 @@ __all__ = [
     "normal_errors",
     "normals_from_depth",
     "normals_to_colours",
+    "voxel_cells",
     "voxel_means",
 ]

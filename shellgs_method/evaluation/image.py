@@ -6,13 +6,14 @@ import logging
 import os
 import threading
 import urllib.request
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING
 
 import torch
 import torchvision
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
@@ -25,17 +26,27 @@ SMALLEST_LPIPS_IMAGE = 31
 logger = logging.getLogger(__name__)
 
 
-def image_errors(rgb: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> dict[str, float]:
+def image_errors(
+    rgb: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"],
+    regions: Mapping[str, Bool[Tensor, "H W 1"]] | None = None,
+) -> dict[str, float]:
     """PSNR in dB (at most 100, so that an exact picture can be averaged), SSIM, and LPIPS where it can be had.
 
     Colours are in [0, 1]. SSIM is that of the loss, of a Gaussian window of 11 pixels and sigma 1.5; LPIPS has the
-    AlexNet backbone.
+    AlexNet backbone. PSNR and SSIM of each region that is not empty are ``psnr_…`` and ``ssim_…`` with its name.
     """
     rgb, target = rgb.detach().clamp(0, 1).permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
-    figures = {
-        "psnr": min(psnr(rgb, target, max_val=1.0).item(), 100.0),
-        "ssim": ssim(rgb, target, window_size=11).mean().item(),
-    }
+    similarity = ssim(rgb, target, window_size=11)[0]
+    everywhere = torch.ones_like(similarity[0], dtype=torch.bool)
+    figures = {}
+    for suffix, region in {
+        "": everywhere,
+        **{f"_{name}": mask[..., 0] for name, mask in (regions or {}).items()},
+    }.items():
+        if region.any():
+            figures[f"psnr{suffix}"] = min(psnr(rgb[..., region], target[..., region], max_val=1.0).item(), 100.0)
+            figures[f"ssim{suffix}"] = similarity[:, region].mean().item()
     network = lpips_network()
     if not isinstance(network, str) and min(rgb.shape[-2:]) >= SMALLEST_LPIPS_IMAGE:
         with torch.no_grad():

@@ -51,6 +51,17 @@ MAIN_COLUMNS = (
 )
 """The paper's main comparison, and the normals of the rendered depth."""
 
+REGION_COLUMNS = (
+    Column("psnr_seen", "PSNR, seen", max, ".2f"),
+    Column("ssim_seen", "SSIM, seen", max),
+    Column("psnr_on_shell", "PSNR on the shell", max, ".2f"),
+    Column("ssim_on_shell", "SSIM on the shell", max),
+    Column("psnr_off_shell", "PSNR off the shell", max, ".2f"),
+    Column("ssim_off_shell", "SSIM off the shell", max),
+    Column("psnr_before_shell", "PSNR before it", max, ".2f"),
+)
+"""Pictures by their parts; pixels that no training view has seen are left out."""
+
 SURFACE_COLUMNS = (
     Column("accuracy_m", "Acc. (m)", min),
     Column("completeness_m", "Comp. (m)", min),

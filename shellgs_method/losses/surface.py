@@ -9,6 +9,9 @@ from shellgs_method.fusion import run_fused
 from shellgs_method.losses.normal import unit
 from shellgs_method.losses.reduction import mean_weights
 
+BEHIND = 1.0
+"""Metres beyond the shell at which light counts that nothing has stopped."""
+
 
 class PointToPlaneLoss:
     """:func:`point_to_plane_loss` for many renderings of one view."""
@@ -30,6 +33,17 @@ class PointToPlaneLoss:
     def __call__(self, depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
         """The loss of one rendering."""
         return run_fused(_beyond, depth, self._target, self._slope, self._weights, self._tolerance, varying=2)
+
+    def of_all(self, squares: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
+        """The loss of the root mean square distance of all that a pixel shows, in place of that of its mean depth.
+
+        What is left of the light counts as if it ended a metre (:data:`BEHIND`) beyond the shell.
+
+        Args:
+            squares: Σ w (z - target)², not divided by alpha.
+            alpha: Σ w.
+        """
+        return run_fused(_all_beyond, squares, alpha, self._slope, self._weights, self._tolerance, varying=2)
 
 
 def point_to_plane_loss(
@@ -67,3 +81,14 @@ def _beyond(
     tolerance: Float[Tensor, "1 1 1"],
 ) -> Float[Tensor, ""]:
     return (weights * (slope * (depth - target).abs() - tolerance).relu().log1p()).sum()
+
+
+def _all_beyond(
+    squares: Float[Tensor, "H W 1"],
+    alpha: Float[Tensor, "H W 1"],
+    slope: Float[Tensor, "H W 1"],
+    weights: Float[Tensor, "H W 1"],
+    tolerance: Float[Tensor, "1 1 1"],
+) -> Float[Tensor, ""]:
+    squares = slope * slope * squares + BEHIND**2 * (1 - alpha).relu()
+    return (weights * (squares.clamp_min(1e-8).sqrt() - tolerance).relu().log1p()).sum()

@@ -67,6 +67,15 @@ class Alignment:
         """Metres in one scene unit."""
         return self.metres_per_shell_unit / self.scale
 
+    @property
+    def error(self) -> float | None:
+        """Metres that the shell may be off as a whole; None where the alignment was not validated.
+
+        It is the larger of the SfM points' median distance, with its sign, and how far a fit to them would move it.
+        """
+        known = [abs(figure) for name in ("bias_m", "pull_m") if (figure := self.figures.get(name)) is not None]
+        return max(known, default=None)
+
     def places_like(self, other: Alignment) -> bool:
         """Whether both put the same shell in the same place, however they were found."""
         return (

@@ -97,6 +97,7 @@ def cast_views(
         revisions={"mesher": f"{mesh.meshing.mesher} {VERSION}"} if mesh.meshing else {},
         metres_per_unit=alignment.metres_per_unit,
         max_image_size=max_image_size,
+        error=Alignment.load(kept).error,
     )
     cast = 0
     with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast; there are never more in memory

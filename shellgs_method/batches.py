@@ -1,0 +1,75 @@
+"""What is in a batch of nerfstudio's, as the types of this project."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from dataparsers.camera import Camera
+from shellgs_method.evaluation import Reference, Rendering, geometry_errors
+
+REFERENCES = {"shell": "", "truth": "truth_"}
+"""Kinds of maps that geometry is measured against, and what the names of their figures begin with."""
+
+
+def reference_errors(
+    rendering: Rendering, camera: Camera, batch: dict, metres_per_unit: float | None
+) -> dict[str, float]:
+    """Figures of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``."""
+    figures = {}
+    for prefix, reference in references(batch, rendering.depth.device).items():
+        errors = geometry_errors(rendering, camera, reference, metres_per_unit)
+        figures |= {prefix + name: value for name, value in errors.items()}
+    return figures
+
+
+def regions(batch: dict, metres_per_unit: float | None, device: torch.device) -> dict[str, Bool[Tensor, "H W 1"]]:
+    """Parts of a held-out view that pictures are measured in, by name, all of pixels that training views have seen.
+
+    * ``seen``: all of these.
+    * ``on_shell``, ``off_shell``: on the shell, or where it is not or does not count.
+    * ``before_shell``: where the truth, if there is one, is nearer than the shell by more than 5 cm (1/200 of its
+      depth where metres are unknown); then these pixels are in neither of the two.
+    """
+    if "seen" not in batch:
+        return {}
+    seen = batch["seen"].to(device)
+    if "shell_depth" not in batch:
+        return {"seen": seen, "off_shell": seen}
+    shell, on_shell = (batch[f"shell_{name}"].to(device) for name in ("depth", "mask"))
+    parts = {"seen": seen, "on_shell": seen & on_shell, "off_shell": seen & ~on_shell}
+    if "truth_depth" in batch:
+        truth = batch["truth_depth"].to(device)
+        gap = 0.05 / metres_per_unit if metres_per_unit else shell / 200
+        before = seen & (truth > 0) & (truth < shell - gap)
+        parts = {name: mask if name == "seen" else mask & ~before for name, mask in parts.items()}
+        parts["before_shell"] = before
+    return parts
+
+
+def references(batch: dict, device: torch.device) -> dict[str, Reference]:
+    """The maps that a batch has to measure against, by what the names of their figures begin with."""
+    return {
+        prefix: reference_maps(batch, kind, device) for kind, prefix in REFERENCES.items() if f"{kind}_depth" in batch
+    }
+
+
+def reference_maps(batch: dict, kind: str, device: torch.device) -> Reference:
+    """The maps of one kind in a batch; what the user masked out is not supported."""
+    depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
+    if "mask" in batch:
+        mask = mask & batch["mask"].to(device)
+    return Reference(depth, normal.float(), mask)
+
+
+def pinhole_camera(camera: Cameras) -> Camera:
+    """The one camera of a nerfstudio ``Cameras``, which is OpenGL and has its centres at 0.5 as ours."""
+    pose = camera.camera_to_worlds[0]
+    rotation = (pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])).T
+    viewmat = torch.eye(4, dtype=pose.dtype, device=pose.device)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ pose[:, 3]
+    K = camera.get_intrinsics_matrices()[0].to(pose.device)
+    return Camera(viewmat, K, int(camera.width[0]), int(camera.height[0]))

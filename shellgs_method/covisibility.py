@@ -1,0 +1,93 @@
+"""Which pixels of a held-out view the training has seen: in the others there is nothing right to be measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from dataparsers.camera import Camera
+
+MAX_SIZE = 320
+"""Longer side in pixels at which visibility is worked out."""
+MIN_VIEWS = 2
+"""Training views that must see a pixel: one alone does not tell how far away it is."""
+BEHIND = 0.02
+"""Share of its depth that a point may lie behind a training view's shell without being hidden by it."""
+
+
+@dataclass(frozen=True)
+class SeenBy:
+    """What training views see of the scene.
+
+    Attributes:
+        cameras: of the training views.
+        depths: z-depth of the shell in each of them, 0 where there is none; of the camera's size or thinned.
+        points: SfM points in the cameras' world.
+    """
+
+    cameras: Sequence[Camera]
+    depths: Sequence[Float[Tensor, "h w"]]
+    points: Float[Tensor, "N 3"]
+
+    def mask(self, camera: Camera, depth: Float[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
+        """Pixels of a view that at least two training views have in their picture, not hidden by the shell.
+
+        This is the co-visibility of Gao et al. 2022, from geometry instead of optical flow. A pixel's place is that of
+        the shell or, where there is none, as far away as the nearest SfM point in the picture.
+
+        Args:
+            camera: of the view.
+            depth: z-depth of the shell, 0 where there is none.
+        """
+        step = thinning(camera)
+        rays, thinned = camera.rays()[::step, ::step], depth[::step, ::step]
+        thinned = torch.where(thinned > 0, thinned, self._depth_of_points(camera, rays))
+        world = (thinned * rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+        count = sum(_sees(*each, world).int() for each in zip(self.cameras, self.depths, strict=True))
+        seen = torch.as_tensor(count, device=depth.device) >= MIN_VIEWS
+        seen = seen.expand(thinned.shape[:2]).repeat_interleave(step, 0).repeat_interleave(step, 1)
+        return seen[: camera.height, : camera.width, None]
+
+    def _depth_of_points(self, camera: Camera, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
+        """Depth of the SfM point that is nearest in the picture; as far as the sky where none is in it."""
+        pixels, z = _project(camera, self.points)
+        inside = _inside(camera, pixels, z)
+        if not inside.any():
+            return rays.new_full((*rays.shape[:2], 1), 1e6)
+        wanted = (rays @ camera.K.T)[..., :2].reshape(-1, 2)
+        nearest = KDTree(pixels[inside].cpu().numpy()).query(wanted.cpu().numpy(), workers=-1)[1]
+        return z[inside][torch.as_tensor(nearest, device=z.device)].view(*rays.shape[:2], 1)
+
+
+def thinning(camera: Camera) -> int:
+    """Every how many pixels visibility is worked out."""
+    return -(-max(camera.width, camera.height) // MAX_SIZE)
+
+
+def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "*shape 3"]) -> Bool[Tensor, "*shape"]:
+    pixels, z = _project(camera, world)
+    inside = _inside(camera, pixels, z)
+    size = pixels.new_tensor([camera.width, camera.height])
+    thinned = pixels.new_tensor([depth.shape[1], depth.shape[0]])
+    columns, rows = (pixels.where(inside[..., None], 0.0) / size * thinned).long().unbind(dim=-1)
+    surface = depth[rows, columns]
+    return inside & ((surface <= 0) | (z < (1 + BEHIND) * surface))
+
+
+def _project(
+    camera: Camera, world: Float[Tensor, "*shape 3"]
+) -> tuple[Float[Tensor, "*shape 2"], Float[Tensor, "*shape"]]:
+    """Pixels and z-depths."""
+    points = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = points[..., 2]
+    return (points @ camera.K.T)[..., :2] / z.clamp_min(1e-9)[..., None], z
+
+
+def _inside(camera: Camera, pixels: Float[Tensor, "*shape 2"], z: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
+    size = pixels.new_tensor([camera.width, camera.height])
+    return (z > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)

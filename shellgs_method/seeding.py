@@ -1,0 +1,131 @@
+"""Points of the shell as Gaussians to begin with, as densely as the photographs resolve them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from dataparsers.camera import Camera
+from shellgs_method.evaluation import Reference, cell_means, voxel_cells
+
+GRAZING = 0.2
+"""Least cosine of the shell's normal and the ray at which a pixel is a sample: below it, colours and depth smear."""
+MAX_SAMPLES = 8_000_000
+"""Pixels of all views that seeds are made from."""
+
+
+class SeededView(NamedTuple):
+    """What seeds are made from: one training view."""
+
+    camera: Camera
+    image: Float[Tensor, "H W 3"]
+    """Colours in [0, 1]."""
+    shell: Reference
+    """In units and axes of the camera's world; its mask is where seeds may be."""
+
+
+class Seeds(NamedTuple):
+    """Points on the shell."""
+
+    points: Float[ndarray, "N 3"]
+    normals: Float[ndarray, "N 3"]
+    """Unit normals in the world."""
+    colours: Float[ndarray, "N 3"]
+    """Median over the views that show the point, in [0, 1]."""
+    spacing: Float[ndarray, " N"]
+    """Distance to the next seeds, in the units of the points."""
+
+
+class _Samples(NamedTuple):
+    points: Float[ndarray, "S 3"]
+    normals: Float[ndarray, "S 3"]
+    colours: Float[ndarray, "S 3"]
+    footprint: Float[ndarray, " S"]  # of a pixel on the shell, seen from the front
+    view: Int[ndarray, " S"]
+
+    def select(self, kept: Bool[ndarray, " S"]) -> _Samples:
+        return _Samples(*(each[kept] for each in self))
+
+
+def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, most: int) -> Seeds:
+    """Seeds about ``spacing`` pixels apart in the view that is closest to them.
+
+    The pixels of all views are lifted to the shell and thinned to one point in a voxel, whose side is a power of two
+    times the smallest there is: what a view shows from near is thinned finely first, and then what others add.
+
+    Args:
+        views: of the training.
+        num_pixels: of all views together.
+        spacing: in pixels.
+        most: number of seeds beyond which they are spread more widely.
+
+    Returns:
+        The seeds; none where no view has a pixel on the shell that is neither masked nor grazing.
+    """
+    stride = int(np.ceil((num_pixels / MAX_SAMPLES) ** 0.5))
+    lifted = (_lift(view, index, stride) for index, view in enumerate(views))
+    samples = _Samples(*map(np.concatenate, zip(*lifted, strict=True)))
+    if len(samples.points) == 0:
+        return Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    while True:
+        points, normals, apart = _thinned(samples, spacing)
+        if len(points) <= most:
+            break
+        spacing *= 1.05 * (len(points) / most) ** 0.5
+    distance, nearest = map(np.asarray, KDTree(points).query(samples.points, workers=-1))
+    near = distance < apart[nearest]
+    by_view, pairs = np.unique(nearest[near] * (samples.view.max() + 1) + samples.view[near], return_inverse=True)
+    shown = by_view // (samples.view.max() + 1)  # the seed of each pair of a seed and a view
+    colours, known = _medians(cell_means(samples.colours[near], pairs), shown, len(points))
+    return Seeds(points[known], normals[known], colours[known], apart[known])
+
+
+def _lift(view: SeededView, index: int, stride: int) -> _Samples:
+    """Every ``stride``-th pixel of a view in both directions, on the shell."""
+    depth, normal, mask = (each[::stride, ::stride] for each in view.shell)
+    rays, image = view.camera.rays()[::stride, ::stride], view.image[::stride, ::stride]
+    facing = -(normal * torch.nn.functional.normalize(rays, dim=-1)).sum(dim=-1)
+    kept = mask[..., 0] & (facing > GRAZING)
+    rotation = view.camera.viewmat[:3, :3]
+    points = (depth * rays)[kept] @ rotation + view.camera.position
+    focal = view.camera.K[[0, 1], [0, 1]].mean()
+    fields = points, normal[kept] @ rotation, image[kept], (depth / focal)[kept].squeeze(-1)
+    points, normals, colours, footprint = (each.double().cpu().numpy() for each in fields)
+    return _Samples(points, normals, colours, footprint, np.full(len(points), index))
+
+
+def _thinned(
+    samples: _Samples, spacing: float
+) -> tuple[Float[ndarray, "N 3"], Float[ndarray, "N 3"], Float[ndarray, " N"]]:
+    """Points, unit normals, and the side of the voxel that each was thinned by."""
+    wanted = spacing * samples.footprint
+    finest = np.percentile(wanted, 1)
+    levels = np.floor(np.log2(wanted / finest)).clip(0).astype(int)
+    points, normals, apart = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
+    for level in np.unique(levels):
+        voxel = finest * 2.0**level
+        new = samples.select(levels == level)
+        if len(points):
+            new = new.select(KDTree(points).query(new.points, distance_upper_bound=voxel, workers=-1)[0] == np.inf)
+        means = cell_means(np.concatenate([new.points, new.normals], axis=1), voxel_cells(new.points, voxel))
+        points, normals = np.concatenate([points, means[:, :3]]), np.concatenate([normals, means[:, 3:]])
+        apart = np.concatenate([apart, np.full(len(means), voxel)])
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12), apart
+
+
+def _medians(
+    values: Float[ndarray, "S 3"], groups: Int[ndarray, " S"], num_groups: int
+) -> tuple[Float[ndarray, "G 3"], Bool[ndarray, " G"]]:
+    """Median of each group's values, channel by channel, and which groups have any."""
+    counts = np.bincount(groups, minlength=num_groups)
+    middle = (np.cumsum(counts) - counts + (counts - 1) // 2).clip(0)
+    middle = middle.clip(max=len(values) - 1)
+    medians = [channel[np.lexsort((channel, groups))][middle] for channel in values.T]
+    return np.stack(medians, axis=1), counts > 0

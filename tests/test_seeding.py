@@ -1,0 +1,110 @@
+"""Seeds on a wall whose place, colour and resolution are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.models.splatfacto import SH2RGB
+from runs import data_of, model_of, trainer_of
+from scipy.spatial import KDTree
+
+from dataparsers.camera import Camera
+from shellgs_method.evaluation import Reference
+from shellgs_method.geometry import DISC_LOG_THICKNESS
+from shellgs_method.rasterizer import quats_to_rotations
+from shellgs_method.seeding import SeededView, shell_seeds
+
+FOCAL, WIDTH, HEIGHT = 60.0, 80, 60
+NORMAL = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+"""Of the wall through (0, 0, 10), in the world."""
+
+
+def camera(position: tuple[float, float, float]) -> Camera:
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, 3] = -torch.tensor(position, dtype=torch.float64)
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(viewmat, K, WIDTH, HEIGHT)
+
+
+def view(position=(0.0, 0.0, 0.0), colour: float = 0.5, normal=NORMAL) -> SeededView:
+    """The wall in one colour, where it is before the camera."""
+    here = camera(position)
+    distance = (torch.tensor([0.0, 0.0, 10.0], dtype=torch.float64) - here.position) @ normal
+    depth = (distance / (here.rays() @ normal))[..., None]
+    mask = depth > 0
+    image = torch.full((HEIGHT, WIDTH, 3), colour)
+    return SeededView(here, image, Reference(depth.where(mask, 0.0), normal.expand(HEIGHT, WIDTH, 3), mask))
+
+
+def seeds_of(views: list[SeededView], spacing: float = 4.0, most: int = 100_000):
+    return shell_seeds(views, len(views) * WIDTH * HEIGHT, spacing, most)
+
+
+def test_seeds_lie_on_the_wall_and_face_as_it_does():
+    seeds = seeds_of([view(), view((2.0, 0.0, 1.0))])
+    assert len(seeds.points) > 50
+    np.testing.assert_allclose((seeds.points - [0, 0, 10]) @ NORMAL.numpy(), 0, atol=1e-9)
+    np.testing.assert_allclose(seeds.normals, NORMAL.expand(len(seeds.points), 3))
+
+
+def test_seeds_are_a_few_pixels_apart_in_the_closest_view():
+    frontal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    seeds = seeds_of([view(normal=frontal), view((0.0, 0.0, 6.0), normal=frontal)], spacing=4.0)
+    near = (abs(seeds.points[:, :2]) < [2, 1.5]).all(axis=1)  # what the second view shows, from 4 instead of 10
+    neighbours = KDTree(seeds.points).query(seeds.points, k=2)[0][:, 1] * FOCAL
+    assert 2 < np.median(neighbours[near] / 4) < 6
+    assert 2 < np.median(neighbours[~near] / 10) < 6
+    assert np.median(seeds.spacing[near]) < np.median(seeds.spacing[~near])
+
+
+def test_a_seed_has_the_median_colour_of_the_views():
+    """A passer-by in one of three photographs does not colour the wall."""
+    seeds = seeds_of([view(colour=0.3), view((0.1, 0.0, 0.0), colour=0.3), view((-0.1, 0.0, 0.0), colour=1.0)])
+    central = np.linalg.norm(seeds.points - [0, 0, 10], axis=1) < 3
+    np.testing.assert_allclose(seeds.colours[central], 0.3, atol=1e-6)
+
+
+def test_there_are_no_seeds_where_the_mask_or_the_angle_says_no():
+    masked = view()
+    masked.shell.mask[:, : WIDTH // 2] = False
+    assert (camera((0, 0, 0)).K.numpy() @ seeds_of([masked]).points.T)[0].min() > 0
+    assert len(seeds_of([masked]).points) < 0.7 * len(seeds_of([view()]).points)
+    grazing = torch.tensor([1.0, 0.0, -0.05], dtype=torch.float64)
+    edge_on = view(normal=grazing / grazing.norm())
+    edge_on = edge_on._replace(shell=edge_on.shell._replace(mask=edge_on.shell.depth > 5))
+    assert len(seeds_of([edge_on]).points) == 0
+
+
+def test_seeds_are_spread_more_widely_where_there_would_be_too_many():
+    few = seeds_of([view()], most=40)
+    assert 15 < len(few.points) <= 40
+    assert np.ptp(few.points, axis=0)[0] > 0.8 * np.ptp(seeds_of([view()]).points, axis=0)[0]
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_a_run_begins_with_flat_gaussians_on_the_shell_beside_the_sfm_points(
+    eager, pristine_scene, tmp_path, primitive
+):
+    def choose(config):
+        config.pipeline.model.primitive = primitive
+
+    trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
+    model, sfm = model_of(trainer), model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
+    n, seeds = sfm.num_points, data_of(trainer).shell_seeds(model.config.seed_spacing, model.config.max_seeds)
+    assert len(seeds.points) > 50
+    torch.testing.assert_close(model.means[:n], sfm.means)
+    torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
+    thin = quats_to_rotations(model.quats[n:])[..., 2]
+    cosines = (thin * torch.from_numpy(seeds.normals).float()).sum(dim=-1).abs()
+    torch.testing.assert_close(cosines, torch.ones_like(cosines))
+    scales = model.scales[n:].exp()
+    assert (scales[:, 2] < 0.11 * scales[:, :2].amin(dim=-1)).all()
+    assert primitive == "3d" or (model.scales[:, 2] == DISC_LOG_THICKNESS).all()
+    torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+
+
+def test_without_shell_maps_in_any_training_view_there_are_no_seeds():
+    empty = view()
+    empty.shell.mask[:] = False
+    assert [len(each) for each in seeds_of([empty])] == [0, 0, 0, 0]
