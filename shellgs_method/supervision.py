@@ -25,10 +25,8 @@ from shellgs_method.losses import (
     vid2sim_ncc_loss,
 )
 
-TOLERANCES = (0.02, 0.10)
-"""Least and largest tolerance in metres that is taken from the figures of an alignment."""
-UNVALIDATED = 0.05
-"""Tolerance in metres of a shell whose alignment was not validated."""
+TOLERANCES = (0.05, 0.15)
+"""Least and largest tolerance in metres: with less, pictures of Herz-Jesu lost more than its surface gained."""
 
 
 @dataclass
@@ -70,7 +68,7 @@ class ExtraLossConfig:
     behind the shell may have the right mean."""
     tolerance: Optional[float] = None
     """Distance from the plane that costs nothing, in metres. If not set: how far the shell may be off by the figures of
-    its alignment, from 2 to 10 cm; 5 cm where it was not validated."""
+    its alignment, from 5 to 15 cm; 5 cm where it was not validated."""
     occlusion_gate: float = 0.0
     """Metres that a pixel's rendered depth may be in front of the cue before it is taken for an occluder's."""
     occlusion_gate_from: int = 3000
@@ -83,7 +81,7 @@ class ExtraLossConfig:
         if self.tolerance is not None:
             return self.tolerance
         low, high = TOLERANCES
-        return UNVALIDATED if shell_error is None else min(max(shell_error, low), high)
+        return min(max(shell_error or 0.0, low), high)
 
 
 class CueLosses:
