@@ -158,6 +158,8 @@ class FacadeModel(SplatfactoModel):
             raise SceneError("median depth and distortion are those of discs: set pipeline.model.primitive to 2d")
         if config.depth == "plane" and config.extra.empty_space > 0:
             raise SceneError("empty_space is made of the centres' depths: set pipeline.model.depth to expected")
+        if config.seeds == "shell" and "shell" not in self.kwargs["metadata"]["cues"]:
+            raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
         if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
             method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
             raise SceneError(

@@ -69,11 +69,11 @@ def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, mo
     Returns:
         The seeds; none where no view has a pixel on the shell that is neither masked nor grazing.
     """
-    stride = int(np.ceil((num_pixels / MAX_SAMPLES) ** 0.5))
-    lifted = (_lift(view, index, stride) for index, view in enumerate(views))
-    samples = _Samples(*map(np.concatenate, zip(*lifted, strict=True)))
-    if len(samples.points) == 0:
+    stride = max(1, int(np.ceil((num_pixels / MAX_SAMPLES) ** 0.5)))
+    lifted = [_lift(view, index, stride) for index, view in enumerate(views)]
+    if not any(len(samples.points) for samples in lifted):
         return Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    samples = _Samples(*map(np.concatenate, zip(*lifted, strict=True)))
     while True:
         points, normals, apart = _thinned(samples, spacing)
         if len(points) <= most:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -107,4 +109,11 @@ def test_a_run_begins_with_flat_gaussians_on_the_shell_beside_the_sfm_points(
 def test_without_shell_maps_in_any_training_view_there_are_no_seeds():
     empty = view()
     empty.shell.mask[:] = False
-    assert [len(each) for each in seeds_of([empty])] == [0, 0, 0, 0]
+    for views in ([empty], []):
+        assert [len(each) for each in seeds_of(views)] == [0, 0, 0, 0]
+
+
+def test_seeds_without_shell_maps_are_refused_in_one_sentence(scene, tmp_path):
+    shutil.rmtree(scene / "cues" / "shell")
+    with pytest.raises(SystemExit, match="run `shellgs cast SCENE` first"):
+        trainer_of(scene, tmp_path, "shellgs_metric")
