@@ -155,6 +155,26 @@ def test_photo_gs_renders_no_geometry_while_it_trains(pristine_scene, tmp_path):
     assert "normal" not in trainer.pipeline.model(camera)
 
 
+def test_the_same_seed_on_one_thread_gives_the_same_run_to_the_last_digit(eager, pristine_scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+    def gaussians(folder: str) -> dict[str, torch.Tensor]:
+        trainer = trainer_of(pristine_scene, tmp_path / folder, "shellgs_metric", iterations=12, change=densify_early)
+        trainer.train()
+        return {name: parameter.detach() for name, parameter in model_of(trainer).gauss_params.items()}
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    first, second = gaussians("first"), gaussians("second")
+    torch.set_num_threads(before)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def densify_early(config) -> None:
+    model = config.pipeline.model
+    model.warmup_length, model.refine_every, model.densify_grad_thresh = 2000, 3, 1e-6
+
+
 def test_a_checkpoint_loads_as_weights_only(trained):
     (checkpoint,) = trained.checkpoint_dir.glob("*.ckpt")
     loaded = torch.load(checkpoint, weights_only=True)
