@@ -66,6 +66,9 @@ class ExtraLossConfig:
     empty_space: float = 0.0
     """Weight of the same loss on all that a pixel shows, where ``point_to_plane`` takes the mean: what lies before and
     behind the shell may have the right mean."""
+    empty_space_from: int = 3000
+    """First iteration of that term. Before it the wall lets light through, and what is seen beside the building in one
+    view would be taken for haze behind the wall in another."""
     tolerance: Optional[float] = None
     """Distance from the plane that costs nothing, in metres. If not set: how far the shell may be off by the figures of
     its alignment, from 5 to 15 cm; 5 cm where it was not validated."""
@@ -114,7 +117,7 @@ class CueLosses:
             ),
             "point_to_plane": (extra.point_to_plane, lambda: self._point_to_plane(geometry)(geometry.depth)),
             "empty_space": (
-                extra.empty_space,
+                extra.empty_space if progress >= extra.empty_space_from / PAPER_ITERATIONS else 0.0,
                 lambda: self._point_to_plane(geometry).of_all(self._squares(geometry), geometry.alpha),
             ),
         }
