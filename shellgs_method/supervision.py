@@ -66,9 +66,8 @@ class ExtraLossConfig:
     empty_space: float = 0.0
     """Weight of the same loss on all that a pixel shows, where ``point_to_plane`` takes the mean: what lies before and
     behind the shell may have the right mean."""
-    empty_space_from: int = 3000
-    """First iteration of that term. Before it the wall lets light through, and what is seen beside the building in one
-    view would be taken for haze behind the wall in another."""
+    empty_space_from: int = 0
+    """First iteration of that term."""
     tolerance: Optional[float] = None
     """Distance from the plane that costs nothing, in metres. If not set: how far the shell may be off by the figures of
     its alignment, from 5 to 15 cm; 5 cm where it was not validated."""
