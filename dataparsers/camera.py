@@ -46,6 +46,10 @@ class Camera:
         stretch = self.K.new_tensor([width / self.width, height / self.height, 1.0])
         return Camera(self.viewmat, stretch[:, None] * self.K, width, height)
 
+    def thinning(self, max_image_size: int) -> int:
+        """The step from pixel to pixel that leaves at most ``max_image_size`` along the longer side."""
+        return -(-max(self.width, self.height) // max_image_size)
+
     def rays(self) -> Float[Tensor, "height width 3"]:
         """Ray through each pixel's centre in the camera frame, scaled to z = 1, so that ``depth * ray`` is a point."""
         u = torch.arange(self.width, dtype=self.K.dtype, device=self.K.device) + 0.5

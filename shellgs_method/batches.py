@@ -39,14 +39,13 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
     if "shell_depth" not in batch:
         return {"seen": seen, "off_shell": seen}
     shell, on_shell = (batch[f"shell_{name}"].to(device) for name in ("depth", "mask"))
-    parts = {"seen": seen, "on_shell": seen & on_shell, "off_shell": seen & ~on_shell}
+    before = torch.zeros_like(seen)
     if "truth_depth" in batch:
         truth = batch["truth_depth"].to(device)
         gap = 0.05 / metres_per_unit if metres_per_unit else shell / 200
         before = seen & (truth > 0) & (truth < shell - gap)
-        parts = {name: mask if name == "seen" else mask & ~before for name, mask in parts.items()}
-        parts["before_shell"] = before
-    return parts
+    rest = seen & ~before
+    return {"seen": seen, "on_shell": rest & on_shell, "off_shell": rest & ~on_shell, "before_shell": before}
 
 
 def references(batch: dict, device: torch.device) -> dict[str, Reference]:

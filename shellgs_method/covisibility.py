@@ -44,7 +44,7 @@ class SeenBy:
             camera: of the view.
             depth: z-depth of the shell, 0 where there is none.
         """
-        step = thinning(camera)
+        step = camera.thinning(MAX_SIZE)
         rays, thinned = camera.rays()[::step, ::step], depth[::step, ::step]
         thinned = torch.where(thinned > 0, thinned, self._depth_of_points(camera, rays))
         world = (thinned * rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
@@ -62,11 +62,6 @@ class SeenBy:
         wanted = (rays @ camera.K.T)[..., :2].reshape(-1, 2)
         nearest = KDTree(pixels[inside].cpu().numpy()).query(wanted.cpu().numpy(), workers=-1)[1]
         return z[inside][torch.as_tensor(nearest, device=z.device)].view(*rays.shape[:2], 1)
-
-
-def thinning(camera: Camera) -> int:
-    """Every how many pixels visibility is worked out."""
-    return -(-max(camera.width, camera.height) // MAX_SIZE)
 
 
 def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "*shape 3"]) -> Bool[Tensor, "*shape"]:

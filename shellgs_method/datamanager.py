@@ -9,16 +9,18 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from torch import Tensor
 
 from dataparsers.camera import Camera
+from dataparsers.cue_maps import CueMap
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
 from shellgs_method.batches import pinhole_camera, reference_maps
-from shellgs_method.covisibility import SeenBy, thinning
+from shellgs_method.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.seeding import SeededView, Seeds, shell_seeds
 
 
@@ -49,7 +51,12 @@ class FacadeDataset(InputDataset):
         mask = load_mask(self.views[image_idx])
         if mask is not None:
             data["mask"] = torch.from_numpy(mask)[..., None]
-        return data | self.get_metadata(data)
+        data |= self.get_metadata(data)
+        if self.seen_by is not None:
+            camera = self.camera(image_idx)
+            no_depth = torch.zeros(camera.height, camera.width, 1)
+            data["seen"] = self.seen_by().mask(camera, data.get("shell_depth", no_depth))
+        return data
 
     def get_metadata(self, data: dict) -> dict:
         """The cue maps of the view ``data["image_idx"]``."""
@@ -63,14 +70,19 @@ class FacadeDataset(InputDataset):
             inside = self.bands.mask(cues["shell"], view.camera) if "shell" in cues else False
         maps = {}
         for kind, cue in cues.items():
-            maps[f"{kind}_depth"] = torch.from_numpy(cue.depth)[..., None] * self._dataparser_outputs.dataparser_scale
+            maps[f"{kind}_depth"] = self._rescaled_depth(cue)
             maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
             maps[f"{kind}_mask"] = torch.from_numpy(cue.mask & inside)[..., None]
-        if self.seen_by is not None:
-            camera = self.camera(data["image_idx"])
-            no_depth = torch.zeros(camera.height, camera.width, 1)
-            maps["seen"] = self.seen_by().mask(camera, maps.get("shell_depth", no_depth))
         return maps
+
+    def shell_depth(self, image_idx: int) -> Float[Tensor, "H W 1"] | None:
+        """Depth of the shell in a view, without its other maps; None where the view has none."""
+        view, shell = self.views[image_idx], self._dataparser_outputs.metadata["cues"].get("shell")
+        cue = shell and shell.read(view.name, view.camera)
+        return cue and self._rescaled_depth(cue)
+
+    def _rescaled_depth(self, cue: CueMap) -> Float[Tensor, "H W 1"]:
+        return torch.from_numpy(cue.depth)[..., None] * self._dataparser_outputs.dataparser_scale
 
     def camera(self, image_idx: int) -> Camera:
         """The camera of a view in nerfstudio's rescaled world."""
@@ -112,11 +124,10 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         """What the training views see."""
         dataset, cameras, depths = self.train_dataset, [], []
         for index in range(len(dataset)):
-            camera = dataset.camera(index)
-            depth = dataset.get_metadata({"image_idx": index}).get("shell_depth", torch.zeros(1, 1, 1))
-            step = thinning(camera)
+            camera, depth = dataset.camera(index), dataset.shell_depth(index)
+            step = camera.thinning(MAX_SIZE)
             cameras.append(camera)
-            depths.append(depth[::step, ::step, 0].contiguous())
+            depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())
         points = self.train_dataparser_outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
         return SeenBy(cameras, depths, points.float())
 

@@ -125,7 +125,6 @@ def _medians(
 ) -> tuple[Float[ndarray, "G 3"], Bool[ndarray, " G"]]:
     """Median of each group's values, channel by channel, and which groups have any."""
     counts = np.bincount(groups, minlength=num_groups)
-    middle = (np.cumsum(counts) - counts + (counts - 1) // 2).clip(0)
-    middle = middle.clip(max=len(values) - 1)
+    middle = (np.cumsum(counts) - counts + (counts - 1) // 2).clip(0, len(values) - 1)
     medians = [channel[np.lexsort((channel, groups))][middle] for channel in values.T]
     return np.stack(medians, axis=1), counts > 0

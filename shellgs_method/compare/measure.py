@@ -168,7 +168,7 @@ def _snapshot(
     reference = reference_maps(batch, "shell", rendering.depth.device)
     depth = rendering.depth.where(rendering.alpha >= OPAQUE, 0.0)
     normal = normals_from_depth(depth, camera) if rendering.normal is None else rendering.normal
-    step = -(-max(camera.width, camera.height) // PICTURE_SIZE)
+    step = camera.thinning(PICTURE_SIZE)
     K = camera.K.double().cpu().numpy().copy()
     K[:2] /= step
     K[:2, 2] += 0.5 - 0.5 / step  # pixel i of the picture is pixel step * i: centres at 0.5 in both

@@ -38,12 +38,10 @@ def image_errors(
     """
     rgb, target = rgb.detach().clamp(0, 1).permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
     similarity = ssim(rgb, target, window_size=11)[0]
-    everywhere = torch.ones_like(similarity[0], dtype=torch.bool)
+    parts = {"": torch.ones_like(similarity[0], dtype=torch.bool)}
+    parts |= {f"_{name}": mask[..., 0] for name, mask in (regions or {}).items()}
     figures = {}
-    for suffix, region in {
-        "": everywhere,
-        **{f"_{name}": mask[..., 0] for name, mask in (regions or {}).items()},
-    }.items():
+    for suffix, region in parts.items():
         if region.any():
             figures[f"psnr{suffix}"] = min(psnr(rgb[..., region], target[..., region], max_val=1.0).item(), 100.0)
             figures[f"ssim{suffix}"] = similarity[:, region].mean().item()
