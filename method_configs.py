@@ -62,7 +62,11 @@ shellgs_metric = _method(
     "shellgs-metric",
     "3D Gaussians that begin on an aligned facade shell and stay within its tolerance: the method to use",
     FacadeModelConfig(
-        cues="shell", seeds="shell", densify_grad_thresh=THRESHOLD_METRIC, extra=ExtraLossConfig(empty_space=1.0)
+        cues="shell",
+        shell_counts="uncontradicted",
+        seeds="shell",
+        densify_grad_thresh=THRESHOLD_METRIC,
+        extra=ExtraLossConfig(empty_space=1.0),
     ),
 )
 mono_gs = _method(

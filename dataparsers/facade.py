@@ -166,6 +166,11 @@ def read_views(config: FacadeDataParserConfig) -> list[View]:
     return sorted((view for split in ("train", "test") for view in parser.read(split)[1]), key=lambda view: view.name)
 
 
+def held_out_names(config: FacadeDataParserConfig) -> set[str]:
+    """Names of the views that are held out for evaluation."""
+    return {view.name for view in FacadeDataParser(config).read("test")[1]}
+
+
 def scene_camera(outputs: DataparserOutputs, index: int) -> Camera:
     """A camera of nerfstudio's rescaled, OpenGL world, back in the scene's own frame (OpenCV, float64)."""
     cameras = outputs.cameras

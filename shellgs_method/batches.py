@@ -6,12 +6,17 @@ import torch
 from jaxtyping import Bool
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from dataparsers.camera import Camera
 from shellgs_method.evaluation import Reference, Rendering, geometry_errors
 
 REFERENCES = {"shell": "", "truth": "truth_"}
 """Kinds of maps that geometry is measured against, and what the names of their figures begin with."""
+
+
+MARGIN = 2
+"""Pixels around what stands before the shell in which its splats are seen, too."""
 
 
 def reference_errors(
@@ -30,8 +35,8 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
 
     * ``seen``: all of these.
     * ``on_shell``, ``off_shell``: on the shell, or where it is not or does not count.
-    * ``before_shell``: where the truth, if there is one, is nearer than the shell by more than 5 cm (1/200 of its
-      depth where metres are unknown); then these pixels are in neither of the two.
+    * ``before_shell``: where the truth is nearer than the shell by more than 5 cm (1/200 of its depth where metres are
+      unknown) or, where there is no truth, photographs show something nearer. These pixels are in neither of the two.
     """
     if "seen" not in batch:
         return {}
@@ -39,7 +44,7 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
     if "shell_depth" not in batch:
         return {"seen": seen, "off_shell": seen}
     shell, on_shell = (batch[f"shell_{name}"].to(device) for name in ("depth", "mask"))
-    before = torch.zeros_like(seen)
+    before = seen & batch["contradicted"].to(device) if "contradicted" in batch else torch.zeros_like(seen)
     if "truth_depth" in batch:
         truth = batch["truth_depth"].to(device)
         gap = 0.05 / metres_per_unit if metres_per_unit else shell / 200
@@ -55,9 +60,15 @@ def references(batch: dict, device: torch.device) -> dict[str, Reference]:
     }
 
 
-def reference_maps(batch: dict, kind: str, device: torch.device) -> Reference:
-    """The maps of one kind in a batch; what the user masked out is not supported."""
+def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: bool = False) -> Reference:
+    """The maps of one kind in a batch; what the user masked out is not supported.
+
+    Nor is the shell where photographs contradict it, and beside, unless it is asked for ``everywhere``.
+    """
     depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
+    if kind == "shell" and "contradicted" in batch and not everywhere:
+        before = batch["contradicted"].to(device, torch.float32).permute(2, 0, 1)
+        mask = mask & ~max_pool2d(before, 2 * MARGIN + 1, 1, MARGIN).bool().permute(1, 2, 0)
     if "mask" in batch:
         mask = mask & batch["mask"].to(device)
     return Reference(depth, normal.float(), mask)

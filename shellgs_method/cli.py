@@ -203,11 +203,13 @@ def cast(
     metres_per_shell_unit: float = 1.0,
     max_image_size: Optional[int] = None,
     mesher: Literal["planes", "bpa", "poisson"] = "planes",
+    check: bool = True,
 ) -> None:
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
-    An interrupted cast goes on where it stopped. What stands before the shell can be painted black in masks,
-    scene/shell/masks/<image path>.png: there the shell does not count.
+    Then the photographs are compared with each other, on the shell and before it: where they agree on something nearer
+    (a tree, a railing) the shell does not count. These maps are in scene/cues/checked. What they miss can be painted
+    black in masks, scene/shell/masks/<image path>.png. An interrupted cast goes on where it stopped.
 
     Args:
         scene: Scene folder.
@@ -216,10 +218,11 @@ def cast(
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
         mesher: Makes a mesh of a point cloud: planes (balls between), balls alone (bpa), poisson for round things.
+        check: Compare the photographs, to find what stands before the shell.
     """
     from dataparsers.cue_maps import CueMaps, relative_path
-    from dataparsers.facade import FacadeDataParserConfig, read_views
-    from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+    from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
+    from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, check_views
 
     if (shell is None) != (matrix is None):
         raise SceneError("--shell and --matrix go together: which mesh, and where it stands in the scene")
@@ -227,7 +230,8 @@ def cast(
         alignment = Alignment.from_matrix_file(matrix, relative_path(shell, scene), metres_per_shell_unit)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
-    views = read_views(FacadeDataParserConfig(data=scene))
+    config = FacadeDataParserConfig(data=scene)
+    views = read_views(config)
     summary = cast_views(scene, views, alignment, max_image_size=max_image_size, mesher=mesher)
     if summary.meshing:
         console.print(f"The shell is a point cloud, whose mesh is kept in {scene / 'shell'}: {summary.meshing}")
@@ -235,6 +239,12 @@ def cast(
         f"{summary.cast} views cast, {summary.skipped} there already, in {summary.seconds:.1f} s; the shell is in "
         f"{summary.seeing} of {len(views)} views and in {summary.supported:.0%} of their pixels."
     )
+    if check:
+        found = check_views(scene, views, held_out_names(config))
+        console.print(
+            f"Photographs contradict {found.contradicted:.1%} of these pixels: something stands before the shell there "
+            f"({found.checked} views compared, {found.skipped} there already, in {found.seconds:.1f} s)."
+        )
     panel = _save_panel(CueMaps.open(scene, "shell"), views)
     console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
 

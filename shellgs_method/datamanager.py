@@ -28,8 +28,9 @@ class FacadeDataset(InputDataset):
     """Photographs at the size of their cameras, with ``K``, ``{cue}_depth``, ``{cue}_normal`` and ``{cue}_mask``.
 
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
-    kind lacks that kind's keys. With ``bands``, all masks are those of pixels whose wall lies in them. ``seen_by``
-    tells of the training views: then ``seen`` is true where these have seen what a pixel shows.
+    kind lacks that kind's keys. ``contradicted`` is where photographs show something before the shell. With ``bands``,
+    all masks are those of pixels whose wall lies in them. ``seen_by`` tells of the training views: then ``seen`` is
+    true where these have seen what a pixel shows.
     """
 
     bands: Bands | None = None
@@ -65,10 +66,11 @@ class FacadeDataset(InputDataset):
             kind: maps.read(view.name, view.camera) for kind, maps in self._dataparser_outputs.metadata["cues"].items()
         }
         cues = {kind: cue for kind, cue in read.items() if cue is not None}
+        checked = cues.pop("checked", None)
         inside = True
         if self.bands is not None:
             inside = self.bands.mask(cues["shell"], view.camera) if "shell" in cues else False
-        maps = {}
+        maps = {} if checked is None else {"contradicted": torch.from_numpy(checked.mask)[..., None]}
         for kind, cue in cues.items():
             maps[f"{kind}_depth"] = self._rescaled_depth(cue)
             maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
@@ -140,21 +142,22 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             raise SceneError("a holdout of bands needs the shell maps of the scene: run `shellgs cast SCENE` first")
         return facade_bands(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
 
-    def shell_seeds(self, spacing: float, most: int) -> Seeds:
+    def shell_seeds(self, spacing: float, most: int, everywhere: bool) -> Seeds:
         """Seeds on the shell as the training views see it, in nerfstudio's rescaled world.
 
         Args:
             spacing: in pixels of the closest view.
             most: number of seeds beyond which they are spread more widely.
+            everywhere: also behind what photographs show before the shell.
         """
         batches = [batch for batch in self.cached_train if "shell_depth" in batch]
         num_pixels = sum(batch["shell_mask"].numel() for batch in batches)
-        return shell_seeds(map(self._seeded_view, batches), num_pixels, spacing, most)
+        return shell_seeds((self._seeded_view(batch, everywhere) for batch in batches), num_pixels, spacing, most)
 
-    def _seeded_view(self, batch: dict) -> SeededView:
+    def _seeded_view(self, batch: dict, everywhere: bool) -> SeededView:
         index, cpu = batch["image_idx"], torch.device("cpu")
         image = batch["image"][..., :3].to(cpu) / (255 if batch["image"].dtype == torch.uint8 else 1)
-        return SeededView(self.train_dataset.camera(index), image, reference_maps(batch, "shell", cpu))
+        return SeededView(self.train_dataset.camera(index), image, reference_maps(batch, "shell", cpu, everywhere))
 
     def _load_images(self, split, cache_images_device):
         # "cpu" pins memory, which needs CUDA, and nerfstudio switches to it by itself above 500 images; "gpu" means

@@ -79,6 +79,8 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Terms beyond the paper."""
     depth: DepthKind = "expected"
     """Depth that is rendered and supervised: expected, median (discs only), or that of the composited plane."""
+    shell_counts: Literal["everywhere", "uncontradicted"] = "everywhere"
+    """Where the shell supervises and has seeds: all over, or not where photographs show something before it."""
     densification: Literal["default", "mcmc"] = "default"
     """default: clone, split and prune by the gradient; mcmc: move and add by opacity, up to a cap."""
     mcmc: MCMCConfig = MCMCConfig()  # noqa: RUF009
@@ -374,7 +376,7 @@ class FacadeModel(SplatfactoModel):
         kept = batch["mask"].to(self.device) if "mask" in batch else None
         cue = None
         if f"{config.cues}_depth" in batch:
-            maps = reference_maps(batch, config.cues, self.device)
+            maps = reference_maps(batch, config.cues, self.device, config.shell_counts == "everywhere")
             shell_error = self.kwargs["metadata"].get("shell_error")
             cue = CueLosses(maps, config.geometry, config.extra, self.metres_per_unit, shell_error)
         view = ViewLosses(PhotometricLoss(target, kept, config.ssim_lambda), cue)

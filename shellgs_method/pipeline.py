@@ -38,7 +38,8 @@ class FacadePipeline(VanillaPipeline):
             assert isinstance(model, FacadeModel)
             assert isinstance(datamanager, FacadeDataManager)
             if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run brings all its Gaussians
-                model.add_seeds(datamanager.shell_seeds(model.config.seed_spacing, model.config.max_seeds))
+                everywhere = model.config.shell_counts == "everywhere"
+                model.add_seeds(datamanager.shell_seeds(model.config.seed_spacing, model.config.max_seeds, everywhere))
 
     def get_average_image_metrics(
         self, data_loader, image_prefix: str, step: int | None = None, output_path: Path | None = None, get_std=False

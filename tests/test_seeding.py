@@ -93,7 +93,7 @@ def test_a_run_begins_with_flat_gaussians_on_the_shell_beside_the_sfm_points(
 
     trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
     model, sfm = model_of(trainer), model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
-    n, seeds = sfm.num_points, data_of(trainer).shell_seeds(model.config.seed_spacing, model.config.max_seeds)
+    n, seeds = sfm.num_points, data_of(trainer).shell_seeds(model.config.seed_spacing, model.config.max_seeds, True)
     assert len(seeds.points) > 50
     torch.testing.assert_close(model.means[:n], sfm.means)
     torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())

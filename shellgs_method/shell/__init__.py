@@ -1,11 +1,13 @@
 """The facade shell: its file, where it stands in the scene, and what each camera sees of it.
 
-:func:`align_picks`, :func:`refine` and :func:`propose` find its place, :func:`validate` judges it, and
-:func:`cast_views` makes the maps; the parts these are made of can be used alone.
+:func:`align_picks`, :func:`refine` and :func:`propose` find its place, :func:`validate` judges it,
+:func:`cast_views` makes the maps, and :func:`check_views` compares the photographs on it and before it; the parts these
+are made of can be used alone.
 """
 
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.cast import ALIGNMENT, MASKS, CastSummary, cast_views
+from shellgs_method.shell.check import CheckSummary, check_views
 from shellgs_method.shell.clouds import Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell
 from shellgs_method.shell.panel import supervision_panel
@@ -21,6 +23,7 @@ __all__ = [
     "MASKS",
     "Alignment",
     "CastSummary",
+    "CheckSummary",
     "Mesher",
     "Meshing",
     "ShellCaster",
@@ -29,6 +32,7 @@ __all__ = [
     "Validation",
     "align_picks",
     "cast_views",
+    "check_views",
     "load_shell",
     "mesh_cloud",
     "propose",

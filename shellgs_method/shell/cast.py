@@ -64,8 +64,8 @@ def cast_views(
     on where it stopped. ``scene/shell/alignment.json``, which the maps are bound to, is written if it holds another
     alignment. Nothing is written before some camera is known to see the shell.
 
-    The shell knows nothing of what stands before it, a tree or a car: what is black in
-    ``scene/shell/masks/<image's name>.png``, if there is such a picture, is taken out of the view's mask.
+    The shell knows nothing of what stands before it, a tree or a car: :func:`check_views` finds it, and what is black
+    in ``scene/shell/masks/<image's name>.png``, if there is such a picture, is taken out of the view's mask.
 
     Args:
         scene: the scene's folder.

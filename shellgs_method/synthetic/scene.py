@@ -9,15 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 from PIL import Image
 from rich.progress import track
-from scipy.ndimage import binary_dilation
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
 from shellgs_method.open3d import import_open3d
-from shellgs_method.shell import ALIGNMENT, MASKS, Alignment
+from shellgs_method.shell import ALIGNMENT, Alignment
 from shellgs_method.shell.similarity import transformed
 from shellgs_method.synthetic.appearance import Daylight, photograph, rays
 from shellgs_method.synthetic.building import Layout, building, shell
@@ -98,12 +96,6 @@ class Facade:
         normal = hits.normal @ camera.viewmat[:3, :3].numpy().T
         return CueMap(depth, normal.astype(np.float16), hits.material <= Material.RAILING)
 
-    def unoccluded(self, camera: Camera) -> Bool[np.ndarray, "H W"]:
-        """Where neither pole nor tree stands before the building, with the margin that a brush leaves."""
-        material = self.daylight.world.cast(*rays(camera)).material
-        before = np.isin(material, (Material.POLE, Material.TRUNK, Material.LEAF))
-        return np.logical_not(binary_dilation(before, iterations=2))
-
 
 def write_scene(scene: Path, config: FacadeConfig) -> None:
     """Write the scene folder of a synthetic facade; it appears whole or not at all.
@@ -142,9 +134,6 @@ def _write(scene: Path, config: FacadeConfig) -> None:
         maps = facade.truth(camera)
         truth.write(name, maps, scene_camera(camera))
         np.save(scene / PREDICTIONS / f"{Path(name).stem}.npy", predicted_disparity(maps, network))
-        mask = scene / MASKS / f"{name}.png"
-        mask.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(facade.unoccluded(camera)).save(mask)
     points = triangulate(facade.daylight.world, facade.cameras, found, config.points, sfm)
     _write_points(scene / "sparse_pc.ply", points)
     (scene / "transforms.json").write_text(json.dumps(_transforms(names, facade.cameras), indent=1) + "\n")

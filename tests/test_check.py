@@ -1,0 +1,175 @@
+"""Photographs against the shell: what stands before it is found, and what is right is left alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dataparsers.camera import Camera
+from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
+from shellgs_method.batches import reference_maps, regions
+from shellgs_method.shell import check_views
+from shellgs_method.shell.contradiction import (
+    CONFIRMED,
+    CONTRADICTED,
+    MOVES,
+    OFFSETS,
+    ShellView,
+    _better_half,
+    agreed_score,
+    neighbours,
+    sweep,
+)
+
+WIDTH, HEIGHT = 144, 64
+K = torch.tensor([[160.0, 0, WIDTH / 2], [0, 160, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+WALL = 8.0
+
+
+def camera_at(x: float) -> Camera:
+    """A camera at z = 0 that looks along z."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 3] = -x
+    return Camera(viewmat, K, WIDTH, HEIGHT)
+
+
+def painted(points: np.ndarray, seed: int) -> np.ndarray:
+    """Colours of a plane's points: a sum of waves, the same from everywhere."""
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(0, 6, (24, 2)), rng.uniform(0, 2 * np.pi, 24), rng.normal(0, 0.09, (24, 3))
+    return 0.5 + np.sin(points[..., :2] @ waves[0].T + waves[1]) @ waves[2]
+
+
+def street(
+    cameras: list[Camera], post: float | None = None, mirror: bool = False
+) -> list[tuple[ShellView, np.ndarray]]:
+    """Views of a painted wall, perhaps with a post at some depth before it or a mirror in it, and where the post is."""
+    views = []
+    for camera in cameras:
+        rays, position = camera.rays().numpy(), camera.position.numpy()
+        image = painted(position + WALL * rays, 0)
+        if mirror:
+            pane = np.abs((position + WALL * rays)[..., 0]) < 1.5
+            image[pane] = painted(position + 2.5 * WALL * rays, 1)[pane]
+        before = np.zeros(image.shape[:2], bool)
+        if post is not None:
+            place = position + post * rays
+            before = np.abs(place[..., 0] - 0.3) < 0.4
+            image[before] = painted(place, 2)[before]
+        pixels = torch.from_numpy((image.clip(0, 1) * 255).round().astype(np.uint8))
+        views.append((ShellView(camera, pixels, torch.full((HEIGHT, WIDTH), WALL)), before))
+    return views
+
+
+CAMERAS = [camera_at(x) for x in np.linspace(-2.5, 2.5, 9)]
+
+
+def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Of the middle view: its sweep's score, the agreed one, and the depth found."""
+    sweeps = [sweep(view, [other for other in views if other is not view]) for view in views]
+    middle = len(views) // 2
+    beside = [index for index in range(len(views)) if index != middle]
+    score = agreed_score(views[middle], sweeps[middle], [views[k] for k in beside], [sweeps[k] for k in beside])
+    return sweeps[middle].score.float(), score, WALL / (1 + sweeps[middle].offset)
+
+
+@pytest.mark.parametrize("depth", [7.0, 5.0, 3.5])
+def test_a_post_before_the_wall_is_found_where_it_stands(depth: float):
+    views = street(CAMERAS, post=depth)
+    _, score, found = scores([view for view, _ in views])
+    before, contradicted = views[len(views) // 2][1], score.numpy() > CONTRADICTED
+    both = (before & contradicted).sum()
+    assert both / before.sum() > 0.9
+    assert both / contradicted.sum() > 0.8
+    inverse = WALL / np.median(found.numpy()[before & contradicted]) - 1
+    assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # a rung of the ladder
+
+
+def test_a_wall_that_is_as_the_shell_says_is_confirmed():
+    swept, score, _ = scores([view for view, _ in street(CAMERAS)])
+    assert (score > CONTRADICTED).float().mean() < 0.002
+    assert (swept < CONFIRMED).float().mean() > 0.8
+
+
+def test_what_a_mirror_shows_is_farther_and_contradicts_nothing():
+    _, score, _ = scores([view for view, _ in street(CAMERAS, mirror=True)])
+    assert (score > CONTRADICTED).float().mean() < 0.01
+
+
+@pytest.mark.parametrize("offset", [OFFSETS[3], OFFSETS[8]])
+def test_neighbours_on_both_sides_see_an_offset_move_by_some_pixels(offset: float):
+    view, others = camera_at(0.0), [camera_at(x) for x in np.linspace(-12, 12, 200)]
+    chosen = neighbours(view, others, WALL, offset)
+    assert {side for _, side in chosen} == {0, 1}
+    for index, side in chosen:
+        x = float(others[index].position[0])
+        assert (x > 0) == (side == 1)
+        pixels = 160 * abs(x) * ((1 + offset) / WALL - 1 / WALL)
+        assert pixels == pytest.approx(MOVES, rel=0.25)
+
+
+def test_the_better_half_is_a_mean_of_the_least_costs_by_weight():
+    costs = torch.tensor([0.9, 0.1, torch.nan, 0.3, 0.5]).view(5, 1, 1)
+    weights = torch.tensor([1.0, 1.0, 1.0, 0.5, 1.5]).view(5, 1, 1)
+    # Half of the weight that counts is 2: all of 0.1's, all of 0.3's, and half a unit of 0.5's.
+    expected = (1.0 * 0.1 + 0.5 * 0.3 + 0.5 * 0.5) / 2
+    assert _better_half(costs, weights).item() == pytest.approx(expected)
+
+
+def check(scene: Path):
+    config = FacadeDataParserConfig(data=scene)
+    return check_views(scene, read_views(config), held_out_names(config))
+
+
+def contents(scene: Path) -> dict[str, bytes]:
+    """Depth and mask of every map."""
+    maps = {}
+    for path in sorted((scene / "cues/checked").rglob("*.npz")):
+        with np.load(path) as file:
+            maps[path.stem] = file["depth"].tobytes() + file["mask"].tobytes()
+    return maps
+
+
+def test_maps_are_made_once_and_again_only_where_they_are_missing(scene: Path):
+    first = check(scene)
+    assert (first.checked, first.skipped) == (10, 0)
+    before = contents(scene)
+    assert not [path for path in (scene / "cues/checked").iterdir() if path.name.startswith(".")]
+    again = check(scene)
+    assert (again.checked, again.skipped) == (0, 10)
+    next((scene / "cues/checked").rglob("*00004.png.npz")).unlink()
+    mended = check(scene)
+    assert (mended.checked, mended.skipped) == (1, 9)
+    assert contents(scene) == before
+
+
+def test_the_maps_of_training_views_know_nothing_of_held_out_photographs(scene: Path):
+    check(scene)
+    before = contents(scene)
+    held_out = sorted(held_out_names(FacadeDataParserConfig(data=scene)))
+    for name in held_out:
+        with Image.open(scene / name) as image:
+            noise = np.random.default_rng(0).integers(0, 255, (*image.size[::-1], 3), dtype=np.uint8)
+        Image.fromarray(noise).save(scene / name)
+    assert check(scene).checked == 10  # the photographs are others
+    stems = {f"{Path(name).name}" for name in held_out}
+    after = contents(scene)
+    assert {name for name in before if after[name] != before[name]} <= stems
+
+
+def test_a_contradicted_shell_is_no_reference_and_supervises_only_where_asked():
+    mask = torch.tensor([True] * 7 + [False]).view(1, 8, 1)
+    contradicted = torch.tensor([False, True] + [False] * 6).view(1, 8, 1)
+    batch = {"shell_depth": torch.full((1, 8, 1), 2.0), "shell_normal": torch.zeros(1, 8, 3), "shell_mask": mask}
+    batch |= {"contradicted": contradicted, "seen": torch.ones(1, 8, 1, dtype=torch.bool)}
+    cpu = torch.device("cpu")
+    assert reference_maps(batch, "shell", cpu).mask.view(-1).tolist() == [False] * 4 + [True] * 3 + [False]
+    assert (reference_maps(batch, "shell", cpu, everywhere=True).mask == mask).all()
+    parts = {name: part.view(-1).tolist() for name, part in regions(batch, 1.0, cpu).items()}
+    assert parts["before_shell"] == [False, True] + [False] * 6
+    assert parts["on_shell"] == [True, False] + [True] * 5 + [False]
+    assert parts["off_shell"] == [False] * 7 + [True]
