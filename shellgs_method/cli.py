@@ -18,7 +18,7 @@ from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 
 if TYPE_CHECKING:
-    from dataparsers.cue_maps import CueMaps
+    from dataparsers.cue_maps import CueMap, CueMaps
     from dataparsers.photograph import View
     from shellgs_method.export import Frame
     from shellgs_method.shell.align import Placement
@@ -245,6 +245,8 @@ def cast(
             f"Photographs contradict {found.contradicted:.1%} of these pixels: something stands before the shell there "
             f"({found.checked} views compared, {found.skipped} there already, in {found.seconds:.1f} s)."
         )
+        checked = _save_check_panel(CueMaps.open(scene, "checked"), views)
+        console.print(f"Look at {checked}: red is what stands before the shell, green is where they confirm it.")
     panel = _save_panel(CueMaps.open(scene, "shell"), views)
     console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
 
@@ -296,17 +298,34 @@ def _save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
     from shellgs_method.evaluation.figures import save_figure
     from shellgs_method.shell import supervision_panel
 
-    mapped = [view for view in views if maps.record(view.name)]
-    shrunk = [
-        replace(view, camera=view.camera.shrunk(maps.manifest.max_image_size))
-        for view in mapped[:: max(len(mapped) // 8, 1)]
-    ]
-    cues = ((view, maps.read(view.name, view.camera)) for view in shrunk)
-    view, cue = max(((v, cue) for v, cue in cues if cue is not None), key=lambda pair: pair[1].mask.mean())
+    view, cue = max(_some_maps(maps, views, 8), key=lambda pair: pair[1].mask.mean())
     panel = maps.folder / "panel.png"
     figure = supervision_panel(load_photograph(view)[..., :3], cue, maps.manifest.metres_per_unit, maps.kind)
     save_figure(panel, figure)
     return panel
+
+
+def _save_check_panel(maps: CueMaps, views: Sequence[View]) -> Path:
+    """Some views with what the photographs say of the shell."""
+    from dataparsers.photograph import load_photograph
+    from shellgs_method.evaluation.figures import save_figure
+    from shellgs_method.shell import check_panel
+
+    some = _some_maps(maps, views, 4)
+    panel = maps.folder / "panel.png"
+    save_figure(panel, check_panel([load_photograph(view)[..., :3] for view, _ in some], [cue for _, cue in some]))
+    return panel
+
+
+def _some_maps(maps: CueMaps, views: Sequence[View], count: int) -> list[tuple[View, CueMap]]:
+    """About so many views, spread over the scene, at the size of their maps, and these."""
+    mapped = [view for view in views if maps.record(view.name)]
+    shrunk = [
+        replace(view, camera=view.camera.shrunk(maps.manifest.max_image_size))
+        for view in mapped[:: max(len(mapped) // count, 1)]
+    ]
+    read = ((view, maps.read(view.name, view.camera)) for view in shrunk)
+    return [(view, cue) for view, cue in read if cue is not None]
 
 
 def mesh(

@@ -10,7 +10,7 @@ from shellgs_method.shell.cast import ALIGNMENT, MASKS, CastSummary, cast_views
 from shellgs_method.shell.check import CheckSummary, check_views
 from shellgs_method.shell.clouds import Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell
-from shellgs_method.shell.panel import supervision_panel
+from shellgs_method.shell.panel import check_panel, supervision_panel
 from shellgs_method.shell.picks import align_picks
 from shellgs_method.shell.proposal import propose
 from shellgs_method.shell.raycast import ShellCaster
@@ -32,6 +32,7 @@ __all__ = [
     "Validation",
     "align_picks",
     "cast_views",
+    "check_panel",
     "check_views",
     "load_shell",
     "mesh_cloud",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import matplotlib
 import numpy as np
 from jaxtyping import UInt8
@@ -38,4 +40,27 @@ def supervision_panel(
     bar.set_label("metres" if metres_per_unit else "scene units")
     axes[2].imshow(normal_colours(cue.normal, cue.mask), interpolation="nearest")
     axes[3].imshow(cue.mask, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    return figure
+
+
+def check_panel(images: Sequence[UInt8[np.ndarray, "H W 3"]], checked: Sequence[CueMap]) -> Figure:
+    """Where photographs contradict the shell (red) and confirm it (green), in some views; save it with ``.savefig``.
+
+    Args:
+        images: the photographs.
+        checked: their maps of the kind that :func:`~shellgs_method.shell.check_views` makes.
+    """
+    height, width = checked[0].mask.shape
+    columns = 2
+    rows = -(-len(images) // columns)
+    figure = Figure(figsize=(16, (8 * height / width + 0.3) * rows), dpi=100, layout="constrained")
+    for ax in figure.subplots(rows, columns, squeeze=False).flat:
+        ax.set_axis_off()
+    for ax, image, cue in zip(figure.axes, images, checked, strict=False):
+        shown = image / 255
+        confirmed = (cue.depth > 0) & ~cue.mask
+        shown[cue.mask] = 0.3 * shown[cue.mask] + [0.7, 0.0, 0.0]
+        shown[confirmed] = 0.75 * shown[confirmed] + [0.0, 0.25, 0.0]
+        ax.imshow(shown)
+        ax.set_title(f"contradicted {cue.mask.mean():.1%}, confirmed {confirmed.mean():.0%} of the pixels")
     return figure
