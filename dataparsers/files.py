@@ -8,7 +8,9 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+from dataparsers.errors import SceneError
 
 
 @contextmanager
@@ -42,3 +44,18 @@ def content_hash(path: Path) -> str:
 def fingerprint(*parts: object) -> str:
     """A key that changes with any of the parts, which are such as JSON can hold."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What a json file holds, which must be an object.
+
+    Raises:
+        SceneError: it is damaged or holds something else.
+    """
+    try:
+        contents = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{path} is damaged: it is no json ({error})") from error
+    if not isinstance(contents, dict):
+        raise SceneError(f"{path} is damaged: it holds {type(contents).__name__} where an object is wanted")
+    return contents

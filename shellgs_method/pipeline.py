@@ -37,6 +37,8 @@ class FacadePipeline(VanillaPipeline):
             model, datamanager = self.model, self.datamanager
             assert isinstance(model, FacadeModel)
             assert isinstance(datamanager, FacadeDataManager)
+            if self.test_mode == "val":
+                datamanager.train_on(model.training_cues)
             if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run brings all its Gaussians
                 model.add_seeds(datamanager.shell_seeds(model.config.seed_spacing, model.config.max_seeds))
 

@@ -19,7 +19,7 @@ from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, find_cues
 from dataparsers.files import atomic_write
-from shellgs_method.batches import pinhole_camera, reference_errors, reference_maps, regions
+from shellgs_method.batches import picture_errors, pinhole_camera, reference_errors, reference_maps
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
 from shellgs_method.evaluation import (
@@ -27,7 +27,6 @@ from shellgs_method.evaluation import (
     angular_error,
     colours_to_normals,
     geometry_errors,
-    image_errors,
     mean_over_views,
     normals_from_depth,
 )
@@ -101,7 +100,7 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
         camera = pinhole_camera(cameras)
         rendering, photograph = _render(model, cameras, camera), _photograph(model, batch)
         figures.append(
-            image_errors(rendering.rgb, photograph, regions(batch, metres_per_unit, rendering.rgb.device))
+            picture_errors(rendering.rgb, photograph, batch, metres_per_unit)
             | reference_errors(rendering, camera, batch, metres_per_unit)
         )
         if pictures and "shell_mask" in batch and batch["shell_mask"].any():

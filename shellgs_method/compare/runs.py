@@ -240,7 +240,7 @@ def grid(
 
 def _scene_settings(scene: Path, cues: set[str]) -> dict[str, str]:
     """Hashes of a scene's cameras and of what its maps were made from."""
-    colmap = FacadeDataParserConfig(data=scene).setup().colmap_folder()
+    colmap = FacadeDataParserConfig(data=scene).colmap_folder()
     cameras = [scene / "transforms.json"] if colmap is None else sorted((scene / colmap).glob("*.*"))
     hashes = {"cameras": fingerprint(*(content_hash(path) for path in cameras))}
     for kind in find_cues(scene):
