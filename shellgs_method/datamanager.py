@@ -112,9 +112,15 @@ class FacadeDataset(InputDataset):
         return pixels * (COLOUR_BYTES + MAP_BYTES * len(self.cues))
 
     def missing(self) -> dict[str, int]:
-        """How many views have no map that supports a pixel, by kind."""
+        """How many views have no map that supports a pixel, by kind.
+
+        Raises:
+            SceneError: a view's map belongs to another camera, shell or alignment.
+        """
         counts = {}
         for kind, maps in self.cues.items():
+            for view in self.views:
+                maps.check(view.name, view.camera, any_size=self.any_size)
             records = [maps.record(view.name) for view in self.views]
             counts[kind] = sum(record is None or not record.supported for record in records)
         return counts
@@ -177,7 +183,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         """Read these kinds of maps for the training views, and no others.
 
         Raises:
-            SceneError: the scene lacks maps of these kinds in all training views, though it has their manifest.
+            SceneError: a map belongs to another camera, or no training view has one, though there is a manifest.
         """
         dataset = self.train_dataset
         dataset.kinds = kinds
