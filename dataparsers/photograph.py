@@ -147,7 +147,9 @@ def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:
     """SfM may or may not have honoured the EXIF orientation: the shape of its camera tells."""
     width, height = _calibrated_size(view)
     for candidate in (image, ImageOps.exif_transpose(image)):
-        if abs(candidate.width / candidate.height / (width / height) - 1) < 0.01:
+        aspect = candidate.width / candidate.height
+        rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which tells in thumbnails
+        if abs(width - height * aspect) < max(0.01 * width, rounding):
             return candidate
     if path != view.image:
         raise SceneError(

@@ -73,6 +73,9 @@ class FacadeDataset(InputDataset):
         image = self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx)
         data = {"image_idx": image_idx, "image": image, "K": self.views[image_idx].camera.K.float()}
         mask = load_mask(self.views[image_idx])
+        if mask is not None and not mask.any():
+            view = self.views[image_idx]
+            raise SceneError(f"the mask {view.mask} is black everywhere: white is kept; leave {view.name} out instead")
         if mask is not None:
             data["mask"] = torch.from_numpy(mask)[..., None]
         if self.held:
@@ -165,22 +168,20 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         dataset.bands = self._held_out
         dataset.seen_by = lambda: self._seen_by
         dataset.any_size = True
-        if self.test_mode == "val":  # a training goes on without what can only be measured
-            dataset.kinds = [kind for kind in dataset.cues if self._can_be_measured(kind, dataset)]
         return dataset
 
-    def _can_be_measured(self, kind: str, dataset: FacadeDataset) -> bool:
-        views = [*self.train_dataset.views, *dataset.views] if kind == "shell" else dataset.views
+    def _can_be_measured(self, kind: str, maps: CueMaps) -> bool:
+        held_out = self.eval_dataset.views
         try:
-            for view in views:
-                dataset.cues[kind].check(view.name, view.camera, any_size=True)
+            for view in [*self.train_dataset.views, *held_out] if kind == "shell" else held_out:
+                maps.check(view.name, view.camera, any_size=True)
         except SceneError as error:
             logger.warning("This training measures nothing against the %s maps: %s.", kind, error)
             return False
         return True
 
     def train_on(self, kinds: Collection[str]) -> None:
-        """Read these kinds of maps for the training views, and no others.
+        """Read these kinds of maps for the training views, and for the held-out ones what can be measured beside them.
 
         Raises:
             SceneError: a map belongs to another camera, or no training view has one, though there is a manifest.
@@ -203,6 +204,9 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
                     kind,
                     command,
                 )
+        held_out = self.eval_dataset
+        held_out.kinds = {*REFERENCES, *kinds}
+        held_out.kinds = [kind for kind, maps in held_out.cues.items() if self._can_be_measured(kind, maps)]
 
     @cached_property
     def _seen_by(self) -> SeenBy:

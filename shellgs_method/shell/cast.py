@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 from rich.progress import track
 
 from dataparsers.camera import Camera, positions
@@ -84,6 +85,8 @@ def cast_views(
     mesh = alignment.load_shell(scene, views)
     caster = ShellCaster(mesh, alignment.shell_to_scene)
     _check_placement(caster, cameras, shell)
+    if not any(kept is None or kept.any() for kept in (_kept(view, scene) for view in views)):
+        raise SceneError(f"the masks of {scene} are black everywhere in every view: white is what is kept")
     kept = scene / ALIGNMENT
     if not kept.is_file() or not Alignment.load(kept).places_like(alignment):  # else it keeps its verdict
         alignment.save(kept)
@@ -137,12 +140,17 @@ def _mask_sources(scene: Path, views: Sequence[View]) -> list[Path]:
     return sorted({scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask})
 
 
-def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
+def _kept(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
+    """What the photograph's mask and the shell's leave of a view; None where it has neither."""
     painted = scene / MASKS / f"{view.name}.png"
-    for path in (view.mask, painted if painted.is_file() else None):
-        kept = load_mask(replace(view, mask=path))
-        cue = cue if kept is None else replace(cue, mask=cue.mask & kept)
-    return cue
+    masks = [load_mask(replace(view, mask=path)) for path in (view.mask, painted if painted.is_file() else None)]
+    masks = [mask for mask in masks if mask is not None]
+    return np.logical_and.reduce(masks) if masks else None
+
+
+def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
+    kept = _kept(view, scene)
+    return cue if kept is None else replace(cue, mask=cue.mask & kept)
 
 
 def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path) -> None:
