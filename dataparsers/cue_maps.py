@@ -20,7 +20,7 @@ from typing import TypeVar
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write, content_hash, fingerprint, read_json
+from dataparsers.files import atomic_write, content_hash, fingerprint, read_json, remove_leftovers
 from dataparsers.map_files import (
     FORMAT,
     UNREADABLE,
@@ -138,8 +138,7 @@ class CueMaps:
 
     def _write_manifest(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        for path in self.folder.rglob(".*.tmp"):  # of a run that was killed
-            path.unlink(missing_ok=True)
+        remove_leftovers(self.folder)
         with atomic_write(self.folder / "manifest.json") as file:
             file.write(json.dumps(asdict(self.manifest), indent=1).encode())
 

@@ -70,11 +70,11 @@ class SceneLayout(ScenePaths):
         """
         if not self.data.is_dir():
             raise FileNotFoundError(f"{self.data} is not a folder; --data takes a scene folder.")
-        if (self.data / transforms.NAME).exists() and self.colmap_path is None:
+        if (self.data / transforms.NAME).is_file() and self.colmap_path is None:
             return None
         candidates = [self.colmap_path] if self.colmap_path else list(map(Path, colmap_model.FOLDERS))
         for folder in candidates:
-            if any((self.data / folder / f"cameras.{suffix}").exists() for suffix in ("bin", "txt")):
+            if any((self.data / folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
                 return folder
         raise FileNotFoundError(
             f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "

@@ -13,9 +13,7 @@ from dataparsers import colmap_model, transforms
 from dataparsers.errors import SceneError
 from dataparsers.layout import SceneLayout
 from dataparsers.photograph import View
-
-FAR = 1e6
-"""Times the spread of most points from their middle: what is farther is no point of the scene."""
+from dataparsers.strays import sound
 
 log = logging.getLogger(__name__)
 
@@ -91,12 +89,8 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
 
 
 def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:
-    """The indices of the points that are near the others."""
-    finite = np.isfinite(positions).all(axis=1)
-    if not finite.any():
-        return np.flatnonzero(finite)
-    distance = np.linalg.norm(positions - np.median(positions[finite], axis=0), axis=1)
-    near = finite & (distance <= FAR * max(np.median(distance[finite]), np.finfo(float).tiny))
+    """The indices of the points that can be meant."""
+    near = sound(positions)
     if not near.all():
         log.warning(
             "%d of %d SfM points of %s are NaN, infinite or absurdly far away, and are left out",

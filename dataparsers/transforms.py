@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8
 
 from dataparsers.errors import SceneError
 from dataparsers.files import read_json
-from dataparsers.ply import check_ply
+from dataparsers.headers import check_ply
 from dataparsers.shots import DISTORTION, Recording, Shot, in_order, inside, shot
 
 NAME = "transforms.json"

@@ -237,13 +237,13 @@ def cast(
 
     if (shell is None) != (matrix is None):
         raise SceneError("--shell and --matrix go together: which mesh, and where it stands in the scene")
+    views = read_views(paths.of(scene))
     if shell is not None and matrix is not None:
         alignment = Alignment.from_matrix_file(matrix, relative_path(shell, scene), metres_per_shell_unit)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
     if alignment.meshed_by(mesher) != alignment and alignment.verdict:
         console.print(f"The alignment was judged with another mesher: judge it again with `shellgs align {scene}`.")
-    views = read_views(paths.of(scene))
     aligned = alignment.meshed_by(mesher)
     summary = cast_views(scene, views, aligned, max_image_size=max_image_size, flags=paths.flags)
     if summary.meshing:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,6 @@ from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, to_camera
 from dataparsers.sparse_points import SparsePoints
-from shellgs_method.cli import main
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
 from shellgs_method.shell import alignment as alignment_module
 from shellgs_method.shell.align import PROPOSAL, REPORT, place_by_guess
@@ -585,21 +583,6 @@ def test_a_crease_is_drawn_and_the_noise_of_the_triangles_beside_it_is_not():
     assert (neighbours < np.cos(np.radians(25)))[:, beside[1:]].mean() > 0.1  # what a threshold alone would draw
     assert edges[:, beside].mean() < 0.02
     assert edges[1:-1, 76:84].any(axis=1).mean() > 0.7
-
-
-def command(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *words: object) -> str:
-    """What `shellgs` prints, or the sentence that it ends with."""
-    monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
-    try:
-        main()
-    except SystemExit as stop:
-        return f"refused: {stop}"
-    return capsys.readouterr().out.replace("\n", " ")
-
-
-@pytest.fixture
-def shellgs(capsys, monkeypatch):
-    return lambda *words: command(capsys, monkeypatch, *words)
 
 
 def test_a_matrix_is_judged_reported_and_written(scene, shellgs):

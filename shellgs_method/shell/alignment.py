@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from dataparsers.camera import positions
 from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write, read_json
+from dataparsers.files import atomic_write, read_json, remove_leftovers
 from dataparsers.photograph import View
 from shellgs_method.shell.clouds import Mesher
 from shellgs_method.shell.mesh import ShellMesh, load_shell
@@ -126,6 +126,7 @@ class Alignment:
     def save(self, path: Path) -> None:
         """Write the alignment as json."""
         path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
         with atomic_write(path) as file:
             file.write((json.dumps(self._fields(), indent=1, ensure_ascii=False) + "\n").encode())
 

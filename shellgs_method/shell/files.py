@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dataparsers.errors import SceneError
+from dataparsers.headers import check_las, check_ply
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +67,8 @@ def _read_mesh(path: Path) -> Geometry:
     """All triangles or points of a file, the nodes of a scene graph placed and joined."""
     import trimesh
 
+    if path.suffix.lower() == ".ply":
+        check_ply(path)
     # process=False: merging vertices would round them. trimesh, unlike Open3D's tensor reader, keeps doubles.
     loaded = trimesh.load(path, process=False, skip_materials=True)
     scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
@@ -100,7 +103,14 @@ def _read_las(path: Path) -> Geometry:
 
     if path.suffix.lower() == ".laz":
         import lazrs  # noqa: F401  # laspy itself would not say which of its backends to install
-    return Geometry(np.array(laspy.read(path).xyz, np.float64), NO_FACES, NOWHERE)
+    check_las(path)
+    with laspy.open(path) as file:  # in pieces: what a damaged file only claims to hold takes no memory
+        pieces = [np.stack([piece.x, piece.y, piece.z], axis=1) for piece in file.chunk_iterator(1_000_000)]
+        claimed = file.header.point_count
+    points = np.concatenate([NOWHERE, *pieces])
+    if len(points) != claimed:
+        raise ValueError(f"it holds {len(points)} of {claimed} points")
+    return Geometry(points, NO_FACES, NOWHERE)
 
 
 def _read_e57(path: Path) -> Geometry:

@@ -12,6 +12,7 @@ from jaxtyping import Float64, Int64
 
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash
+from dataparsers.strays import sound
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.files import read_geometry
 
@@ -72,7 +73,7 @@ def load_shell(
 ) -> ShellMesh:
     """Read a shell, a triangle mesh or a point cloud, in full double precision where the file has it.
 
-    Triangles with a NaN or infinite vertex and points that are NaN or infinite are dropped; their number is logged. A
+    Triangles with a vertex, and points, that are NaN, infinite or absurdly far away are dropped, and counted. A
     point cloud is meshed by :func:`~shellgs_method.shell.clouds.mesh_cloud`, and its mesh kept, as
     ``<cache>/<file name>.<mesher>.ply``, until the cloud changes.
 
@@ -94,7 +95,7 @@ def load_shell(
     geometry = read_geometry(path)
     try:
         if len(geometry.faces) or not len(geometry.vertices):
-            return ShellMesh(*_without_nan(geometry.vertices, geometry.faces, path))
+            return ShellMesh(*_without_strays(geometry.vertices, geometry.faces, path))
         seen_from = viewpoints if viewpoints is not None and not len(geometry.scanners) else geometry.scanners
         mesh = ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher))
     except SceneError as error:
@@ -145,14 +146,19 @@ def _read_kept(kept: Path, source: Path, viewpoints: np.ndarray | None) -> Shell
         return None
 
 
-def _without_nan(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh without the triangles that touch a NaN or infinite vertex."""
-    finite = np.isfinite(vertices).all(axis=1)
-    if finite.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
+def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh without the triangles that touch a vertex that cannot be meant."""
+    kept = sound(vertices)
+    if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
         return vertices, faces
-    usable = finite[faces].all(axis=1)
+    usable = kept[faces].all(axis=1)
     if not usable.any():
         raise SceneError("every triangle of the shell has a NaN or infinite vertex")
-    log.warning("%s: dropped %d of %d triangles with a NaN or infinite vertex", path, (~usable).sum(), len(faces))
-    renumbered = np.cumsum(finite) - 1
-    return vertices[finite], renumbered[faces[usable]]
+    log.warning(
+        "%s: dropped %d of %d triangles with a NaN or infinite vertex, or one absurdly far away",
+        path,
+        (~usable).sum(),
+        len(faces),
+    )
+    renumbered = np.cumsum(kept) - 1
+    return vertices[kept], renumbered[faces[usable]]

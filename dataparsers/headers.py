@@ -1,7 +1,8 @@
-"""What a PLY file claims to hold, against its size: readers believe the header and miss nothing."""
+"""What headers of PLY and LAS files claim, against the files' size: readers believe them, whatever memory it takes."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 _BYTES = {
@@ -49,3 +50,34 @@ def _check_lines(path: Path, length: int, elements: list[tuple[str, int, int]]) 
         if count > there:
             raise ValueError(f"it holds {there} of the {count} lines of its element {name!r}")
         there -= count
+
+
+_LAS_RECORD, _LAS_EXTENDED_RECORD = 54, 60  # least bytes of what describes a LAS file beside its points
+_MOST_POINTS_PER_BYTE = 50  # that LAZ may be compressed to; scans have less than one
+
+
+def check_las(path: Path) -> None:
+    """Make sure that a LAS or LAZ file is as long as its header claims (LAS 1.4 specification, table 3).
+
+    Raises:
+        ValueError: it is cut off, or its header is damaged.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = file.read(375)
+    if not header.startswith(b"LASF") or len(header) < 227:
+        raise ValueError("it does not begin with the header of a LAS file")
+    minor = header[25]
+    length, start, records, kind, each, points = struct.unpack_from("<HIIBHI", header, 94)
+    extended_start = extended = 0
+    if minor >= 4 and len(header) == 375:
+        extended_start, extended, points = struct.unpack_from("<QIQ", header, 235)
+    if not 227 <= length <= start <= size or (each == 0 and points):
+        raise ValueError(f"its header claims that points begin at byte {start} of {size}")
+    if length + _LAS_RECORD * records > start:
+        raise ValueError(f"its header claims {records} records in {start - length} bytes")
+    if extended and extended_start + _LAS_EXTENDED_RECORD * extended > size:
+        raise ValueError(f"its header claims {extended} records behind its points")
+    most = (size - start) * _MOST_POINTS_PER_BYTE if kind & 0x80 else (size - start) // max(each, 1)
+    if points > most:
+        raise ValueError(f"its header claims {points} points, for which {size} bytes are too few")
