@@ -17,9 +17,11 @@ from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import load_mask
+from dataparsers.sparse_points import read_sparse_points
 from shellgs_method import cli
 from shellgs_method.evaluation import image, image_errors
 from shellgs_method.geometry import Geometry
+from shellgs_method.shell import ALIGNMENT, Alignment, load_shell, validate
 from shellgs_method.supervision import ExtraLossConfig, self_losses
 
 
@@ -74,6 +76,18 @@ def test_cast_leaves_masked_pixels_out_and_knows_when_masks_change(scene):
     paint(scene / "masks" / "frame_00002.png", left=20)
     with pytest.raises(SceneError, match=r"masks has changed since; run `shellgs cast"):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
+
+
+def test_align_judges_by_what_masks_keep(scene):
+    alignment = Alignment.load(scene / ALIGNMENT)
+    mesh, config = load_shell(scene / alignment.shell), FacadeDataParserConfig(data=scene)
+    points = read_sparse_points(config)
+    before = validate(mesh, alignment, read_views(config), points)
+    paint_all(scene)
+    after = validate(mesh, alignment, read_views(config), points)
+    for quantity in (lambda view: view.supported, lambda view: len(view.errors)):
+        all_of_it, kept = (sum(map(quantity, judged.views)) for judged in (before, after))
+        assert 0.3 * all_of_it < kept < 0.95 * all_of_it
 
 
 def test_a_mask_of_another_shape_is_refused_by_its_own_name(scene):

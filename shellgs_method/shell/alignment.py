@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -194,14 +193,14 @@ class Alignment:
 def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
     try:
         if path.suffix == ".npy":
-            matrix = np.load(path, allow_pickle=False)
+            matrix = np.load(path, allow_pickle=False, mmap_mode="r")  # nothing that it only claims is allocated
         elif path.suffix == ".json":
             matrix = json.loads(path.read_bytes())
         else:
             matrix = [line.replace(",", " ").split() for line in path.read_text().splitlines() if line.strip()]
         matrix = np.array(matrix, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError, EOFError, RecursionError, OSError, zipfile.BadZipFile) as error:
-        raise SceneError(f"this is not a 4x4 matrix ({error})") from error
+    except Exception as error:  # each form has its own kinds of error for a damaged file
+        raise SceneError(f"this is not a 4x4 matrix ({' '.join(str(error).split())})") from error
     if matrix.shape != (4, 4):
         raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")
     return matrix
