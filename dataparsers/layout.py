@@ -16,7 +16,7 @@ MASKS = Path("masks")
 """Where masks are looked for, in the scene."""
 
 
-@dataclass
+@dataclass(unsafe_hash=True)
 class ScenePaths:
     """Where in a scene the photographs, the cameras and the masks are."""
 
@@ -28,15 +28,16 @@ class ScenePaths:
     """Folder of masks (white is kept, black is ignored), relative to the scene folder. If not set: masks, if there."""
 
     @property
-    def flags(self) -> str:
-        """What the command line must say for this layout, with a blank before it; empty for the usual one."""
-        chosen = {field.name: getattr(self, field.name) for field in fields(ScenePaths)}
+    def chosen(self) -> dict[str, str]:
+        """What is not as usual, by the words of the command line."""
         usual = vars(ScenePaths())
-        return "".join(
-            f" --{name.replace('_', '-')} {shlex.quote(str(path))}"
-            for name, path in chosen.items()
-            if path != usual[name]
-        )
+        there = {field.name: getattr(self, field.name) for field in fields(ScenePaths)}
+        return {name.replace("_", "-"): str(path) for name, path in there.items() if path != usual[name]}
+
+    @property
+    def flags(self) -> str:
+        """What the command line must say for these paths, with a blank before it; empty for the usual ones."""
+        return "".join(f" --{name} {shlex.quote(path)}" for name, path in self.chosen.items())
 
     def of(self, scene: Path) -> SceneLayout:
         """These paths in a scene."""

@@ -393,6 +393,7 @@ def compare(
     jobs: int = 1,
     address: Optional[str] = None,
     wandb: Optional[str] = None,
+    paths: Paths = _PATHS,
 ) -> None:
     """Train and evaluate methods on scenes; end with the paper's tables, its figures, and a report to look at.
 
@@ -410,6 +411,7 @@ def compare(
         jobs: Runs at once, with the local launcher.
         address: Of a running Ray cluster, say auto. If not set: one is started on this machine.
         wandb: Project of Weights & Biases that gets the tables and figures as a run. If not set: none.
+        paths: Where in the scenes their files are.
     """
     from functools import partial
 
@@ -420,7 +422,7 @@ def compare(
 
     if wandb:
         log_in()
-    runs = grid(scenes, methods, seeds, iterations, output, curve_points)
+    runs = grid(scenes, methods, seeds, iterations, output, curve_points, paths)
     if launcher == "ray":
         from shellgs_method.compare.cluster import launch_on_ray
 

@@ -24,6 +24,7 @@ from runs import Method, trainer_of
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+from dataparsers.layout import SceneLayout, ScenePaths
 from shellgs_method.compare import launch
 from shellgs_method.compare.launch import launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_figures
@@ -121,13 +122,25 @@ def test_the_paper_stands_beside_scenes_of_the_same_part(pristine_scene, tmp_pat
 
 def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
     """Of a shell in the place of the truth it lacks only what the shell lacks."""
-    shell = measure_shell(pristine_scene)
+    shell = measure_shell(SceneLayout(data=pristine_scene))
     assert 0 < shell["truth_normal_deg"] < 15
     assert 0 < shell["truth_chamfer_m"] < 0.1
     runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path)
     fabricate(runs[0], truth_normal_deg=40.0)
     (truth,) = (table for table in tables(runs, {runs[0].scene: shell}) if table.name == "truth")
     assert list(truth.rows) == ["photo-gs", "the shell itself"]
+
+
+def test_the_paths_of_a_scene_reach_every_run(pristine_scene, tmp_path):
+    """And what a run's settings are hashed from."""
+    paths = ScenePaths(images_path=Path("photos"), colmap_path=Path("model"))
+    ours, splatfacto = grid([pristine_scene], ["shellgs", "splatfacto"], [0], 20, tmp_path, paths=paths)
+    words = " ".join(next(ours.commands()))
+    assert "--pipeline.datamanager.dataparser.images-path photos" in words
+    assert "--pipeline.datamanager.dataparser.colmap-path model" in words
+    assert " ".join(next(splatfacto.commands())).endswith(" facade-data --images-path photos --colmap-path model")
+    with pytest.raises(FileNotFoundError, match="nor a COLMAP model in model"):
+        ours.settle()
 
 
 def test_a_holdout_is_compared_with_all_methods_in_the_same_half(pristine_scene, tmp_path):

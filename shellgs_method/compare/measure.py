@@ -16,9 +16,11 @@ from rich.progress import track
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from dataparsers.cue_maps import find_cues
 from dataparsers.errors import SceneError
-from dataparsers.facade import FacadeDataParserConfig, find_cues
+from dataparsers.facade import FacadeDataParserConfig
 from dataparsers.files import atomic_write
+from dataparsers.layout import SceneLayout
 from shellgs_method.batches import picture_errors, pinhole_camera, reference_errors, reference_maps
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
@@ -114,12 +116,12 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
     }
 
 
-def measure_shell(scene: Path) -> dict[str, float]:
+def measure_shell(layout: SceneLayout) -> dict[str, float]:
     """Figures of the shell itself against the truth, in held-out views and where both are; empty without a truth."""
-    if not {"shell", "truth"} <= {*find_cues(scene)}:
+    if not {"shell", "truth"} <= {*find_cues(layout.data)}:
         return {}
-    dataparser, cpu = FacadeDataParserConfig(data=scene), torch.device("cpu")
-    datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=scene), None, cpu)
+    dataparser, cpu = FacadeDataParserConfig(**vars(layout)), torch.device("cpu")
+    datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=layout.data), None, cpu)
     dataset, figures = datamanager.eval_dataset, []
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
     for index in range(len(dataset)):

@@ -57,7 +57,8 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
 
 def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]) -> Comparison:
     """Write results.md, tables/, the pictures and report.html of what is measured so far."""
-    made = list(tables(runs, {scene: measure_shell(scene) for scene in {run.scene for run in runs}}))
+    layouts = {run.scene: run.paths.of(run.scene) for run in runs}
+    made = list(tables(runs, {scene: measure_shell(layout) for scene, layout in layouts.items()}))
     for table in made:
         table.save(output / "tables")
     with atomic_write(output / "results.md") as file:

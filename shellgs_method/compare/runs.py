@@ -6,17 +6,18 @@ import json
 import re
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 
-from dataparsers.cue_maps import CueMaps
+from dataparsers.cue_maps import CueMaps, find_cues
 from dataparsers.errors import SceneError
-from dataparsers.facade import FacadeDataParserConfig, find_cues, read_views
+from dataparsers.facade import read_views
 from dataparsers.files import atomic_write, content_hash, fingerprint
+from dataparsers.layout import SceneLayout, ScenePaths
 from shellgs_method.ablations import ABLATIONS
 from shellgs_method.trainer import FacadeTrainerConfig
 
@@ -95,6 +96,8 @@ class Run:
     """Halves of the facade that are measured apart, beside the whole."""
     curve_points: int = 0
     """How often all held-out views are measured during the training."""
+    paths: ScenePaths = field(default_factory=ScenePaths)
+    """Where in the scene its files are."""
 
     @property
     def label(self) -> str:
@@ -158,8 +161,10 @@ class Run:
         # optimizers (https://github.com/nerfstudio-project/nerfstudio/issues/3290): these start again.
         if variant.ours and any(self.checkpoints.glob("step-*.ckpt")):
             words += ["--load-dir", self.checkpoints]
-        words += variant.flags
-        return _words(*words, *([] if variant.ours else ["facade-data"]))
+        prefix = "--pipeline.datamanager.dataparser." if variant.ours else "--"
+        paths = [word for name, path in self.paths.chosen.items() for word in (prefix + name, path)]
+        words += [*paths, *variant.flags] if variant.ours else [*variant.flags, "facade-data", *paths]
+        return _words(*words)
 
     @property
     def settings(self) -> dict:
@@ -169,7 +174,7 @@ class Run:
             "flags": list(self.variant.flags),
             "iterations": self.iterations,
             "seed": self.seed,
-            **_scene_settings(self.scene, self.variant.cues),
+            **_scene_settings(self.paths.of(self.scene), self.variant.cues),
         }
 
     def settle(self) -> None:
@@ -189,7 +194,7 @@ class Run:
                 )
             return
         if not self.variant.ours:
-            _refuse_photographs_that_change(self.scene, self.variant.method)
+            _refuse_photographs_that_change(self.paths.of(self.scene), self.variant.method)
         if self.config.exists() and not path.exists():
             raise SceneError(f"{self.folder} is a run that `shellgs compare` did not make: give another --output")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -204,6 +209,7 @@ def grid(
     iterations: int,
     output: Path,
     curve_points: int = 0,
+    paths: ScenePaths | None = None,
 ) -> list[Run]:
     """All runs of a comparison: seed by seed, so that a first table is there early.
 
@@ -231,6 +237,7 @@ def grid(
             output.resolve(),
             () if variant.held_out else halves,
             curve_points,
+            paths or ScenePaths(),
         )
         for seed in dict.fromkeys(seeds)
         for scene in scenes
@@ -238,9 +245,9 @@ def grid(
     ]
 
 
-def _scene_settings(scene: Path, cues: set[str]) -> dict[str, str]:
+def _scene_settings(layout: SceneLayout, cues: set[str]) -> dict[str, str]:
     """Hashes of a scene's cameras and of what its maps were made from."""
-    colmap = FacadeDataParserConfig(data=scene).colmap_folder()
+    scene, colmap = layout.data, layout.colmap_folder()
     cameras = [scene / "transforms.json"] if colmap is None else sorted((scene / colmap).glob("*.*"))
     hashes = {"cameras": fingerprint(*(content_hash(path) for path in cameras))}
     for kind in find_cues(scene):
@@ -250,11 +257,11 @@ def _scene_settings(scene: Path, cues: set[str]) -> dict[str, str]:
     return hashes
 
 
-def _refuse_photographs_that_change(scene: Path, method: str) -> None:
+def _refuse_photographs_that_change(layout: SceneLayout, method: str) -> None:
     """Only our datamanager undistorts and resizes photographs for the cameras of facade-data."""
-    config = FacadeDataParserConfig(data=scene)
+    scene = layout.data
     resized = any(CueMaps.open(scene, kind).manifest.max_image_size for kind in find_cues(scene))
-    if resized or any(view.lens for view in read_views(config)):
+    if resized or any(view.lens for view in read_views(layout)):
         raise SceneError(
             f"{method} takes photographs as they are, and the cameras of {scene} are of undistorted or resized ones: "
             "bring the scene to pinhole cameras at the size of its maps (colmap image_undistorter), or leave it out"
