@@ -212,8 +212,9 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     def _seen_by(self) -> SeenBy:
         """What the training views see."""
         dataset, cameras, depths = self.train_dataset, [], []
+        hidden_by_shell = "shell" in self.eval_dataset.cues
         for index in range(len(dataset)):
-            camera, depth = dataset.camera(index), dataset.shell_depth(index)
+            camera, depth = dataset.camera(index), dataset.shell_depth(index) if hidden_by_shell else None
             step = camera.thinning(MAX_SIZE)
             cameras.append(camera)
             depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())

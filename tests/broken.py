@@ -183,7 +183,7 @@ class Workbench:
         for suffix, version in (("las", "1.2"), ("laz", "1.4")):
             file = laspy.create(point_format=3 if version == "1.2" else 6, file_version=version)
             file.x, file.y, file.z = np.asarray(points).T
-            file.write(folder / f"cloud.{suffix}")
+            file.write(str(folder / f"cloud.{suffix}"))
         return sorted(folder.iterdir())
 
     def _write_picks(self) -> None:

@@ -311,7 +311,7 @@ def test_a_damaged_video_is_not_told_to_be_converted_alone(tmp_path, shellgs, ke
 def las(path: Path, change: Callable[[bytearray], object]) -> None:
     file = laspy.create(point_format=3, file_version="1.2")
     file.x, file.y, file.z = scan(500).T
-    file.write(path)
+    file.write(str(path))
     data = bytearray(path.read_bytes())
     change(data)
     path.write_bytes(data)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from runs import data_of, model_of, trainer_of
 from test_facade_dataparser import parse, write_colmap
 
 from dataparsers.cue_maps import CueMaps
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.sparse_points import read_sparse_points
 from shellgs_method.export import scene_frame
+from shellgs_method.export.runs import TrainedRun
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 
 NATIONAL = np.array([410_123.25, 5_413_987.5, 250.125])
@@ -103,6 +105,24 @@ def test_maps_of_a_national_scene_are_those_of_the_local_one(national, pristine_
         assert (one.mask == other.mask).mean() > 0.999
         close = np.abs(one.depth - other.depth)[both] < MILLIMETRE
         assert close.mean() > 0.999  # but for pixels on the edge of a sill
+
+
+@pytest.mark.usefixtures("eager")
+def test_what_is_exported_from_a_national_scene_stands_where_it_stands_in_the_local_one(
+    national, pristine_scene, tmp_path
+):
+    """The shell is the same in both, and so is its frame."""
+    if (national / "sparse").exists():
+        pytest.skip("its points are others")
+    views = read_views(FacadeDataParserConfig(data=national))
+    cast_views(national, views, Alignment.load(national / ALIGNMENT))
+    placed = []
+    for name, scene in (("here", pristine_scene), ("there", national)):
+        trainer = trainer_of(scene, tmp_path / name, "photo_gs")
+        run = TrainedRun(model_of(trainer), data_of(trainer))
+        placed.append(run.splats().means.double().numpy() + run.frame.offset)
+    assert np.abs(placed[0]).max() > 1000
+    np.testing.assert_allclose(placed[1], placed[0], atol=MILLIMETRE)
 
 
 def test_results_without_a_shell_are_shifted_by_whole_hundreds():

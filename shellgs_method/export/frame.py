@@ -118,8 +118,8 @@ def scene_frame(up: UpAxis = "z", middle: Float64[np.ndarray, " 3"] | None = Non
         up: the axis that points up.
         middle: somewhere in the middle of the scene; the origin if not given.
     """
-    far = middle is not None and np.abs(middle).max() > FAR
-    offset = np.round(middle, -2) if far else np.zeros(3)
+    middle = np.zeros(3) if middle is None else middle
+    offset = np.round(middle, -2) if np.abs(middle).max() > FAR else np.zeros(3)
     to_scene = np.eye(4)
     to_scene[:3, 3] = offset
     return Frame("scene", to_scene, offset, metric=False, up=up)

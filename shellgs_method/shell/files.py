@@ -105,7 +105,7 @@ def _read_las(path: Path) -> Geometry:
         import lazrs  # noqa: F401  # laspy itself would not say which of its backends to install
     check_las(path)
     with laspy.open(path) as file:  # in pieces: what a damaged file only claims to hold takes no memory
-        pieces = [np.stack([piece.x, piece.y, piece.z], axis=1) for piece in file.chunk_iterator(1_000_000)]
+        pieces = [np.stack([np.array(piece[x]) for x in "xyz"], axis=1) for piece in file.chunk_iterator(1_000_000)]
         claimed = file.header.point_count
     points = np.concatenate([NOWHERE, *pieces])
     if len(points) != claimed:
