@@ -82,7 +82,8 @@ class MapRecord:
             or not 0 < self.width * self.height <= MAX_PIXELS
         ):
             raise ValueError(f"it is of {self.width!r}x{self.height!r} pixels")
-        if np.array(self.K, dtype=np.float64).shape != (3, 3) or np.array(self.viewmat, np.float64).shape != (4, 4):
+        K, viewmat = (np.array(matrix, dtype=np.float64) for matrix in (self.K, self.viewmat))
+        if K.shape != (3, 3) or viewmat.shape != (4, 4) or not np.isfinite([K.sum(), viewmat.sum()]).all():
             raise ValueError("its camera has no intrinsics of 3x3 or no pose of 4x4 numbers")
         if not is_number(self.supported) or not (self.mean_depth is None or is_number(self.mean_depth)):
             raise TypeError("its share of supported pixels or its mean depth is no number")

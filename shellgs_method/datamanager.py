@@ -44,12 +44,12 @@ class FacadeDataset(InputDataset):
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
     kind lacks that kind's keys. With ``bands``, all masks are those of pixels whose wall lies in them. ``seen_by``
     tells of the training views: then ``seen`` is true where these have seen what a pixel shows. ``kinds`` are the maps
-    that are read, of those that the scene has, and with ``any_size`` they are resampled where they do not fit.
+    that are read, all that the scene has if not set, and with ``any_size`` they are resampled where they do not fit.
     """
 
     bands: Bands | None = None
     seen_by: Callable[[], SeenBy] | None = None
-    kinds: Collection[str] = tuple(REFERENCES)
+    kinds: Collection[str] | None = None
     any_size: bool = False
     held: bool = True
     """Whether maps stay in memory with the photographs; else they are read whenever they are needed."""
@@ -57,7 +57,8 @@ class FacadeDataset(InputDataset):
     @property
     def cues(self) -> dict[str, CueMaps]:
         """The sets of maps that are read, by kind."""
-        return {kind: maps for kind, maps in self._dataparser_outputs.metadata["cues"].items() if kind in self.kinds}
+        found = self._dataparser_outputs.metadata["cues"]
+        return {kind: maps for kind, maps in found.items() if self.kinds is None or kind in self.kinds}
 
     @property
     def views(self) -> list[View]:
@@ -160,6 +161,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         dataset = super().create_train_dataset()
         held_out = self._held_out
         dataset.bands = held_out and held_out.others
+        if self.test_mode != "val":
+            dataset.kinds = ()
         return dataset
 
     def create_eval_dataset(self) -> FacadeDataset:
@@ -167,7 +170,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         dataset = super().create_eval_dataset()
         dataset.bands = self._held_out
         dataset.seen_by = lambda: self._seen_by
-        dataset.any_size = True
+        dataset.any_size, dataset.kinds = True, tuple(REFERENCES)
         return dataset
 
     def _can_be_measured(self, kind: str, maps: CueMaps) -> bool:

@@ -375,6 +375,23 @@ def test_one_point_absurdly_far_away_does_not_stop_a_cloud_from_being_meshed(tmp
     assert "dropped 2 of 3002 points" in caplog.text
 
 
+def test_a_cloud_of_too_few_points_is_refused_without_viewpoints_too(tmp_path):
+    np.savetxt(tmp_path / "scan.xyz", scan(3))
+    with pytest.raises(SceneError, match=r"scan\.xyz: the points make no surface with the mesher 'planes' \(\[Open3D"):
+        load_shell(tmp_path / "scan.xyz")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [lambda data: data[:100], lambda data: b"not a matrix", lambda data: data.replace(b"(4, 4)", b"(4, 9**9)")],
+)
+def test_a_matrix_in_a_damaged_npy_is_refused(scene, shellgs, damage):
+    np.save(scene / "matrix.npy", np.eye(4))
+    (scene / "matrix.npy").write_bytes(damage((scene / "matrix.npy").read_bytes())[:200])
+    words = ("align", scene, scene / "shell" / "facade.ply", "--matrix", scene / "matrix.npy")
+    assert "matrix.npy: this is not a 4x4 matrix" in refused(shellgs, scene, *words)
+
+
 def test_sfm_points_that_cannot_be_meant_are_left_out_and_counted(scene, caplog):
     folder = model(scene)
     for k, point in enumerate(("1e12 0 0", "nan 0 0")):
@@ -482,6 +499,7 @@ def test_a_source_that_is_no_file_is_never_read(scene):
         {"width": 10**9, "height": 10**9},
         {"K": "none"},
         {"K": [[1]]},
+        {"K": [[None] * 3] * 3},
         {"viewmat": [1, 2]},
         {"supported": "all"},
         {"mean_depth": [1]},

@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay, KDTree, QhullError
 
 from dataparsers.errors import SceneError
 from dataparsers.strays import sound
-from shellgs_method.open3d import import_open3d
+from shellgs_method.open3d import import_open3d, reason
 
 log = logging.getLogger(__name__)
 
@@ -100,8 +100,11 @@ def mesh_cloud(
     kept = points[meant]
     origin = np.median(kept, axis=0)  # what follows is relative to it: georeferenced digits would swamp squares
     kept = kept - origin
-    cloud = _Cloud.of(kept, viewpoints - origin)
-    parts = list(_MESHERS[mesher](cloud))
+    try:
+        cloud = _Cloud.of(kept, viewpoints - origin)
+        parts = list(_MESHERS[mesher](cloud))
+    except RuntimeError as error:  # Open3D's, of too few points or of the like
+        raise SceneError(f"the points make no surface with the mesher {mesher!r} ({reason(error)})") from error
     vertices, faces = _merge(parts)
     if len(faces) == 0:
         raise SceneError(f"the points make no surface with the mesher {mesher!r}: try another, or a denser cloud")

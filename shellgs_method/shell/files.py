@@ -12,6 +12,7 @@ from jaxtyping import Float64, Int64
 
 from dataparsers.errors import SceneError
 from dataparsers.headers import check_las, check_ply
+from shellgs_method.open3d import reason
 
 log = logging.getLogger(__name__)
 
@@ -57,8 +58,7 @@ def read_geometry(path: Path) -> Geometry:
         extra = "e57" if path.suffix.lower() == ".e57" else "las"
         raise SceneError(f"the shell {path} needs {error.name}: run `pip install 'shellgs[{extra}]'`") from error
     except Exception as error:  # each format's reader has its own kinds of error for a damaged file
-        reason = " ".join(str(error).split())
-        raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason})") from error
+        raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason(error)})") from error
     _warn_of_float32(geometry.vertices, path)
     return geometry
 
