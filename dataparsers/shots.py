@@ -107,8 +107,8 @@ def inside(scene: Path, name: str, where: str) -> Path:
         SceneError: the path leads out of the scene.
     """
     path = PurePosixPath(str(name))
-    if path.is_absolute() and path.is_relative_to(scene.absolute().as_posix()):
-        path = path.relative_to(scene.absolute().as_posix())
+    for folder in (scene.absolute().as_posix(), scene.resolve().as_posix()):
+        path = path.relative_to(folder) if path.is_relative_to(folder) else path
     if path.is_absolute() or ".." in path.parts or not path.parts or "\0" in str(path):
         raise SceneError(f"{where} names the file {str(name)!r}, which is not inside the scene: move it there")
     return scene / path

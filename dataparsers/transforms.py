@@ -16,6 +16,8 @@ from dataparsers.headers import check_ply
 from dataparsers.shots import DISTORTION, Recording, Shot, in_order, inside, shot
 
 NAME = "transforms.json"
+GREY = 128
+"""Of points whose file has no colours."""
 # What old versions of ns-process-data did to COLMAP's frame without saying so.
 _UNSAID = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -64,12 +66,13 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
         check_ply(path)
         cloud = trimesh.load(path, process=False)
         positions = np.asarray(cloud.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
-        colours = np.asarray(cloud.visual.vertex_colors if hasattr(cloud, "visual") else cloud.colors)[:, :3]  # pyright: ignore
+        colours = np.asarray(cloud.visual.vertex_colors, np.uint8)  # pyright: ignore[reportAttributeAccessIssue]
     except Exception as error:  # trimesh has its own kinds of error for damaged files
         reason = " ".join(str(error).split())
         raise SceneError(f"the SfM points {path} cannot be read ({reason}): make them again") from error
     undo = np.linalg.inv(_applied(meta, scene))
-    return positions @ undo[:3, :3].T + undo[:3, 3], colours.astype(np.uint8)
+    colours = colours[:, :3] if len(colours) == len(positions) else np.full(positions.shape, GREY, np.uint8)
+    return positions @ undo[:3, :3].T + undo[:3, 3], colours
 
 
 def _shot(scene: Path, frame: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Shot:

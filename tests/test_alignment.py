@@ -721,7 +721,6 @@ def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
     assert (judged.mesher, bool(judged.verdict)) == ("bpa", True)
     assert "10 views cast" in shellgs("cast", scanned)
     judged.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
-    shellgs("align", scanned)
     assert set(used) == {"bpa"}
     assert "judged with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
     assert Alignment.load(scanned / ALIGNMENT) == replace(judged, mesher="planes", verdict="", figures={})

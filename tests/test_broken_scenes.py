@@ -27,6 +27,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import load_photograph
 from dataparsers.sparse_points import read_sparse_points
 from shellgs_method import cli
+from shellgs_method.cues.maps import Fits
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
 Command = Callable[..., str]
@@ -530,6 +531,13 @@ def test_an_array_that_claims_to_be_huge_is_not_allocated(scene):
     view = read_views(FacadeDataParserConfig(data=scene))[0]
     with pytest.raises(SceneError, match=r"frame_00001.png.*its depth is float32 \[4000000, 4000000\]"):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
+
+
+@pytest.mark.parametrize("views", ["all", {"a": 1}, {"a": []}, {"a": {}}, {"a": {"residual": "small"}}, None])
+def test_damaged_fits_are_made_again(scene, views):
+    maps = CueMaps.create(scene, "mono", command="shellgs mono {scene}")
+    (maps.folder / "fits.json").write_text(json.dumps({"sources": {"max_image_size": None}, "views": views}))
+    assert Fits.open(maps).views == {}
 
 
 # The disk

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dataparsers.camera import positions, upwards
-from dataparsers.cue_maps import CueMaps, find_cues, source_hash
+from dataparsers.cue_maps import CueMaps, source_hash
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
-from shellgs_method.shell.alignment import ALIGNMENT, Alignment
+from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.bays import facade_axes
 from shellgs_method.shell.correspondences import Correspondence, measured_again
 from shellgs_method.shell.mesh import ShellMesh
@@ -154,8 +155,8 @@ def judge(
         return validation
     judged = replace(placement.alignment, verdict=validation.verdict, figures=validation.figures())
     judged.save(target)
-    if target == scene / ALIGNMENT and "shell" in find_cues(scene):
+    with suppress(FileNotFoundError, SceneError):  # none, or damaged, of which whoever reads them is told
         maps = CueMaps.open(scene, "shell")
-        if maps.manifest.sources.get(ALIGNMENT.as_posix()) == source_hash(target):
+        if maps.manifest.sources.get(target.relative_to(scene).as_posix()) == source_hash(target):
             maps.with_error(judged.error)
     return validation
