@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import torchvision
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from rich.progress import track
 
-from dataparsers.errors import refusals_end_the_program
+from dataparsers.errors import SceneError, refusals_end_the_program
+from shellgs_method.checkpoints import check_gaussians
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.model import FacadeModel
@@ -39,6 +41,26 @@ class FacadePipeline(VanillaPipeline):
             assert isinstance(datamanager, FacadeDataManager)
             if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run brings all its Gaussians
                 model.add_seeds(datamanager.shell_seeds(model.config.seed_spacing, model.config.max_seeds))
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint's Gaussians.
+
+        Damaged ones, and those of other harmonics than these settings give, end the program with a sentence.
+        """
+        with refusals_end_the_program():
+            try:
+                check_gaussians(loaded_state)
+            except SceneError as error:
+                raise SceneError(f"the checkpoint cannot be used: {error}") from error
+            assert isinstance(self.model, FacadeModel)
+            for name, parameter in self.model.gauss_params.items():
+                stored = loaded_state[f"_model.gauss_params.{name}"]
+                if stored.shape[1:] != parameter.shape[1:]:
+                    raise SceneError(
+                        f"the checkpoint's {name} are of shape {list(stored.shape)}, where these settings (sh_degree) "
+                        f"want {list(parameter.shape)}: load it with the settings that it was trained with"
+                    )
+        super().load_pipeline(loaded_state, step)
 
     def get_average_image_metrics(
         self, data_loader, image_prefix: str, step: int | None = None, output_path: Path | None = None, get_std=False

@@ -14,6 +14,7 @@ from runs import held_out, model_of, render, trainer_of
 from scipy.spatial.transform import Rotation
 
 from dataparsers.camera import Camera
+from dataparsers.errors import SceneError
 from shellgs_method.batches import pinhole_camera
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry import geometry_channels
@@ -221,7 +222,7 @@ def test_a_failed_save_leaves_the_last_checkpoint(trained, monkeypatch):
         raise OSError("No space left on device")
 
     monkeypatch.setattr(torch, "save", full_disk)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(SceneError, match=r"No space left.* disk .*--load-dir"):
         trained.save_checkpoint(77)
     assert sorted(trained.checkpoint_dir.iterdir()) == before
     assert not list(trained.base_dir.glob("checkpoint-*"))
