@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class SceneError(ValueError):
@@ -25,6 +26,19 @@ def explained(error: OSError) -> str:
     if why := _DISK.get(error.errno or 0):
         return f"{name} cannot be written, {why}: make room and give the same command again; what was there is kept"
     return f"{name} cannot be used: {(error.strerror or str(error)).lower()}"
+
+
+def check_output(path: Path) -> None:
+    """Refuse a place that no file can be written to, before the work that makes it.
+
+    Raises:
+        SceneError: it is a folder, or lies below a file.
+    """
+    if path.is_dir():
+        raise SceneError(f"{path} is a folder: name the file that is to be written")
+    above = next(parent for parent in path.absolute().parents if parent.exists())
+    if not above.is_dir():
+        raise SceneError(f"{path} cannot be written: {above} is a file, not a folder")
 
 
 @contextmanager

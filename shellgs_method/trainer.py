@@ -24,8 +24,8 @@ from dataparsers.files import atomic_write
 from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.config_file import guard_nerfstudio
 from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
+from shellgs_method.folders import held
 from shellgs_method.limits import check_settings
-from shellgs_method.locks import held
 
 if TYPE_CHECKING:
     from shellgs_method.model import FacadeModel

@@ -18,7 +18,7 @@ from runs import data_of, model_of, render, trainer_of
 
 import method_configs
 from shellgs_method.faults import MAX_FAULTS
-from shellgs_method.locks import held
+from shellgs_method.folders import held
 from shellgs_method.trainer import FacadeTrainer
 
 pytestmark = pytest.mark.usefixtures("eager")
