@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import psutil
 import pytest
@@ -14,7 +11,7 @@ import torch
 import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import Trainer
-from runs import data_of, model_of, render, trainer_of
+from runs import data_of, model_of, render, small_disk, trainer_of
 
 import method_configs
 from shellgs_method.faults import MAX_FAULTS
@@ -211,17 +208,6 @@ def test_what_a_killed_save_left_goes_at_the_next_start_and_what_is_being_saved_
 
 
 # disks
-
-
-@contextmanager
-def small_disk(largest: int) -> Iterator[None]:
-    """A disk that takes no file of more bytes."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_a_full_disk_ends_a_training_with_its_name_and_keeps_the_checkpoint_before(pristine_scene, tmp_path):

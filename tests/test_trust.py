@@ -12,13 +12,14 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 import yaml
 from nerfstudio.configs.base_config import LoggingConfig
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
 from nerfstudio.utils.eval_utils import eval_setup
-from runs import trainer_of
+from runs import small_disk, trainer_of
 
 from dataparsers.errors import SceneError
 from shellgs_method import cli
@@ -256,3 +257,48 @@ def test_a_run_whose_folder_was_moved_is_found_beside_its_config(run, tmp_path):
 
 def test_a_run_without_its_config_is_named(tmp_path, monkeypatch):
     assert "does not exist" in refusal(monkeypatch, "evaluate", tmp_path / "config.yml")
+
+
+# outputs
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["evaluate", "--output-path", "folder"], "folder is a folder"),
+        (["evaluate", "--output-path", "file/eval.json"], "is a file, not a folder"),
+        (["evaluate", "--output-path", "eval.json", "--pictures", "file"], "file is a file: name a folder"),
+        (["splats", "--output", "folder"], "folder is a folder"),
+        (["mesh", "--output", "folder.ply"], "folder.ply is a folder"),
+        (["mesh", "--output", "file/mesh.ply"], "is a file, not a folder"),
+        (["mesh", "--faces", "0"], "at least 4 --faces"),
+        (["mesh", "--voxel", "nan"], "a --voxel above 0"),
+        (["mesh", "--margin", "-1"], "a --margin from 0"),
+    ],
+)
+def test_a_place_or_a_number_that_cannot_be_is_refused_before_the_work(run, monkeypatch, words, why):
+    monkeypatch.chdir(run)
+    Path("file").touch()
+    for name in ("folder", "folder.ply"):
+        Path(name).mkdir()
+    before = files(run)
+    assert why in refusal(monkeypatch, words[0], "config.yml", *words[1:])
+    assert files(run) == before
+
+
+@pytest.mark.parametrize("command", ["evaluate", "splats", "mesh"])
+def test_a_full_disk_is_told_with_its_name_and_harms_nothing_that_is_there(run, monkeypatch, command):
+    target = {"evaluate": run / "eval.json", "splats": run / "splats.ply", "mesh": run / "mesh.ply"}[command]
+    target.write_text("of before")
+    before = files(run)
+    ball = trimesh.creation.icosphere()
+    ball.metadata["voxel"] = 1.0
+    monkeypatch.setattr("shellgs_method.export.fuse", lambda *_: ball)
+    monkeypatch.setattr("shellgs_method.export.runs.mesh_errors", lambda *_: {})
+    flag = "--output-path" if command == "evaluate" else "--output"
+    with small_disk(2000):
+        said = refusal(
+            monkeypatch, command, run / "config.yml", flag, target, *(["--margin", "1e9"] * (command == "mesh"))
+        )
+    assert f"{target} cannot be written, the disk" in said
+    assert files(run) == before

@@ -51,12 +51,13 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
     failures: dict[Run, str] = {}
     for run in runs:
         try:
-            run.settle()
+            run.check()
         except DamagedRunError as error:
             failures[run] = str(error)
-        else:
-            _remove_damaged(run, console)
     usable = [run for run in runs if run not in failures]
+    for run in usable:
+        run.settle()
+        _remove_damaged(run, console)
     unfinished = [run for run in usable if not run.finished]
     console.print(f"{len(usable) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
     if unfinished:

@@ -213,16 +213,16 @@ class Run:
             **scene_settings(self.scene, config),
         }
 
-    def settle(self) -> None:
-        """Write the settings into the run's folder, where a later comparison finds them.
+    def check(self) -> None:
+        """Refuse a run that cannot be made, or whose folder is another's; everything is left as it is.
 
         Raises:
-            SceneError: the folder holds a run of other settings that has come to a checkpoint; it is left as it is.
+            SceneError: the flags cannot be, or the folder holds a run of other settings that has come to a checkpoint.
             DamagedRunError: the settings that lie there cannot be read.
         """
         recover_folder(self.folder)
-        path, settings = self.folder / "settings.json", self.settings
-        if path.exists() and any(self.checkpoints.glob("step-*.ckpt")):
+        path, settings = self._recorded, self.settings
+        if self._begun:
             before = _settings_before(path)
             # An earlier build did not write all of them; what it did not write it did not have, or as the default.
             known = settings | default_settings(self.variant.method) | before
@@ -237,9 +237,27 @@ class Run:
             _refuse_photographs_that_change(self.scene, self.variant.method)
         if self.config.exists() and not path.exists():
             raise SceneError(f"{self.folder} is a run that `shellgs compare` did not make: give another --output")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as file:
-            file.write(json.dumps(settings, indent=2).encode())
+
+    def settle(self) -> None:
+        """Write the settings into the run's folder, where a later comparison finds them.
+
+        Raises:
+            SceneError: as :meth:`check`.
+        """
+        self.check()
+        if not self._begun:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self._recorded) as file:
+                file.write(json.dumps(self.settings, indent=2).encode())
+
+    @property
+    def _recorded(self) -> Path:
+        return self.folder / "settings.json"
+
+    @property
+    def _begun(self) -> bool:
+        """Whether a run that a comparison made has come to a checkpoint."""
+        return self._recorded.exists() and any(self.checkpoints.glob("step-*.ckpt"))
 
 
 def _settings_before(path: Path) -> dict:
