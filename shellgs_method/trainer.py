@@ -28,7 +28,7 @@ from shellgs_method.folders import held
 from shellgs_method.limits import check_settings
 
 if TYPE_CHECKING:
-    from shellgs_method.model import FacadeModel
+    from shellgs_method.pipeline import FacadePipeline
 
 PARTIAL = "checkpoint-"
 """How the folder of a checkpoint that is being written begins."""
@@ -115,6 +115,7 @@ class FacadeTrainer(Trainer):
     config: FacadeTrainerConfig
 
     optimizers: GuardedOptimizers
+    pipeline: FacadePipeline
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Everything that training needs."""
@@ -137,6 +138,7 @@ class FacadeTrainer(Trainer):
             return
         self._last_step, self._faults = run_length - 1, 0
         with refusals_end_the_program():
+            self.pipeline.go_on()
             super().train()
 
     def train_iteration(self, step: int):
@@ -158,7 +160,7 @@ class FacadeTrainer(Trainer):
 
     def _tell_fault(self, step: int, losses: dict[str, torch.Tensor]) -> None:
         self._faults += 1
-        forget_gradients(self._model.info)
+        forget_gradients(self.pipeline.model.info)
         terms = [name for name, value in losses.items() if not bool(value.isfinite())]
         what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
         view = self.pipeline.datamanager.last_trained
@@ -173,7 +175,7 @@ class FacadeTrainer(Trainer):
             )
 
     def _remove_broken_gaussians(self, step: int) -> None:
-        model = self._model
+        model = self.pipeline.model
         count = remove_broken(model.gauss_params, self.optimizers.optimizers, model.strategy_state)
         if count:
             CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were no numbers, and are taken out.")
@@ -182,10 +184,6 @@ class FacadeTrainer(Trainer):
                     f"the training ends at step {step}, since no Gaussian is a number any more: lower the learning "
                     f"rates; the last good checkpoint is kept in {self.checkpoint_dir}"
                 )
-
-    @property
-    def _model(self) -> FacadeModel:
-        return self.pipeline.model  # pyright: ignore[reportReturnType]
 
     def _after_train(self) -> None:
         self.step = min(self.step, self._last_step)
