@@ -424,7 +424,7 @@ def repaint(path: Path) -> None:
 def move_points(path: Path) -> None:
     cloud = trimesh.load(path)
     cloud.apply_translation([0.1, 0, 0])
-    path.write_bytes(cloud.export(file_type="ply"))
+    cloud.export(path)
 
 
 @pytest.mark.usefixtures("fake_commands")
@@ -577,6 +577,7 @@ def test_our_figures_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_
     trainer.config.save_config()
     trainer.train()
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    assert isinstance(pipeline, FacadePipeline)
     theirs = pipeline.get_average_eval_image_metrics()
     ours = measure(trainer.base_dir / "config.yml")["results"]
     assert ours["psnr"] == pytest.approx(theirs["psnr"], rel=1e-5)
