@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Optional, Union
 
@@ -13,7 +14,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from dataparsers.errors import SceneError, refusals_end_the_program
+from dataparsers.errors import SceneError, check_output, refusals_end_the_program
 from dataparsers.layout import ScenePaths
 from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
@@ -345,6 +346,8 @@ def mesh(
 
     output = output or config.with_name("mesh.ply")
     check_mesh_format(output)
+    if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
+        raise SceneError("a mesh has at least 4 --faces, a --voxel above 0 and a --margin from 0")
     run = TrainedRun.load(config, up)
     made = decimate(run.facade(fuse(run.views(), run.box(margin), voxel), margin), faces)
     figures = mesh_errors(run, made)
@@ -376,6 +379,7 @@ def splats(
     from shellgs_method.export.runs import TrainedRun
 
     output = output or config.with_name("splats.ply")
+    check_output(output)
     run = TrainedRun.load(config, up)
     count = write_splats(output, run.splats())
     run.frame.describe(output, {"splats": count})
@@ -420,6 +424,8 @@ def compare(
     from shellgs_method.compare.runs import grid
     from shellgs_method.compare.wandb_report import log_comparison, log_in
 
+    if jobs < 1:
+        raise SceneError(f"--jobs {jobs} would start nothing: give 1 or more")
     if wandb:
         log_in()
     runs = grid(scenes, methods, seeds, iterations, output, curve_points, paths)

@@ -73,4 +73,4 @@ def offline_wandb(monkeypatch) -> Iterator[None]:
     import wandb  # slow
 
     yield
-    wandb.finish()
+    wandb.teardown()
