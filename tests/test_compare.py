@@ -140,10 +140,8 @@ def test_the_paths_of_a_scene_reach_every_run(pristine_scene, tmp_path):
     """And what a run's settings are hashed from."""
     paths = ScenePaths(images_path=Path("photos"), colmap_path=Path("model"))
     ours, splatfacto = grid([pristine_scene], ["shellgs", "splatfacto"], [0], 20, tmp_path, paths=paths)
-    words = " ".join(next(ours.commands()))
-    assert "--pipeline.datamanager.dataparser.images-path photos" in words
-    assert "--pipeline.datamanager.dataparser.colmap-path model" in words
-    assert " ".join(next(splatfacto.commands())).endswith(" facade-data --images-path photos --colmap-path model")
+    for run in (ours, splatfacto):
+        assert " ".join(next(run.commands())).endswith(" facade-data --images-path photos --colmap-path model")
     with pytest.raises(FileNotFoundError, match="nor a COLMAP model in model"):
         ours.settle()
 

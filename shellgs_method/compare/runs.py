@@ -185,10 +185,11 @@ class Run:
         # optimizers (https://github.com/nerfstudio-project/nerfstudio/issues/3290): these start again.
         if variant.ours and any(self.checkpoints.glob("step-*.ckpt")):
             words += ["--load-dir", self.checkpoints]
-        prefix = "--pipeline.datamanager.dataparser." if variant.ours else "--"
-        paths = [word for name, path in self.paths.chosen.items() for word in (prefix + name, path)]
-        words += [*paths, *variant.flags] if variant.ours else [*variant.flags, "facade-data", *paths]
-        return _words(*words)
+        words += variant.flags
+        paths = [word for name, path in self.paths.chosen.items() for word in (f"--{name}", path)]
+        if "facade-data" not in words and (paths or not variant.ours):
+            words += ["facade-data"]
+        return _words(*words, *paths)
 
     @cached_property
     def settings(self) -> dict:
