@@ -41,7 +41,7 @@ def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpec
             "scales": _adam(0.005),
             "quats": _adam(0.001),
         },
-        viewer=ViewerConfig(quit_on_train_completion=True),
+        viewer=ViewerConfig(quit_on_train_completion=True, websocket_host="127.0.0.1"),
         vis="viewer",
     )
     return MethodSpecification(config=config, description=description)

@@ -43,6 +43,12 @@ class Camera:
             return self
         width = max(1, round(self.width * max_image_size / longest))
         height = max(1, round(self.height * max_image_size / longest))
+        return self.resized(width, height)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same photograph resized to so many pixels."""
+        if (width, height) == (self.width, self.height):
+            return self
         stretch = self.K.new_tensor([width / self.width, height / self.height, 1.0])
         return Camera(self.viewmat, stretch[:, None] * self.K, width, height)
 

@@ -7,51 +7,38 @@ writing a view touches one file, and an interrupted set is a smaller set, never 
 
 from __future__ import annotations
 
-import io
 import json
+import re
 import shlex
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path, PurePosixPath
-from typing import IO, TypeVar
-
-import numpy as np
-from jaxtyping import Bool, Float16, Float32
-from torch import Tensor
+from typing import TypeVar
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write, content_hash
+from dataparsers.files import atomic_write, content_hash, fingerprint, read_json, remove_leftovers
+from dataparsers.map_files import (
+    FORMAT,
+    UNREADABLE,
+    CueMap,
+    MapRecord,
+    are_words,
+    damage,
+    difference,
+    is_number,
+    read_arrays,
+    read_record,
+    resampled,
+    write_map,
+)
 
-FORMAT = 1
+__all__ = ["CueMap", "CueMaps", "Manifest", "MapRecord", "find_cues", "relative_path", "source_hash"]
 
 T = TypeVar("T")
-
-# A pose that went through nerfstudio's float32 cameras comes back within 1e-6 rad and 1e-6 of the scene's size; a
-# camera that was refined, undistorted or resized differently is off by far more than these. 5e-4 of the image's size
-# is half a pixel at 1000: nerfstudio's integer rounding of a downscaled image passes, another focal length does not.
-ROTATION_TOLERANCE = 1e-4  # rad
-POSITION_TOLERANCE = 1e-4  # of the view's mean depth
-INTRINSICS_TOLERANCE = 5e-4  # of the image's longer side
-
-
-@dataclass(frozen=True)
-class CueMap:
-    """What is known of the surface seen in each pixel of one view; the camera frame is OpenCV's.
-
-    Attributes:
-        depth: forward z-depth in scene units, 0 where there is none.
-        normal: unit normal in the camera frame, facing the camera.
-        mask: true where the maps supervise.
-    """
-
-    depth: Float32[np.ndarray, "H W"]
-    normal: Float16[np.ndarray, "H W 3"]
-    mask: Bool[np.ndarray, "H W"]
 
 
 @dataclass(frozen=True)
@@ -77,20 +64,20 @@ class Manifest:
     shellgs: str = field(default_factory=lambda: _version())
     format: int = FORMAT
 
-
-@dataclass(frozen=True)
-class MapRecord:
-    """The camera and the sources one map was made for, stored inside the map."""
-
-    image: str
-    width: int
-    height: int
-    K: list[list[float]]
-    viewmat: list[list[float]]
-    supported: float  # share of the pixels in the mask
-    mean_depth: float | None  # over the mask; None where it is empty
-    sources: dict[str, str]
-    format: int = FORMAT
+    def __post_init__(self) -> None:
+        """Refuse what no set of maps has: json may hold anything."""
+        if not isinstance(self.command, str) or not are_words(self.sources):
+            raise TypeError("its command or its sources are no words")
+        for source in self.sources:
+            if ".." in PurePosixPath(source).parts:
+                raise ValueError(f"its source {source!r} is not inside the scene")
+        size = self.max_image_size
+        if size is not None and (type(size) is not int or size < 1):
+            raise ValueError(f"its max_image_size is {size!r}")
+        for name in ("metres_per_unit", "error"):
+            value = getattr(self, name)
+            if value is not None and not (is_number(value) and (value > 0 or (name == "error" and value == 0))):
+                raise ValueError(f"its {name} is {value!r}")
 
 
 @dataclass(frozen=True)
@@ -119,12 +106,9 @@ class CueMaps:
 
         Maps already there stay, and count while they match it.
         """
-        hashes = {relative_path(path, scene): content_hash(path) for path in sources} | dict(revisions or {})
-        manifest = Manifest(command, hashes, metres_per_unit, max_image_size, licence, error)
-        maps = cls(scene, kind, manifest)
-        maps.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(maps.folder / "manifest.json") as file:
-            file.write(json.dumps(asdict(manifest), indent=1).encode())
+        hashes = {relative_path(path, scene): source_hash(path) for path in sources} | dict(revisions or {})
+        maps = cls(scene, kind, Manifest(command, hashes, metres_per_unit, max_image_size, licence, error))
+        maps._write_manifest()
         return maps
 
     @classmethod
@@ -139,12 +123,24 @@ class CueMaps:
         if not path.is_file():
             raise FileNotFoundError(f"{scene} has no {kind} maps: {path} is missing")
         try:
-            manifest = Manifest(**json.loads(path.read_bytes()))
+            manifest = Manifest(**read_json(path))
         except (ValueError, TypeError) as error:
             raise SceneError(f"{path} is damaged ({error}): make the {kind} maps again") from error
         if manifest.format != FORMAT:
-            raise SceneError(f"{path} is of format {manifest.format}, not {FORMAT}: make the {kind} maps again")
+            raise SceneError(f"{path} is of format {manifest.format!r}, not {FORMAT}: make the {kind} maps again")
         return cls(scene, kind, manifest)
+
+    def with_error(self, error: float | None) -> CueMaps:
+        """The same set where it has become known how far the surface may be off; the maps stay as they are."""
+        maps = replace(self, manifest=replace(self.manifest, error=error))
+        maps._write_manifest()
+        return maps
+
+    def _write_manifest(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self.folder)
+        with atomic_write(self.folder / "manifest.json") as file:
+            file.write(json.dumps(asdict(self.manifest), indent=1).encode())
 
     @property
     def folder(self) -> Path:
@@ -159,28 +155,45 @@ class CueMaps:
     def record(self, name: str) -> MapRecord | None:
         """What the view's map was made for, without decoding it; None when the view has no map."""
         path = self._path_of(name)
-        return None if path is None else self._attempt(_read_record, path, name)
+        return None if path is None else self._attempt(read_record, path, name)
 
-    def read(self, name: str, camera: Camera) -> CueMap | None:
+    def read(self, name: str, camera: Camera, *, any_size: bool = False) -> CueMap | None:
         """The map of a view, or None when it has none.
 
         Args:
             name: the image's path relative to the scene, with forward slashes.
-            camera: the camera the map is to be used with, of the map's size.
+            camera: the camera the map is to be used with.
+            any_size: take a map of the same camera at another size, and resample it.
 
         Raises:
             SceneError: the file is damaged, or its map belongs to another camera, shell or alignment.
         """
+        own = self.check(name, camera, any_size=any_size)
+        if own is None:
+            return None
+        cue = self._attempt(lambda path: read_arrays(path, own), self._path(name), name)
+        if problem := damage(cue, own):
+            raise self._refusal(name, problem)
+        return cue if (own.width, own.height) == (camera.width, camera.height) else resampled(cue, camera)
+
+    def check(self, name: str, camera: Camera, *, any_size: bool = False) -> Camera | None:
+        """The camera that a view's map was made for, or None when it has no map, without decoding it.
+
+        Raises:
+            SceneError: as :meth:`read`, of what the map's record tells.
+        """
         path = self._path_of(name)
         if path is None:
             return None
-        record = self._attempt(_read_record, path, name)
-        if problem := self._stale or _difference(record, camera, self.manifest):
+        record = self._attempt(read_record, path, name)
+        own = record.camera
+        if not any_size and (own.width, own.height) != (camera.width, camera.height):
+            sizes = f"it is {own.width}x{own.height} pixels, the camera {camera.width}x{camera.height}"
+            raise self._refusal(name, sizes, max(camera.width, camera.height))
+        fitted = own.resized(camera.width, camera.height)
+        if problem := self._stale or difference(record, fitted, camera, self.manifest.sources):
             raise self._refusal(name, problem)
-        cue = self._attempt(_read_arrays, path, name)
-        if problem := _damage(cue, camera):
-            raise self._refusal(name, problem)
-        return cue
+        return own
 
     def current(self, name: str, camera: Camera) -> bool:
         """Whether the view has a sound map for this camera and this manifest, so that it need not be made again."""
@@ -191,23 +204,10 @@ class CueMaps:
 
     def write(self, name: str, cue: CueMap, camera: Camera) -> None:
         """Store the map of a view; the file appears whole or not at all."""
-        if problem := _damage(cue, camera):
+        if problem := damage(cue, camera):
             raise SceneError(f"the {self.kind} map of view {name!r} cannot be stored: {problem}")
-        record = MapRecord(
-            image=name,
-            width=camera.width,
-            height=camera.height,
-            K=_float64(camera.K).tolist(),
-            viewmat=_float64(camera.viewmat).tolist(),
-            supported=float(cue.mask.mean()),
-            mean_depth=float(cue.depth[cue.mask].mean(dtype=np.float64)) if cue.mask.any() else None,
-            sources=self.manifest.sources,
-        )
         path = self._path(name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as file:
-            text = np.array(json.dumps(asdict(record)))
-            _write_npz(file, {"depth": cue.depth, "normal": cue.normal, "mask": cue.mask, "record": text})
+        write_map(path, cue, MapRecord.of(name, cue, camera, self.manifest.sources))
         claims = self._files.setdefault(name, [path])
         if path not in claims:
             claims.append(path)
@@ -230,7 +230,7 @@ class CueMaps:
         if strays:
             raise SceneError(
                 f"view {name!r} has two {self.kind} maps: {', '.join(strays)} claims to be its map, but {path} is its "
-                f"place; delete the wrong one, then run `{self._command}`"
+                f"place; delete the wrong one, then run `{self.command}`"
             )
         return path if claims else None
 
@@ -240,8 +240,8 @@ class CueMaps:
         files: dict[str, list[Path]] = {}
         for path in sorted(self.folder.rglob("*.npz")):
             try:
-                name = _read_record(path).image
-            except _UNREADABLE:
+                name = read_record(path).image
+            except UNREADABLE:
                 name = path.relative_to(self.folder).as_posix().removesuffix(".npz")
             files.setdefault(name, []).append(path)
         return files
@@ -251,90 +251,53 @@ class CueMaps:
         """Which source has changed since the maps were made; a source that is gone tells nothing."""
         for source, sha256 in self.manifest.sources.items():
             path = self.scene / source
-            if path.exists() and content_hash(path) != sha256:
+            # What lies elsewhere is a shell's file: nothing else is opened because a manifest says so.
+            known = path.is_file() or (path.is_dir() and not Path(source).is_absolute())
+            if known and sha256 not in (source_hash(path), content_hash(path)):
                 return f"{source} has changed since"
         return None
 
     @property
-    def _command(self) -> str:
+    def command(self) -> str:
+        """The command that makes the maps again."""
         return self.manifest.command.replace("{scene}", shlex.quote(str(self.scene)))
 
     def _attempt(self, reader: Callable[[Path], T], path: Path, name: str) -> T:
         try:
             return reader(path)
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             raise self._refusal(name, f"the file is damaged ({error})") from error
 
-    def _refusal(self, name: str, problem: str) -> SceneError:
+    def _refusal(self, name: str, problem: str, max_image_size: int | None = None) -> SceneError:
+        """The refusal of a map, with the command that makes it again, at another size where that is the problem."""
+        command = self.command
+        if max_image_size is not None:
+            program, _, rest = re.sub(r" --max-image-size \d+", "", self.manifest.command).partition("{scene}")
+            command = f"{program}{shlex.quote(str(self.scene))} --max-image-size {max_image_size}{rest}"
         return SceneError(
             f"the {self.kind} map of view {name!r} ({self._path(name)}) cannot be used: {problem}; "
-            f"run `{self._command}` to make it again"
+            f"run `{command}` to make it again"
         )
 
 
-_UNREADABLE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error)
+def find_cues(scene: Path) -> list[str]:
+    """The kinds of cue maps that a scene holds."""
+    return sorted(manifest.parent.name for manifest in scene.glob("cues/*/manifest.json"))
 
 
-def _write_npz(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
-    """An npz, like :func:`numpy.savez_compressed` at a tenth of the time: zlib makes little of a depth's digits."""
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, array in arrays.items():
-            data = io.BytesIO()
-            np.lib.format.write_array(data, array, allow_pickle=False)
-            method = zipfile.ZIP_STORED if name == "depth" else zipfile.ZIP_DEFLATED
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getbuffer(), method, compresslevel=1)
+PLACING = {"shell_to_scene": None, "shell": None, "metres_per_shell_unit": 1.0, "mesher": "planes"}
+"""What of an alignment's json decides where a map lies, and what it is where it is missing: a verdict that is added
+makes no map stale."""
 
 
-def _read_record(path: Path) -> MapRecord:
-    if not zipfile.is_zipfile(path):
-        raise ValueError("it is not a complete npz file")
-    with np.load(path, allow_pickle=False) as file:
-        return MapRecord(**json.loads(str(file["record"])))
-
-
-def _read_arrays(path: Path) -> CueMap:
-    with np.load(path, allow_pickle=False) as file:
-        return CueMap(file["depth"], file["normal"], file["mask"])
-
-
-def _damage(cue: CueMap, camera: Camera) -> str | None:
-    """What is wrong with the arrays of a map, in words."""
-    size = (camera.height, camera.width)
-    for name, shape, dtype in (("depth", size, "float32"), ("normal", (*size, 3), "float16"), ("mask", size, "bool")):
-        array = getattr(cue, name)
-        if array.shape != shape or array.dtype != dtype:
-            return f"its {name} is {array.dtype} {list(array.shape)}, not {dtype} {list(shape)}"
-    if not np.isfinite(cue.depth).all() or not np.isfinite(cue.normal).all():
-        return "it holds NaN or infinite values"
-    if (cue.depth < 0).any() or not cue.depth[cue.mask].all():
-        return "it holds negative depths, or pixels of the mask without depth"
-    return None
-
-
-def _difference(record: MapRecord, camera: Camera, manifest: Manifest) -> str | None:
-    """How the camera and sources a map was made for differ from those it is wanted for, in words."""
-    if (record.width, record.height) != (camera.width, camera.height):
-        return f"it is {record.width}x{record.height} pixels, the camera {camera.width}x{camera.height}"
-    intrinsics = np.abs(np.array(record.K) - _float64(camera.K)).max()
-    if not intrinsics <= INTRINSICS_TOLERANCE * max(camera.width, camera.height):
-        return f"its intrinsics differ from the camera's by {intrinsics:.3g} pixels"
-    made, wanted = np.array(record.viewmat), _float64(camera.viewmat)
-    # |R - R'| = 2 sqrt(2) sin(angle / 2) in the Frobenius norm; exact for small angles, where acos(trace) is not.
-    chord = np.linalg.norm(made[:3, :3] - wanted[:3, :3]) / np.sqrt(8)
-    angle = 2 * np.arcsin(np.minimum(chord, 1.0))
-    if not angle <= ROTATION_TOLERANCE:
-        return f"its pose is turned by {np.rad2deg(angle):.3g} degrees against the camera's"
-    moved = np.linalg.norm(made[:3, :3].T @ made[:3, 3] - wanted[:3, :3].T @ wanted[:3, 3])
-    if record.mean_depth is not None and not moved <= POSITION_TOLERANCE * record.mean_depth:
-        return f"its camera stood {moved:.3g} scene units away (the view's mean depth is {record.mean_depth:.3g})"
-    if (record.format, record.sources) != (FORMAT, manifest.sources):
-        changed = [path for path, sha256 in manifest.sources.items() if record.sources.get(path) != sha256]
-        return f"it was made from another {' and '.join(changed) or 'set of sources'}"
-    return None
-
-
-def _float64(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().astype(np.float64)
+def source_hash(path: Path) -> str:
+    """The :func:`content_hash` of a file or folder, or of an alignment's json a hash of what places the shell."""
+    if path.suffix == ".json":
+        with suppress(SceneError):
+            fields = read_json(path)
+            if "shell_to_scene" in fields:
+                return fingerprint({name: fields.get(name, usual) for name, usual in PLACING.items()})
+    return content_hash(path)
 
 
 def relative_path(path: Path, scene: Path) -> str:

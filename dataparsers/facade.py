@@ -2,40 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, Optional
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from jaxtyping import Float64
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMaps
+from dataparsers.cue_maps import CueMaps, find_cues
 from dataparsers.errors import SceneError
+from dataparsers.layout import SceneLayout
 from dataparsers.photograph import View, undistort
+from dataparsers.shots import Recording, Shot
+from dataparsers.sparse_points import find_sparse_points
 
-UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
-COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "colmap/sparse", "sparse")
+ROUNDING = 1e-6
+"""Share of the cameras' spread up to which rounding to float32 does no harm."""
 
 
 @dataclass
-class FacadeDataParserConfig(DataParserConfig):
+class FacadeDataParserConfig(SceneLayout, DataParserConfig):
     """A facade: photographs with COLMAP or transforms.json cameras, and its shell's and monocular cue maps."""
 
     _target: type = field(default_factory=lambda: FacadeDataParser)
-    data: Path = Path()
-    """Scene folder."""
-    images_path: Path = Path("images")
-    """Folder of the photographs in a COLMAP scene, relative to the scene folder."""
-    colmap_path: Optional[Path] = None
-    """COLMAP model, relative to the scene folder. If not set: colmap/sparse/0, sparse/0, colmap/sparse or sparse."""
-    masks_path: Optional[Path] = None
-    """Folder of masks in a COLMAP scene (white is kept, black is ignored), relative to the scene folder."""
     max_image_size: Optional[int] = None
     """Longer side of the images in pixels. If not set: the size that the cue maps were made at, the shell's
     first, else full size."""
@@ -44,11 +41,14 @@ class FacadeDataParserConfig(DataParserConfig):
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
     """How the scene is turned for the viewer."""
     center_method: Literal["poses", "focus", "none"] = "poses"
-    """How the scene is centred for the viewer."""
+    """How the scene is centred for the viewer. Coordinates too large for float32 are centred in any case."""
 
 
 class FacadeDataParser(DataParser):
-    """Reads a scene through nerfstudio's own COLMAP and transforms.json parsers and attaches the cue maps.
+    """Reads a scene and attaches the cue maps.
+
+    Nerfstudio's own parsers round coordinates to float32 before they centre them, which costs decimetres where a scene
+    is georeferenced; here they are centred first, and ``dataparser_transform`` is in double precision.
 
     The outputs' cameras are pinhole cameras. Their metadata holds, in the order of the images, ``views`` (their
     :class:`~dataparsers.photograph.View`), and for the whole scene ``cues`` (the :class:`CueMaps` found, by kind),
@@ -59,173 +59,136 @@ class FacadeDataParser(DataParser):
     config: FacadeDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        outputs, views = self.read(split)
-        cues = {kind: CueMaps.open(self.config.data, kind) for kind in find_cues(self.config.data)}
+        config = self.config
+        recording = config.read()
+        views = _views(recording.shots, config)
+        poses, transform, scale = _rescaled(recording, config)
+        cues = {kind: CueMaps.open(config.data, kind) for kind in find_cues(config.data)}
         shell = cues["shell"].manifest if "shell" in cues else None
         sized = shell or (cues["mono"].manifest if "mono" in cues else None)
-        max_image_size = self.config.max_image_size or (sized.max_image_size if sized else None)
-        views = [replace(view, camera=view.camera.shrunk(max_image_size)) for view in views]
+        max_image_size = _image_size(config, sized.max_image_size if sized else None)
+        chosen = _of_split(recording, split, config)
+        views = [replace(views[k], camera=views[k].camera.shrunk(max_image_size)) for k in chosen]
+        points = find_sparse_points(config)
+        placed = scale * (points.positions @ transform[:3, :3].T + transform[:3, 3])
         metres_per_unit = shell.metres_per_unit if shell else None
-        outputs.cameras = _pinhole_cameras(outputs.cameras, views)
-        outputs.metadata |= {
-            "views": views,
-            "cues": cues,
-            "metres_per_unit": metres_per_unit / outputs.dataparser_scale if metres_per_unit else None,
-            "shell_error": shell.error if shell else None,
-        }
-        return outputs
-
-    def read(self, split: str) -> tuple[DataparserOutputs, list[View]]:
-        """Nerfstudio's outputs as its own parser makes them, and the views of the split at full size."""
-        try:
-            outputs = self._cameras_parser().get_dataparser_outputs(split)
-        except (AssertionError, NotImplementedError) as error:  # a camera model it does not know, or two at once
-            raise SceneError(
-                f"nerfstudio cannot read the cameras of {self.config.data}: {error}; {UNDISTORT}"
-            ) from error
-        _refuse_missing_images(outputs.image_filenames, self.config.data)
-        return outputs, _views(outputs, self.config.data)
-
-    def _cameras_parser(self) -> DataParser:
-        """Nerfstudio's parser for the kind of cameras that the scene folder holds."""
-        scene = self.config.data
-        if not scene.is_dir():
-            raise FileNotFoundError(f"{scene} is not a folder; --data takes a scene folder.")
-        common = {
-            "data": scene,
-            "downscale_factor": 1,
-            "eval_interval": self.config.eval_interval,
-            "orientation_method": self.config.orientation_method,
-            "center_method": self.config.center_method,
-            "load_3D_points": True,
-        }
-        folder = self.colmap_folder()
-        if folder is None:
-            return NerfstudioDataParserConfig(eval_mode="interval", **common).setup()
-        return _SortedColmapDataParser(
-            ColmapDataParserConfig(
-                images_path=self.config.images_path,
-                masks_path=self.config.masks_path,
-                colmap_path=folder,
-                **common,
-            )
-        )
-
-    def colmap_folder(self) -> Path | None:
-        """Where the COLMAP model lies, relative to the scene folder; None where transforms.json holds the cameras.
-
-        Raises:
-            FileNotFoundError: the scene has neither.
-        """
-        scene = self.config.data
-        if (scene / "transforms.json").exists() and self.config.colmap_path is None:
-            return None
-        candidates = [self.config.colmap_path] if self.config.colmap_path else map(Path, COLMAP_FOLDERS)
-        for folder in candidates:
-            if any((scene / folder / f"cameras.{suffix}").exists() for suffix in ("bin", "txt")):
-                return folder
-        raise FileNotFoundError(
-            f"{scene} holds no cameras: neither transforms.json nor a COLMAP model in {', '.join(COLMAP_FOLDERS)}."
+        masks = [view.mask for view in views if view.mask is not None]
+        return DataparserOutputs(
+            image_filenames=[view.image for view in views],
+            cameras=_pinhole_cameras(poses[chosen], views),
+            scene_box=SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]])),
+            mask_filenames=masks if len(masks) == len(views) else None,  # nerfstudio knows all or none
+            dataparser_scale=scale,
+            dataparser_transform=torch.from_numpy(transform[:3]),
+            metadata={
+                "points3D_xyz": torch.from_numpy(placed).float(),
+                "points3D_rgb": torch.from_numpy(np.ascontiguousarray(points.colours)),
+                "views": views,
+                "cues": cues,
+                "metres_per_unit": metres_per_unit / scale if metres_per_unit else None,
+                "shell_error": shell.error if shell else None,
+            },
         )
 
 
-class _SortedColmapDataParser(ColmapDataParser):
-    """ColmapDataParser without two of its faults.
-
-    It orders and splits by COLMAP's image ids; the split here is by sorted name. It takes the fourth coefficient of a
-    fisheye for one of Brown's model, which it refuses; here that comes through.
-    """
-
-    def _get_all_images_and_cameras(self, recon_dir):
-        meta = super()._get_all_images_and_cameras(recon_dir)
-        self._k4 = {Path(frame["file_path"]): frame.pop("k4", 0.0) for frame in meta["frames"]}
-        return meta
-
-    def _generate_dataparser_outputs(self, split="train", **kwargs):
-        outputs = super()._generate_dataparser_outputs(split, **kwargs)
-        assert outputs.cameras.distortion_params is not None
-        outputs.cameras.distortion_params[:, 3] = torch.tensor([self._k4[path] for path in outputs.image_filenames])
-        return outputs
-
-    def _get_image_indices(self, image_filenames, split):
-        order = np.argsort([str(path) for path in image_filenames], kind="stable")
-        if any((self.config.data / f"{name}_list.txt").exists() for name in ("train", "test", "validation")):
-            return super()._get_image_indices(image_filenames, split)
-        held_out = np.arange(len(order)) % self.config.eval_interval == 0
-        return order[~held_out] if split == "train" else order[held_out]
-
-
-def find_cues(scene: Path) -> list[str]:
-    """The kinds of cue maps that a scene holds."""
-    return sorted(manifest.parent.name for manifest in scene.glob("cues/*/manifest.json"))
-
-
-def read_views(config: FacadeDataParserConfig) -> list[View]:
+def read_views(layout: SceneLayout) -> list[View]:
     """All views of a scene at full size, training and held-out, sorted by name."""
-    parser = FacadeDataParser(config)
-    return sorted((view for split in ("train", "test") for view in parser.read(split)[1]), key=lambda view: view.name)
+    return _views(layout.read().shots, layout)
 
 
 def held_out_names(config: FacadeDataParserConfig) -> set[str]:
     """Names of the views that are held out for evaluation."""
-    return {view.name for view in FacadeDataParser(config).read("test")[1]}
+    recording = config.read()
+    return {recording.shots[k].name for k in _of_split(recording, "test", config)}
 
 
-def scene_camera(outputs: DataparserOutputs, index: int) -> Camera:
-    """A camera of nerfstudio's rescaled, OpenGL world, back in the scene's own frame (OpenCV, float64)."""
-    cameras = outputs.cameras
-    transform = outputs.dataparser_transform.double()  # rescaled = scale * (transform @ scene)
-    pose = cameras.camera_to_worlds[index].double()
-    rotation = transform[:3, :3].T @ pose[:, :3] @ torch.diag(pose.new_tensor([1.0, -1.0, -1.0]))
-    position = transform[:3, :3].T @ (pose[:, 3] / outputs.dataparser_scale - transform[:3, 3])
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ position
-    K = cameras.get_intrinsics_matrices()[index].double()
-    return Camera(viewmat, K, int(cameras.width[index]), int(cameras.height[index]))
-
-
-def _views(outputs: DataparserOutputs, scene: Path) -> list[View]:
+def _views(shots: Sequence[Shot], layout: SceneLayout) -> list[View]:
+    _refuse_missing_images(shots, layout.data)
+    masks = layout.masks(shots)
     views = []
-    pinholes: dict[bytes, Camera] = {}  # photographs of one lens share their undistorted camera
-    for i, path in enumerate(outputs.image_filenames):
-        camera, lens = scene_camera(outputs, i), outputs.cameras[i]
-        _refuse_lens(lens, path)
-        distortion = lens.distortion_params
-        assert distortion is not None  # both of nerfstudio's parsers give zeros
-        if not bool((distortion != 0).any()) and lens.camera_type.item() == CameraType.PERSPECTIVE.value:
-            lens = None
-        else:
-            key = (
-                camera.K.numpy().tobytes() + distortion.numpy().tobytes() + repr((camera.width, camera.height)).encode()
-            )
+    pinholes: dict[tuple, Camera] = {}  # photographs of one lens share their undistorted camera
+    for shot in shots:
+        camera, lens = shot.camera, None
+        if not shot.is_pinhole:
+            lens = _lens(shot)
+            key = (camera.K.numpy().tobytes(), shot.distortion, shot.kind, camera.width, camera.height)
             if key not in pinholes:
                 K, image = undistort(lens, np.zeros((camera.height, camera.width, 3), np.uint8))
                 pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K).double(), image.shape[1], image.shape[0])
             camera = replace(pinholes[key], viewmat=camera.viewmat)
-        mask = outputs.mask_filenames[i] if outputs.mask_filenames else None
-        name = path.relative_to(scene).as_posix() if path.is_relative_to(scene) else path.name
-        views.append(View(name, path, camera, lens, mask))
+        views.append(View(shot.name, shot.image, camera, lens, masks.get(shot.name)))
     return views
 
 
-def _refuse_lens(lens: Cameras, path: Path) -> None:
-    """Refuse what nerfstudio's undistortion makes no pinhole camera of."""
-    kind = CameraType(lens.camera_type.item())
-    if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
+def _lens(shot: Shot) -> Cameras:
+    """The calibrated camera as nerfstudio undistorts it."""
+    K = shot.camera.K.float()
+    return Cameras(
+        camera_to_worlds=torch.eye(4)[None, :3],
+        fx=K[0, 0],
+        fy=K[1, 1],
+        cx=K[0, 2],
+        cy=K[1, 2],
+        width=shot.camera.width,
+        height=shot.camera.height,
+        distortion_params=torch.tensor(shot.distortion)[None],
+        camera_type=shot.kind,
+    )[0]
+
+
+def _rescaled(
+    recording: Recording, config: FacadeDataParserConfig
+) -> tuple[torch.Tensor, Float64[np.ndarray, "4 4"], float]:
+    """Poses in nerfstudio's world (OpenGL, float32), and what carries the scene there: a rigid motion, then a scale."""
+    poses = np.stack([np.linalg.inv(shot.camera.viewmat.numpy()) for shot in recording.shots])
+    poses = recording.applied @ poses @ np.diag([1.0, -1.0, -1.0, 1.0])
+    to_origin = np.eye(4)
+    positions = poses[:, :3, 3]
+    if np.spacing(np.abs(positions).max().astype(np.float32)) > ROUNDING * np.linalg.norm(np.ptp(positions, axis=0)):
+        to_origin[:3, 3] = -positions.mean(axis=0)
+    oriented, motion = auto_orient_and_center_poses(
+        torch.from_numpy(to_origin @ poses).float(),
+        method=recording.orientation or config.orientation_method,  # pyright: ignore[reportArgumentType]
+        center_method=config.center_method,
+    )
+    farthest = float(oriented[:, :3, 3].abs().max())
+    scale = 1.0 / farthest if farthest > 0 else 1.0
+    oriented[:, :3, 3] *= scale
+    transform = np.vstack([motion.double().numpy(), [0, 0, 0, 1]]) @ to_origin @ recording.applied
+    return oriented[:, :3], transform, scale
+
+
+def _image_size(config: FacadeDataParserConfig, of_maps: int | None) -> int | None:
+    if config.max_image_size is not None and config.max_image_size < 1:
+        raise SceneError(f"max_image_size is a number of pixels, at least 1, not {config.max_image_size}")
+    return config.max_image_size or of_maps
+
+
+def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) -> list[int]:
+    """The indices of the photographs of a split."""
+    names = [shot.name for shot in recording.shots]
+    if recording.listed:
+        listed = recording.listed.get(split, recording.listed.get("test" if split == "val" else "val", set()))
+        strangers = sorted(listed - set(names))
+        if strangers or not listed:
+            what = f"lists {strangers[0]}, which has no camera" if strangers else "lists no photographs"
+            raise SceneError(f"the {split} split of {config.data} {what}: mend the list, or remove all lists")
+        return [k for k, name in enumerate(names) if name in listed]
+    interval = config.eval_interval
+    if interval < 2:
+        raise SceneError(f"eval_interval must be at least 2, not {interval}: 8 holds out every 8th photograph")
+    if len(names) < 2:
         raise SceneError(
-            f"the camera of {path} is {kind.name}, but only perspective and fisheye ones work; {UNDISTORT}"
+            f"{config.data} has one photograph: one is held out, and at least one more is to be trained on"
         )
-    distortion = lens.distortion_params
-    if kind is CameraType.PERSPECTIVE and distortion is not None and distortion[3] != 0:
-        raise SceneError(f"the camera of {path} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
+    return [k for k in range(len(names)) if (k % interval == 0) != (split == "train")]
 
 
-def _pinhole_cameras(cameras: Cameras, views: list[View]) -> Cameras:
-    """The same poses with the intrinsics and image sizes of the views."""
+def _pinhole_cameras(poses: torch.Tensor, views: Sequence[View]) -> Cameras:
+    """The poses with the intrinsics and image sizes of the views."""
     Ks = torch.stack([view.camera.K for view in views]).float()
     return Cameras(
-        camera_to_worlds=cameras.camera_to_worlds,
+        camera_to_worlds=poses,
         fx=Ks[:, 0, 0],
         fy=Ks[:, 1, 1],
         cx=Ks[:, 0, 2],
@@ -235,12 +198,12 @@ def _pinhole_cameras(cameras: Cameras, views: list[View]) -> Cameras:
     )
 
 
-def _refuse_missing_images(paths: list[Path], scene: Path) -> None:
-    missing = [path.name for path in paths if not path.exists()]
+def _refuse_missing_images(shots: Sequence[Shot], scene: Path) -> None:
+    missing = [shot.image.name for shot in shots if not shot.image.is_file()]
     if missing:
         shown = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
         raise FileNotFoundError(
-            f"{len(missing)} of {len(paths)} images of the cameras in {scene} are not on disk ({shown}); "
+            f"{len(missing)} of {len(shots)} images of the cameras in {scene} are not on disk ({shown}); "
             "put them back or take them out of the model."
         )
 

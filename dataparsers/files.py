@@ -8,7 +8,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import psutil
+
+from dataparsers.errors import SceneError
 
 
 @contextmanager
@@ -24,6 +28,14 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what processes that were killed in the middle of an :func:`atomic_write` left in a folder and below it."""
+    for path in folder.rglob(".*.tmp"):
+        process = path.name.split(".")[-2]
+        if process.isdigit() and not psutil.pid_exists(int(process)):
+            path.unlink(missing_ok=True)
 
 
 def content_hash(path: Path) -> str:
@@ -42,3 +54,18 @@ def content_hash(path: Path) -> str:
 def fingerprint(*parts: object) -> str:
     """A key that changes with any of the parts, which are such as JSON can hold."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What a json file holds, which must be an object.
+
+    Raises:
+        SceneError: it is damaged or holds something else.
+    """
+    try:
+        contents = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{path} is damaged: it is no json ({error})") from error
+    if not isinstance(contents, dict):
+        raise SceneError(f"{path} is damaged: it holds {type(contents).__name__} where an object is wanted")
+    return contents

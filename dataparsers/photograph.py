@@ -12,6 +12,7 @@ from PIL import Image, ImageOps
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+from dataparsers.shots import MAX_PIXELS
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -42,14 +43,18 @@ def load_photograph(view: View) -> UInt8[np.ndarray, "H W C"]:
     Raises:
         SceneError: the file is no readable image, or its shape is not the camera's.
     """
-    return _as_seen(view, read_image(view.image))
+    return _as_seen(view, read_image(view.image), view.image)
 
 
 def load_mask(view: View) -> Bool[np.ndarray, "H W"] | None:
-    """The user's mask of the photograph, true where a pixel is kept; None where there is none."""
+    """The user's mask of the photograph, true where a pixel is kept; None where there is none.
+
+    Raises:
+        SceneError: the file is no readable image, or its shape is not the camera's.
+    """
     if view.mask is None:
         return None
-    return _as_seen(view, read_image(view.mask).convert("RGB"))[..., 0] > 127
+    return _as_seen(view, read_image(view.mask).convert("RGB"), view.mask)[..., 0] > 127
 
 
 def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "3 3"], np.ndarray]:
@@ -76,7 +81,7 @@ def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndar
     from nerfstudio.cameras.cameras import CameraType
 
     width, height = _calibrated_size(view)
-    picture = _upright(view, read_image(view.image))
+    picture = _upright(view, read_image(view.image), view.image)
     pixels = pixels * [width / picture.width, height / picture.height]
     if view.lens is None:
         return pixels
@@ -98,14 +103,23 @@ def read_image(path: Path) -> Image.Image:
     """An image file in mode RGB or RGBA, 8 bits, its EXIF data kept and its orientation not yet applied.
 
     Raises:
-        SceneError: the file is no readable image.
+        SceneError: the file is no readable image, or one of floating-point numbers.
     """
     try:
         with Image.open(path) as image:
+            if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
+                raise ValueError(f"it claims to be of {image.width}x{image.height} pixels")
             image.load()
-    except OSError as error:
-        raise SceneError(f"{path} cannot be read as an image ({error})") from error
-    exif = image.getexif()
+        exif = image.getexif()
+    except Exception as error:  # each format's decoder has its own kinds of error for a damaged file
+        reason = " ".join(str(error).split())
+        raise SceneError(f"{path} cannot be read as an image ({reason}): put the whole file back") from error
+    if image.mode == "F":
+        broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""
+        raise SceneError(
+            f"{path} holds floating-point numbers{broken}, of which nobody knows what is white: save it with 8 or 16 "
+            "bits"
+        )
     if image.mode.startswith("I"):  # 16 bits
         image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
     transparent = "A" in image.getbands() or "transparency" in image.info
@@ -114,8 +128,8 @@ def read_image(path: Path) -> Image.Image:
     return image
 
 
-def _as_seen(view: View, image: Image.Image) -> UInt8[np.ndarray, "H W C"]:
-    upright = _upright(view, image)
+def _as_seen(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray, "H W C"]:
+    upright = _upright(view, image, path)
     if view.lens is not None:
         if upright.size != _calibrated_size(view):
             upright = upright.resize(_calibrated_size(view), Image.Resampling.BOX)
@@ -129,13 +143,20 @@ def _calibrated_size(view: View) -> tuple[int, int]:
     return int(calibrated.width), int(calibrated.height)
 
 
-def _upright(view: View, image: Image.Image) -> Image.Image:
+def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:
     """SfM may or may not have honoured the EXIF orientation: the shape of its camera tells."""
     width, height = _calibrated_size(view)
     for candidate in (image, ImageOps.exif_transpose(image)):
-        if abs(candidate.width / candidate.height / (width / height) - 1) < 0.01:
+        aspect = candidate.width / candidate.height
+        rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which tells in thumbnails
+        if abs(width - height * aspect) < max(0.01 * width, rounding):
             return candidate
+    if path != view.image:
+        raise SceneError(
+            f"the mask {path} is {image.width}x{image.height} pixels, but the camera of {view.name} is "
+            f"{width}x{height}: paint it on that photograph"
+        )
     raise SceneError(
-        f"{view.image} is {image.width}x{image.height} pixels, but its camera is {width}x{height}: "
+        f"{path} is {image.width}x{image.height} pixels, but its camera is {width}x{height}: "
         "the photographs and the cameras do not belong together"
     )

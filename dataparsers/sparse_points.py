@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int
-from nerfstudio.data.utils import colmap_parsing_utils as colmap
+from jaxtyping import Float64, Int, UInt8
 
+from dataparsers import colmap_model, transforms
 from dataparsers.errors import SceneError
-from dataparsers.facade import FacadeDataParser, FacadeDataParserConfig
+from dataparsers.layout import SceneLayout
 from dataparsers.photograph import View
+from dataparsers.strays import sound
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -23,10 +26,12 @@ class SparsePoints:
         positions: in the scene's own frame and units.
         observed: the indices of the points that each view observes, by the view's name; None where the scene does not
             tell, as a transforms.json.
+        colours: RGB, where the scene tells.
     """
 
     positions: Float64[np.ndarray, "N 3"]
     observed: Mapping[str, Int[np.ndarray, " M"]] | None = None
+    colours: UInt8[np.ndarray, "N 3"] | None = None
 
     def seen_in(self, view: View) -> tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, " M"]]:
         """Pixels and z-depths of the view's points: those it observes, or else all that project into it.
@@ -43,48 +48,54 @@ class SparsePoints:
         return pixels[inside], points[inside, 2]
 
 
-def read_sparse_points(config: FacadeDataParserConfig) -> SparsePoints:
+def read_sparse_points(layout: SceneLayout) -> SparsePoints:
     """The SfM points of a scene: of its COLMAP model with their tracks, or of the cloud its transforms.json names.
 
     Raises:
-        SceneError: the scene has no points.
+        SceneError: the scene has no points, or their file is damaged.
     """
-    parser = FacadeDataParser(config)
-    folder = parser.colmap_folder()
-    points = _read_cloud(parser) if folder is None else _read_model(config.data / folder, config.images_path)
+    points = find_sparse_points(layout)
     if len(points.positions) == 0:
         raise SceneError(
-            f"{config.data} has no SfM points, which monocular depth and the shell are held against: put points3D.bin "
+            f"{layout.data} has no SfM points, which monocular depth and the shell are held against: put points3D.bin "
             "beside the COLMAP cameras, or name a cloud as ply_file_path in transforms.json"
         )
     return points
 
 
-def _read_cloud(parser: FacadeDataParser) -> SparsePoints:
-    outputs, _ = parser.read("train")
-    rescaled = outputs.metadata.get("points3D_xyz")
-    if rescaled is None:
-        return SparsePoints(np.empty((0, 3)))
-    transform = outputs.dataparser_transform.double()  # rescaled = scale * (transform @ scene)
-    positions = (rescaled.double() / outputs.dataparser_scale - transform[:3, 3]) @ transform[:3, :3]
-    return SparsePoints(positions.numpy())
+def find_sparse_points(layout: SceneLayout) -> SparsePoints:
+    """The SfM points of a scene, of which there may be none.
 
+    What is NaN, infinite or absurdly far away is left out, and counted in a message.
 
-def _read_model(folder: Path, images_path: Path) -> SparsePoints:
-    images = _read(folder, "images", colmap.read_images_binary, colmap.read_images_text)
-    points = list(_read(folder, "points3D", colmap.read_points3D_binary, colmap.read_points3D_text).values())
-    positions = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
-    observed: dict[str, list[int]] = {(images_path / image.name).as_posix(): [] for image in images.values()}
-    for index, point in enumerate(points):
-        for image in set(point.image_ids) & images.keys():
-            observed[(images_path / images[image].name).as_posix()].append(index)
+    Raises:
+        SceneError: their file is damaged.
+    """
+    folder = layout.colmap_folder()
+    if folder is None:
+        positions, colours = transforms.read_cloud(layout.data)
+        kept = _sound(positions, layout)
+        return SparsePoints(positions[kept], None, colours[kept])
+    points, names = colmap_model.read_points(layout.data, folder, layout.images_path)
+    kept = _sound(points.positions, layout)
+    observed: dict[str, list[int]] = {name: [] for name in names.values()}
+    for index, point in enumerate(kept):
+        for image in set(points.observers[point].tolist()) & names.keys():
+            observed[names[image]].append(index)
+    positions, colours = points.positions[kept], points.colours[kept]
     if not any(observed.values()):
-        return SparsePoints(positions)
-    return SparsePoints(positions, {name: np.array(indices, dtype=int) for name, indices in observed.items()})
+        return SparsePoints(positions, None, colours)
+    return SparsePoints(positions, {name: np.array(of, dtype=int) for name, of in observed.items()}, colours)
 
 
-def _read(folder: Path, name: str, binary, text) -> dict:
-    for path, reader in ((folder / f"{name}.bin", binary), (folder / f"{name}.txt", text)):
-        if path.is_file():
-            return reader(path)
-    return {}
+def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:
+    """The indices of the points that can be meant."""
+    near = sound(positions)
+    if not near.all():
+        log.warning(
+            "%d of %d SfM points of %s are NaN, infinite or absurdly far away, and are left out",
+            (~near).sum(),
+            len(positions),
+            layout.data,
+        )
+    return np.flatnonzero(near)

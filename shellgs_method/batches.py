@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from dataparsers.camera import Camera
-from shellgs_method.evaluation import Reference, Rendering, geometry_errors
+from shellgs_method.evaluation import Reference, Rendering, geometry_errors, image_errors
 
 REFERENCES = {"shell": "", "truth": "truth_"}
 """Kinds of maps that geometry is measured against, and what the names of their figures begin with."""
@@ -17,6 +17,20 @@ REFERENCES = {"shell": "", "truth": "truth_"}
 
 MARGIN = 2
 """Pixels around what stands before the shell in which its splats are seen, too."""
+
+
+def kept_pixels(batch: dict, picture: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"]:
+    """What the user's mask keeps of a picture; all of it where there is none."""
+    if "mask" in batch:
+        return batch["mask"].to(picture.device)
+    return torch.ones_like(picture[..., :1], dtype=torch.bool)
+
+
+def picture_errors(
+    rgb: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], batch: dict, metres_per_unit: float | None
+) -> dict[str, float]:
+    """Figures of :func:`image_errors` over what the user's mask keeps, and in the :func:`regions` of it."""
+    return image_errors(rgb, target, regions(batch, metres_per_unit, rgb.device), kept_pixels(batch, target))
 
 
 def reference_errors(

@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Optional, Union
 
@@ -13,7 +14,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from dataparsers.errors import SceneError, refusals_end_the_program
+from dataparsers.errors import SceneError, check_output, refusals_end_the_program
+from dataparsers.layout import ScenePaths
 from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 
@@ -37,7 +39,10 @@ MonoSource = Annotated[
 ]
 _MOGE = MoGe2()
 UpAxis = Literal["y", "z"]
+Mesher = Literal["planes", "bpa", "poisson"]
 _CAPTURE = CaptureConfig()
+Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
+_PATHS = ScenePaths()
 
 
 def demo(
@@ -112,6 +117,8 @@ def align(
     accept: bool = False,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
+    mesher: Optional[Mesher] = None,
+    paths: Paths = _PATHS,
 ) -> None:
     """Find the shell's place in the scene, judge it, and write scene/shell/alignment.json unless it is refused.
 
@@ -129,9 +136,12 @@ def align(
         accept: Take the proposal made before.
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres.
+        mesher: Makes a mesh of a point cloud, here and wherever the alignment is used: planes (balls between), balls
+            alone (bpa), poisson for round things. If not set: the one of the alignment that is there, else planes.
+        paths: Where in the scene its files are.
     """
     from dataparsers.cue_maps import relative_path
-    from dataparsers.facade import FacadeDataParserConfig, read_views
+    from dataparsers.facade import read_views
     from dataparsers.sparse_points import read_sparse_points
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
     from shellgs_method.shell.align import (
@@ -149,8 +159,8 @@ def align(
         raise SceneError(
             "give the shell with --matrix, --picks or --positions, or alone, or no shell to judge what is there"
         )
-    config = FacadeDataParserConfig(data=scene)
-    views, points = read_views(config), read_sparse_points(config)
+    layout = paths.of(scene)
+    views, points = read_views(layout), read_sparse_points(layout)
     name = relative_path(shell, scene) if shell else ""
     if shell is None:
         placement = Placement(Alignment.load(scene / (PROPOSAL if accept else ALIGNMENT)))
@@ -161,8 +171,10 @@ def align(
     elif positions:
         placement = place_by_positions(positions, views, name, metres_per_shell_unit)
     else:
-        placement = place_by_guess(load_shell(shell, cache=scene / "shell"), views, points, name, metres_per_shell_unit)
-    mesh = load_shell(scene / placement.alignment.shell, cache=scene / "shell")
+        guessed = load_shell(shell, cache=scene / "shell", mesher=mesher or "planes")
+        placement = place_by_guess(guessed, views, points, name, metres_per_shell_unit)
+    placement = replace(placement, alignment=placement.alignment.meshed_by(mesher))
+    mesh = placement.alignment.load_shell(scene, views)
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
@@ -202,8 +214,9 @@ def cast(
     matrix: Optional[Path] = None,
     metres_per_shell_unit: float = 1.0,
     max_image_size: Optional[int] = None,
-    mesher: Literal["planes", "bpa", "poisson"] = "planes",
+    mesher: Optional[Mesher] = None,
     check: bool = True,
+    paths: Paths = _PATHS,
 ) -> None:
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
@@ -217,8 +230,10 @@ def cast(
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
-        mesher: Makes a mesh of a point cloud: planes (balls between), balls alone (bpa), poisson for round things.
+        mesher: Makes a mesh of a point cloud: planes (balls between), balls alone (bpa), poisson for round things. If
+            not set: the one that the alignment was judged with. Another one leaves it without a verdict.
         check: Compare the photographs, to find what stands before the shell.
+        paths: Where in the scene its files are.
     """
     from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
@@ -226,13 +241,17 @@ def cast(
 
     if (shell is None) != (matrix is None):
         raise SceneError("--shell and --matrix go together: which mesh, and where it stands in the scene")
+    views = read_views(paths.of(scene))
     if shell is not None and matrix is not None:
         alignment = Alignment.from_matrix_file(matrix, relative_path(shell, scene), metres_per_shell_unit)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
-    config = FacadeDataParserConfig(data=scene)
+    if alignment.meshed_by(mesher) != alignment and alignment.verdict:
+        console.print(f"The alignment was judged with another mesher: judge it again with `shellgs align {scene}`.")
+    aligned = alignment.meshed_by(mesher)
+    config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
-    summary = cast_views(scene, views, alignment, max_image_size=max_image_size, mesher=mesher)
+    summary = cast_views(scene, views, aligned, max_image_size=max_image_size, flags=paths.flags)
     if summary.meshing:
         console.print(f"The shell is a point cloud, whose mesh is kept in {scene / 'shell'}: {summary.meshing}")
     console.print(
@@ -251,7 +270,7 @@ def cast(
     console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
 
 
-def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int] = None) -> None:
+def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int] = None, paths: Paths = _PATHS) -> None:
     """Monocular depth and normals of every view, aligned to the SfM points, in scene/cues/mono.
 
     They come from a network (moge, depth-anything) or from maps made elsewhere (from FOLDER). A view whose depth does
@@ -262,14 +281,17 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
         source: What predicts.
         max_image_size: Longer side in pixels that photographs are resized to for training. If not set: the size that
             the shell maps were cast at, else full size.
+        paths: Where in the scene its files are.
     """
-    from dataparsers.cue_maps import CueMaps
-    from dataparsers.facade import FacadeDataParserConfig, find_cues, read_views
+    from dataparsers.cue_maps import CueMaps, find_cues
+    from dataparsers.facade import read_views
     from dataparsers.sparse_points import read_sparse_points
     from shellgs_method.cues.maps import make_maps
 
-    config = FacadeDataParserConfig(data=scene)
-    views, points, predictor = read_views(config), read_sparse_points(config), source.load()
+    if max_image_size is not None and max_image_size < 1:
+        raise SceneError(f"the longer side of the maps must be at least 1 pixel, not {max_image_size}")
+    layout = paths.of(scene)
+    views, points, predictor = read_views(layout), read_sparse_points(layout), source.load()
     if max_image_size is None and "shell" in find_cues(scene):
         max_image_size = CueMaps.open(scene, "shell").manifest.max_image_size
     licence = f", licence {predictor.licence}" if predictor.licence else ""
@@ -279,7 +301,7 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
     if points.observed is None:
         console.print("The scene does not say which points a view observes: all that project into it are used.")
     size = f" --max-image-size {max_image_size}" if max_image_size else ""
-    command = f"shellgs mono {{scene}}{size} {source.command}"
+    command = f"shellgs mono {{scene}}{size}{paths.flags} {source.command}"
     summary = make_maps(scene, views, points, predictor, command=command, max_image_size=max_image_size)
     console.print(
         f"{summary.made} maps made, {summary.skipped} views decided before, in {summary.seconds:.1f} s; "
@@ -354,6 +376,8 @@ def mesh(
 
     output = output or config.with_name("mesh.ply")
     check_mesh_format(output)
+    if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
+        raise SceneError("a mesh has at least 4 --faces, a --voxel above 0 and a --margin from 0")
     run = TrainedRun.load(config, up)
     made = decimate(run.facade(fuse(run.views(), run.box(margin), voxel), margin), faces)
     figures = mesh_errors(run, made)
@@ -385,6 +409,7 @@ def splats(
     from shellgs_method.export.runs import TrainedRun
 
     output = output or config.with_name("splats.ply")
+    check_output(output)
     run = TrainedRun.load(config, up)
     count = write_splats(output, run.splats())
     run.frame.describe(output, {"splats": count})
@@ -402,6 +427,7 @@ def compare(
     jobs: int = 1,
     address: Optional[str] = None,
     wandb: Optional[str] = None,
+    paths: Paths = _PATHS,
 ) -> None:
     """Train and evaluate methods on scenes; end with the paper's tables, its figures, and a report to look at.
 
@@ -419,6 +445,7 @@ def compare(
         jobs: Runs at once, with the local launcher.
         address: Of a running Ray cluster, say auto. If not set: one is started on this machine.
         wandb: Project of Weights & Biases that gets the tables and figures as a run. If not set: none.
+        paths: Where in the scenes their files are.
     """
     from functools import partial
 
@@ -427,9 +454,11 @@ def compare(
     from shellgs_method.compare.runs import grid
     from shellgs_method.compare.wandb_report import log_comparison, log_in
 
+    if jobs < 1:
+        raise SceneError(f"--jobs {jobs} would start nothing: give 1 or more")
     if wandb:
         log_in()
-    runs = grid(scenes, methods, seeds, iterations, output, curve_points)
+    runs = grid(scenes, methods, seeds, iterations, output, curve_points, paths)
     if launcher == "ray":
         from shellgs_method.compare.cluster import launch_on_ray
 
@@ -472,11 +501,10 @@ def evaluate(
 
 def _place(frame: Frame) -> str:
     """Where a result stands, in words."""
+    shift = f" less {' '.join(f'{value:.0f}' for value in frame.offset)}" if frame.offset.any() else ""
     if not frame.metric:
-        return "The scene has no aligned shell: this is its own frame, and the size of its unit is unknown."
-    if not frame.offset.any():
-        return "In metres, in the shell's frame."
-    return f"In metres, in the shell's frame less {' '.join(f'{value:.0f}' for value in frame.offset)}."
+        return f"The scene has no aligned shell: this is its own frame{shift}, and the size of its unit is unknown."
+    return f"In metres, in the shell's frame{shift}."
 
 
 def doctor(install_libraries: bool = False) -> None:

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import psutil
 import torch
 from jaxtyping import Float, UInt8
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMap
+from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
-from shellgs_method.batches import pinhole_camera, reference_maps
+from shellgs_method.batches import REFERENCES, pinhole_camera, reference_maps
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.seeding import SeededView, Seeds, shell_seeds
+
+logger = logging.getLogger(__name__)
+
+COLOUR_BYTES = 3
+MAP_BYTES = 11
+"""Of a pixel: depth float32, normal float16, mask."""
+WORTH_SAYING = 1e9
+"""Bytes in memory from which their sum is told."""
+MOST_OF_MEMORY = 0.6
+"""Share of the free memory that photographs and maps may take."""
 
 
 class FacadeDataset(InputDataset):
@@ -30,11 +44,23 @@ class FacadeDataset(InputDataset):
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
     kind lacks that kind's keys. ``contradicted`` is where photographs show something before the shell. With ``bands``,
     all masks are those of pixels whose wall lies in them. ``seen_by`` tells of the training views: then ``seen`` is
-    true where these have seen what a pixel shows.
+    true where these have seen what a pixel shows. ``kinds`` are the maps that are read, all that the scene has if not
+    set, and with ``any_size`` they are resampled where they do not fit.
     """
 
     bands: Bands | None = None
     seen_by: Callable[[], SeenBy] | None = None
+    kinds: Collection[str] | None = None
+    any_size: bool = False
+    held: bool = True
+    """Whether maps stay in memory with the photographs; else they are read whenever they are needed."""
+
+    @property
+    def cues(self) -> dict[str, CueMaps]:
+        """The sets of maps that are read, by kind."""
+        found = self._dataparser_outputs.metadata["cues"]
+        wanted = set(found) - {"checked"} if self.kinds is None else self.kinds  # that goes with the shell
+        return {kind: maps for kind, maps in found.items() if kind in wanted}
 
     @property
     def views(self) -> list[View]:
@@ -50,9 +76,13 @@ class FacadeDataset(InputDataset):
         image = self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx)
         data = {"image_idx": image_idx, "image": image, "K": self.views[image_idx].camera.K.float()}
         mask = load_mask(self.views[image_idx])
+        if mask is not None and not mask.any():
+            view = self.views[image_idx]
+            raise SceneError(f"the mask {view.mask} is black everywhere: white is kept; leave {view.name} out instead")
         if mask is not None:
             data["mask"] = torch.from_numpy(mask)[..., None]
-        data |= self.get_metadata(data)
+        if self.held:
+            data |= self.get_metadata(data)
         if self.seen_by is not None:
             camera = self.camera(image_idx)
             no_depth = torch.zeros(camera.height, camera.width, 1)
@@ -62,15 +92,16 @@ class FacadeDataset(InputDataset):
     def get_metadata(self, data: dict) -> dict:
         """The cue maps of the view ``data["image_idx"]``."""
         view = self.views[data["image_idx"]]
-        read = {
-            kind: maps.read(view.name, view.camera) for kind, maps in self._dataparser_outputs.metadata["cues"].items()
-        }
+        read = {kind: self._read(maps, view) for kind, maps in self.cues.items()}
         cues = {kind: cue for kind, cue in read.items() if cue is not None}
-        checked = cues.pop("checked", None)
         inside = True
-        if self.bands is not None:
-            inside = self.bands.mask(cues["shell"], view.camera) if "shell" in cues else False
-        maps = {} if checked is None else {"contradicted": torch.from_numpy(checked.mask)[..., None]}
+        if self.bands is not None and cues:
+            shell = cues.get("shell") or self._read(self._dataparser_outputs.metadata["cues"]["shell"], view)
+            inside = False if shell is None else self.bands.mask(shell, view.camera)
+        maps = {}
+        checked = self._dataparser_outputs.metadata["cues"].get("checked")
+        if "shell" in cues and checked and (found := self._read(checked, view)):
+            maps["contradicted"] = torch.from_numpy(found.mask)[..., None]
         for kind, cue in cues.items():
             maps[f"{kind}_depth"] = self._rescaled_depth(cue)
             maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
@@ -80,8 +111,31 @@ class FacadeDataset(InputDataset):
     def shell_depth(self, image_idx: int) -> Float[Tensor, "H W 1"] | None:
         """Depth of the shell in a view, without its other maps; None where the view has none."""
         view, shell = self.views[image_idx], self._dataparser_outputs.metadata["cues"].get("shell")
-        cue = shell and shell.read(view.name, view.camera)
+        cue = shell and shell.read(view.name, view.camera, any_size=True)
         return cue and self._rescaled_depth(cue)
+
+    @property
+    def nbytes(self) -> int:
+        """Of all photographs and maps, in memory."""
+        pixels = sum(view.camera.width * view.camera.height for view in self.views)
+        return pixels * (COLOUR_BYTES + MAP_BYTES * len(self.cues))
+
+    def missing(self) -> dict[str, int]:
+        """How many views have no map that supports a pixel, by kind.
+
+        Raises:
+            SceneError: a view's map belongs to another camera, shell or alignment.
+        """
+        counts = {}
+        for kind, maps in self.cues.items():
+            for view in self.views:
+                maps.check(view.name, view.camera, any_size=self.any_size)
+            records = [maps.record(view.name) for view in self.views]
+            counts[kind] = sum(record is None or not record.supported for record in records)
+        return counts
+
+    def _read(self, maps: CueMaps, view: View) -> CueMap | None:
+        return maps.read(view.name, view.camera, any_size=self.any_size)
 
     def _rescaled_depth(self, cue: CueMap) -> Float[Tensor, "H W 1"]:
         return torch.from_numpy(cue.depth)[..., None] * self._dataparser_outputs.dataparser_scale
@@ -106,12 +160,16 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     """Full images with cue maps, cached on any machine."""
 
     config: FacadeDataManagerConfig
+    last_trained = ""
+    """Name of the view that the last step was trained on."""
 
     def create_train_dataset(self) -> FacadeDataset:
         """The training views, whose maps leave out the bands held out."""
         dataset = super().create_train_dataset()
         held_out = self._held_out
         dataset.bands = held_out and held_out.others
+        if self.test_mode != "val":
+            dataset.kinds = ()
         return dataset
 
     def create_eval_dataset(self) -> FacadeDataset:
@@ -119,14 +177,54 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         dataset = super().create_eval_dataset()
         dataset.bands = self._held_out
         dataset.seen_by = lambda: self._seen_by
+        dataset.any_size, dataset.kinds = True, tuple(REFERENCES)
         return dataset
+
+    def _can_be_measured(self, kind: str, maps: CueMaps) -> bool:
+        held_out = self.eval_dataset.views
+        try:
+            for view in [*self.train_dataset.views, *held_out] if kind == "shell" else held_out:
+                maps.check(view.name, view.camera, any_size=True)
+        except SceneError as error:
+            logger.warning("This training measures nothing against the %s maps: %s.", kind, error)
+            return False
+        return True
+
+    def train_on(self, kinds: Collection[str]) -> None:
+        """Read these kinds of maps for the training views, and for the held-out ones what can be measured beside them.
+
+        Raises:
+            SceneError: a map belongs to another camera, or no training view has one, though there is a manifest.
+        """
+        dataset = self.train_dataset
+        dataset.kinds = kinds
+        for kind, missing in dataset.missing().items():
+            command = dataset.cues[kind].command
+            if missing == len(dataset):
+                raise SceneError(
+                    f"none of the {missing} training views has a {kind} map with a pixel in it, though "
+                    f"{dataset.cues[kind].folder} has a manifest: run `{command}` to make them again"
+                )
+            if missing:
+                logger.warning(
+                    "%d of the %d training views have no %s map, or an empty one, and train with their photograph "
+                    "alone; `%s` makes maps.",
+                    missing,
+                    len(dataset),
+                    kind,
+                    command,
+                )
+        held_out = self.eval_dataset
+        held_out.kinds = {*REFERENCES, *kinds}
+        held_out.kinds = [kind for kind, maps in held_out.cues.items() if self._can_be_measured(kind, maps)]
 
     @cached_property
     def _seen_by(self) -> SeenBy:
         """What the training views see."""
         dataset, cameras, depths = self.train_dataset, [], []
+        hidden_by_shell = "shell" in self.eval_dataset.cues
         for index in range(len(dataset)):
-            camera, depth = dataset.camera(index), dataset.shell_depth(index)
+            camera, depth = dataset.camera(index), dataset.shell_depth(index) if hidden_by_shell else None
             step = camera.thinning(MAX_SIZE)
             cameras.append(camera)
             depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())
@@ -150,16 +248,39 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             most: number of seeds beyond which they are spread more widely.
             everywhere: also behind what photographs show before the shell.
         """
-        batches = [batch for batch in self.cached_train if "shell_depth" in batch]
-        num_pixels = sum(batch["shell_mask"].numel() for batch in batches)
+        maps, views = self.train_dataset.cues["shell"], self.train_dataset.views
+        batches = [batch for batch in self.cached_train if maps.record(views[batch["image_idx"]].name)]
+        num_pixels = sum(batch["image"][..., 0].numel() for batch in batches)
         return shell_seeds((self._seeded_view(batch, everywhere) for batch in batches), num_pixels, spacing, most)
 
     def _seeded_view(self, batch: dict, everywhere: bool) -> SeededView:
-        index, cpu = batch["image_idx"], torch.device("cpu")
+        index, cpu, batch = batch["image_idx"], torch.device("cpu"), self._with_maps(batch)
         image = batch["image"][..., :3].to(cpu) / (255 if batch["image"].dtype == torch.uint8 else 1)
         return SeededView(self.train_dataset.camera(index), image, reference_maps(batch, "shell", cpu, everywhere))
 
+    def next_train(self, step: int) -> tuple[Cameras, dict]:
+        """The next training view, with its maps."""
+        camera, batch = super().next_train(step)
+        self.last_trained = self.train_dataset.views[batch["image_idx"]].name
+        return camera, self._with_maps(batch)
+
+    def _with_maps(self, batch: dict) -> dict:
+        return batch if self.train_dataset.held else batch | self.train_dataset.get_metadata(batch)
+
+    def _hold_what_fits(self) -> None:
+        dataset, free = self.train_dataset, psutil.virtual_memory().available
+        dataset.held = dataset.nbytes <= MOST_OF_MEMORY * free
+        if dataset.nbytes > WORTH_SAYING:
+            kinds = f" and their {' and '.join(dataset.cues)} maps" if dataset.cues else ""
+            how = "" if dataset.held else ": the maps are read from disk in every step, which takes longer"
+            CONSOLE.print(
+                f"{len(dataset)} photographs{kinds} take {dataset.nbytes / 1e9:.1f} GB of memory, of which "
+                f"{free / 1e9:.1f} GB are free{how}."
+            )
+
     def _load_images(self, split, cache_images_device):
+        if split == "train":
+            self._hold_what_fits()
         # "cpu" pins memory, which needs CUDA, and nerfstudio switches to it by itself above 500 images; "gpu" means
         # self.device (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
         with refusals_end_the_program():

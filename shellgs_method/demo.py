@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import torch
 from rich.console import Console
 
+from dataparsers.errors import SceneError
 from shellgs_method.compare.launch import CommandError, follow, launch_locally
 from shellgs_method.compare.results import compare
 from shellgs_method.compare.runs import grid
-from shellgs_method.synthetic import FacadeConfig, write_scene
+from shellgs_method.synthetic import FacadeConfig, settings_of, write_scene
 
 METHODS = ("photo-gs", "shellgs", "shellgs-metric")
 
@@ -20,9 +22,19 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
     """Make the facade, cast its shell, train and evaluate the methods, show tables and pictures.
 
     What an earlier, interrupted demo finished is kept.
+
+    Raises:
+        SceneError: the folder holds a demo of another facade, or there is nothing to train.
     """
+    if iterations < 1:
+        raise SceneError(f"a training has at least one iteration, not {iterations}")
     scene = folder / "scene"
-    if not scene.exists():
+    if scene.exists():
+        made, asked = settings_of(scene), asdict(config)
+        if other := [name for name in asked if made.get(name, asked[name]) != asked[name]]:
+            what = ", ".join(f"--{name} {made[name]}, not {asked[name]}" for name in other)
+            raise SceneError(f"{scene} was made with {what}: name another folder for this demo, or remove {folder}")
+    else:
         write_scene(scene, config)
     console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
     try:

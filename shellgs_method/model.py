@@ -26,13 +26,19 @@ from tyro.conf import Suppress
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
-from shellgs_method.batches import pinhole_camera, reference_errors, reference_maps, references, regions
+from shellgs_method.batches import (
+    kept_pixels,
+    picture_errors,
+    pinhole_camera,
+    reference_errors,
+    reference_maps,
+    references,
+)
 from shellgs_method.densification import MCMCConfig, MCMCStrategy
 from shellgs_method.evaluation import (
     Rendering,
     colours_to_normals,
     geometry_pictures,
-    image_errors,
     normals_to_colours,
 )
 from shellgs_method.geometry import (
@@ -45,6 +51,7 @@ from shellgs_method.geometry import (
     squared_depths,
 )
 from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
+from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.seeding import Seeds
 from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
@@ -153,6 +160,11 @@ class FacadeModel(SplatfactoModel):
         self.metres_per_unit: float | None = self.kwargs["metadata"].get("metres_per_unit")
         self.step = 0
         self.plan(PAPER_ITERATIONS)
+
+    @property
+    def training_cues(self) -> set[str]:
+        """The kinds of maps that the training views need."""
+        return {self.config.cues, self.config.seeds} - {"none"}
 
     def _refuse_what_cannot_be(self) -> None:
         config = self.config
@@ -352,7 +364,8 @@ class FacadeModel(SplatfactoModel):
     def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
         """Figures of a training view."""
         target = self._view_losses(batch, outputs["background"]).photometric.target
-        psnr = -10 * (outputs["rgb"].detach() - target).square().mean().log10()
+        error = (outputs["rgb"].detach() - target).square()
+        psnr = -10 * weighted_mean(error, kept_pixels(batch, target)).log10()
         return {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
@@ -361,7 +374,7 @@ class FacadeModel(SplatfactoModel):
         view = self._view_losses(batch, outputs["background"])
         losses = {"photometric": view.photometric(outputs["rgb"])}
         if self.geometry is not None:
-            losses |= self_losses(self.geometry, config.extra, progress)
+            losses |= self_losses(self.geometry, config.extra, progress, kept_pixels(batch, outputs["rgb"]))
             if view.cue is not None:
                 losses |= view.cue(self.geometry, progress)
         return losses | self._shape_losses()
@@ -408,7 +421,7 @@ class FacadeModel(SplatfactoModel):
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
         rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
-        figures = image_errors(rendering.rgb, target, regions(batch, self.metres_per_unit, self.device))
+        figures = picture_errors(rendering.rgb, target, batch, self.metres_per_unit)
         figures |= reference_errors(rendering, camera, batch, self.metres_per_unit)
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}
         if "shell_depth" not in batch:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import ModuleType
 
 
@@ -15,3 +16,8 @@ def import_open3d() -> ModuleType:
             "apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
         ) from error
     return open3d
+
+
+def reason(error: Exception) -> str:
+    """What an error says, on one line, without the colours that Open3D gives it."""
+    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(error)).split())

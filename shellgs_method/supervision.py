@@ -24,6 +24,7 @@ from shellgs_method.losses import (
     normal_loss,
     vid2sim_ncc_loss,
 )
+from shellgs_method.losses.reduction import weighted_mean
 
 TOLERANCES = (0.05, 0.15)
 """Least and largest tolerance in metres: with less, pictures of Herz-Jesu lost more than its surface gained."""
@@ -175,15 +176,23 @@ def cue_losses(
     return CueLosses(cue, paper, extra, metres_per_unit)(geometry, progress)
 
 
-def self_losses(geometry: Geometry, extra: ExtraLossConfig, progress: float) -> dict[str, Tensor]:
-    """Terms of the rendered geometry that need no cue, those of 2DGS, at the share ``progress`` of the run."""
+def self_losses(
+    geometry: Geometry, extra: ExtraLossConfig, progress: float, kept: Bool[Tensor, "H W 1"] | None = None
+) -> dict[str, Tensor]:
+    """Terms of the rendered geometry that need no cue, those of 2DGS, at the share ``progress`` of the run.
+
+    They are means over the pixels that the user's mask keeps.
+    """
     iteration = progress * PAPER_ITERATIONS
     losses = {}
     if extra.agreement > 0 and iteration >= extra.agreement_from:
-        losses["agreement"] = extra.agreement * agreement_loss(geometry.normal, geometry.depth_normal, geometry.alpha)
+        losses["agreement"] = extra.agreement * agreement_loss(
+            geometry.normal, geometry.depth_normal, geometry.alpha, kept
+        )
     if extra.distortion > 0 and iteration >= extra.distortion_from:
         assert geometry.distortion is not None
-        losses["distortion"] = extra.distortion * geometry.distortion.mean()
+        mean = geometry.distortion.mean() if kept is None else weighted_mean(geometry.distortion, kept)
+        losses["distortion"] = extra.distortion * mean
     return losses
 
 

@@ -5,17 +5,38 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+import torch
+from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import Pipeline
-from nerfstudio.utils.eval_utils import eval_setup
+
+from dataparsers.errors import SceneError
+from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.config_file import load_config
 
 
-def load_run(config: Path, test_mode: Literal["test", "inference"]) -> tuple[TrainerConfig, Pipeline, Path]:
-    """Config, pipeline and file of the last checkpoint of the run that ``config`` (config.yml) belongs to.
+def load_run(config_path: Path, test_mode: Literal["test", "inference"]) -> tuple[TrainerConfig, Pipeline, Path]:
+    """Config, pipeline and file of the last checkpoint of the run that a config.yml belongs to.
+
+    As nerfstudio's ``eval_setup``, but neither file can run a program, and a damaged one is refused.
 
     Raises:
         FileNotFoundError: there is no such file.
+        SceneError: it is no config of a registered method, or its checkpoint cannot be used.
     """
-    if not config.is_file():
-        raise FileNotFoundError(f"{config} does not exist: name the config.yml of a trained run")
-    return eval_setup(config, test_mode=test_mode)[:3]
+    config = load_config(config_path)
+    if config.method_name not in all_methods:
+        raise SceneError(f"{config_path} is of {config.method_name}, which is not installed")
+    folder = config.get_checkpoint_dir()
+    beside = config_path.parent / config.relative_model_dir  # where the run lies if its folder was moved
+    checkpoint = find_checkpoint(folder if folder.is_dir() else beside)
+    state = load_checkpoint(checkpoint)
+    config.load_dir = checkpoint.parent
+    pipeline = config.pipeline.setup(device="cuda" if torch.cuda.is_available() else "cpu", test_mode=test_mode)
+    pipeline.eval()
+    try:
+        pipeline.load_pipeline(state["pipeline"], state["step"])
+    except RuntimeError as error:  # torch lists what is missing, unexpected and of another shape
+        words = str(error).strip().splitlines()
+        raise SceneError(f"{checkpoint} does not fit {config_path}: {' '.join(words[:2])[:300]}") from error
+    return config, pipeline, checkpoint

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
 import torch
-from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+import yaml
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.optim.lr_scheduler import LambdaLR
 
 from dataparsers.errors import SceneError, refusals_end_the_program
+from dataparsers.files import atomic_write
+from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.config_file import guard_nerfstudio
+from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
+from shellgs_method.folders import held
+from shellgs_method.limits import check_settings
 
-# Nerfstudio's own scheduler puts np.float64 into checkpoints, which torch >= 2.6 refuses to load
-# (https://github.com/nerfstudio-project/nerfstudio/issues/3683). Ours writes float; this lets older files load.
-_REBUILD_SCALAR: Any = np.float64(0).__reduce__()[0]
-torch.serialization.add_safe_globals([_REBUILD_SCALAR, np.dtype, type(np.dtype(np.float64))])
+if TYPE_CHECKING:
+    from shellgs_method.pipeline import FacadePipeline
+
+PARTIAL = "checkpoint-"
+"""How the folder of a checkpoint that is being written begins."""
+CHECK_EVERY = 100
+"""Steps between two looks at whether all Gaussians are numbers."""
+
+guard_nerfstudio()
 
 
 @contextmanager
@@ -81,6 +93,17 @@ class FacadeTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: FacadeTrainer)
 
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+    def save_config(self) -> None:
+        """Save the config to the run's folder, whole or not at all."""
+        with refusals_end_the_program():
+            folder = self.get_base_dir()
+            folder.mkdir(parents=True, exist_ok=True)
+            with atomic_write(folder / "config.yml") as file:
+                file.write(yaml.dump(self).encode())
+
 
 class FacadeTrainer(Trainer):
     """Nerfstudio's trainer, with its resume and its checkpoints mended.
@@ -91,17 +114,21 @@ class FacadeTrainer(Trainer):
 
     config: FacadeTrainerConfig
 
+    optimizers: GuardedOptimizers
+    pipeline: FacadePipeline
+
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Everything that training needs."""
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
+            _remove_leftovers(self.base_dir)
             super().setup(test_mode)
 
-    def setup_optimizers(self) -> Optimizers:
+    def setup_optimizers(self) -> GuardedOptimizers:
         """Optimizers whose learning rates decay over the run."""
         for group in self.config.optimizers.values():
             if isinstance(group["scheduler"], RunLengthDecayConfig):
                 group["scheduler"].max_steps = self.config.max_num_iterations
-        return super().setup_optimizers()
+        return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train up to ``max_num_iterations``, counting those of the checkpoint that was loaded."""
@@ -109,36 +136,113 @@ class FacadeTrainer(Trainer):
         if self._start_step >= run_length:
             CONSOLE.print(f"The checkpoint has all {run_length} iterations of this run already: nothing to do.")
             return
-        self.config.max_num_iterations = run_length - self._start_step
-        try:
+        self._last_step, self._faults = run_length - 1, 0
+        with refusals_end_the_program():
+            self.pipeline.go_on()
             super().train()
-        finally:
-            self.config.max_num_iterations = run_length
+
+    def train_iteration(self, step: int):
+        """One step; left out where its gradients are no numbers. The last one ends the run.
+
+        Nerfstudio 1.1.5 counts the iterations of a resumed run anew, later ones may not: neither is relied on.
+
+        Raises:
+            SceneError: too many steps were left out.
+        """
+        loss, losses, metrics = super().train_iteration(step)
+        if self.optimizers.left_out:
+            self._tell_fault(step, losses)
+        if step % CHECK_EVERY == 0 or self.optimizers.left_out:
+            self._remove_broken_gaussians(step)
+        if step >= self._last_step:
+            self.stop_training = True
+        return loss, losses, metrics
+
+    def _tell_fault(self, step: int, losses: dict[str, torch.Tensor]) -> None:
+        self._faults += 1
+        forget_gradients(self.pipeline.model.info)
+        terms = [name for name, value in losses.items() if not bool(value.isfinite())]
+        what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
+        view = self.pipeline.datamanager.last_trained
+        CONSOLE.print(
+            f"[yellow]Step {step} is left out: {what} of {view} is no number ({self._faults} of at most {MAX_FAULTS}).",
+        )
+        if self._faults > MAX_FAULTS:
+            raise SceneError(
+                f"the training ends at step {step}, since more than {MAX_FAULTS} steps had a loss or a gradient that "
+                f"is no number, the last one with {view}: look at its photograph and maps, then go on with "
+                f"--load-dir {self.checkpoint_dir}, where the last good checkpoint is kept"
+            )
+
+    def _remove_broken_gaussians(self, step: int) -> None:
+        model = self.pipeline.model
+        count = remove_broken(model.gauss_params, self.optimizers.optimizers, model.strategy_state)
+        if count:
+            CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were no numbers, and are taken out.")
+            if count == model.num_points:
+                raise SceneError(
+                    f"the training ends at step {step}, since no Gaussian is a number any more: lower the learning "
+                    f"rates; the last good checkpoint is kept in {self.checkpoint_dir}"
+                )
+
+    def _after_train(self) -> None:
+        self.step = min(self.step, self._last_step)
+        super()._after_train()
 
     def _load_checkpoint(self) -> None:
-        """Load the newest checkpoint of ``load_dir``, and say so where there is none."""
-        load_dir = self.config.load_dir
-        with refusals_end_the_program():
-            if load_dir is not None and not any(load_dir.glob("step-*.ckpt")):
-                raise SceneError(
-                    f"{load_dir} holds no checkpoint (step-*.ckpt); --load-dir takes the nerfstudio_models of a run"
-                )
-        super()._load_checkpoint()
+        """Go on from the checkpoint that ``load_dir`` or ``load_checkpoint`` names, if one does."""
+        path = self.config.load_checkpoint
+        if self.config.load_dir is not None:
+            path = find_checkpoint(self.config.load_dir, self.config.load_step)
+            _remove_leftovers(self.config.load_dir.parent)
+        if path is None:
+            return
+        state = load_checkpoint(path)
+        try:
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.optimizers.load_optimizers(state["optimizers"])
+            if "schedulers" in state and self.config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+        except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+            words = " ".join(str(error).split())[:200]
+            raise SceneError(f"{path} is no checkpoint of this method with these settings ({words})") from error
+        self._start_step = state["step"] + 1
+        CONSOLE.print(f"Going on from {path}.")
 
     def save_checkpoint(self, step: int) -> None:
-        """Save a checkpoint so that a kill at any moment leaves a whole one behind."""
+        """Save a checkpoint so that a kill at any moment leaves a whole one behind.
+
+        Raises:
+            SceneError: the disk is full, or cannot be written; checkpoints that are there stay.
+        """
         if self.local_rank != 0:
             return
+        self._remove_broken_gaussians(step)
         folder = self.checkpoint_dir
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=self.base_dir, prefix="checkpoint-") as partial:
-            self.checkpoint_dir = Path(partial)
-            try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryDirectory(dir=self.base_dir, prefix=PARTIAL) as partial, held(Path(partial)):
+                self.checkpoint_dir = Path(partial)
                 super().save_checkpoint(step)
-            finally:
-                self.checkpoint_dir = folder
-            (saved,) = Path(partial).iterdir()
-            os.replace(saved, folder / saved.name)
+                (saved,) = Path(partial).iterdir()
+                os.replace(saved, folder / saved.name)
+        except (OSError, RuntimeError) as error:  # torch says nothing of the disk
+            free = shutil.disk_usage(self.base_dir).free
+            raise SceneError(
+                f"the checkpoint of step {step} cannot be written to {folder} ({str(error).splitlines()[0][:200]}; the "
+                f"disk has {free / 1e6:.0f} MB free): make room, and go on with --load-dir {folder} if it has one"
+            ) from error
+        finally:
+            self.checkpoint_dir = folder
         if self.config.save_only_latest_checkpoint:
             for older in set(folder.glob("*.ckpt")) - {folder / saved.name}:
                 older.unlink()
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what saves that were killed have left of their checkpoints."""
+    for partial in folder.glob(f"{PARTIAL}*"):
+        with held(partial) as abandoned:
+            if abandoned:
+                shutil.rmtree(partial, ignore_errors=True)

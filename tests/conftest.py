@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from torch._inductor.cpp_builder import get_cpp_compiler
 from torch._inductor.exc import InvalidCxxCompiler
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method import fusion
+from shellgs_method import cli, fusion
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
@@ -30,6 +31,21 @@ def pristine_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(pristine_scene: Path, tmp_path: Path) -> Path:
     """A copy of the scene that a test may change."""
     return Path(shutil.copytree(pristine_scene, tmp_path / "scene"))
+
+
+@pytest.fixture
+def shellgs(capsys, monkeypatch) -> Callable[..., str]:
+    """The `shellgs` command in this process: its output on one line, or ``refused: `` and what it ended with."""
+
+    def command(*words: object) -> str:
+        monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
+        try:
+            cli.main()
+        except SystemExit as stop:
+            return f"refused: {stop}"
+        return capsys.readouterr().out.replace("\n", " ")
+
+    return command
 
 
 @pytest.fixture
@@ -57,4 +73,4 @@ def offline_wandb(monkeypatch) -> Iterator[None]:
     import wandb  # slow
 
     yield
-    wandb.finish()
+    wandb.teardown()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -62,3 +64,14 @@ def held_out(trainer: FacadeTrainer) -> tuple[Cameras, dict]:
 
 def render(trainer: FacadeTrainer) -> dict[str, Tensor]:
     return model_of(trainer).get_outputs_for_camera(held_out(trainer)[0])
+
+
+@contextmanager
+def small_disk(largest: int) -> Iterator[None]:
+    """A disk that takes no file of more bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

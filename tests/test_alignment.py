@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from test_facade_dataparser import write_colmap
 
 from dataparsers.camera import Camera
+from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
+from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, to_camera
 from dataparsers.sparse_points import SparsePoints
-from shellgs_method.cli import main
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
+from shellgs_method.shell import alignment as alignment_module
 from shellgs_method.shell.align import PROPOSAL, REPORT, place_by_guess
 from shellgs_method.shell.bays import facade_axes, scan_shifts
 from shellgs_method.shell.picks import Pick, align_picks, read_picks, triangulate
@@ -582,21 +585,6 @@ def test_a_crease_is_drawn_and_the_noise_of_the_triangles_beside_it_is_not():
     assert edges[1:-1, 76:84].any(axis=1).mean() > 0.7
 
 
-def command(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, *words: object) -> str:
-    """What `shellgs` prints, or the sentence that it ends with."""
-    monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
-    try:
-        main()
-    except SystemExit as stop:
-        return f"refused: {stop}"
-    return capsys.readouterr().out.replace("\n", " ")
-
-
-@pytest.fixture
-def shellgs(capsys, monkeypatch):
-    return lambda *words: command(capsys, monkeypatch, *words)
-
-
 def test_a_matrix_is_judged_reported_and_written(scene, shellgs):
     true = Alignment.load(scene / ALIGNMENT)
     shift = np.array([412_000.0, 5_123_000.0, 0.0])
@@ -622,8 +610,6 @@ def test_a_matrix_is_judged_reported_and_written(scene, shellgs):
 
 
 def test_picks_and_refinement_give_the_place_and_their_residuals(scene, shellgs):
-    from dataparsers.facade import FacadeDataParserConfig, read_views
-
     true = Alignment.load(scene / ALIGNMENT)
     corners = [(o.x0, 0.0, o.z0) for o in Layout(6, 3).openings] + [(o.x1, 0.0, o.z1) for o in Layout(6, 3).openings]
     building = np.array(corners)
@@ -650,8 +636,6 @@ def test_picks_and_refinement_give_the_place_and_their_residuals(scene, shellgs)
 
 
 def test_camera_positions_give_the_place_and_name_who_was_not_there(scene, shellgs):
-    from dataparsers.facade import FacadeDataParserConfig, read_views
-
     true = Alignment.load(scene / ALIGNMENT)
     lines = ["EPSG:25832", "IMG_0001.jpg 0 0 0"]
     for k, view in enumerate(read_views(FacadeDataParserConfig(data=scene))):
@@ -689,10 +673,97 @@ def test_a_proposal_becomes_the_alignment_only_when_it_is_accepted(scene, shellg
     assert Alignment.load(scene / ALIGNMENT).places_like(Alignment.load(scene / PROPOSAL))
 
 
-def test_judging_what_is_there_keeps_the_file_that_maps_are_bound_to(scene, shellgs):
-    before = (scene / ALIGNMENT).read_bytes()
-    assert "Verdict" in shellgs("align", scene)
-    assert (scene / ALIGNMENT).read_bytes() == before
+def test_judging_what_was_cast_writes_the_figures_and_tells_the_maps(scene, shellgs):
+    before = Alignment.load(scene / ALIGNMENT)
+    assert before.error is None
+    assert "Written" in shellgs("align", scene)
+    judged = Alignment.load(scene / ALIGNMENT)
+    assert judged.verdict in ("good", "doubtful")
+    assert judged.places_like(before)
+    maps = CueMaps.open(scene, "shell")
+    assert maps.manifest.error == judged.error is not None
+    for view in read_views(FacadeDataParserConfig(data=scene)):
+        assert maps.read(view.name, view.camera) is not None
+    assert "0 views cast, 10 there already" in shellgs("cast", scene)
+
+
+def test_another_place_makes_the_maps_stale(scene, shellgs):
+    moved = Alignment.load(scene / ALIGNMENT).shell_to_scene.copy()
+    moved[0, 3] += 0.01
+    np.save(scene / "matrix.npy", moved)
+    assert "Written" in shellgs("align", scene, scene / "shell" / "facade.ply", "--matrix", scene / "matrix.npy")
+    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    with pytest.raises(SceneError, match=r"shell/alignment.json has changed since; run `shellgs cast"):
+        CueMaps.open(scene, "shell").read(view.name, view.camera)
+
+
+@pytest.fixture
+def scanned(scene: Path) -> Path:
+    """The scene whose shell is a point cloud, sparse enough for every mesher to be quick."""
+    alignment = Alignment.load(scene / ALIGNMENT)
+    samples, _ = ShellSurface(load_shell(scene / alignment.shell)).samples(4000)
+    survey = ShellSurface(load_shell(scene / alignment.shell)).survey_from_shell
+    np.savetxt(scene / "shell" / "scan.xyz", transformed(samples, np.linalg.inv(survey)), fmt="%.4f")
+    np.save(scene / "matrix.npy", alignment.shell_to_scene)
+    return scene
+
+
+def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
+    """What is judged is cast, cut and judged again; another mesher takes the verdict away."""
+    used: list[str] = []
+    load = alignment_module.load_shell
+    monkeypatch.setattr(
+        alignment_module, "load_shell", lambda *args, **named: used.append(named["mesher"]) or load(*args, **named)
+    )
+    shell = scanned / "shell" / "scan.xyz"
+    shellgs("align", scanned, shell, "--matrix", scanned / "matrix.npy", "--mesher", "bpa")
+    judged = Alignment.load(scanned / ALIGNMENT)
+    assert (judged.mesher, bool(judged.verdict)) == ("bpa", True)
+    assert "10 views cast" in shellgs("cast", scanned)
+    judged.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
+    assert set(used) == {"bpa"}
+    assert "judged with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
+    assert Alignment.load(scanned / ALIGNMENT) == replace(judged, mesher="planes", verdict="", figures={})
+
+
+def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
+    """A proposal knows of no cameras; what it keeps is not what is cast."""
+    shell, cache = scanned / "shell" / "scan.xyz", scanned / "shell"
+    views = read_views(FacadeDataParserConfig(data=scanned))
+    alignment = Alignment(np.load(scanned / "matrix.npy"), "shell/scan.xyz")
+    load_shell(shell, cache=cache)
+    guessed = (cache / "scan.xyz.planes.ply").read_bytes()
+    alignment.load_shell(scanned, views)
+    seen = (cache / "scan.xyz.planes.ply").read_bytes()
+    assert seen != guessed
+    nearby = replace(alignment, shell_to_scene=shifted(right=0.3).shell_to_scene)
+    nearby.load_shell(scanned, views)
+    assert (cache / "scan.xyz.planes.ply").read_bytes() == seen
+    behind = replace(alignment, shell_to_scene=shifted(out=40.0).shell_to_scene)
+    behind.load_shell(scanned, views)
+    assert (cache / "scan.xyz.planes.ply").read_bytes() != seen
+
+
+def test_chosen_folders_reach_every_command(scene, shellgs):
+    """Photographs and cameras in folders of other names; what the maps say of themselves names them too."""
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    cloud = trimesh.load(scene / "sparse_pc.ply")
+    lines = [
+        f"{k} {x} {y} {z} 9 9 9 0.1 {k % 10 + 1} 0"
+        for k, (x, y, z) in enumerate(cloud.vertices.tolist())  # pyright: ignore[reportAttributeAccessIssue]
+    ]
+    (scene / "sparse" / "0" / "points3D.txt").write_text("\n".join(lines))
+    (scene / "sparse" / "0").rename(scene / "model")
+    (scene / "sparse").rmdir()
+    (scene / "images").rename(scene / "photos")
+    paths = ("--images-path", "photos", "--colmap-path", "model")
+    assert "holds no cameras" in shellgs("align", scene)
+    assert "Written" in shellgs("align", scene, *paths)
+    assert "10 views cast" in shellgs("cast", scene, *paths)
+    command = CueMaps.open(scene, "shell").manifest.command
+    assert command == "shellgs cast {scene} --images-path photos --colmap-path model"
+    made = shellgs("mono", scene, *paths, "from", scene / "predictions")
+    assert "maps made" in made or "no view has a monocular map that can be trusted" in made
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def test_what_is_supervised_and_what_is_measured_share_no_wall(pristine_scene, v
     ):
         coordinates = []
         for view, batch in zip(dataset.views, images, strict=True):
-            for kind in ("shell", "truth"):
+            for kind in dataset.cues:  # the shell, and in the held-out views the truth
                 mask = batch[f"{kind}_mask"][..., 0].numpy()
                 depth = shell_of(pristine_scene, view).depth
                 assert (depth[mask] > 0).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 from pathlib import Path
 
 import av
@@ -356,6 +357,45 @@ def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr("shellgs_method.capture.stages.add_photograph", full)
     with pytest.raises(SceneError, match=r"disk of .* is full"):
         capture(tmp_path / "photographs", tmp_path / "scene")
+
+
+@pytest.fixture
+def without_colmap(monkeypatch) -> list[str]:
+    """Structure from motion that finds every camera at once; the steps that were run."""
+    steps: list[str] = []
+
+    def run_step(step: str, arguments: dict, **_):
+        steps.append(step)
+        names = sorted(path.name for path in Path(arguments.get("photographs", "")).glob("*.jpg"))
+        if step == "undistort":
+            output = Path(arguments["output"])
+            (output / "sparse").mkdir()
+            (output / "images").mkdir()
+            for name in names:
+                (output / "images" / name).write_bytes(b"undistorted")
+        return [{"names": names, "points": 9, "reprojection_error": 0.5, "track_length": 3.0}]
+
+    monkeypatch.setattr("shellgs_method.capture.stages.run_step", run_step)
+    return steps
+
+
+@pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])
+def test_what_was_deleted_from_a_captured_scene_is_made_again(tmp_path, without_colmap, deleted):
+    for k in range(3):
+        (tmp_path / "photographs").mkdir(exist_ok=True)
+        picture(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
+    scene = tmp_path / "scene"
+    for _ in range(2):  # the second time too
+        capture(tmp_path / "photographs", scene)
+        for name in deleted:
+            shutil.rmtree(scene / name)
+        summary = capture(tmp_path / "photographs", scene)
+        assert len(summary.registered) == 3
+        assert sorted(path.name for path in (scene / "images").iterdir()) == ["0.jpg", "1.jpg", "2.jpg"]
+        assert (scene / "colmap" / "sparse" / "0").is_dir()
+    without_colmap.clear()
+    capture(tmp_path / "photographs", scene)
+    assert without_colmap == []
 
 
 # Structure from motion

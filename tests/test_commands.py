@@ -13,7 +13,10 @@ import pytest
 import trimesh
 from PIL import Image
 
+from shellgs_method.cli import main
+
 BIN = Path(sys.executable).parent
+DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20)
 
 
 def run(*words: object, cwd: Path, status: int = 0) -> str:
@@ -31,7 +34,7 @@ def run(*words: object, cwd: Path, status: int = 0) -> str:
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a small `shellgs demo` leaves behind."""
     folder = tmp_path_factory.mktemp("demo")
-    run("shellgs", "demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20, cwd=folder)
+    run("shellgs", *DEMO, cwd=folder)
     return folder / "demo"
 
 
@@ -50,9 +53,27 @@ def test_the_demo_ends_with_a_table_and_pictures(demo):
 def test_a_second_demo_keeps_what_the_first_finished(demo):
     finished = [next(config(demo).parent.glob("nerfstudio_models/*.ckpt")), *demo.glob("scene/cues/shell/images/*.npz")]
     before = [path.stat().st_mtime_ns for path in finished]
-    output = run("shellgs", "demo", demo, "--iterations", 20, cwd=demo.parent)
+    output = run("shellgs", *DEMO, cwd=demo.parent)
     assert "ns-train" not in output
     assert [path.stat().st_mtime_ns for path in finished] == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (["--width", 640], "was made with --width 64, not 640: name another folder"),
+        (["--views", 12, "--seed", 3], "--views 10, not 12, --seed 0, not 3"),
+        (["--iterations", -5], "at least one iteration, not -5"),
+        (["--width", 0], "width must be at least 16, not 0"),
+    ],
+)
+def test_a_demo_of_another_facade_is_not_shown_as_this_one(demo, monkeypatch, flags, sentence):
+    before = {path: path.stat().st_mtime_ns for path in demo.rglob("*")}
+    monkeypatch.chdir(demo.parent)
+    monkeypatch.setattr("sys.argv", ["shellgs", *map(str, [*DEMO, *flags])])
+    with pytest.raises(SystemExit, match=rf"^shellgs: .*{sentence}"):
+        main()
+    assert {path: path.stat().st_mtime_ns for path in demo.rglob("*")} == before
 
 
 def test_ns_eval_writes_all_figures(demo):

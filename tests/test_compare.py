@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import filecmp
 import io
 import json
 import os
 import re
 import shutil
+import socket
 import stat
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from rich.console import Console
@@ -24,7 +27,9 @@ from runs import Method, trainer_of
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
-from shellgs_method.compare import launch
+from dataparsers.layout import SceneLayout, ScenePaths
+from shellgs_method import cli
+from shellgs_method.compare import cluster, launch
 from shellgs_method.compare.launch import launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_figures
 from shellgs_method.compare.pictures import DOT, dotted, recorded_figures
@@ -33,6 +38,7 @@ from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
 from shellgs_method.compare.wandb_report import log_comparison
 from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
+from shellgs_method.folders import held, recover_folder, replace_folder
 from shellgs_method.pipeline import FacadePipeline
 
 COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("normal_deg", "Normal (°)", min, ".2f"))
@@ -121,13 +127,23 @@ def test_the_paper_stands_beside_scenes_of_the_same_part(pristine_scene, tmp_pat
 
 def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
     """Of a shell in the place of the truth it lacks only what the shell lacks."""
-    shell = measure_shell(pristine_scene)
+    shell = measure_shell(SceneLayout(data=pristine_scene))
     assert 0 < shell["truth_normal_deg"] < 15
     assert 0 < shell["truth_chamfer_m"] < 0.1
     runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path)
     fabricate(runs[0], truth_normal_deg=40.0)
     (truth,) = (table for table in tables(runs, {runs[0].scene: shell}) if table.name == "truth")
     assert list(truth.rows) == ["photo-gs", "the shell itself"]
+
+
+def test_the_paths_of_a_scene_reach_every_run(pristine_scene, tmp_path):
+    """And what a run's settings are hashed from."""
+    paths = ScenePaths(images_path=Path("photos"), colmap_path=Path("model"))
+    ours, splatfacto = grid([pristine_scene], ["shellgs", "splatfacto"], [0], 20, tmp_path, paths=paths)
+    for run in (ours, splatfacto):
+        assert " ".join(next(run.commands())).endswith(" facade-data --images-path photos --colmap-path model")
+    with pytest.raises(FileNotFoundError, match="nor a COLMAP model in model"):
+        ours.settle()
 
 
 def test_a_holdout_is_compared_with_all_methods_in_the_same_half(pristine_scene, tmp_path):
@@ -345,6 +361,184 @@ def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pris
     assert "mono-gs needs maps" in (mono_gs.folder / "log.txt").read_text()
 
 
+# what is refused
+
+
+def refusal(monkeypatch, *words: object) -> str:
+    """What `shellgs` ends with."""
+    monkeypatch.setattr("sys.argv", ["shellgs", *map(str, words)])
+    with pytest.raises(SystemExit, match=r"^shellgs: [^\n]*$") as end:
+        cli.main()
+    return str(end.value)
+
+
+REFUSED = {
+    "no method": (["--methods"], "name methods"),
+    "no seed": (["--seeds"], "name seeds"),
+    "a seed below 0": (["--seeds", "-1"], "no seed"),
+    "no iteration": (["--iterations", "-5"], "at least one iteration"),
+    "no points": (["--curve-points", "-1"], "at least one iteration"),
+    "no job": (["--jobs", "0"], "--jobs 0"),
+    "a flag that is none": (["--methods", "a=shellgs --window 3"], "ns-train shellgs --window 3 is refused"),
+    "a setting beyond its limits": (["--methods", "a=shellgs --pipeline.model.sh-degree=7"], "sh_degree cannot be 7"),
+    "an open quote": (["--methods", "a=shellgs '"], "is no method with its flags"),
+    "another length": (["--methods", "a=shellgs --max-num-iterations 3"], "a sets max_num_iterations"),
+    "another folder": (["--methods", "a=shellgs --output-dir=elsewhere"], "a sets output_dir"),
+    "two of one name": (
+        ["--methods", "a=shellgs", "a=shellgs --pipeline.model.geometry.ncc-window=7"],
+        "two methods are named a",
+    ),
+    "the name of a method": (["--methods", "shellgs=photo-gs"], "shellgs is the name of a method"),
+    "the name of an ablation": (["--methods", "shellgs-flat=photo-gs"], "shellgs-flat is the name of a method"),
+    "a cluster that is not there": (["--launcher", "ray", "--address", "127.0.0.1:1"], "no Ray cluster at 127.0.0.1:1"),
+    "a cluster at no address": (["--launcher", "ray", "--address", "nowhere"], "no Ray cluster at nowhere"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_makes_no_comparison_is_refused_with_a_sentence(pristine_scene, tmp_path, monkeypatch, what):
+    words, why = REFUSED[what]
+    output = tmp_path / "out"
+    said = refusal(monkeypatch, "compare", pristine_scene, "--methods", "photo-gs", *words, "--output", output)
+    assert why in said
+    if "cluster" not in what:
+        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_cluster_that_never_answers_is_refused(pristine_scene, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        words = ["--methods", "photo-gs", "--launcher", "ray", "--address", address, "--output", tmp_path]
+        assert f"no Ray cluster at {address}" in refusal(monkeypatch, "compare", pristine_scene, *words)
+
+
+def test_flags_mean_what_ns_train_takes_them_for(pristine_scene, tmp_path):
+    for flag in (["--pipeline.datamanager.holdout", "B"], ["--pipeline.datamanager.holdout=B"]):
+        assert Variant.parse(f"half=shellgs {' '.join(flag)}").held_out == "B"
+    twice = fake_grid(
+        [pristine_scene],
+        ["a=shellgs --optimizers.quats.optimizer.lr 0.5", "a=shellgs --optimizers.quats.optimizer.lr=.5"],
+        tmp_path,
+    )
+    assert len(twice) == 1
+    (mono,) = fake_grid([pristine_scene], ["a=shellgs --pipeline.model.cues=mono"], tmp_path)
+    (shell,) = fake_grid([pristine_scene], ["a=shellgs"], tmp_path)
+    assert {key for key in shell.settings if mono.settings[key] != shell.settings[key]} == {"pipeline.model.cues"}
+
+
+def repaint(path: Path) -> None:
+    Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
+
+
+def move_points(path: Path) -> None:
+    cloud = trimesh.load(path)
+    cloud.apply_translation([0.1, 0, 0])
+    cloud.export(path)
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize(
+    ("file", "change", "what"),
+    [("images/frame_00003.png", repaint, "photographs"), ("sparse_pc.ply", move_points, "cameras")],
+)
+def test_a_photograph_or_points_replaced_after_a_run_make_another_run(scene, tmp_path, file, change, what):
+    finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+    change(scene / file)
+    with pytest.raises(SceneError, match=rf"other settings \({what}: "):
+        finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_setting_that_an_earlier_build_did_not_have_makes_no_other_run(pristine_scene, tmp_path):
+    (run,) = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
+    finish_all([run])
+    path = run.folder / "settings.json"
+    before = json.loads(path.read_text())
+    del before["pipeline.model.seeds"]
+    path.write_text(json.dumps(before))
+    assert not finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+    del before["pipeline.model.densify_grad_thresh"]
+    path.write_text(json.dumps(before | {"pipeline.model.extra.flattening": 100.0}))
+    with pytest.raises(SceneError, match=r"extra.flattening: 100.0, now 0.0"):
+        finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_two_comparisons_do_not_work_in_one_folder(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["shellgs"], tmp_path)
+    with held(tmp_path), pytest.raises(SceneError, match="another comparison works in"):
+        finish_all(runs)
+    assert not finish_all(runs)
+
+
+DAMAGED = {
+    "cut figures": ("eval.json", b'{"results": {"psnr": 2'),
+    "figures of another kind": ("eval.json", b'{"results": {"psnr": "good"}}'),
+    "no figures": ("eval.json", b"[]"),
+    "a cut view": ("views/0000-frame_00001.npz", b"PK\x03\x04"),
+    "an empty view": ("views/0000-frame_00001.npz", b""),
+    "cut settings": ("settings.json", b'{"method"'),
+    "settings of another kind": ("settings.json", b"[1]"),
+}
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_a_damaged_file_of_one_run_stops_no_other_and_is_made_again(pristine_scene, tmp_path, damage):
+    name, content = DAMAGED[damage]
+    names = ["shellgs", "2dgs"]
+    damaged, other = fake_grid([pristine_scene], names, tmp_path / "out")
+    finish_all([damaged, other])
+    before = other.figures().stat().st_mtime_ns
+    (damaged.folder / name).parent.mkdir(exist_ok=True)
+    (damaged.folder / name).write_bytes(content)
+    failures = finish_all(fake_grid([pristine_scene], names, tmp_path / "out"))
+    if name == "settings.json":  # nobody knows what the run is of
+        assert [run.variant.name for run in failures] == ["shellgs"]
+        assert (damaged.folder / name).read_bytes() == content
+    else:
+        assert not failures
+        assert json.loads(damaged.figures().read_text()) == {"results": {"psnr": 20.0}}
+    assert "2dgs" in (tmp_path / "out" / "results.md").read_text()
+    assert other.figures().stat().st_mtime_ns == before
+
+
+def test_a_folder_is_replaced_whole_and_what_a_kill_put_aside_comes_back(tmp_path):
+    folder, fresh = tmp_path / "run", tmp_path / "run.new"
+    for each in (folder, fresh):
+        each.mkdir()
+        (each / "name").write_text(each.name)
+    replace_folder(folder, fresh)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert (folder / "name").read_text() == "run.new"
+    folder.rename(tmp_path / "run.old")  # where a kill between the two leaves it
+    recover_folder(folder)
+    assert (folder / "name").read_text() == "run.new"
+
+
+def test_a_folder_goes_to_a_cluster_in_pieces_and_is_the_same_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "PIECE", 4096)
+    folder = tmp_path / "folder"
+    (folder / "deep").mkdir(parents=True)
+    for name, size in {"a": 0, "b": 5000, "deep/c": 30_000}.items():
+        (folder / name).write_bytes(np.random.default_rng(size).bytes(size))
+    pieces = cluster._packed(folder, lambda piece: piece)
+    assert len(pieces) > 3
+    cluster._unpack(pieces, tmp_path / "there")
+    names = [str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()]
+    assert filecmp.cmpfiles(folder, tmp_path / "there", names, shallow=False) == (names, [], [])
+
+
+def test_a_folder_among_the_temporary_files_that_others_can_write_is_not_used(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert stat.S_IMODE(cluster._own_folder().stat().st_mode) == stat.S_IRWXU
+    cluster._own_folder().chmod(0o777)
+    with pytest.raises(SceneError, match="is not this user's alone"):
+        cluster._own_folder()
+
+
 # measurements and pictures
 
 
@@ -377,6 +571,28 @@ def test_our_figures_are_those_of_ns_eval(measured):
     ours = json.loads(measured[1].figures().read_text())["results"]
     timing = {"fps", "fps_std", "num_rays_per_sec", "num_rays_per_sec_std"}
     assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})
+
+
+@pytest.mark.usefixtures("eager")
+@pytest.mark.parametrize("background", ["black", "white", "random"])
+def test_our_figures_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_path, background):
+    for path in (scene / "images").iterdir():
+        image = Image.open(path).convert("RGBA")
+        image.putalpha(Image.linear_gradient("L").resize(image.size))
+        image.save(path)
+
+    def on(config):
+        config.pipeline.model.background_color = background
+
+    trainer = trainer_of(scene, tmp_path, "photo_gs", iterations=2, change=on)
+    trainer.config.save_config()
+    trainer.train()
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    assert isinstance(pipeline, FacadePipeline)
+    theirs = pipeline.get_average_eval_image_metrics()
+    ours = measure(trainer.base_dir / "config.yml")["results"]
+    assert ours["psnr"] == pytest.approx(theirs["psnr"], rel=1e-5)
+    assert ours["ssim"] == pytest.approx(theirs["ssim"], rel=1e-5)
 
 
 @pytest.mark.usefixtures("eager")

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -69,6 +71,38 @@ def test_colmap_and_transforms_json_give_the_same_cameras(scene):
     for one, other in zip(before, after, strict=True):
         torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat, atol=1e-5, rtol=0)
         torch.testing.assert_close(one.camera.K, other.camera.K)
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "ns-process-data", "COLMAP"])
+@pytest.mark.parametrize("method", [{}, {"orientation_method": "pca", "center_method": "focus"}])
+def test_the_rescaled_world_is_that_of_nerfstudios_own_parsers(scene, kind, method):
+    """So that runs of before, and of other methods, see the same cameras and points."""
+    common = {"data": scene, "downscale_factor": 1, "load_3D_points": True, **method}
+    if kind == "COLMAP":
+        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        config = ColmapDataParserConfig(colmap_path=Path("sparse/0"), eval_mode="all", **common)
+    else:
+        transforms = json.loads((scene / "transforms.json").read_text())
+        if kind == "ns-process-data":
+            transforms["applied_transform"] = [[0.0, 1, 0, 0.5], [1, 0, 0, -2], [0, 0, -1, 3]]
+        (scene / "transforms.json").write_text(json.dumps(transforms))
+        config = NerfstudioDataParserConfig(eval_mode="all", **common)
+    theirs = config.setup().get_dataparser_outputs("train")
+    order = {path: k for k, path in enumerate(theirs.image_filenames)}
+    ours = parse(scene, **method)
+    poses = theirs.cameras.camera_to_worlds[[order[path] for path in ours.image_filenames]]
+    torch.testing.assert_close(ours.cameras.camera_to_worlds, poses, atol=2e-6, rtol=0)
+    assert ours.dataparser_scale == pytest.approx(theirs.dataparser_scale, rel=1e-6)
+    torch.testing.assert_close(ours.dataparser_transform.float(), theirs.dataparser_transform, atol=1e-5, rtol=0)
+    for name, atol in (("points3D_xyz", 1e-5), ("points3D_rgb", 0)):
+        torch.testing.assert_close(ours.metadata[name], theirs.metadata[name], atol=atol, rtol=0)
+
+
+def test_points_without_colours_are_grey(scene):
+    header = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {axis}" for axis in "xyz")]
+    lines = [*header, "end_header", "0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+    (scene / "sparse_pc.ply").write_text("\n".join(lines) + "\n")
+    assert (parse(scene).metadata["points3D_rgb"] == torch.full((4, 3), 128)).all()
 
 
 def test_scene_cameras_undo_nerfstudios_rescaling(pristine_scene):

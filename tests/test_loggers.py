@@ -95,7 +95,7 @@ def test_the_error_picture_says_what_the_figure_does(tensorboard):
 @pytest.mark.usefixtures("eager", "offline_wandb")
 def test_wandb_offline_gets_all_that_tensorboard_gets(tensorboard, pristine_scene, tmp_path):
     trainer = watched(pristine_scene, tmp_path, "wandb")
-    wandb.finish()
+    wandb.teardown()  # finish does not wait for the process that writes the file
     (run,) = trainer.base_dir.glob("wandb/offline-run-*")
     logged = dict(recorded(run))
     tags = tensorboard[1].Tags()

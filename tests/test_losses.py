@@ -457,6 +457,11 @@ def test_equal_ends_are_a_constant_weight(value):
     assert [weight(t) for t in (0, 0.3, 1)] == pytest.approx([value] * 3)
 
 
-def test_negative_weight_is_refused():
-    with pytest.raises(ValueError, match="cannot be negative"):
-        ExponentialDecay(0.5, -0.1)
+def test_a_weight_that_begins_at_0_leaves_its_term_out_to_the_end():
+    assert [ExponentialDecay(0.0, 0.1)(t) for t in (0, 0.5, 1)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("ends", [(0.5, -0.1), (float("nan"), 0.1), (0.1, float("inf")), (0.5, 0.0)])
+def test_weights_that_are_none_and_a_decay_to_0_are_refused(ends):
+    with pytest.raises(ValueError, match="a loss weight"):
+        ExponentialDecay(*ends)

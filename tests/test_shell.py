@@ -365,7 +365,7 @@ def test_maps_are_cast_at_the_size_asked_for(tmp_path: Path, alignment: Alignmen
     maps = CueMaps.open(tmp_path, "shell")
     assert maps.manifest.max_image_size == 32
     assert maps.read(VIEWS[0].name, VIEWS[0].camera.shrunk(32)) is not None
-    with pytest.raises(SceneError, match=r"shellgs cast .* --max-image-size 32"):
+    with pytest.raises(SceneError, match=r"it is 32x24 pixels.* --max-image-size 64`"):
         maps.read(VIEWS[0].name, VIEWS[0].camera)
 
 

@@ -80,4 +80,7 @@ def _opened(video: Path) -> Iterator[av.container.InputContainer]:
             container.streams.video[0].thread_type = "AUTO"
             yield container
     except av.error.FFmpegError as error:
-        raise SceneError(f"{video} cannot be read as a video ({error.strerror}); convert it to mp4") from error
+        raise SceneError(
+            f"{video} cannot be read as a video ({error.strerror}): copy it again if it is cut off or damaged, and "
+            "convert it to mp4 if it is of another kind"
+        ) from error

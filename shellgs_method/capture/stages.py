@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from dataparsers.errors import SceneError
-from dataparsers.files import fingerprint
+from dataparsers.files import fingerprint, read_json
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import add_mask, add_photograph, find_masks, find_photographs, group_by_lens
@@ -113,11 +113,11 @@ class _Capture:
     def run(self) -> Summary:
         self._refuse_to_overwrite()
         self.work = Work(self.scene / WORK)
-        if not self.work.has("undistorted", self.model_key):
+        if not self.work.has("undistorted", self.model_key) or self._lacking():
             self._photographs()
             database = self._features()
             self._model(database)
-        summary = self._judged(json.loads((self.work.folder / "model" / "models.json").read_text()))
+        summary = self._judged(read_json(self.work.folder / "model" / "models.json"))
         self._undistorted(summary)
         return summary
 
@@ -205,25 +205,42 @@ class _Capture:
             )
         return Summary(missing=missing, registered=largest.pop("names"), **largest)
 
+    def _lacking(self) -> list[str]:
+        """What of the scene is neither in its place nor ready to be moved there."""
+        ready = self.work.folder / "undistorted"
+        names = ["images", *(["masks"] if self.masks else []), "colmap"]
+        return [name for name in names if not (self.scene / name).exists() and not (ready / name).exists()]
+
     def _undistorted(self, summary: Summary) -> None:
         if not self.work.has("undistorted", self.model_key):
-            with self.work.making("undistorted", self.model_key) as folder:
-                self._step(
-                    "undistort",
-                    "undistorting",
-                    len(summary.registered),
-                    lambda: sum(path.is_file() for path in (folder / "images").rglob("*")),
-                    model=str(self.work.folder / "model"),
-                    photographs=str(self.folder),
-                    masks=str(self.work.folder / "masks") if self.masks else None,
-                    output=str(folder),
-                )
-                (folder / "colmap" / "sparse").mkdir(parents=True)
-                os.replace(folder / "sparse", folder / "colmap" / "sparse" / "0")
-        # The model last: without it, no dataparser takes the folder for a scene.
+            self._undistort("undistorted", summary)
+        self._move("undistorted")
+        if self._lacking():  # somebody deleted what this capture had made
+            self._undistort("restored", summary)
+            self._move("restored")
+            self.work.drop("restored")
+
+    def _undistort(self, product: str, summary: Summary) -> None:
+        with self.work.making(product, self.model_key) as folder:
+            self._step(
+                "undistort",
+                "undistorting",
+                len(summary.registered),
+                lambda: sum(path.is_file() for path in (folder / "images").rglob("*")),
+                model=str(self.work.folder / "model"),
+                photographs=str(self.folder),
+                masks=str(self.work.folder / "masks") if self.masks else None,
+                output=str(folder),
+            )
+            (folder / "colmap" / "sparse").mkdir(parents=True)
+            os.replace(folder / "sparse", folder / "colmap" / "sparse" / "0")
+
+    def _move(self, product: str) -> None:
+        """Put a product's parts into the scene; the model last: without it, no dataparser takes that for a scene."""
         for name in ("images", "masks", "colmap"):
-            if (self.work.folder / "undistorted" / name).exists():
-                os.replace(self.work.folder / "undistorted" / name, self.scene / name)
+            part = self.work.folder / product / name
+            if part.exists() and not (self.scene / name).exists():
+                os.replace(part, self.scene / name)
 
     def _step(self, step: str, description: str, total: int, count: Callable[[], int] | None, **arguments: Any) -> Any:
         log = self.work.folder / "colmap.log"

@@ -6,10 +6,11 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dataparsers.files import atomic_write
+from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write, read_json
 
 
 class Work:
@@ -22,7 +23,9 @@ class Work:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self._file = folder / "record.json"
-        self._keys: dict[str, str] = json.loads(self._file.read_text()) if self._file.is_file() else {}
+        self._keys: dict[str, str] = {}
+        with suppress(SceneError, FileNotFoundError):  # damaged: all is made anew
+            self._keys = read_json(self._file)
 
     def has(self, product: str, key: str) -> bool:
         """Whether the product is there and was made from this."""
@@ -43,6 +46,10 @@ class Work:
             self._cleared(product).mkdir()
             self._record(product, key)
         return self.folder / product
+
+    def drop(self, product: str) -> None:
+        """Delete a product."""
+        self._cleared(product)
 
     def _cleared(self, product: str) -> Path:
         self._record(product, None)  # first: a product must never stand under another's key

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float16, UInt8
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.splatfacto import SplatfactoModel
 from rich.progress import track
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from dataparsers.errors import SceneError
-from dataparsers.facade import FacadeDataParserConfig, find_cues
+from dataparsers.cue_maps import find_cues
+from dataparsers.errors import SceneError, check_output
+from dataparsers.facade import FacadeDataParserConfig
 from dataparsers.files import atomic_write
-from shellgs_method.batches import pinhole_camera, reference_errors, reference_maps, regions
+from dataparsers.layout import SceneLayout
+from shellgs_method.batches import picture_errors, pinhole_camera, reference_errors, reference_maps
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
 from shellgs_method.evaluation import (
@@ -27,7 +30,6 @@ from shellgs_method.evaluation import (
     angular_error,
     colours_to_normals,
     geometry_errors,
-    image_errors,
     mean_over_views,
     normals_from_depth,
 )
@@ -73,9 +75,20 @@ class Snapshot:
 
     @classmethod
     def load(cls, path: Path) -> Snapshot:
-        """Read what :meth:`save` wrote."""
-        with np.load(path, allow_pickle=False) as arrays:
-            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            SceneError: the file is damaged.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                shot = cls(**{field.name: arrays[field.name] for field in fields(cls)})
+        except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+            raise SceneError(f"{path} is damaged ({type(error).__name__})") from error
+        pixels = [getattr(shot, name) for name in ("photograph", "rgb", "normal", "error", "depth", "mask")]
+        if len({values.shape[:2] for values in pixels}) > 1 or any(values.ndim != 3 for values in pixels):
+            raise SceneError(f"{path} is damaged (its pictures are of different sizes)")
+        return shot
 
 
 @torch.no_grad()
@@ -99,9 +112,10 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
         pictures.mkdir(parents=True, exist_ok=True)
     for index, (cameras, batch) in enumerate(track(datamanager.fixed_indices_eval_dataloader, transient=True)):
         camera = pinhole_camera(cameras)
-        rendering, photograph = _render(model, cameras, camera), _photograph(model, batch)
+        outputs = model.get_outputs_for_camera(cameras.to(model.device))
+        rendering, photograph = _rendering(model, outputs, camera), _photograph(model, outputs, batch)
         figures.append(
-            image_errors(rendering.rgb, photograph, regions(batch, metres_per_unit, rendering.rgb.device))
+            picture_errors(rendering.rgb, photograph, batch, metres_per_unit)
             | reference_errors(rendering, camera, batch, metres_per_unit)
         )
         if pictures and "shell_mask" in batch and batch["shell_mask"].any():
@@ -115,12 +129,12 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
     }
 
 
-def measure_shell(scene: Path) -> dict[str, float]:
+def measure_shell(layout: SceneLayout) -> dict[str, float]:
     """Figures of the shell itself against the truth, in held-out views and where both are; empty without a truth."""
-    if not {"shell", "truth"} <= {*find_cues(scene)}:
+    if not {"shell", "truth"} <= {*find_cues(layout.data)}:
         return {}
-    dataparser, cpu = FacadeDataParserConfig(data=scene), torch.device("cpu")
-    datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=scene), None, cpu)
+    dataparser, cpu = FacadeDataParserConfig(**vars(layout)), torch.device("cpu")
+    datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=layout.data), None, cpu)
     dataset, figures = datamanager.eval_dataset, []
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
     for index in range(len(dataset)):
@@ -144,8 +158,7 @@ def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDa
     return config.setup(device=device, test_mode="test", world_size=1, local_rank=0)
 
 
-def _render(model: Model, cameras: Cameras, camera: Camera) -> Rendering:
-    outputs = model.get_outputs_for_camera(cameras.to(model.device))
+def _rendering(model: Model, outputs: dict[str, Tensor], camera: Camera) -> Rendering:
     if "depth" not in outputs or "accumulation" not in outputs:
         raise SceneError(f"{type(model).__name__} renders no depth, which all geometric figures are made of")
     depth = outputs["depth"]
@@ -155,11 +168,14 @@ def _render(model: Model, cameras: Cameras, camera: Camera) -> Rendering:
     return Rendering(outputs["rgb"], depth, outputs["accumulation"], normal)
 
 
-def _photograph(model: Model, batch: dict) -> Float[Tensor, "H W 3"]:
-    """As the method is to see it: transparency is black, the background of our methods."""
+def _photograph(model: Model, outputs: dict[str, Tensor], batch: dict) -> Float[Tensor, "H W 3"]:
+    """As the method is to see it: what is transparent shows the background that it renders; black, if it has none."""
     image = batch["image"].to(model.device)
     image = image / 255 if image.dtype == torch.uint8 else image
-    return image[..., :3] * image[..., 3:] if image.shape[-1] == 4 else image
+    if image.shape[-1] == 3:
+        return image
+    background = outputs["background"] if isinstance(model, SplatfactoModel) else torch.zeros(3, device=model.device)
+    return image[..., :3] * image[..., 3:] + background * (1 - image[..., 3:])
 
 
 def _snapshot(
@@ -193,6 +209,9 @@ def _snapshot(
 
 def write_figures(config: Path, output: Path, half: Half | None = None, pictures: Path | None = None) -> dict:
     """:func:`measure`, as the json that ns-eval would write; returns the figures."""
+    check_output(output)
+    if pictures is not None and pictures.exists() and not pictures.is_dir():
+        raise SceneError(f"{pictures} is a file: name a folder for the pictures")
     measured = measure(config, half, pictures)
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(output) as file:

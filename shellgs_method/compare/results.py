@@ -9,13 +9,15 @@ from typing import NamedTuple
 
 from rich.console import Console
 
+from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write
-from shellgs_method.compare.measure import measure_shell
+from shellgs_method.compare.measure import Snapshot, measure_shell
 from shellgs_method.compare.pictures import common_views, curves, strip, surfaces
 from shellgs_method.compare.report import write_report
-from shellgs_method.compare.runs import Run
-from shellgs_method.compare.tables import FiguresTable, tables
+from shellgs_method.compare.runs import DamagedRunError, Run
+from shellgs_method.compare.tables import FiguresTable, read_figures, tables
 from shellgs_method.evaluation.tables import rich_table
+from shellgs_method.folders import held
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finishes runs; returns those that failed, with the reason."""
@@ -36,13 +38,33 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
     """Finish the runs that are not, write all results, and show the tables.
 
     Raises:
-        SceneError: a run was made with other settings. Nothing is started then.
+        SceneError: a run was made with other settings, or another comparison works here. Nothing is started then.
     """
+    output.mkdir(parents=True, exist_ok=True)
+    with held(output) as alone:
+        if not alone:
+            raise SceneError(f"another comparison works in {output}: wait for its end, or give another --output")
+        return _compare(runs, launch, output, console)
+
+
+def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Console) -> Comparison:
+    failures: dict[Run, str] = {}
     for run in runs:
+        try:
+            run.check()
+        except DamagedRunError as error:
+            failures[run] = str(error)
+    usable = [run for run in runs if run not in failures]
+    for run in usable:
         run.settle()
-    unfinished = [run for run in runs if not run.finished]
-    console.print(f"{len(runs) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
-    failures = launch(unfinished) if unfinished else {}
+        _remove_damaged(run, console)
+    unfinished = [run for run in usable if not run.finished]
+    console.print(f"{len(usable) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
+    if unfinished:
+        failures |= launch(unfinished)
+    for run in usable:  # what came of the launch is read too
+        _remove_damaged(run, console)
+    runs = usable
     if not console.is_terminal:  # where a status shows nothing
         console.print(WRITING)
     with console.status(WRITING):
@@ -55,9 +77,25 @@ def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Consol
     return comparison
 
 
+def _remove_damaged(run: Run, console: Console) -> None:
+    """Remove measurements that cannot be read; they are made again."""
+    for half in (None, *run.halves):
+        if (path := run.figures(half)).exists() and read_figures(path) is None:
+            console.print(f"[yellow]{path} is damaged: it is measured again.", highlight=False)
+            path.unlink()
+    for path in run.pictures.glob("*.npz"):
+        try:
+            Snapshot.load(path)
+        except SceneError as error:
+            console.print(f"[yellow]{error}: it is rendered again.", highlight=False)
+            path.unlink()
+            run.figures().unlink(missing_ok=True)
+
+
 def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]) -> Comparison:
     """Write results.md, tables/, the pictures and report.html of what is measured so far."""
-    made = list(tables(runs, {scene: measure_shell(scene) for scene in {run.scene for run in runs}}))
+    layouts = {run.scene: run.paths.of(run.scene) for run in runs}
+    made = list(tables(runs, {scene: measure_shell(layout) for scene, layout in layouts.items()}))
     for table in made:
         table.save(output / "tables")
     with atomic_write(output / "results.md") as file:

@@ -6,18 +6,23 @@ import json
 import re
 import shlex
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.engine.trainer import TrainerConfig
 
-from dataparsers.cue_maps import CueMaps
+from dataparsers.cue_maps import CueMaps, find_cues
 from dataparsers.errors import SceneError
-from dataparsers.facade import FacadeDataParserConfig, find_cues, read_views
-from dataparsers.files import atomic_write, content_hash, fingerprint
+from dataparsers.facade import read_views
+from dataparsers.files import atomic_write
+from dataparsers.layout import SceneLayout, ScenePaths
 from shellgs_method.ablations import ABLATIONS
+from shellgs_method.compare.settings import config_settings, default_settings, parsed, scene_settings
+from shellgs_method.folders import recover_folder
 from shellgs_method.trainer import FacadeTrainerConfig
 
 METHODS = ("photo-gs", "mono-gs", "2dgs", "shellgs")
@@ -27,6 +32,11 @@ PAPER = (*METHODS, "shellgs-depth", "shellgs-normal", "shellgs-depth-normal", "s
 """All that the paper's tables compare."""
 SAVES = 10
 """Checkpoints that a run writes, at least: what a kill can cost."""
+
+
+class DamagedRunError(SceneError):
+    """The folder of a run cannot be used, which stops no other run."""
+
 
 Half = Literal["A", "B"]
 HALVES: tuple[Half, ...] = ("A", "B")
@@ -50,13 +60,28 @@ class Variant:
         name, _, words = text.partition("=")
         if not re.fullmatch(r"[\w.+-]*\w[\w.+-]*", name):
             raise SceneError(f"{name!r} is to name a folder: take letters, digits, dots and dashes")
-        method, *flags = shlex.split(words) or ABLATIONS.get(name, (name,))
+        try:
+            method, *flags = shlex.split(words) or ABLATIONS.get(name, (name,))
+        except ValueError as error:
+            raise SceneError(f"{words!r} is no method with its flags: {error}") from error
         if method not in all_methods:
             ours = ", ".join([*ALL, *ABLATIONS])
             raise SceneError(
                 f"there is no method {method!r}: take {ours}, another that ns-train lists, or NAME=METHOD FLAGS"
             )
-        return cls(name, method, tuple(flags))
+        variant = cls(name, method, tuple(flags))
+        if name in {*all_methods, *ABLATIONS} and variant != cls(name, *_definition(name)):
+            raise SceneError(f"{name} is the name of a method: give {words!r} another")
+        return variant
+
+    @property
+    def config(self) -> TrainerConfig:
+        """What ns-train makes of it, where nothing but the flags is said.
+
+        Raises:
+            SceneError: it refuses them.
+        """
+        return parsed((self.method, *self.flags))
 
     @property
     def ours(self) -> bool:
@@ -71,14 +96,14 @@ class Variant:
     @property
     def held_out(self) -> Half | None:
         """The half of the facade that no cue supervises."""
-        pairs = list(zip(self.flags, self.flags[1:], strict=False))
-        return next((half for half in HALVES if ("--pipeline.datamanager.holdout", half) in pairs), None)
+        half = getattr(self.config.pipeline.datamanager, "holdout", "none")
+        return half if half in HALVES else None
 
-    @property
-    def cues(self) -> set[str]:
-        """Kinds of maps that a result depends on: the references, and what supervises."""
-        config = all_methods[self.method].pipeline.model
-        return {"shell", "truth", getattr(config, "cues", "none"), *self.flags}
+
+def _definition(name: str) -> tuple[str, tuple[str, ...]]:
+    """Method and flags of a name that is not the user's own."""
+    method, *flags = ABLATIONS.get(name, (name,))
+    return method, tuple(flags)
 
 
 @dataclass(frozen=True)
@@ -95,6 +120,8 @@ class Run:
     """Halves of the facade that are measured apart, beside the whole."""
     curve_points: int = 0
     """How often all held-out views are measured during the training."""
+    paths: ScenePaths = field(default_factory=ScenePaths)
+    """Where in the scene its files are."""
 
     @property
     def label(self) -> str:
@@ -159,51 +186,104 @@ class Run:
         if variant.ours and any(self.checkpoints.glob("step-*.ckpt")):
             words += ["--load-dir", self.checkpoints]
         words += variant.flags
-        return _words(*words, *([] if variant.ours else ["facade-data"]))
+        paths = [word for name, path in self.paths.chosen.items() for word in (f"--{name}", path)]
+        if "facade-data" not in words and (paths or not variant.ours):
+            words += ["facade-data"]
+        return _words(*words, *paths)
 
-    @property
+    @cached_property
     def settings(self) -> dict:
-        """What the run's result depends on."""
-        return {
-            "method": self.variant.method,
-            "flags": list(self.variant.flags),
-            "iterations": self.iterations,
-            "seed": self.seed,
-            **_scene_settings(self.scene, self.variant.cues),
-        }
-
-    def settle(self) -> None:
-        """Write the settings into the run's folder, where a later comparison finds them.
+        """What the run's result depends on.
 
         Raises:
-            SceneError: the folder holds a run of other settings that has come to a checkpoint; it is left as it is.
+            SceneError: the flags set what the comparison sets.
         """
-        path, settings = self.folder / "settings.json", self.settings
-        if path.exists() and any(self.checkpoints.glob("step-*.ckpt")):
-            before = json.loads(path.read_text())
-            changed = [key for key in settings if settings[key] != before.get(key)]
+        config = parsed(tuple(self._train()[1:]))
+        expected = {
+            "data": self.scene,
+            "max_num_iterations": self.iterations,
+            "output_dir": self.output / "runs" / self.scene.name,
+            "experiment_name": self.variant.name,
+            "timestamp": f"seed-{self.seed}",
+        }
+        for name, value in expected.items():
+            if getattr(config, name) != value:
+                raise SceneError(
+                    f"{self.variant.name} sets {name}, which `shellgs compare` sets for all: leave it out of its flags"
+                )
+        return {
+            "method": self.variant.method,
+            "iterations": self.iterations,
+            "seed": self.seed,
+            **config_settings(config),
+            **scene_settings(self.scene, config),
+        }
+
+    def check(self) -> None:
+        """Refuse a run that cannot be made, or whose folder is another's; everything is left as it is.
+
+        Raises:
+            SceneError: the flags cannot be, or the folder holds a run of other settings that has come to a checkpoint.
+            DamagedRunError: the settings that lie there cannot be read.
+        """
+        recover_folder(self.folder)
+        path, settings = self._recorded, self.settings
+        if self._begun:
+            before = _settings_before(path)
+            # An earlier build did not write all of them; what it did not write it did not have, or as the default.
+            known = settings | default_settings(self.variant.method) | before
+            changed = [key for key in settings if settings[key] != known[key]]
             if changed:
-                what = "; ".join(f"{key}: {_short(before.get(key))}, now {_short(settings[key])}" for key in changed)
+                what = "; ".join(f"{key}: {_short(known[key])}, now {_short(settings[key])}" for key in changed[:5])
                 raise SceneError(
                     f"{self.folder} is a run of other settings ({what}): give another --output, or remove that folder"
                 )
             return
         if not self.variant.ours:
-            _refuse_photographs_that_change(self.scene, self.variant.method)
+            _refuse_photographs_that_change(self.paths.of(self.scene), self.variant.method)
         if self.config.exists() and not path.exists():
             raise SceneError(f"{self.folder} is a run that `shellgs compare` did not make: give another --output")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as file:
-            file.write(json.dumps(settings, indent=2).encode())
+
+    def settle(self) -> None:
+        """Write the settings into the run's folder, where a later comparison finds them.
+
+        Raises:
+            SceneError: as :meth:`check`.
+        """
+        self.check()
+        if not self._begun:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self._recorded) as file:
+                file.write(json.dumps(self.settings, indent=2).encode())
+
+    @property
+    def _recorded(self) -> Path:
+        return self.folder / "settings.json"
+
+    @property
+    def _begun(self) -> bool:
+        """Whether a run that a comparison made has come to a checkpoint."""
+        return self._recorded.exists() and any(self.checkpoints.glob("step-*.ckpt"))
+
+
+def _settings_before(path: Path) -> dict:
+    try:
+        before = json.loads(path.read_text())
+        if isinstance(before, dict):
+            return before
+    except ValueError:
+        pass
+    raise DamagedRunError(f"{path} is damaged, so that nobody knows what the run is of: remove {path.parent}")
 
 
 def grid(
     scenes: Sequence[Path],
-    names: Iterable[str],
+    names: Sequence[str],
     seeds: Sequence[int],
     iterations: int,
     output: Path,
     curve_points: int = 0,
+    paths: ScenePaths | None = None,
 ) -> list[Run]:
     """All runs of a comparison: seed by seed, so that a first table is there early.
 
@@ -213,6 +293,10 @@ def grid(
         SceneError: two scenes of one name, or a method that does not exist.
         FileNotFoundError: a scene that is not there.
     """
+    if not names or not seeds:
+        raise SceneError(f"there is nothing to compare: name {'methods' if seeds else 'seeds'}")
+    if iterations < 1 or curve_points < 0 or min(seeds) < 0:
+        raise SceneError("a run has at least one iteration, and no seed or number of curve points below 0")
     for scene in scenes:
         if not scene.is_dir():
             raise FileNotFoundError(f"{scene} is not a folder; `shellgs compare` takes scene folders.")
@@ -220,7 +304,7 @@ def grid(
     if len({scene.name for scene in scenes}) < len(scenes):
         raise SceneError("two scenes have the same folder name, which names their results: rename one")
     words = [word for name in names for word in {"paper": PAPER, "all": ALL}.get(name, (name,))]
-    variants = [Variant.parse(word) for word in dict.fromkeys(words)]
+    variants = _variants(words)
     halves: tuple[Half, ...] = tuple(half for half in HALVES if any(variant.held_out == half for variant in variants))
     return [
         Run(
@@ -231,6 +315,7 @@ def grid(
             output.resolve(),
             () if variant.held_out else halves,
             curve_points,
+            paths or ScenePaths(),
         )
         for seed in dict.fromkeys(seeds)
         for scene in scenes
@@ -238,23 +323,25 @@ def grid(
     ]
 
 
-def _scene_settings(scene: Path, cues: set[str]) -> dict[str, str]:
-    """Hashes of a scene's cameras and of what its maps were made from."""
-    colmap = FacadeDataParserConfig(data=scene).setup().colmap_folder()
-    cameras = [scene / "transforms.json"] if colmap is None else sorted((scene / colmap).glob("*.*"))
-    hashes = {"cameras": fingerprint(*(content_hash(path) for path in cameras))}
-    for kind in find_cues(scene):
-        if kind in cues:
-            manifest = CueMaps.open(scene, kind).manifest
-            hashes[f"{kind} maps"] = fingerprint(manifest.sources, manifest.metres_per_unit, manifest.max_image_size)
-    return hashes
+def _variants(words: Iterable[str]) -> list[Variant]:
+    """What words stand for, each once.
+
+    Raises:
+        SceneError: one name stands for two methods, or for one with different flags.
+    """
+    found: dict[str, Variant] = {}
+    for variant in map(Variant.parse, words):
+        first = found.setdefault(variant.name, variant)
+        if config_settings(first.config) != config_settings(variant.config) or first.method != variant.method:
+            raise SceneError(f"two methods are named {variant.name}: give each a name of its own (NAME='METHOD FLAGS')")
+    return list(found.values())
 
 
-def _refuse_photographs_that_change(scene: Path, method: str) -> None:
+def _refuse_photographs_that_change(layout: SceneLayout, method: str) -> None:
     """Only our datamanager undistorts and resizes photographs for the cameras of facade-data."""
-    config = FacadeDataParserConfig(data=scene)
+    scene = layout.data
     resized = any(CueMaps.open(scene, kind).manifest.max_image_size for kind in find_cues(scene))
-    if resized or any(view.lens for view in read_views(config)):
+    if resized or any(view.lens for view in read_views(layout)):
         raise SceneError(
             f"{method} takes photographs as they are, and the cameras of {scene} are of undistorted or resized ones: "
             "bring the scene to pinhole cameras at the size of its maps (colmap image_undistorter), or leave it out"
@@ -263,8 +350,6 @@ def _refuse_photographs_that_change(scene: Path, method: str) -> None:
 
 def _short(value: object) -> str:
     """A setting as a message shows it."""
-    if isinstance(value, list):
-        return shlex.join(value) or "none"
     return str(value)[:12]
 
 

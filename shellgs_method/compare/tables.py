@@ -80,11 +80,20 @@ class FiguresTable:
                 file.write(text.encode())
 
 
-def read_figures(path: Path) -> dict[str, float]:
-    """Figures of a run from the json that ns-eval, or we, wrote; without the deviations over the views."""
-    results = json.loads(path.read_text())["results"]
-    spread = {f"{key}{suffix}" for key in results for suffix in ("_std", "_views")}
-    return {key: value for key, value in results.items() if key not in spread}
+def read_figures(path: Path) -> dict[str, float] | None:
+    """Figures of a run from the json that ns-eval, or we, wrote; without the deviations over the views.
+
+    None where the file is damaged.
+    """
+    try:
+        results = json.loads(path.read_text())["results"]
+        numbers = {key: value for key, value in results.items() if isinstance(value, (int, float))}
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+    if len(numbers) < len(results):
+        return None
+    spread = {f"{key}{suffix}" for key in numbers for suffix in ("_std", "_views")}
+    return {key: value for key, value in numbers.items() if key not in spread}
 
 
 def tables(
@@ -135,7 +144,7 @@ def _rows(runs: Sequence[Run], half: Half | None = None) -> dict[str, dict[str, 
     for run in runs:
         if run.figures(half).exists():
             row = rows.setdefault(run.variant.name, {})
-            for key, value in read_figures(run.figures(half)).items():
+            for key, value in (read_figures(run.figures(half)) or {}).items():
                 row.setdefault(key, []).append(value)
     return rows
 

@@ -15,6 +15,7 @@ from rich.progress import track
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write
+from dataparsers.map_files import is_number
 from dataparsers.photograph import View
 from dataparsers.sparse_points import SparsePoints
 from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_disparity
@@ -153,7 +154,8 @@ class Fits:
         try:
             kept = json.loads(path.read_bytes())
             views = dict(kept["views"]) if kept["sources"] == sources else {}
-        except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: all are made again
+            views = {name: fit for name, fit in views.items() if fit is None or is_number(fit["residual"])}
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):  # none, or damaged: all are made again
             views = {}
         return cls(path, sources, views)
 

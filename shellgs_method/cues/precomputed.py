@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Literal, Optional
@@ -113,8 +111,11 @@ class MapFolder:
             return None
         try:
             array = self._decode(path)
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-            raise SceneError(f"the map {path} of view {view.name!r} cannot be read ({error}): make it again") from error
+        except Exception as error:  # each format's reader has its own kinds of error for a damaged file
+            reason = " ".join(str(error).split())
+            raise SceneError(
+                f"the map {path} of view {view.name!r} cannot be read ({reason}): make it again"
+            ) from error
         array = array.squeeze()
         if array.ndim == 3 and array.shape[0] == 3 != array.shape[-1]:
             array = array.transpose(1, 2, 0)
@@ -154,7 +155,7 @@ class MapFolder:
             if array.dtype == np.uint8:
                 raise ValueError("its 8 bits are too few for depth; 16-bit png, npy or npz are enough")
             return array
-        file = np.load(path, allow_pickle=False)
+        file = np.load(path, allow_pickle=False, mmap_mode="r")  # what a file only claims is not allocated
         if isinstance(file, np.ndarray):
             return file
         with file:

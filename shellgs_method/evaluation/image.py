@@ -30,16 +30,23 @@ def image_errors(
     rgb: Float[Tensor, "H W 3"],
     target: Float[Tensor, "H W 3"],
     regions: Mapping[str, Bool[Tensor, "H W 1"]] | None = None,
+    kept: Bool[Tensor, "H W 1"] | None = None,
 ) -> dict[str, float]:
     """PSNR in dB (at most 100, so that an exact picture can be averaged), SSIM, and LPIPS where it can be had.
 
     Colours are in [0, 1]. SSIM is that of the loss, of a Gaussian window of 11 pixels and sigma 1.5; LPIPS has the
     AlexNet backbone. PSNR and SSIM of each region that is not empty are ``psnr_…`` and ``ssim_…`` with its name.
+
+    Pixels that are not kept count nowhere: they are taken to be exact, so that no window sees a difference there, and
+    left out of all means. LPIPS, whose mean is over all pixels, is divided by the share that is kept.
     """
-    rgb, target = rgb.detach().clamp(0, 1).permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
+    kept = torch.ones_like(target[..., :1], dtype=torch.bool) if kept is None else kept
+    if not kept.any():
+        return {}
+    rgb = rgb.detach().clamp(0, 1).where(kept, target)
+    rgb, target, kept = rgb.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], kept[..., 0]
     similarity = ssim(rgb, target, window_size=11)[0]
-    parts = {"": torch.ones_like(similarity[0], dtype=torch.bool)}
-    parts |= {f"_{name}": mask[..., 0] for name, mask in (regions or {}).items()}
+    parts = {"": kept} | {f"_{name}": mask[..., 0] & kept for name, mask in (regions or {}).items()}
     figures = {}
     for suffix, region in parts.items():
         if region.any():
@@ -48,7 +55,7 @@ def image_errors(
     network = lpips_network()
     if not isinstance(network, str) and min(rgb.shape[-2:]) >= SMALLEST_LPIPS_IMAGE:
         with torch.no_grad():
-            figures["lpips"] = network.to(rgb.device)(rgb, target).item()
+            figures["lpips"] = network.to(rgb.device)(rgb, target).item() / kept.float().mean().item()
     return figures
 
 

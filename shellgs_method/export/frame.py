@@ -66,7 +66,7 @@ class Frame:
     Attributes:
         name: "shell" or "scene".
         to_scene: similarity from this frame to the scene's.
-        offset: what brings coordinates back to where the shell has them, added; in metres.
+        offset: what brings coordinates back to where the shell, or the scene, has them, added; in this frame's unit.
         metric: whether the unit is the metre; else it is unknown.
         up: the axis that points up.
     """
@@ -111,6 +111,15 @@ def shell_frame(alignment: Alignment, shell: ShellMesh, up: UpAxis = "z") -> Fra
     return Frame("shell", alignment.shell_to_scene @ to_shell, offset, metric=True, up=up)
 
 
-def scene_frame(up: UpAxis = "z") -> Frame:
-    """The scene's own frame, whose unit nobody knows."""
-    return Frame("scene", np.eye(4), np.zeros(3), metric=False, up=up)
+def scene_frame(up: UpAxis = "z", middle: Float64[np.ndarray, " 3"] | None = None) -> Frame:
+    """The scene's own frame, whose unit nobody knows; large coordinates are shifted as those of a shell.
+
+    Args:
+        up: the axis that points up.
+        middle: somewhere in the middle of the scene; the origin if not given.
+    """
+    middle = np.zeros(3) if middle is None else middle
+    offset = np.round(middle, -2) if np.abs(middle).max() > FAR else np.zeros(3)
+    to_scene = np.eye(4)
+    to_scene[:3, 3] = offset
+    return Frame("scene", to_scene, offset, metric=False, up=up)

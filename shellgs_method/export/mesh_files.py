@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, check_output
 from dataparsers.files import atomic_write
 from shellgs_method.export.frame import Frame
 
@@ -25,12 +25,13 @@ def check_mesh_format(path: Path) -> None:
     """Refuse what cannot be written, before hours of work.
 
     Raises:
-        SceneError: the format is none of :data:`MESH_FORMATS`, or its library is missing.
+        SceneError: the format is none of :data:`MESH_FORMATS`, its library is missing, or the place takes no file.
     """
     if path.suffix.lower() not in MESH_FORMATS:
         raise SceneError(f"{path}: a mesh is written as one of {', '.join(MESH_FORMATS)}")
     if path.suffix.lower() in USD_FORMATS:
         _usd_modules(path)
+    check_output(path)
 
 
 def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | None = None) -> None:
@@ -89,5 +90,7 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
         collider.CreateApproximationAttr(UsdPhysics.Tokens.none)
         stage.GetRootLayer().Save()
         os.replace(temporary, path)
+    except RuntimeError as error:  # pxr's, who says little
+        raise SceneError(f"{path} cannot be written: is there room on the disk? ({str(error)[:200]})") from error
     finally:
         temporary.unlink(missing_ok=True)

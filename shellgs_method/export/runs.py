@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float32, Float64
 from rich.progress import track
 
+from dataparsers.camera import positions
 from dataparsers.errors import SceneError
 from dataparsers.photograph import load_mask
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
@@ -22,7 +23,7 @@ from shellgs_method.export.frame import Box, Frame, UpAxis, scene_frame, shell_f
 from shellgs_method.export.splats import Splats
 from shellgs_method.export.tsdf import DepthView
 from shellgs_method.model import FacadeModel, reference_errors
-from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface, load_shell
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
 from shellgs_method.shell.similarity import transformed
 from shellgs_method.trained import load_run
 
@@ -74,13 +75,15 @@ class TrainedRun:
         if not (scene / ALIGNMENT).is_file():
             return None
         alignment = Alignment.load(scene / ALIGNMENT)
-        return alignment, load_shell(scene / alignment.shell, cache=scene / "shell")
+        views = [view for dataset in self.datasets for view in dataset.views]
+        return alignment, alignment.load_shell(scene, views)
 
     @cached_property
     def frame(self) -> Frame:
         """The shell's frame in metres, else the scene's."""
         if self.shell is None:
-            return scene_frame(self.up or "z")
+            cameras = positions(view.camera for dataset in self.datasets for view in dataset.views)
+            return scene_frame(self.up or "z", cameras.mean(axis=0))
         gltf = self.shell[0].shell.lower().endswith((".glb", ".gltf"))
         return shell_frame(*self.shell, up=self.up or ("y" if gltf else "z"))
 

@@ -9,7 +9,10 @@ from shellgs_method.losses.reduction import weighted_mean
 
 
 def agreement_loss(
-    normal: Float[Tensor, "H W 3"], depth_normal: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]
+    normal: Float[Tensor, "H W 3"],
+    depth_normal: Float[Tensor, "H W 3"],
+    alpha: Float[Tensor, "H W 1"],
+    mask: Bool[Tensor, "H W 1"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean of 1 - <N, A n>: composited normals against those of the rendered depth (Huang et al. 2024, eq. 14).
 
@@ -20,8 +23,10 @@ def agreement_loss(
         normal: N, composited and not normalised.
         depth_normal: n, unit normals of the rendered depth, zero where there are none.
         alpha: A.
+        mask: pixels that count; all if not given.
     """
-    return (1 - (normal * depth_normal * alpha.detach()).sum(dim=-1)).mean()
+    terms = 1 - (normal * depth_normal * alpha.detach()).sum(dim=-1, keepdim=True)
+    return terms.mean() if mask is None else weighted_mean(terms, mask)
 
 
 def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> Float[Tensor, ""]:

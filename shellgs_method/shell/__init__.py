@@ -5,8 +5,8 @@
 are made of can be used alone.
 """
 
-from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.cast import ALIGNMENT, MASKS, CastSummary, cast_views
+from shellgs_method.shell.alignment import ALIGNMENT, Alignment
+from shellgs_method.shell.cast import MASKS, CastSummary, cast_views
 from shellgs_method.shell.check import CheckSummary, check_views
 from shellgs_method.shell.clouds import Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell

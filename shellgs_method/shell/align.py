@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dataparsers.camera import positions, upwards
+from dataparsers.cue_maps import CueMaps, source_hash
+from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.bays import facade_axes
@@ -116,8 +119,10 @@ def refined(
     """The placement brought closer to the SfM points.
 
     Raises:
-        SceneError: too few points are within ``reach`` metres of the shell.
+        SceneError: too few points are within ``reach`` metres of the shell, or these are none.
     """
+    if not 0 < reach < np.inf:
+        raise SceneError(f"--refine takes the metres by which the start may be off, more than 0, not {reach:g}")
     alignment = placement.alignment
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
@@ -140,14 +145,18 @@ def refined(
 def judge(
     scene: Path, placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, target: Path
 ) -> Validation:
-    """Validate a placement, write the report, and unless it is refused write it to ``target``.
+    """Validate a placement, write the report, and unless it is refused write it to ``target``, with its figures.
 
-    A file there that names the same place is left alone: cue maps are bound to its content.
+    Maps that were cast for the same place stay good: they are bound to the place, and told of the figures.
     """
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
     write_report(scene / REPORT, mesh, validation, placement.history)
-    kept = Alignment.load(target) if target.is_file() else None
-    if validation.verdict != "refused" and not (kept and kept.places_like(placement.alignment)):
-        judged = replace(placement.alignment, verdict=validation.verdict, figures=validation.figures())
-        judged.save(target)
+    if validation.verdict == "refused":
+        return validation
+    judged = replace(placement.alignment, verdict=validation.verdict, figures=validation.figures())
+    judged.save(target)
+    with suppress(FileNotFoundError, SceneError):  # none, or damaged, of which whoever reads them is told
+        maps = CueMaps.open(scene, "shell")
+        if maps.manifest.sources.get(target.relative_to(scene).as_posix()) == source_hash(target):
+            maps.with_error(judged.error)
     return validation

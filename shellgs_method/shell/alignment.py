@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float64
 
+from dataparsers.camera import positions
 from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write
+from dataparsers.files import atomic_write, read_json, remove_leftovers
+from dataparsers.photograph import View
+from shellgs_method.shell.clouds import Mesher
+from shellgs_method.shell.mesh import ShellMesh, load_shell
 from shellgs_method.shell.similarity import transformed
+
+ALIGNMENT = Path("shell/alignment.json")
+"""In the scene's folder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +34,10 @@ class Alignment:
         source: how the alignment was found, for people.
         verdict: of the validation, "good" or "doubtful"; empty where there was none.
         figures: the main numbers behind the verdict.
+        mesher: what makes a mesh of a shell that is a point cloud.
 
     Raises:
-        SceneError: the matrix is no similarity, or mirrors.
+        SceneError: the matrix is no similarity, or mirrors, or there is no such mesher.
     """
 
     shell_to_scene: Float64[np.ndarray, "4 4"]
@@ -37,6 +46,7 @@ class Alignment:
     source: str = "matrix"
     verdict: str = ""
     figures: Mapping[str, float | None] = field(default_factory=dict)
+    mesher: Mesher = "planes"
 
     def __post_init__(self) -> None:
         """Check the matrix."""
@@ -46,6 +56,8 @@ class Alignment:
         _check_similarity(matrix)
         if not 0 < self.metres_per_shell_unit < np.inf:
             raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
+        if self.mesher not in get_args(Mesher):
+            raise SceneError(f"there is no mesher {self.mesher!r}: it is one of {', '.join(get_args(Mesher))}")
 
     def __eq__(self, other: object) -> bool:
         """Equal in every number and word."""
@@ -77,12 +89,34 @@ class Alignment:
         return max(known, default=None)
 
     def places_like(self, other: Alignment) -> bool:
-        """Whether both put the same shell in the same place, however they were found."""
+        """Whether both put the same surface in the same place, however they were found."""
         return (
             np.array_equal(self.shell_to_scene, other.shell_to_scene)
             and self.shell == other.shell
             and self.metres_per_shell_unit == other.metres_per_shell_unit
+            and self.mesher == other.mesher
         )
+
+    def meshed_by(self, mesher: Mesher | None) -> Alignment:
+        """The same place of the surface that another mesher makes, which nobody has judged; None: the same mesher."""
+        if mesher is None or mesher == self.mesher:
+            return self
+        return replace(self, mesher=mesher, verdict="", figures={})
+
+    def load_shell(self, scene: Path, views: Sequence[View]) -> ShellMesh:
+        """The shell's mesh, in its own frame; that of a point cloud is kept in ``scene/shell``.
+
+        Args:
+            scene: the scene's folder.
+            views: photographs of the shell, whose cameras tell which side of a cloud's surface is out.
+
+        Raises:
+            FileNotFoundError: the shell is missing.
+            SceneError: the shell cannot be used.
+        """
+        cameras = positions(view.camera for view in views)
+        viewpoints = transformed(cameras, np.linalg.inv(self.shell_to_scene))
+        return load_shell(scene / self.shell, cache=scene / "shell", viewpoints=viewpoints, mesher=self.mesher)
 
     def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the shell in the scene's frame, in double precision."""
@@ -91,6 +125,7 @@ class Alignment:
     def save(self, path: Path) -> None:
         """Write the alignment as json."""
         path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
         with atomic_write(path) as file:
             file.write((json.dumps(self._fields(), indent=1, ensure_ascii=False) + "\n").encode())
 
@@ -107,15 +142,19 @@ class Alignment:
                 f"{path} does not exist: align the shell with `shellgs align {path.parent.parent} SHELL …`"
             )
         try:
-            fields = json.loads(path.read_bytes())
+            fields = read_json(path)
             matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
             unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
-            verdict, figures = str(fields.get("verdict", "")), dict(fields.get("figures", {}))
-            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, figures)
+            verdict, mesher = str(fields.get("verdict", "")), fields.get("mesher", "planes")
+            known = dict(fields.get("figures", {}))
+            figures = {str(name): None if value is None else float(value) for name, value in known.items()}
+            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, figures, mesher)
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
-        except (ValueError, TypeError, AttributeError) as error:
-            raise SceneError(f"{path}: {error}") from error
+        except SceneError as error:
+            raise SceneError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            raise SceneError(f"{path} is damaged ({error}): align the shell again") from error
 
     @classmethod
     def from_matrix_file(
@@ -154,14 +193,14 @@ class Alignment:
 def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
     try:
         if path.suffix == ".npy":
-            matrix = np.load(path, allow_pickle=False)
+            matrix = np.load(path, allow_pickle=False, mmap_mode="r")  # nothing that it only claims is allocated
         elif path.suffix == ".json":
             matrix = json.loads(path.read_bytes())
         else:
             matrix = [line.replace(",", " ").split() for line in path.read_text().splitlines() if line.strip()]
         matrix = np.array(matrix, dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise SceneError(f"this is not a 4x4 matrix ({error})") from error
+    except Exception as error:  # each form has its own kinds of error for a damaged file
+        raise SceneError(f"this is not a 4x4 matrix ({' '.join(str(error).split())})") from error
     if matrix.shape != (4, 4):
         raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")
     return matrix

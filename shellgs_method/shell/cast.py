@@ -10,23 +10,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 from rich.progress import track
 
 from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask
-from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.clouds import VERSION, Mesher, Meshing
-from shellgs_method.shell.mesh import load_shell
+from shellgs_method.shell.alignment import ALIGNMENT, Alignment
+from shellgs_method.shell.clouds import VERSION, Meshing
 from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.similarity import transformed
 
 log = logging.getLogger(__name__)
 
-# In the scene's folder:
-ALIGNMENT = Path("shell/alignment.json")
 MASKS = Path("shell/masks")
+"""In the scene's folder."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def cast_views(
     alignment: Alignment,
     *,
     max_image_size: int | None = None,
-    mesher: Mesher = "planes",
+    flags: str = "",
 ) -> CastSummary:
     """Cast the scene's shell into views and store the maps in ``scene/cues/shell``.
 
@@ -65,26 +63,30 @@ def cast_views(
     alignment. Nothing is written before some camera is known to see the shell.
 
     The shell knows nothing of what stands before it, a tree or a car: :func:`check_views` finds it, and what is black
-    in ``scene/shell/masks/<image's name>.png``, if there is such a picture, is taken out of the view's mask.
+    in ``scene/shell/masks/<image's name>.png``, if there is such a picture, is taken out of the view's mask. So is what
+    the photograph's own mask leaves out.
 
     Args:
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
-        alignment: names the shell and places it.
+        alignment: names the shell, says how it is meshed if it is a point cloud, and places it.
         max_image_size: cast for photographs resized to this longer side.
-        mesher: makes a mesh of a shell that is a point cloud; the mesh is kept in ``scene/shell``.
+        flags: what the command line must say to find the same photographs, with a blank before it.
 
     Raises:
         FileNotFoundError: the shell is missing.
         SceneError: the shell cannot be used, or no camera sees it.
     """
     start = time.monotonic()
+    if max_image_size is not None and max_image_size < 1:
+        raise SceneError(f"the longer side of the maps must be at least 1 pixel, not {max_image_size}")
     shell = scene / alignment.shell
     cameras = [view.camera for view in views]
-    viewpoints = transformed(positions(cameras), np.linalg.inv(alignment.shell_to_scene))
-    mesh = load_shell(shell, cache=scene / "shell", viewpoints=viewpoints, mesher=mesher)
+    mesh = alignment.load_shell(scene, views)
     caster = ShellCaster(mesh, alignment.shell_to_scene)
     _check_placement(caster, cameras, shell)
+    if not any(kept is None or kept.any() for kept in (_kept(view, scene) for view in views)):
+        raise SceneError(f"the masks of {scene} are black everywhere in every view: white is what is kept")
     kept = scene / ALIGNMENT
     if not kept.is_file() or not Alignment.load(kept).places_like(alignment):  # else it keeps its verdict
         alignment.save(kept)
@@ -92,8 +94,8 @@ def cast_views(
     maps = CueMaps.create(
         scene,
         "shell",
-        command=_command(max_image_size, mesh.meshing),
-        sources=[shell, kept, scene / MASKS],
+        command=_command(max_image_size, mesh.meshing) + flags,
+        sources=[shell, kept, scene / MASKS, *_mask_sources(scene, views)],
         revisions={"mesher": f"{mesh.meshing.mesher} {VERSION}"} if mesh.meshing else {},
         metres_per_unit=alignment.metres_per_unit,
         max_image_size=max_image_size,
@@ -133,9 +135,21 @@ def _command(max_image_size: int | None, meshing: Meshing | None) -> str:
     return command
 
 
+def _mask_sources(scene: Path, views: Sequence[View]) -> list[Path]:
+    """The files or folders, at the top of the scene, that hold the photographs' masks."""
+    return sorted({scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask})
+
+
+def _kept(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
+    """What the photograph's mask and the shell's leave of a view; None where it has neither."""
+    painted = scene / MASKS / f"{view.name}.png"
+    masks = [load_mask(replace(view, mask=path)) for path in (view.mask, painted if painted.is_file() else None)]
+    masks = [mask for mask in masks if mask is not None]
+    return np.logical_and.reduce(masks) if masks else None
+
+
 def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
-    path = scene / MASKS / f"{view.name}.png"
-    kept = load_mask(replace(view, mask=path)) if path.is_file() else None
+    kept = _kept(view, scene)
     return cue if kept is None else replace(cue, mask=cue.mask & kept)
 
 

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from dataparsers.errors import SceneError
-from shellgs_method.open3d import import_open3d
+from dataparsers.strays import sound
+from shellgs_method.open3d import import_open3d, reason
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ class Meshing:
     Attributes:
         mesher: the method.
         points: read from the file.
-        dropped: of these, how many were NaN or infinite.
+        dropped: of these, how many were NaN, infinite or absurdly far away.
         spacing: mean distance between neighbouring points after merging them in cells.
         planes: found by RANSAC.
         triangles: of the mesh.
@@ -89,16 +90,21 @@ def mesh_cloud(
     Raises:
         SceneError: the points make no surface.
     """
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.any():
+    meant = sound(points)
+    if not meant.any():
         raise SceneError("the point cloud has no points" if len(points) == 0 else "all points are NaN or infinite")
-    if not finite.all():
-        log.warning("dropped %d of %d points that are NaN or infinite", (~finite).sum(), len(points))
-    kept = points[finite]
+    if not meant.all():
+        log.warning(
+            "dropped %d of %d points that are NaN or infinite, or absurdly far away", (~meant).sum(), len(points)
+        )
+    kept = points[meant]
     origin = np.median(kept, axis=0)  # what follows is relative to it: georeferenced digits would swamp squares
     kept = kept - origin
-    cloud = _Cloud.of(kept, viewpoints - origin)
-    parts = list(_MESHERS[mesher](cloud))
+    try:
+        cloud = _Cloud.of(kept, viewpoints - origin)
+        parts = list(_MESHERS[mesher](cloud))
+    except RuntimeError as error:  # Open3D's, of too few points or of the like
+        raise SceneError(f"the points make no surface with the mesher {mesher!r} ({reason(error)})") from error
     vertices, faces = _merge(parts)
     if len(faces) == 0:
         raise SceneError(f"the points make no surface with the mesher {mesher!r}: try another, or a denser cloud")
@@ -107,7 +113,7 @@ def mesh_cloud(
     report = Meshing(
         mesher=mesher,
         points=len(points),
-        dropped=int((~finite).sum()),
+        dropped=int((~meant).sum()),
         spacing=cloud.spacing,
         planes=sum(part.is_plane for part in parts),
         triangles=len(faces),

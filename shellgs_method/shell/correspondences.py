@@ -21,6 +21,8 @@ from shellgs_method.shell.similarity import centred, fit_similarity, transformed
 MAX_ERROR = 0.15
 """Metres between a point on the shell and the same one in the scene from which it counts as a mistake: five times the
 scatter of careful picks (1 cm on a scan, 3 cm from photographs) and of RTK positions (2 to 3 cm)."""
+LARGEST = 1e12
+"""Of any coordinate, in any unit."""
 _THIN = 0.02  # breadth over length below which points are on one line
 _MAX_TRIPLES = 2000
 
@@ -126,11 +128,15 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        SceneError: a quote is not closed.
+        SceneError: the file is no text, or a quote is not closed.
     """
     if not path.is_file():
         raise FileNotFoundError(f"the file of {contents} {path} does not exist")
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path} is no text file of {contents} ({error.reason}): save it as UTF-8") from error
+    for number, line in enumerate(text.splitlines(), start=1):
         where = f"{path}, line {number}"
         try:
             words = shlex.split(line, comments=True)
@@ -153,9 +159,9 @@ def view_named(name: str, views: Sequence[View], where: str) -> View | None:
 
 
 def are_numbers(words: Sequence[str]) -> bool:
-    """Whether all words of a line are finite numbers."""
+    """Whether all words of a line are numbers, as large as coordinates are."""
     try:
-        return bool(np.isfinite([float(word) for word in words]).all())
+        return all(abs(float(word)) < LARGEST for word in words)
     except ValueError:
         return False
 

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dataparsers.errors import SceneError
+from dataparsers.headers import check_las, check_ply
+from shellgs_method.open3d import reason
 
 log = logging.getLogger(__name__)
 
@@ -56,8 +58,7 @@ def read_geometry(path: Path) -> Geometry:
         extra = "e57" if path.suffix.lower() == ".e57" else "las"
         raise SceneError(f"the shell {path} needs {error.name}: run `pip install 'shellgs[{extra}]'`") from error
     except Exception as error:  # each format's reader has its own kinds of error for a damaged file
-        reason = " ".join(str(error).split())
-        raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason})") from error
+        raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason(error)})") from error
     _warn_of_float32(geometry.vertices, path)
     return geometry
 
@@ -66,6 +67,8 @@ def _read_mesh(path: Path) -> Geometry:
     """All triangles or points of a file, the nodes of a scene graph placed and joined."""
     import trimesh
 
+    if path.suffix.lower() == ".ply":
+        check_ply(path)
     # process=False: merging vertices would round them. trimesh, unlike Open3D's tensor reader, keeps doubles.
     loaded = trimesh.load(path, process=False, skip_materials=True)
     scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
@@ -100,7 +103,14 @@ def _read_las(path: Path) -> Geometry:
 
     if path.suffix.lower() == ".laz":
         import lazrs  # noqa: F401  # laspy itself would not say which of its backends to install
-    return Geometry(np.array(laspy.read(path).xyz, np.float64), NO_FACES, NOWHERE)
+    check_las(path)
+    with laspy.open(path) as file:  # in pieces: what a damaged file only claims to hold takes no memory
+        pieces = [np.stack([np.array(piece[x]) for x in "xyz"], axis=1) for piece in file.chunk_iterator(1_000_000)]
+        claimed = file.header.point_count
+    points = np.concatenate([NOWHERE, *pieces])
+    if len(points) != claimed:
+        raise ValueError(f"it holds {len(points)} of {claimed} points")
+    return Geometry(points, NO_FACES, NOWHERE)
 
 
 def _read_e57(path: Path) -> Geometry:

@@ -12,12 +12,15 @@ from jaxtyping import Float64, Int64
 
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash
+from dataparsers.strays import sound
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.files import read_geometry
 
 log = logging.getLogger(__name__)
 
 COMMENT = "comment shellgs "
+SCANNER = "scanner"
+"""Where the points were seen from, by the file's own word."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ def load_shell(
 ) -> ShellMesh:
     """Read a shell, a triangle mesh or a point cloud, in full double precision where the file has it.
 
-    Triangles with a NaN or infinite vertex and points that are NaN or infinite are dropped; their number is logged. A
+    Triangles with a vertex, and points, that are NaN, infinite or absurdly far away are dropped, and counted. A
     point cloud is meshed by :func:`~shellgs_method.shell.clouds.mesh_cloud`, and its mesh kept, as
     ``<cache>/<file name>.<mesher>.ply``, until the cloud changes.
 
@@ -78,7 +81,7 @@ def load_shell(
         path: ply, obj, glb, gltf, stl, off, pcd, xyz, las, laz or e57; the last three need the extras ``las``, ``e57``.
         cache: folder for the mesh of a point cloud; None does not keep it.
         viewpoints: places that see the surface, in the shell's frame: they orient the normals of a cloud whose file
-            does not tell where its scanner stood. They do not count for a mesh that was kept.
+            does not tell where its scanner stood. A mesh that was kept for others is made again.
         mesher: turns a point cloud into a mesh.
 
     Raises:
@@ -87,25 +90,37 @@ def load_shell(
     """
     path = Path(path)
     kept = None if cache is None else cache / f"{path.name}.{mesher}.ply"
-    if kept is not None and path.is_file() and (mesh := _read_kept(kept, path)):
+    if kept is not None and path.is_file() and (mesh := _read_kept(kept, path, viewpoints)):
         return mesh
     geometry = read_geometry(path)
     try:
         if len(geometry.faces) or not len(geometry.vertices):
-            return ShellMesh(*_without_nan(geometry.vertices, geometry.faces, path))
+            return ShellMesh(*_without_strays(geometry.vertices, geometry.faces, path))
         seen_from = viewpoints if viewpoints is not None and not len(geometry.scanners) else geometry.scanners
         mesh = ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     if kept is not None:
-        _keep(mesh, kept, path)
+        _keep(mesh, kept, path, SCANNER if len(geometry.scanners) else _seen_from(viewpoints))
     return mesh
 
 
-def _keep(mesh: ShellMesh, kept: Path, source: Path) -> None:
+def _seen_from(viewpoints: np.ndarray | None) -> list[float] | None:
+    return None if viewpoints is None or not len(viewpoints) else viewpoints.mean(axis=0).tolist()
+
+
+def _seen_alike(before: list[float] | str | None, now: list[float] | None, mesh: ShellMesh) -> bool:
+    """Whether the points' normals were oriented as they would be now: an alignment's last centimetres turn none."""
+    if before is None or now is None or before == SCANNER:
+        return now is None or before == SCANNER
+    return bool(np.linalg.norm(np.subtract(before, now)) <= 0.1 * np.ptp(mesh.bounds, axis=0).max())
+
+
+def _keep(mesh: ShellMesh, kept: Path, source: Path, seen_from: list[float] | str | None) -> None:
     """Write the mesh as a PLY of doubles, with a comment that says what it was made from."""
     assert mesh.meshing is not None
-    record = json.dumps({"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)})
+    made = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
+    record = json.dumps(made | {"seen_from": seen_from})
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
     faces["count"], faces["indices"] = 3, mesh.faces
     header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]
@@ -116,8 +131,8 @@ def _keep(mesh: ShellMesh, kept: Path, source: Path) -> None:
         file.write("\n".join(header).encode() + mesh.vertices.astype("<f8").tobytes() + faces.tobytes())
 
 
-def _read_kept(kept: Path, source: Path) -> ShellMesh | None:
-    """The mesh made of a point cloud before, if it was made of this one, in this way, and is whole."""
+def _read_kept(kept: Path, source: Path, viewpoints: np.ndarray | None) -> ShellMesh | None:
+    """The mesh made of a point cloud before, if it was made of this one, seen from about there, and is whole."""
     try:
         with kept.open("rb") as file:
             comment = file.read(4096).decode(errors="replace").splitlines()[2]
@@ -125,19 +140,25 @@ def _read_kept(kept: Path, source: Path) -> ShellMesh | None:
         if (record["version"], record["sha256"]) != (VERSION, content_hash(source)):
             return None
         geometry = read_geometry(kept)
-        return ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]))
+        mesh = ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]))
+        return mesh if _seen_alike(record["seen_from"], _seen_from(viewpoints), mesh) else None
     except (OSError, IndexError, KeyError, TypeError, ValueError):  # none, or damaged: it is made again
         return None
 
 
-def _without_nan(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh without the triangles that touch a NaN or infinite vertex."""
-    finite = np.isfinite(vertices).all(axis=1)
-    if finite.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
+def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh without the triangles that touch a vertex that cannot be meant."""
+    kept = sound(vertices)
+    if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
         return vertices, faces
-    usable = finite[faces].all(axis=1)
+    usable = kept[faces].all(axis=1)
     if not usable.any():
         raise SceneError("every triangle of the shell has a NaN or infinite vertex")
-    log.warning("%s: dropped %d of %d triangles with a NaN or infinite vertex", path, (~usable).sum(), len(faces))
-    renumbered = np.cumsum(finite) - 1
-    return vertices[finite], renumbered[faces[usable]]
+    log.warning(
+        "%s: dropped %d of %d triangles with a NaN or infinite vertex, or one absurdly far away",
+        path,
+        (~usable).sum(),
+        len(faces),
+    )
+    renumbered = np.cumsum(kept) - 1
+    return vertices[kept], renumbered[faces[usable]]

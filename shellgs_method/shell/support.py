@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 
-from dataparsers.photograph import View
+from dataparsers.photograph import View, load_mask
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.similarity import transformed
 
@@ -68,10 +68,12 @@ def look(
     points: SparsePoints,
     survey_from_scene: Float64[np.ndarray, "4 4"],
 ) -> ViewSupport:
-    """Cast the shell into a thumbnail of the view and compare its SfM points."""
+    """Cast the shell into a thumbnail of the view and compare its SfM points, both where its mask keeps them."""
     thumbnail = view.camera.shrunk(_THUMBNAIL)
     metres = float(np.cbrt(np.linalg.det(survey_from_scene[:3, :3])))
     cue = caster.cast(thumbnail)
+    kept = load_mask(replace(view, camera=thumbnail))
+    cue = cue if kept is None else replace(cue, mask=cue.mask & kept)
     seen = np.flatnonzero(cue.mask)
     seen = seen[:: max(1, len(seen) // _MAX_HITS)]
     depth = cue.depth.reshape(-1)[seen].astype(np.float64)

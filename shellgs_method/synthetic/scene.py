@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from rich.progress import track
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
+from dataparsers.errors import SceneError
 from shellgs_method.open3d import import_open3d
 from shellgs_method.shell import ALIGNMENT, Alignment
 from shellgs_method.shell.similarity import transformed
@@ -33,6 +34,7 @@ from shellgs_method.synthetic.street import street
 from shellgs_method.synthetic.world import World
 
 SHELL = "shell/facade.ply"
+RECORD = "facade.json"
 PREDICTIONS = "predictions"  # disparity as a monocular network might see it
 
 
@@ -62,7 +64,7 @@ class FacadeConfig:
         least = {"width": 16, "height": 16, "views": 3, "seed": 0, "bays": 1, "storeys": 1, "points": 1}
         for name, minimum in {**least, "supersampling": 1}.items():
             if getattr(self, name) < minimum:
-                raise ValueError(f"a synthetic facade's {name} must be at least {minimum}, not {getattr(self, name)}")
+                raise SceneError(f"a synthetic facade's {name} must be at least {minimum}, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,24 @@ def write_scene(scene: Path, config: FacadeConfig) -> None:
         raise
 
 
+def settings_of(scene: Path) -> dict[str, int]:
+    """What a synthetic scene was made with, as far as it tells.
+
+    Raises:
+        SceneError: it is no such scene, or damaged.
+    """
+    try:
+        if (scene / RECORD).exists():
+            return dict(json.loads((scene / RECORD).read_text()))
+        cameras = json.loads((scene / "transforms.json").read_text())  # of a build that kept no record
+        return {"width": cameras["w"], "height": cameras["h"], "views": len(cameras["frames"])}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SceneError(f"{scene} is no synthetic scene, or damaged: give another folder, or remove it") from error
+
+
 def _write(scene: Path, config: FacadeConfig) -> None:
     facade = Facade.build(config)
+    (scene / RECORD).write_text(json.dumps(asdict(config), indent=1) + "\n")
     _write_shell(scene, shell(facade.layout))
     truth = CueMaps.create(scene, "truth", command="shellgs demo", metres_per_unit=1 / UNITS_PER_METRE)
     names = [f"images/frame_{i + 1:05d}.png" for i in range(config.views)]

@@ -1,0 +1,254 @@
+"""Kill commands at random moments, give them again, and hold the results against those of commands left in peace.
+
+Every command works on a small synthetic scene, on one thread, where all of it repeats exactly. SIGKILL leaves no time
+to tidy up. A training or a comparison goes on from its last checkpoint; the others simply begin again.
+"""
+
+from __future__ import annotations
+
+import filecmp
+import io
+import json
+import math
+import multiprocessing
+import os
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+RUN = Path("outputs/scene/shellgs/run")
+CHECKPOINTS = RUN / "nerfstudio_models"
+COMPARED = Path("compare/runs/scene/photo-gs/photo-gs/seed-0")
+TRAIN = "ns-train shellgs --data scene --output-dir outputs --experiment-name scene --timestamp run --vis tensorboard \
+--max-num-iterations 60 --steps-per-save 10 --pipeline.model.warmup-length 1000 --pipeline.model.refine-every 10"
+COMMANDS = {
+    "align": "shellgs align scene scene/shell/facade.ply --matrix matrix.txt",
+    "cast": "shellgs cast scene",
+    "train": TRAIN,
+    "mesh": f"shellgs mesh {RUN / 'config.yml'} --output mesh.ply",
+    "compare": "shellgs compare scene --methods photo-gs --iterations 60 --curve-points 0",
+    "capture": "shellgs capture photographs captured",
+}
+"""In the order in which each finds what it needs."""
+RESULTS = {
+    "align": ["scene/shell/alignment.json"],
+    "cast": ["scene/cues/shell"],
+    "train": [str(CHECKPOINTS)],
+    "mesh": ["mesh.ply", "mesh.json"],
+    "compare": [str(COMPARED / "nerfstudio_models"), str(COMPARED / "eval.json"), "compare/tables"],
+    "capture": ["captured/images", "captured/colmap"],
+}
+"""Files and folders that must come out the same."""
+
+
+@dataclass(frozen=True)
+class Kills:
+    """What to kill.
+
+    Attributes:
+        kills: of each command.
+        commands: that are killed; those before them are run in peace.
+        seed: of the moments.
+        keep: folder for what is made, else a temporary one that is removed.
+    """
+
+    kills: int = 10
+    commands: tuple[str, ...] = tuple(COMMANDS)
+    seed: int = 0
+    keep: Path | None = None
+
+
+@dataclass
+class Tally:
+    """What came of killing one command."""
+
+    seconds: float
+    kills: int = 0
+    finished: int = 0
+    same: int = 0
+    litter: int = 0
+
+
+def words_of(command: str) -> list[str]:
+    """As a user types it, who goes on with a training where there is a checkpoint."""
+    words = COMMANDS[command].split()
+    if command == "train" and any(CHECKPOINTS.glob("step-*.ckpt")):
+        words += ["--load-dir", str(CHECKPOINTS)]
+    return words
+
+
+def act(command: str, folder: Path, log: Path) -> None:
+    """Give a command in this process, in a folder; its words go to a log."""
+    from nerfstudio.scripts import train
+
+    from shellgs_method import cli
+
+    os.chdir(folder)
+    torch.set_num_threads(1)
+    sys.argv = words_of(command)
+    with log.open("a") as file, redirect_stdout(file), redirect_stderr(file):
+        print(f"$ {' '.join(sys.argv)}", flush=True)
+        try:
+            (train.entrypoint if sys.argv[0] == "ns-train" else cli.main)()
+        except SystemExit as end:
+            if end.code not in (None, 0):
+                print(end.code, flush=True)
+                raise
+
+
+def start(command: str, folder: Path, log: Path) -> Any:
+    """The same in a process of its own, which has all imports already."""
+    process = multiprocessing.get_context("forkserver").Process(target=act, args=(command, folder, log))
+    process.start()
+    return process
+
+
+def prepare(folder: Path, captured: bool) -> None:
+    """A scene without maps, the matrix of its shell, and photographs that cameras can be found of, if they must."""
+    from shellgs_method.shell import ALIGNMENT, Alignment
+    from shellgs_method.synthetic import FacadeConfig, write_scene
+
+    scene = folder / "scene"
+    write_scene(scene, FacadeConfig(width=96, height=64, views=10, points=600, supersampling=1))
+    np.savetxt(folder / "matrix.txt", Alignment.load(scene / ALIGNMENT).shell_to_scene)
+    (scene / ALIGNMENT).unlink()
+    if captured:
+        large = FacadeConfig(width=640, height=360, views=12, bays=3, storeys=2, points=50, supersampling=2)
+        write_scene(folder / "large", large)
+        (folder / "large" / "images").rename(folder / "photographs")
+        shutil.rmtree(folder / "large")
+
+
+def files(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def differences(command: str, here: Path, there: Path) -> Iterator[str]:
+    """Results of a command that are not the same in two folders."""
+    for result in RESULTS[command]:
+        names = files(there / result) if (there / result).is_dir() else {""}
+        for name in sorted(names):
+            one, other = here / result / name, there / result / name
+            if not one.is_file() or not same_file(one, other):
+                yield f"{result}/{name}".rstrip("/")
+
+
+def same_file(one: Path, other: Path) -> bool:
+    """Byte for byte; checkpoints, which are zip files of another name, number for number; meshes in any order.
+
+    Open3D's threads hand out the vertices of a mesh as they come, so that sums over them differ in the last digits.
+    """
+    if one.suffix == ".ckpt":
+        return same(torch.load(one, weights_only=True), torch.load(other, weights_only=True))
+    if one.suffix == ".ply":
+        corners = (trimesh.load(path, process=False).triangles.reshape(-1, 9) for path in (one, other))  # pyright: ignore
+        return np.array_equal(*(np.unique(np.round(each, 5), axis=0) for each in corners))
+    if one.name == "mesh.json":
+        return same(json.loads(one.read_text()), json.loads(other.read_text()))
+    return filecmp.cmp(one, other, shallow=False)
+
+
+def same(one: object, other: object) -> bool:
+    """Whether nested numbers and tensors are the same; those of JSON but for the last digits."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
+        return torch.equal(one, other)
+    return one == other or (isinstance(one, float) and isinstance(other, float) and math.isclose(one, other))
+
+
+def kill(command: str, before: Path, after: Path, tally: Tally, moment: float, trial: Path, say: Callable) -> None:
+    """Start a command on a copy, kill it, give it again, and count."""
+    shutil.copytree(before, trial, symlinks=True)
+    log = trial.with_suffix(".log")
+    process = start(command, trial, log)
+    process.join(moment * tally.seconds)
+    if process.is_alive():
+        process.kill()
+    process.join()
+    if process.exitcode == 0:  # it was faster than we
+        shutil.rmtree(trial)
+        return
+    tally.kills += 1
+    again = start(command, trial, log)
+    again.join()
+    tally.finished += again.exitcode == 0
+    wrong = list(differences(command, trial, after))
+    tally.same += not wrong
+    litter = {name for name in files(trial) - files(after) if not is_record(name)}
+    tally.litter += bool(litter)
+    for what, names in (("differs", wrong), ("is left over", sorted(litter))):
+        if names:
+            say(f"{command}, killed after {moment:.0%}: {', '.join(names[:4])} {what} ({log})")
+    if not wrong and not litter and again.exitcode == 0:
+        shutil.rmtree(trial)
+
+
+def is_record(name: str) -> bool:
+    """Whether a file is of what was done rather than of what came out: each start of a training writes its events."""
+    return "events.out.tfevents" in name or name.endswith((".log", "log.txt"))
+
+
+def main(config: Kills, folder: Path, console: Console) -> Sequence[Tally]:
+    """Everything in a folder; the table."""
+    dice = random.Random(config.seed)
+    before, tallies = folder / "0", []
+    before.mkdir()
+    with redirect_stdout(io.StringIO()):
+        prepare(before, "capture" in config.commands)
+    start_up = multiprocessing.get_context("forkserver").Process(target=time.sleep, args=(0,))
+    start_up.start()  # all imports, which are in no command's time
+    start_up.join()
+    table = Table("command", "seconds", "kills", "finished again", "same result", "with litter")
+    last = max(list(COMMANDS).index(command) for command in config.commands)
+    for number, command in enumerate(list(COMMANDS)[: last + 1], start=1):
+        after = folder / str(number)
+        shutil.copytree(before, after, symlinks=True)
+        since = time.perf_counter()
+        process = start(command, after, folder / f"{command}.log")
+        process.join()
+        tally = Tally(time.perf_counter() - since)
+        if process.exitcode != 0:
+            raise SystemExit(f"{command} fails when left in peace: see {folder / f'{command}.log'}")
+        if command in config.commands:
+            for each in range(3 * config.kills):  # some moments come too late
+                if tally.kills < config.kills:
+                    kill(command, before, after, tally, dice.random(), folder / f"{command}-{each}", console.print)
+            tallies.append(tally)
+            numbers = (tally.kills, tally.finished, tally.same, tally.litter)
+            table.add_row(command, f"{tally.seconds:.1f}", *map(str, numbers))
+            console.print(f"{command}: {tally}", highlight=False)
+        before = after
+    console.print(table)
+    return tallies
+
+
+if __name__ == "__main__":
+    os.environ |= {"OMP_NUM_THREADS": "1", "SHELLGS_COMPILE": "0"}
+    multiprocessing.get_context("forkserver").set_forkserver_preload(
+        ["method_configs", "nerfstudio.scripts.train", "shellgs_method.cli", "shellgs_method.compare.results"]
+    )
+    chosen = tyro.cli(Kills, description=__doc__)
+    if chosen.keep:
+        chosen.keep.mkdir(parents=True)
+        counts = main(chosen, chosen.keep.absolute(), Console())
+    else:
+        with tempfile.TemporaryDirectory() as made:
+            counts = main(chosen, Path(made), Console())
+    sys.exit(any(tally.finished < tally.kills or tally.same < tally.kills or tally.litter for tally in counts))

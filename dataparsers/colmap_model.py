@@ -1,0 +1,246 @@
+"""A COLMAP model on disk, binary or text: cameras, images, points. Nothing that a damaged file claims is believed."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
+from scipy.spatial.transform import Rotation
+
+from dataparsers.errors import SceneError
+from dataparsers.shots import UNDISTORT, Recording, Shot, in_order, shot
+
+FOLDERS = ("colmap/sparse/0", "sparse/0", "colmap/sparse", "sparse")
+# From COLMAP's axes, whose -y is up, to nerfstudio's.
+APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_MODELS = (  # by COLMAP's numbers: names, and how many parameters they have
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+)
+_PARAMETERS = dict(_MODELS)
+
+T = TypeVar("T")
+
+
+class _Camera(NamedTuple):
+    """A camera as nerfstudio's ``parse_colmap_camera_params`` takes it."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class _Image(NamedTuple):
+    quaternion: tuple[float, ...]  # w x y z
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of a model.
+
+    Attributes:
+        positions: in the model's frame.
+        colours: RGB.
+        observers: the numbers of the images that observe each point.
+    """
+
+    positions: Float64[np.ndarray, "N 3"]
+    colours: UInt8[np.ndarray, "N 3"]
+    observers: list[Int64[np.ndarray, " M"]]
+
+
+def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
+    """The photographs of the model in ``scene/folder``, which lie in ``scene/images_path``.
+
+    Raises:
+        FileNotFoundError: a file of the model is missing.
+        SceneError: a file is damaged, or a camera is none.
+    """
+    cameras = _read(scene / folder, "cameras", _binary_cameras, _text_cameras)
+    shots = [_shot(scene, images_path, image, cameras, folder) for image in _images(scene / folder).values()]
+    return Recording(in_order(shots, str(scene / folder)), APPLIED, _listed(scene, images_path))
+
+
+def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, Mapping[int, str]]:
+    """The points of a model, and the names of its photographs by their numbers; no points where it has no such file.
+
+    Raises:
+        SceneError: a file is damaged.
+    """
+    names = {number: (images_path / image.name).as_posix() for number, image in _images(scene / folder).items()}
+    if not any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
+        return Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), []), names
+    return _read(scene / folder, "points3D", _binary_points, _text_points), names
+
+
+def _images(folder: Path) -> dict[int, _Image]:
+    return _read(folder, "images", _binary_images, _text_images)
+
+
+def _shot(scene: Path, images_path: Path, image: _Image, cameras: Mapping[int, _Camera], folder: Path) -> Shot:
+    where = str(scene / folder)
+    camera = cameras.get(image.camera)
+    if camera is None:
+        raise SceneError(f"{where}: the camera {image.camera} of {image.name} is not among its cameras")
+    try:
+        lens = parse_colmap_camera_params(camera)
+    except NotImplementedError as error:  # its words name the model
+        raise SceneError(f"nerfstudio cannot read the cameras of {scene}: {error}; {UNDISTORT}") from error
+    quaternion = np.array(image.quaternion)
+    if not np.isfinite(quaternion).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
+        raise SceneError(f"{where}: the pose of {image.name} has no rotation: its quaternion is {image.quaternion}")
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
+    viewmat[:3, 3] = image.translation
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = viewmat[:3, :3].T, -viewmat[:3, :3].T @ viewmat[:3, 3]
+    return shot(scene, (images_path / image.name).as_posix(), pose, lens, where)
+
+
+def _listed(scene: Path, images_path: Path) -> dict[str, set[str]]:
+    """The splits that ``train_list.txt`` and so on name, as nerfstudio has them."""
+    files = {"train": "train_list.txt", "test": "test_list.txt", "val": "validation_list.txt"}
+    return {
+        split: {(images_path / line).as_posix() for line in (scene / file).read_text("utf-8").splitlines() if line}
+        for split, file in files.items()
+        if (scene / file).is_file()
+    }
+
+
+def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable[[Iterator[list[str]]], T]) -> T:
+    path = next((path for path in (folder / f"{name}.bin", folder / f"{name}.txt") if path.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(f"{folder} is no COLMAP model: {name}.bin and {name}.txt are missing")
+    try:
+        if path.suffix == ".bin":
+            return binary(_Bytes(path.read_bytes()))
+        # Lines keep their places where they are empty: an image's second one may be.
+        lines = (line.split() for line in path.read_text("utf-8").splitlines() if not line.lstrip().startswith("#"))
+        return text(lines)
+    except (ValueError, IndexError, OverflowError, struct.error, StopIteration) as error:
+        raise SceneError(
+            f"{path} is damaged ({str(error) or 'it ends too early'}): copy it again, or run COLMAP again"
+        ) from error
+
+
+class _Bytes:
+    """Bytes that are read from the front; what is not there is a ValueError, whatever a file claims."""
+
+    def __init__(self, data: bytes):
+        self.data, self.at = data, 0
+
+    def take(self, form: str) -> tuple:
+        values = struct.unpack_from(form, self.data, self.at)
+        self.at += struct.calcsize(form)
+        return values
+
+    def text(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        text = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
+        return text
+
+    def array(self, dtype: str, count: int) -> np.ndarray:
+        array = np.frombuffer(self.data, dtype, count, self.at) if count else np.empty(0, dtype)
+        self.at += array.nbytes
+        return array
+
+    def records(self) -> range:
+        """Of a file that begins with their number, each of which takes 8 bytes at least."""
+        (count,) = self.take("<Q")
+        if 8 * count > len(self.data):
+            raise ValueError(f"it claims {count} entries in {len(self.data)} bytes")
+        return range(count)
+
+
+def _binary_cameras(file: _Bytes) -> dict[int, _Camera]:
+    cameras = {}
+    for _ in file.records():
+        number, model, width, height = file.take("<iiQQ")
+        if not 0 <= model < len(_MODELS):
+            raise ValueError(f"no camera model has the number {model}")
+        name, count = _MODELS[model]
+        cameras[number] = _Camera(name, width, height, file.take(f"<{count}d"))
+    return cameras
+
+
+def _text_cameras(lines: Iterator[list[str]]) -> dict[int, _Camera]:
+    cameras = {}
+    for words in filter(None, lines):
+        params = tuple(map(float, words[4:]))
+        if len(params) != _PARAMETERS.get(words[1], len(params)):
+            raise ValueError(f"{words[1]} has {_PARAMETERS[words[1]]} parameters, not {len(params)}")
+        cameras[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), params)
+    return cameras
+
+
+def _binary_images(file: _Bytes) -> dict[int, _Image]:
+    images = {}
+    for _ in file.records():
+        number, *pose, camera = file.take("<i7di")
+        name = file.text()
+        (count,) = file.take("<Q")
+        file.array("V24", count)  # the features: x, y and the point
+        images[number] = _Image(tuple(pose[:4]), tuple(pose[4:]), camera, name)
+    return images
+
+
+def _text_images(lines: Iterator[list[str]]) -> dict[int, _Image]:
+    images = {}
+    for words in filter(None, lines):
+        pose = tuple(map(float, words[1:8]))
+        images[int(words[0])] = _Image(pose[:4], pose[4:], int(words[8]), " ".join(words[9:]))
+        if len(pose) != 7 or len(words) < 10:
+            raise ValueError(f"a line of images is NUMBER, 7 of the pose, CAMERA, NAME, not {' '.join(words)[:40]!r}")
+        next(lines, None)  # its features
+    return images
+
+
+def _binary_points(file: _Bytes) -> Points:
+    positions, colours, observers = [], [], []
+    for _ in file.records():
+        _, *known, _, count = file.take("<Q3d3BdQ")
+        positions.append(known[:3])
+        colours.append(known[3:])
+        observers.append(file.array("<i4", 2 * count)[::2].astype(np.int64))
+    return _points(positions, colours, observers)
+
+
+def _text_points(lines: Iterator[list[str]]) -> Points:
+    positions, colours, observers = [], [], []
+    for words in filter(None, lines):
+        position = [float(word) for word in words[1:4]]
+        colour = [int(word) for word in words[4:7]]
+        if len(position) != 3 or len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
+            raise ValueError(f"a line of points is NUMBER X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
+        positions.append(position)
+        colours.append(colour)
+        observers.append(np.array(words[8::2], dtype=np.int64))
+    return _points(positions, colours, observers)
+
+
+def _points(positions: list, colours: list, observers: list) -> Points:
+    return Points(
+        np.array(positions, dtype=np.float64).reshape(-1, 3),
+        np.array(colours, dtype=np.uint8).reshape(-1, 3),
+        observers,
+    )

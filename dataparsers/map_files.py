@@ -1,0 +1,234 @@
+"""The file of one view's cue map: an npz of depth, normal and mask, and the record of the camera they belong to."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float16, Float32
+from torch import Tensor
+
+from dataparsers.camera import Camera
+from dataparsers.files import atomic_write
+from dataparsers.shots import MAX_PIXELS
+
+FORMAT = 1
+LONGEST_RECORD = 1 << 24
+"""Bytes of a map's record: it names its sources, not more."""
+
+# A pose that went through nerfstudio's float32 cameras comes back within 1e-6 rad and 1e-6 of the scene's size; a
+# camera that was refined, undistorted or resized differently is off by far more than these. 5e-4 of the image's size
+# is half a pixel at 1000: nerfstudio's integer rounding of a downscaled image passes, another focal length does not.
+ROTATION_TOLERANCE = 1e-4  # rad
+POSITION_TOLERANCE = 1e-4  # of the view's mean depth
+INTRINSICS_TOLERANCE = 5e-4  # of the image's longer side
+
+
+UNREADABLE = (
+    *(OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError),
+    *(RuntimeError, SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+
+"""What a reader of a damaged map may raise."""
+
+
+@dataclass(frozen=True)
+class CueMap:
+    """What is known of the surface seen in each pixel of one view; the camera frame is OpenCV's.
+
+    Attributes:
+        depth: forward z-depth in scene units, 0 where there is none.
+        normal: unit normal in the camera frame, facing the camera.
+        mask: true where the maps supervise.
+    """
+
+    depth: Float32[np.ndarray, "H W"]
+    normal: Float16[np.ndarray, "H W 3"]
+    mask: Bool[np.ndarray, "H W"]
+
+
+@dataclass(frozen=True)
+class MapRecord:
+    """The camera and the sources one map was made for, stored inside the map."""
+
+    image: str
+    width: int
+    height: int
+    K: list[list[float]]
+    viewmat: list[list[float]]
+    supported: float  # share of the pixels in the mask
+    mean_depth: float | None  # over the mask; None where it is empty
+    sources: dict[str, str]
+    format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        """Refuse what no map has."""
+        if not isinstance(self.image, str) or not are_words(self.sources):
+            raise TypeError("its image or its sources are no words")
+        if (
+            type(self.width) is not int
+            or type(self.height) is not int
+            or not 0 < self.width * self.height <= MAX_PIXELS
+        ):
+            raise ValueError(f"it is of {self.width!r}x{self.height!r} pixels")
+        K, viewmat = (np.array(matrix, dtype=np.float64) for matrix in (self.K, self.viewmat))
+        if K.shape != (3, 3) or viewmat.shape != (4, 4) or not np.isfinite([K.sum(), viewmat.sum()]).all():
+            raise ValueError("its camera has no intrinsics of 3x3 or no pose of 4x4 numbers")
+        if not is_number(self.supported) or not (self.mean_depth is None or is_number(self.mean_depth)):
+            raise TypeError("its share of supported pixels or its mean depth is no number")
+
+    @classmethod
+    def of(cls, image: str, cue: CueMap, camera: Camera, sources: dict[str, str]) -> MapRecord:
+        """The record of a map."""
+        return cls(
+            image=image,
+            width=camera.width,
+            height=camera.height,
+            K=_float64(camera.K).tolist(),
+            viewmat=_float64(camera.viewmat).tolist(),
+            supported=float(cue.mask.mean()),
+            mean_depth=float(cue.depth[cue.mask].mean(dtype=np.float64)) if cue.mask.any() else None,
+            sources=sources,
+        )
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the map was made for."""
+        K, viewmat = (torch.tensor(matrix, dtype=torch.float64) for matrix in (self.K, self.viewmat))
+        return Camera(viewmat, K, self.width, self.height)
+
+
+def resampled(cue: CueMap, camera: Camera) -> CueMap:
+    """A map of the same view at another size.
+
+    Inverse depth is interpolated linearly, which is exact on planes, except where it has an edge: there, as for normals
+    and masks, the nearest pixel counts.
+    """
+    rows, columns = (
+        (np.arange(wanted) + 0.5) * there / wanted - 0.5
+        for wanted, there in zip((camera.height, camera.width), cue.depth.shape, strict=True)
+    )
+    near = np.ix_(np.rint(rows).astype(int), np.rint(columns).astype(int))
+    inverse = np.divide(1, cue.depth, out=np.zeros_like(cue.depth), where=cue.depth > 0)
+    low_high = [[f(values).astype(int).clip(0, n - 1) for f in (np.floor, np.ceil)]
+                for values, n in zip((rows, columns), cue.depth.shape, strict=True)]  # fmt: skip
+    corners = np.stack([inverse[np.ix_(row, column)] for row in low_high[0] for column in low_high[1]])
+    smooth = (corners.min(axis=0) > 0) & (corners.max(axis=0) < 1.05 * corners.min(axis=0))
+    down, right = (rows - np.floor(rows))[:, None], (columns - np.floor(columns))[None]
+    weights = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right])
+    between = (weights * corners).sum(axis=0)
+    depth = np.where(smooth, 1 / np.where(smooth, between, 1), cue.depth[near]).astype(np.float32)
+    return CueMap(depth, cue.normal[near], cue.mask[near])
+
+
+def write_map(path: Path, cue: CueMap, record: MapRecord) -> None:
+    """Write a map, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as file:
+        text = np.array(json.dumps(asdict(record)))
+        _write_npz(file, {"depth": cue.depth, "normal": cue.normal, "mask": cue.mask, "record": text})
+
+
+def _write_npz(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
+    """An npz, like :func:`numpy.savez_compressed` at a tenth of the time: zlib makes little of a depth's digits."""
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            data = io.BytesIO()
+            np.lib.format.write_array(data, array, allow_pickle=False)
+            method = zipfile.ZIP_STORED if name == "depth" else zipfile.ZIP_DEFLATED
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getbuffer(), method, compresslevel=1)
+
+
+def read_record(path: Path) -> MapRecord:
+    """The record of a map; raises one of :data:`UNREADABLE` where the file is damaged."""
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is not a complete npz file")
+    with zipfile.ZipFile(path) as archive:
+        return MapRecord(**json.loads(str(_read_array(archive, "record"))))
+
+
+def read_arrays(path: Path, camera: Camera) -> CueMap:
+    """The arrays of a map of a camera's size; raises one of :data:`UNREADABLE` where the file holds others."""
+    size = camera.height, camera.width
+    with zipfile.ZipFile(path) as archive:
+        return CueMap(
+            _read_array(archive, "depth", size, "float32"),
+            _read_array(archive, "normal", (*size, 3), "float16"),
+            _read_array(archive, "mask", size, "bool"),
+        )
+
+
+def _read_array(
+    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...] = (), dtype: str | None = None
+) -> np.ndarray:
+    """An array of an npz, of this shape and type (text if not given); what claims to be another is not allocated."""
+    with archive.open(f"{name}.npy") as file:
+        version = np.lib.format.read_magic(file)
+        read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        there, fortran, found = read_header[version](file)
+        wanted = np.dtype(dtype) if dtype else found
+        if there != shape or found != wanted or found.kind == "O" or (dtype is None and found.kind != "U"):
+            raise ValueError(f"its {name} is {found} {list(there)}, not {dtype or 'text'} {list(shape)}")
+        if found.itemsize > LONGEST_RECORD and dtype is None:
+            raise ValueError(f"its {name} claims {found.itemsize} bytes")
+        data = file.read(int(np.prod(shape)) * found.itemsize)
+    return np.frombuffer(data, found).reshape(shape, order="F" if fortran else "C").copy()
+
+
+def damage(cue: CueMap, camera: Camera) -> str | None:
+    """What is wrong with the arrays of a map, in words."""
+    size = (camera.height, camera.width)
+    for name, shape, dtype in (("depth", size, "float32"), ("normal", (*size, 3), "float16"), ("mask", size, "bool")):
+        array = getattr(cue, name)
+        if array.shape != shape or array.dtype != dtype:
+            return f"its {name} is {array.dtype} {list(array.shape)}, not {dtype} {list(shape)}"
+    if not np.isfinite(cue.depth).all() or not np.isfinite(cue.normal).all():
+        return "it holds NaN or infinite values"
+    if (cue.depth < 0).any() or not cue.depth[cue.mask].all():
+        return "it holds negative depths, or pixels of the mask without depth"
+    return None
+
+
+def difference(record: MapRecord, own: Camera, camera: Camera, sources: Mapping[str, str]) -> str | None:
+    """How the camera and sources a map was made for differ from those it is wanted for, in words."""
+    intrinsics = np.abs(_float64(own.K) - _float64(camera.K)).max()
+    if not intrinsics <= INTRINSICS_TOLERANCE * max(camera.width, camera.height):
+        return f"its intrinsics differ from the camera's by {intrinsics:.3g} pixels"
+    made, wanted = _float64(own.viewmat), _float64(camera.viewmat)
+    # |R - R'| = 2 sqrt(2) sin(angle / 2) in the Frobenius norm; exact for small angles, where acos(trace) is not.
+    chord = np.linalg.norm(made[:3, :3] - wanted[:3, :3]) / np.sqrt(8)
+    angle = 2 * np.arcsin(np.minimum(chord, 1.0))
+    if not angle <= ROTATION_TOLERANCE:
+        return f"its pose is turned by {np.rad2deg(angle):.3g} degrees against the camera's"
+    moved = np.linalg.norm(made[:3, :3].T @ made[:3, 3] - wanted[:3, :3].T @ wanted[:3, 3])
+    if record.mean_depth is not None and not moved <= POSITION_TOLERANCE * record.mean_depth:
+        return f"its camera stood {moved:.3g} scene units away (the view's mean depth is {record.mean_depth:.3g})"
+    if (record.format, record.sources) != (FORMAT, sources):
+        changed = [path for path, sha256 in sources.items() if record.sources.get(path) != sha256]
+        return f"it was made from another {' and '.join(changed) or 'set of sources'}"
+    return None
+
+
+def are_words(words: object) -> bool:
+    """Whether json has words by words."""
+    return isinstance(words, dict) and all(isinstance(word, str) for pair in words.items() for word in pair)
+
+
+def is_number(value: object) -> bool:
+    """Whether json has a finite number."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _float64(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().astype(np.float64)

@@ -1,0 +1,20 @@
+"""Points that cannot be meant: NaN, infinite, or absurdly far from all others."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+FAR = 1e6
+"""Times the median distance from the middle of the points: one point there would cost all others their digits."""
+
+
+def sound(points: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Which points are finite and near the others."""
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        return finite
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = np.linalg.norm(points - np.median(points[finite], axis=0), axis=1)
+        typical = np.median(distance[finite])
+        return finite & (distance <= FAR * typical if typical > 0 else np.isfinite(distance))

@@ -1,0 +1,127 @@
+"""A transforms.json of nerfstudio: cameras, and the cloud of points that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from dataparsers.errors import SceneError
+from dataparsers.files import read_json
+from dataparsers.headers import check_ply
+from dataparsers.shots import DISTORTION, Recording, Shot, in_order, inside, shot
+
+NAME = "transforms.json"
+GREY = 128
+"""Of points whose file has no colours."""
+# What old versions of ns-process-data did to COLMAP's frame without saying so.
+_UNSAID = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *DISTORTION)
+
+
+def read_recording(scene: Path) -> Recording:
+    """The photographs that the scene's transforms.json lists.
+
+    Raises:
+        SceneError: the file is damaged, or a camera is none.
+    """
+    path = scene / NAME
+    meta = read_json(path)
+    frames = meta.get("frames")
+    if not isinstance(frames, list):
+        raise SceneError(f"{path} has no list of frames: make it again")
+    applied = _applied(meta, scene)
+    shots = [_shot(scene, frame, meta, applied, f"{path}, frame {k}") for k, frame in enumerate(frames, start=1)]
+    listed = {split: _names(meta[f"{split}_filenames"], path) for split in _SPLITS if f"{split}_filenames" in meta}
+    orientation = meta.get("orientation_override")
+    if orientation not in (None, "pca", "up", "vertical", "none"):
+        raise SceneError(f"{path} has {orientation!r} as its orientation_override: pca, up, vertical or none")
+    return Recording(in_order(shots, str(path)), applied, listed, orientation)
+
+
+_SPLITS = ("train", "val", "test")
+
+
+def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
+    """Positions, in the scene's frame, and colours of the points that transforms.json names; none where it does not.
+
+    Raises:
+        FileNotFoundError: the cloud is missing.
+        SceneError: it is damaged.
+    """
+    meta = read_json(scene / NAME)
+    if meta.get("ply_file_path") is None:
+        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    path = inside(scene, meta["ply_file_path"], str(scene / NAME))
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}, the SfM points that {scene / NAME} names, does not exist")
+    import trimesh
+
+    try:
+        check_ply(path)
+        cloud = trimesh.load(path, process=False)
+        positions = np.asarray(cloud.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+        colours = np.asarray(cloud.visual.vertex_colors, np.uint8)  # pyright: ignore[reportAttributeAccessIssue]
+    except Exception as error:  # trimesh has its own kinds of error for damaged files
+        reason = " ".join(str(error).split())
+        raise SceneError(f"the SfM points {path} cannot be read ({reason}): make them again") from error
+    undo = np.linalg.inv(_applied(meta, scene))
+    colours = colours[:, :3] if len(colours) == len(positions) else np.full(positions.shape, GREY, np.uint8)
+    return positions @ undo[:3, :3].T + undo[:3, 3], colours
+
+
+def _shot(scene: Path, frame: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Shot:
+    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        raise SceneError(f"{where}: there is no file_path that names its photograph")
+    try:
+        pose = np.array(frame.get("transform_matrix"), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape != (4, 4):
+        raise SceneError(f"{where} ({frame['file_path']}): its transform_matrix is no matrix of 4x4 numbers")
+    lens = {key: source[key] for key in _LENS for source in (frame, meta) if key in source}
+    for key in DISTORTION if _has_distortion(meta) else ():  # nerfstudio's order: the file's own before the frame's
+        lens.pop(key, None)
+    lens |= _distortion(meta if _has_distortion(meta) else frame, where)
+    path = inside(scene, frame["file_path"], where)
+    made = shot(scene, path.relative_to(scene).as_posix(), np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
+    if frame.get("mask_path") is None:
+        return made
+    return replace(made, mask=inside(scene, frame["mask_path"], where))
+
+
+def _has_distortion(meta: Mapping[str, Any]) -> bool:
+    return any(key in meta for key in (*DISTORTION, "distortion_params"))
+
+
+def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
+    listed = source.get("distortion_params")
+    if listed is None:
+        return {key: source[key] for key in DISTORTION if key in source}
+    if not isinstance(listed, list) or len(listed) != len(DISTORTION):
+        raise SceneError(f"{where}: distortion_params are {', '.join(DISTORTION)}, not {str(listed)[:40]}")
+    return dict(zip(DISTORTION, listed, strict=True))
+
+
+def _applied(meta: Mapping[str, Any], scene: Path) -> Float64[np.ndarray, "4 4"]:
+    """What was done to the scene's own frame before the poses were written."""
+    applied = meta.get("applied_transform", _UNSAID if (scene / "colmap/sparse/0").exists() else np.eye(4)[:3])
+    try:
+        matrix = np.array(applied, dtype=np.float64)[:3]
+    except (TypeError, ValueError, OverflowError, IndexError):
+        matrix = np.empty(0)
+    gram = matrix[:, :3].T @ matrix[:, :3] if matrix.shape == (3, 4) else np.zeros((3, 3))
+    if not np.isfinite(matrix).all() or not np.abs(gram - np.eye(3)).max() < 1e-3:
+        raise SceneError(f"{scene / NAME}: its applied_transform is no 3x4 matrix of a rotation and a translation")
+    return np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+
+
+def _names(listed: Any, path: Path) -> set[str]:
+    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+        raise SceneError(f"{path}: a list of filenames holds something else than names")
+    return {Path(name).as_posix() for name in listed}

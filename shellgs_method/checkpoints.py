@@ -1,0 +1,85 @@
+"""Checkpoints read as data, and refused where they are damaged."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dataparsers.errors import SceneError
+
+# Nerfstudio's own scheduler puts np.float64 into checkpoints, which torch >= 2.6 refuses to load
+# (https://github.com/nerfstudio-project/nerfstudio/issues/3683). Ours writes float; this lets older files load.
+_REBUILD_SCALAR: Any = np.float64(0).__reduce__()[0]
+torch.serialization.add_safe_globals([_REBUILD_SCALAR, np.dtype, type(np.dtype(np.float64))])
+
+_GAUSSIANS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
+
+
+def find_checkpoint(folder: Path, step: int | None = None) -> Path:
+    """The checkpoint of a step in a folder, or the last.
+
+    Raises:
+        SceneError: there is none.
+    """
+    steps = [
+        int(match[1]) for path in folder.glob("step-*.ckpt") if (match := re.fullmatch(r"step-(\d{9,})", path.stem))
+    ]
+    if not steps or step not in (None, *steps):
+        which = "" if step is None else f" of step {step}"
+        raise SceneError(
+            f"{folder} holds no checkpoint{which} (step-*.ckpt): --load-dir takes the nerfstudio_models of a run, and "
+            "a run that was stopped before its first has none"
+        )
+    return folder / f"step-{max(steps) if step is None else step:09d}.ckpt"
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """What a checkpoint holds: numbers, tensors, and the lists and dictionaries of them; on the CPU.
+
+    Raises:
+        SceneError: it cannot be read, holds anything else, or Gaussians that are none.
+    """
+    remedy = "remove it to go on from an earlier one, or train again"
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged or hostile file lets torch fail in any way
+        words = str(error).strip().splitlines() or [type(error).__name__]
+        raise SceneError(f"{path} cannot be read as a checkpoint ({words[0][:200]}): {remedy}") from error
+    if not isinstance(state, dict) or not isinstance(state.get("step"), int):
+        raise SceneError(f"{path} is no checkpoint of nerfstudio: {remedy}")
+    for part in ("pipeline", "optimizers", "scalers"):
+        if not isinstance(state.get(part), dict):
+            raise SceneError(f"{path} lacks its {part}: {remedy}")
+    try:
+        check_gaussians(state["pipeline"])
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}; {remedy}") from error
+    return state
+
+
+def check_gaussians(state: Mapping[str, Any]) -> None:
+    """Refuse Gaussians of a checkpoint that lack a parameter or are no numbers; other models are left alone.
+
+    Raises:
+        SceneError: with what is wrong.
+    """
+    stored: dict[str, Tensor] = {
+        key.rpartition(".")[2]: value for key, value in state.items() if ".gauss_params." in f".{key}"
+    }
+    if not stored:
+        return
+    if lacking := [name for name in _GAUSSIANS if not isinstance(stored.get(name), Tensor)]:
+        raise SceneError(f"its Gaussians have no {' and no '.join(lacking)}")
+    counts = {len(value) if value.dim() else -1 for value in stored.values()}
+    if len(counts) > 1 or min(counts) < 1:
+        raise SceneError(f"its Gaussians have parameters of {' and '.join(map(str, sorted(counts)))} Gaussians")
+    wrong = sum((~value.reshape(len(value), -1).isfinite().all(dim=1)).long() for value in stored.values())
+    assert isinstance(wrong, Tensor)
+    if wrong.any():
+        raise SceneError(f"{int((wrong > 0).sum())} of its {len(wrong)} Gaussians are no numbers")

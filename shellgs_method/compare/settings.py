@@ -1,0 +1,119 @@
+"""What the result of a run depends on: the config that its words make, and what the scene holds."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import fields, is_dataclass, replace
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
+from nerfstudio.engine.trainer import TrainerConfig
+
+from dataparsers.cue_maps import CueMaps, find_cues
+from dataparsers.errors import SceneError
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from dataparsers.files import content_hash, fingerprint
+
+_PLACES = re.compile(
+    r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"
+    r"|(load|steps_per|save_only)_\w+|(viewer|logging|machine)\..*|(pipeline\.datamanager\.(dataparser\.)?)?data"
+    r"|pipeline\.datamanager\.train_cameras_sampling_seed)"
+)
+"""Settings that say where a run lies, how it is watched and how often it is saved, or that have a name of their own."""
+
+
+@cache
+def parsed(words: tuple[str, ...]) -> TrainerConfig:
+    """The config that ns-train makes of its words; shared, not to be changed.
+
+    Raises:
+        SceneError: ns-train refuses them.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said), redirect_stdout(said):
+            config = tyro.cli(AnnotatedBaseConfigUnion, args=list(words))
+    except SystemExit as error:
+        lines = (line.strip("│╭╮╰╯─ ") for line in said.getvalue().splitlines())
+        why = " ".join(line for line in lines if line and "helptext" not in line and "error" not in line.lower()[-8:])
+        raise SceneError(f"ns-train {' '.join(words)} is refused: {why or 'it asks for help'}") from error
+    assert isinstance(config, TrainerConfig)
+    return config
+
+
+def config_settings(config: TrainerConfig) -> dict[str, Any]:
+    """What of a config a result depends on, by the path of the setting, as JSON has it."""
+    return {path: value for path, value in _flat(config) if not _PLACES.fullmatch(path)}
+
+
+def default_settings(method: str) -> dict[str, Any]:
+    """:func:`config_settings` of a method as it is registered."""
+    return config_settings(all_methods[method])
+
+
+def _flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    if is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from _flat(getattr(value, field.name), f"{path}.{field.name}".lstrip("."))
+    elif isinstance(value, dict):
+        for key, each in value.items():
+            yield from _flat(each, f"{path}.{key}")
+    elif isinstance(value, (list, tuple)):
+        yield path, [each.value if isinstance(each, Enum) else each for each in value]
+    elif isinstance(value, (bool, int, float, str)) or value is None:
+        yield path, value
+    elif isinstance(value, Enum):
+        yield path, value.value
+    else:
+        yield path, getattr(value, "__qualname__", str(value))
+
+
+def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:
+    """Hashes of what a run takes from its scene: photographs, masks, cameras, points, and what its maps are made of."""
+    dataparser = getattr(config.pipeline.datamanager, "dataparser", None)
+    if not isinstance(dataparser, FacadeDataParserConfig):
+        dataparser = FacadeDataParserConfig()
+    dataparser = replace(dataparser, data=scene)
+    views = read_views(dataparser)
+    hashes = {
+        "cameras": fingerprint(*map(_hash, _camera_files(dataparser))),
+        "photographs": fingerprint(*([view.name, _hash(view.image)] for view in views)),
+        "masks": fingerprint(*([view.name, _hash(view.mask)] for view in views if view.mask)),
+    }
+    model = config.pipeline.model
+    kinds = {"shell", "truth", getattr(model, "cues", "none"), getattr(model, "seeds", "none")}
+    for kind in find_cues(scene):
+        if kind in kinds:
+            manifest = CueMaps.open(scene, kind).manifest
+            hashes[f"{kind} maps"] = fingerprint(
+                manifest.sources, manifest.metres_per_unit, manifest.max_image_size, manifest.error
+            )
+    return hashes
+
+
+def _camera_files(dataparser: FacadeDataParserConfig) -> list[Path]:
+    """The files with the cameras and the points."""
+    scene, colmap = dataparser.data, dataparser.colmap_folder()
+    if colmap is not None:
+        return sorted((scene / colmap).glob("*.*"))
+    cameras = scene / "transforms.json"
+    cloud = json.loads(cameras.read_text()).get("ply_file_path")
+    return [cameras] if cloud is None or not (scene / cloud).is_file() else [cameras, scene / cloud]
+
+
+def _hash(path: Path) -> str:
+    status = path.stat()
+    return _hash_of(path, status.st_mtime_ns, status.st_size)
+
+
+@cache
+def _hash_of(path: Path, _changed: int, _size: int) -> str:
+    return content_hash(path)

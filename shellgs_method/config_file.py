@@ -1,0 +1,184 @@
+"""config.yml read as data. Nerfstudio's is YAML that may build any Python object, which is to say run any program."""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, Field, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from numbers import Real
+from pathlib import Path
+from types import FunctionType, GenericAlias
+from typing import Any, get_args, get_origin
+
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+
+from dataparsers.errors import SceneError, refusals_end_the_program
+
+MAX_BYTES = 1 << 20
+"""Of a config.yml; those of nerfstudio's methods are a hundredth of it."""
+_COMPLETE = ("method_name", "experiment_name", "timestamp", "output_dir", "pipeline", "vis")
+"""Settings that every config.yml has, the last of which is at its end."""
+
+
+def load_config(path: Path) -> TrainerConfig:
+    """The config of a run, built from the classes of registered methods and of nothing else.
+
+    Settings that it does not have, being older, are at their defaults; those that are no more are left out.
+
+    Args:
+        path: a config.yml.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        SceneError: it is no whole config of a registered method.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: name the config.yml of a trained run")
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise SceneError(f"it has more than {MAX_BYTES} bytes")
+        text = path.read_text("utf8")
+        config = yaml.load(text, Loader=_Loader)
+        if not isinstance(config, TrainerConfig):
+            raise SceneError("it holds no config of a run" if text.strip() else "it is empty")
+        lacking = [name for name in _COMPLETE if f"\n{name}:" not in text]
+        if lacking:
+            raise SceneError(f"it is cut: {lacking[0]} is not there")
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        what = " ".join(str(error).split())
+        raise SceneError(
+            f"{path} cannot be read as the config.yml of a run ({what}): name one that ns-train wrote, or train again"
+        ) from error
+    return config
+
+
+@cache
+def _known() -> dict[str, Any]:
+    """The classes, functions and kinds of values that configs of registered methods are made of, by their paths."""
+    from nerfstudio.configs.dataparser_configs import all_dataparsers  # both import the methods, and so this module
+    from nerfstudio.configs.method_configs import all_methods
+
+    found: dict[str, Any] = {}
+    configs = [config for config in all_methods.values() if isinstance(config, TrainerConfig)]
+    for part in _parts([*configs, *all_dataparsers.values()]):
+        found[f"{part.__module__}.{part.__qualname__}"] = part
+    return found
+
+
+def _parts(value: Any) -> Iterator[Any]:
+    """Classes and functions that a config holds, and the classes of what it holds."""
+    if isinstance(value, (type, FunctionType)) and not isinstance(value, GenericAlias):
+        yield value
+    elif get_origin(value):
+        yield from _parts([get_origin(value), *get_args(value)])
+    elif isinstance(value, dict):
+        yield from _parts(list(value.values()))
+    elif isinstance(value, (list, tuple)):
+        for each in value:
+            yield from _parts(each)
+    elif isinstance(value, Enum):
+        yield type(value)
+    elif is_dataclass(value):
+        yield type(value)
+        yield from _parts([getattr(value, field.name) for field in fields(value)])
+
+
+def _find(path: str) -> Any:
+    """What a path names, by its own or by another name that an imported module has for it; nothing is imported."""
+    module, _, name = path.rpartition(".")
+    elsewhere = vars(sys.modules[module]).get(name) if module in sys.modules else None
+    found = _known().get(path, elsewhere)
+    if not any(found is each for each in _known().values()):
+        raise SceneError(f"it names {path}, which no registered method's config has; that may be a program to run")
+    return found
+
+
+def _object(loader: Any, path: str, node: yaml.Node) -> Any:
+    cls = _find(path)
+    if not (isinstance(cls, type) and is_dataclass(cls)):
+        raise SceneError(f"it takes {path} for settings")
+    values = loader.construct_mapping(node, deep=True)
+    given = [field for field in fields(cls) if field.init and field.name in values]
+    for field in given:
+        if not _fits(values[field.name], field):
+            raise SceneError(f"{field.name} of {cls.__name__} cannot be {values[field.name]!r}")
+    return cls(**{field.name: values[field.name] for field in given})
+
+
+def _fits(value: Any, field: Field) -> bool:
+    """Whether a value is of its setting's kind, as far as the default tells."""
+    default = field.default if field.default_factory is MISSING else field.default_factory()
+    if value is None or default is None:
+        return default is None or not isinstance(default, Real)
+    if is_dataclass(default):
+        return is_dataclass(value)
+    for kind in (bool, Real, str, Path, dict):
+        if isinstance(default, kind):
+            return isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    return True
+
+
+def _applied(loader: Any, path: str, node: yaml.Node) -> Any:
+    """What PyYAML writes as a call: paths, enumerations, and generic classes with their parameters."""
+    arguments = loader.construct_sequence(node, deep=True)
+    if path in ("pathlib.PosixPath", "pathlib.WindowsPath", "pathlib._local.PosixPath", "pathlib._local.WindowsPath"):
+        return pathlib.Path(*arguments)
+    if path == "_operator.getitem":
+        generic, parameters = arguments
+        if isinstance(generic, type):
+            return generic[parameters]  # pyright: ignore[reportIndexIssue]
+    kind = _find(path)
+    if not (isinstance(kind, type) and issubclass(kind, Enum)):
+        raise SceneError(f"it wants {path} to be called")
+    return kind(*arguments)
+
+
+def _tuple(loader: Any, node: Any) -> tuple:
+    return tuple(loader.construct_sequence(node, deep=True))
+
+
+def _refused(_loader: Any, path: str, _node: yaml.Node) -> Any:
+    raise SceneError(f"it wants {path} to be imported")
+
+
+_CONSTRUCTORS: dict[str, Callable[[Any, str, yaml.Node], Any]] = {
+    "name:": lambda _loader, path, _node: _find(path),
+    "object:": _object,
+    "object/apply:": _applied,
+    "object/new:": _refused,
+    "module:": _refused,
+}
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain YAML, and what configs are made of."""
+
+
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _tuple)
+for _tag, _construct in _CONSTRUCTORS.items():
+    _Loader.add_multi_constructor(f"tag:yaml.org,2002:python/{_tag}", _construct)
+
+
+def guard_nerfstudio() -> None:
+    """Let nerfstudio's own commands build of a config.yml what :func:`load_config` does.
+
+    They read it with ``yaml.Loader``, which calls whatever a file names, in two places that hold the loader by its
+    name; so the loader itself is changed, in processes that know our methods.
+    """
+
+    def ending(construct: Callable[[Any, str, yaml.Node], Any]) -> Callable[[Any, str, yaml.Node], Any]:
+        def build(loader: Any, path: str, node: yaml.Node) -> Any:
+            with refusals_end_the_program():
+                try:
+                    return construct(loader, path, node)
+                except SceneError as error:
+                    raise SceneError(f"{loader.name} is no config.yml of a run: {error}") from error
+
+        return build
+
+    for tag, construct in _CONSTRUCTORS.items():
+        yaml.Loader.add_multi_constructor(f"tag:yaml.org,2002:python/{tag}", ending(construct))

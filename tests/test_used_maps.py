@@ -1,0 +1,129 @@
+"""Which maps a training reads, and which a measurement: those it does not need cannot stop it."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import torch
+from runs import data_of, model_of, trainer_of
+
+from dataparsers.cue_maps import CueMap, CueMaps
+from dataparsers.errors import SceneError
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from dataparsers.map_files import resampled
+from shellgs_method import cli
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
+
+pytestmark = pytest.mark.usefixtures("eager")
+
+
+def spoil(scene: Path, kind: str) -> None:
+    """Maps that belong to other cameras."""
+    views = read_views(FacadeDataParserConfig(data=scene))
+    maps = CueMaps.create(scene, kind, command=f"shellgs {kind} {{scene}}")
+    nothing = CueMap(np.zeros((32, 48), np.float32), np.zeros((32, 48, 3), np.float16), np.zeros((32, 48), bool))
+    for one, other in zip(views, views[1:] + views[:1], strict=True):
+        maps.write(one.name, nothing, other.camera)
+    manifest = maps.folder / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"sources": {"a": "b"}}))
+
+
+@pytest.mark.parametrize("kind", ["mono", "shell", "truth"])
+def test_maps_that_a_method_does_not_train_on_do_not_stop_it(scene, tmp_path, kind, caplog):
+    spoil(scene, kind)
+    trainer = trainer_of(scene, tmp_path, "photo_gs", iterations=2)
+    trainer.train()
+    assert not any(key.startswith(("shell", "mono", "truth")) for key in data_of(trainer).cached_train[0])
+    figures = trainer.pipeline.get_average_eval_image_metrics()
+    assert {"psnr", "psnr_seen"} <= figures.keys()
+    assert ("normal_deg" in figures, "truth_normal_deg" in figures) == (kind != "shell", kind != "truth")
+    told = [record.message for record in caplog.records if "measures nothing against" in record.message]
+    assert len(told) == (kind != "mono")
+    assert all(f"the {kind} maps" in message for message in told)
+
+
+def test_only_what_is_trained_on_is_held_in_memory(scene, tmp_path):
+    batch = data_of(trainer_of(scene, tmp_path)).cached_train[0]
+    assert {key for key in batch if key.endswith("_depth")} == {"shell_depth"}
+
+
+def test_a_cast_at_another_size_leaves_every_method_its_truth(scene, tmp_path):
+    cli.cast(scene, max_image_size=24)
+    trainer = trainer_of(scene, tmp_path, "shellgs", iterations=2)
+    trainer.train()
+    figures = trainer.pipeline.get_average_eval_image_metrics()
+    assert {"normal_deg", "truth_normal_deg", "truth_chamfer_m"} <= figures.keys()
+
+
+@pytest.mark.parametrize("size", [(24, 16), (36, 24), (96, 64)])
+def test_a_resampled_map_is_that_of_the_camera_of_its_size(scene, size):
+    """On planes to float32's rounding; at edges the nearest pixel counts."""
+    alignment = Alignment.load(scene / ALIGNMENT)
+    caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
+    camera = read_views(FacadeDataParserConfig(data=scene))[4].camera
+    wanted = camera.resized(*size)
+    made, expected = resampled(caster.cast(camera), wanted), caster.cast(wanted)
+    both = made.mask & expected.mask
+    relative = np.abs(made.depth / np.where(both, expected.depth, 1) - 1)[both]
+    assert (made.mask == expected.mask).mean() > 0.93
+    assert np.median(relative) < 1e-5
+    assert (relative < 0.01).mean() > 0.75
+    assert made.depth.dtype == np.float32
+    assert made.depth[made.mask].all()
+
+
+@pytest.mark.parametrize("empty", [False, True])
+def test_maps_that_are_all_gone_are_told_of_before_training(scene, tmp_path, empty):
+    for path in (scene / "cues" / "shell").rglob("*.npz"):
+        path.unlink()
+    if empty:
+        spoilt = CueMaps.open(scene, "shell")
+        for view in read_views(FacadeDataParserConfig(data=scene)):
+            shape = (view.camera.height, view.camera.width)
+            nothing = CueMap(np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float16), np.zeros(shape, bool))
+            spoilt.write(view.name, nothing, view.camera)
+    with pytest.raises(SystemExit, match=r"none of the 8 training views has a shell map.*run `shellgs cast"):
+        trainer_of(scene, tmp_path)
+
+
+def test_training_views_without_a_map_are_counted(scene, tmp_path, caplog):
+    (scene / "cues" / "shell" / "images" / "frame_00003.png.npz").unlink()
+    trainer_of(scene, tmp_path)
+    assert "1 of the 8 training views have no shell map" in caplog.text
+
+
+def test_memory_is_told_of_and_maps_that_do_not_fit_are_read_in_every_step(scene, tmp_path, monkeypatch, capsys):
+    held, read = (trainer_of(scene, tmp_path / name, "shellgs_metric", iterations=2) for name in ("a", "b"))
+    data_of(held).cached_train  # noqa: B018
+    assert "of memory" not in capsys.readouterr().out
+    monkeypatch.setattr("shellgs_method.datamanager.WORTH_SAYING", 1e5)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1e5})())
+    data_of(read).train_dataset.held = True
+    data_of(read).__dict__.pop("cached_train", None)
+    said = data_of(read).cached_train and " ".join(capsys.readouterr().out.split())
+    assert "8 photographs and their shell maps take 0.0 GB of memory" in said
+    assert "read from disk in every step" in said
+    assert "shell_depth" not in data_of(read).cached_train[0]
+    (_, one), (_, other) = data_of(held).next_train(0), data_of(read).next_train(0)
+    assert one["image_idx"] == other["image_idx"]
+    torch.testing.assert_close(one["shell_depth"], other["shell_depth"])
+    assert len(model_of(held).gauss_params["means"]) == len(model_of(read).gauss_params["means"])
+
+
+def test_a_map_of_another_size_names_the_command_for_the_size_that_is_wanted(scene):
+    cli.cast(scene, max_image_size=40)
+    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    with pytest.raises(
+        SceneError, match=r"it is 40x27 pixels, the camera 24x16; run `shellgs cast .* --max-image-size 24`"
+    ):
+        CueMaps.open(scene, "shell").read(view.name, view.camera.shrunk(24))
+
+
+@pytest.fixture(autouse=True)
+def _warnings(caplog):
+    caplog.set_level(logging.WARNING)
