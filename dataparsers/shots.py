@@ -80,6 +80,7 @@ def shot(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping
     Raises:
         SceneError: the numbers are those of no camera, or the path leaves the scene.
     """
+    image = inside(scene, name, where)
     where = f"{where}: the camera of {name}"
     width, height = (_number(lens, key, where) for key in ("w", "h"))
     if not (width >= 1 and height >= 1 and width % 1 == height % 1 == 0):
@@ -97,7 +98,7 @@ def shot(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping
         raise SceneError(f"{where} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(torch.from_numpy(np.linalg.inv(_rigid(pose, where))), K, int(width), int(height))
-    return Shot(name, inside(scene, name, where), camera, distortion, kind)
+    return Shot(name, image, camera, distortion, kind)
 
 
 def inside(scene: Path, name: str, where: str) -> Path:
@@ -109,7 +110,7 @@ def inside(scene: Path, name: str, where: str) -> Path:
     path = PurePosixPath(str(name))
     for folder in (scene.absolute().as_posix(), scene.resolve().as_posix()):
         path = path.relative_to(folder) if path.is_relative_to(folder) else path
-    if path.is_absolute() or ".." in path.parts or not path.parts or "\0" in str(path):
+    if path.is_absolute() or ".." in path.parts or not path.parts or not str(path).isprintable():
         raise SceneError(f"{where} names the file {str(name)!r}, which is not inside the scene: move it there")
     return scene / path
 

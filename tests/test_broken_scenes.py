@@ -114,6 +114,7 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a path out of the scene": (lambda scene: change(scene, 3, file_path="../x.png"), "is not inside the scene"),
     "an absolute path": (lambda scene: change(scene, 3, file_path="/etc/passwd"), "'/etc/passwd', which is not"),
+    "a path of two lines": (lambda scene: change(scene, 3, file_path="images/a\nb.png"), "is not inside the scene"),
     "a path of nothing": (lambda scene: change(scene, 3, file_path=""), "'', which is not inside"),
     "a photograph that is a folder": (lambda scene: change(scene, 3, file_path="images"), "not on disk (images)"),
     "no photograph": (lambda scene: change(scene, 3, file_path="images/x.png"), "1 of 10 images"),
