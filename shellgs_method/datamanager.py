@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
@@ -105,14 +104,6 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     """Full images with cue maps, cached on any machine."""
 
     config: FacadeDataManagerConfig
-    last_trained = ""
-    """Name of the view that the last step was trained on."""
-
-    def next_train(self, step: int) -> tuple[Cameras, dict]:
-        """The next training view."""
-        camera, batch = super().next_train(step)
-        self.last_trained = self.train_dataset.views[batch["image_idx"]].name
-        return camera, batch
 
     def create_train_dataset(self) -> FacadeDataset:
         """The training views, whose maps leave out the bands held out."""
