@@ -160,8 +160,6 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     """Full images with cue maps, cached on any machine."""
 
     config: FacadeDataManagerConfig
-    last_trained = ""
-    """Name of the view that the last step was trained on."""
 
     def create_train_dataset(self) -> FacadeDataset:
         """The training views, whose maps leave out the bands held out."""
@@ -261,7 +259,6 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """The next training view, with its maps."""
         camera, batch = super().next_train(step)
-        self.last_trained = self.train_dataset.views[batch["image_idx"]].name
         return camera, self._with_maps(batch)
 
     def _with_maps(self, batch: dict) -> dict:

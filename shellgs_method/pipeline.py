@@ -37,6 +37,8 @@ class FacadePipeline(VanillaPipeline):
 
     config: FacadePipelineConfig
     datamanager: FacadeDataManager
+    last_trained = ""
+    """Name of the view that the last step was trained on."""
     _left: Mapping[str, Any] = MappingProxyType({})
 
     @property
@@ -75,6 +77,12 @@ class FacadePipeline(VanillaPipeline):
                         f"want {list(parameter.shape)}: load it with the settings that it was trained with"
                     )
         super().load_pipeline(loaded_state, step)
+
+    def get_train_loss_dict(self, step: int):
+        """One step on the next view."""
+        data = self.datamanager
+        self.last_trained = data.train_dataset.views[data.train_unseen_cameras[0]].name
+        return super().get_train_loss_dict(step)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What checkpoints hold beside parameters: the densification's sums, views still to come, random numbers."""

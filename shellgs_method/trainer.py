@@ -163,7 +163,7 @@ class FacadeTrainer(Trainer):
         forget_gradients(self.pipeline.model.info)
         terms = [name for name, value in losses.items() if not bool(value.isfinite())]
         what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
-        view = self.pipeline.datamanager.last_trained
+        view = self.pipeline.last_trained
         CONSOLE.print(
             f"[yellow]Step {step} is left out: {what} of {view} is no number ({self._faults} of at most {MAX_FAULTS}).",
         )

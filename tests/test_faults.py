@@ -51,7 +51,7 @@ def spoil_gradient(trainer: FacadeTrainer, views: slice) -> str:
     names = [view.name for view in data_of(trainer).train_dataset.views]
     spoiled = names[views]
     model_of(trainer).scales.register_hook(
-        lambda gradient: gradient * math.nan if data_of(trainer).last_trained in spoiled else gradient
+        lambda gradient: gradient * math.nan if trainer.pipeline.last_trained in spoiled else gradient
     )
     return names[views.start]
 
