@@ -1,0 +1,243 @@
+"""The collider: convex parts behind the shell's planes, and behind the fused surface where it stands before these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from dataparsers.errors import SceneError
+from shellgs_method.sim.convex import convex_pieces, fewer_pieces
+from shellgs_method.sim.parts import Part, joined, prism
+from shellgs_method.sim.patches import convex_patches
+from shellgs_method.sim.planes import Plane, find_planes, grid_in, polygons_of
+from shellgs_method.sim.rays import Surface, outward_faces
+
+THICKNESS = 0.3
+"""Metres that parts reach behind a surface, where nothing says that the building ends before."""
+THINNEST = 0.03
+"""Metres; what is thinner, fast bodies pass between two steps of a simulation."""
+FOR_SURFACES = 0.4
+"""Share of the parts for what is no plane, at most."""
+COVERED = 0.01
+"""Metres before other parts up to which a part adds nothing to them."""
+DEEP = 1.0
+"""Metres of air behind a plane that count at most, where parts are joined over an opening."""
+GROUND = 0.1
+"""Metres above the ground up to which the fused surface is taken for it: simulators have a plane there."""
+BACKED = 0.9
+"""Share of the eyes that see something before the shell which must see the shell behind it."""
+SPECK = 0.01
+"""Square metres below which a separate piece of surface before the shell is noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Collider:
+    """Convex parts, and what they were made from.
+
+    Attributes:
+        parts: convex, overlapping; in metres, in the simulation's frame.
+        shell: the shell, wound so that the cameras see its outside; None where there is none.
+        before: triangles of the fused surface that stand before the shell, wound in the same way.
+        filled: cubic metres of air, in openings and notches, that the budget of parts covers up.
+    """
+
+    parts: list[Part]
+    shell: Surface | None
+    before: Surface | None
+    filled: float
+
+    @property
+    def surface(self) -> Surface:
+        """All parts as one mesh."""
+        return Surface(*joined(self.parts))
+
+
+def make_collider(
+    shell: Surface | None,
+    fused: Surface,
+    eyes: Float64[np.ndarray, "E 3"],
+    most: int = 256,
+    before: float = 0.05,
+) -> Collider:
+    """The collider of a building.
+
+    Args:
+        shell: of any winding; None where the scene has none: all of the fused surface counts then.
+        fused: the surface that was reconstructed; what of it lies behind the shell does not count.
+        eyes: the cameras' places, which are outside.
+        most: convex parts.
+        before: metres before the shell from which the fused surface stands on its own: it is noisy up to there.
+
+    Raises:
+        SceneError: there is nothing to collide with.
+    """
+    if most < 1:
+        raise SceneError(f"a collider cannot have {most} parts: give --parts above 0")
+    planes: list[Plane] = []
+    surfaces, filled = [], 0.0
+    if shell is not None:
+        faces, _ = outward_faces(shell, eyes)
+        shell = Surface(shell.vertices, faces)
+        planes, rest = find_planes(shell.vertices, shell.faces)
+        planes = [_facing(plane, shell) for plane in planes]
+        surfaces = [(shell, group) for group in connected(shell.faces, rest)]
+    faces, seen = outward_faces(fused, eyes)
+    fused = Surface(fused.vertices, faces)
+    above = fused.vertices[fused.faces].mean(axis=1)[:, 2] > GROUND
+    standing = np.flatnonzero(seen & above if shell is None else standing_before(shell, fused, eyes, before) & above)
+    groups = [group for group in connected(fused.faces, standing) if fused.areas[group].sum() >= SPECK]
+    standing = np.concatenate(groups) if groups else np.empty(0, np.int64)
+    parts = _patched([*surfaces, *((fused, group) for group in groups)], max(1, int(FOR_SURFACES * most)) if planes else most)
+    if planes and shell is not None:
+        solid, filled = _behind(planes, shell, max(1, most - len(parts)))
+        parts = [*solid, *parts]
+    parts = uncovered(parts)
+    if not parts:
+        raise SceneError("the collider is empty: neither shell nor reconstruction has a surface that cameras see")
+    return Collider(parts, shell, Surface(fused.vertices, fused.faces[standing]) if len(standing) else None, filled)
+
+
+def standing_before(
+    shell: Surface, fused: Surface, eyes: Float64[np.ndarray, "E 3"], least: float, count: int = 24
+) -> Bool[np.ndarray, " F"]:
+    """Which triangles of a surface stand before the shell by ``least`` metres, as the eyes see it.
+
+    Nearly all eyes that see them must have the shell behind them: beside a building's outline, a reconstruction goes
+    on where the shell ends.
+    """
+    centres = fused.vertices[fused.faces].mean(axis=1)
+    near = np.flatnonzero(shell.signed_distance(centres) > least)
+    seeing, backed = np.zeros(len(near)), np.zeros(len(near))
+    for eye in eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]:
+        visible = fused.sees(np.broadcast_to(eye, (len(near), 3)), centres[near], 0.02)
+        _, behind = shell.cast(np.broadcast_to(eye, (len(near), 3)), centres[near] - eye)
+        seeing += visible
+        backed += visible & (behind >= 0)
+    standing = np.zeros(len(centres), bool)
+    standing[near] = (seeing > 0) & (backed >= BACKED * seeing)
+    return standing
+
+
+def _patched(groups: Sequence[tuple[Surface, np.ndarray]], most: int) -> list[Part]:
+    """Parts of pieces of surfaces, each surface getting its share by area."""
+    parts, areas = [], [surface.areas[group].sum() for surface, group in groups]
+    for surface in dict.fromkeys(surface for surface, _ in groups):
+        own = [group for other, group in groups if other is surface]
+        share = sum(surface.areas[group].sum() for group in own) / max(sum(areas), 1e-9)
+        parts += convex_patches(surface, own, max(1, round(share * most)), THICKNESS / 3)
+    return parts
+
+
+def _behind(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Part], float]:
+    """Prisms behind planes, ``most`` if that can be, and the cubic metres of air that joining them costs."""
+    depths = [thickness(plane, shell) for plane in planes]
+
+    def solid(cut: Sequence[Sequence[shapely.Polygon]]) -> dict[Part, tuple[int, shapely.Polygon]]:
+        pieces = [(index, piece) for index, pieces in enumerate(cut) for piece in pieces]
+        made = {prism(planes[index], piece, depths[index]): (index, piece) for index, piece in pieces}
+        return {part: made[part] for part in uncovered([part for part in made if part is not None])}
+
+    parts, spent = solid([convex_pieces(plane.outline) for plane in planes]), 0.0
+    if len(parts) > most:
+        cut = [[piece for index, piece in parts.values() if index == k] for k in range(len(planes))]
+        cut, spent = fewer_pieces(cut, most, lambda k, area: _air(planes[k], area, shell))
+        parts = solid(cut)
+    return sorted(parts, key=_size, reverse=True)[:most], spent
+
+
+def _air(plane: Plane, area: shapely.Geometry, shell: Surface) -> float:
+    """Cubic metres of air between an area of a plane and the shell behind it; none inside the building."""
+    pieces = [piece for piece in polygons_of(area) if piece.area > 1e-4]
+    total = 0.0
+    for piece in pieces:
+        points = plane.to_space(grid_in(piece, max(0.05, float(np.sqrt(piece.area)) / 10)))
+        outwards = np.broadcast_to(plane.normal, points.shape)
+        _, ahead = shell.cast(points, outwards)
+        inside = (ahead >= 0) & (shell.normals[ahead] @ plane.normal > 0.2)
+        behind = np.minimum(shell.cast(points, -outwards)[0], DEEP)
+        total += piece.area * float(np.where(inside, 0.0, behind).mean())
+    return total
+
+
+def _size(part: Part) -> float:
+    return float(np.prod(np.sort(np.ptp(part.vertices, axis=0))[1:]))
+
+
+def _facing(plane: Plane, shell: Surface) -> Plane:
+    """The plane with its normal to the side that most of its triangles face."""
+    if shell.areas[plane.faces] @ (shell.normals[plane.faces] @ plane.normal) >= 0:
+        return plane
+    mirrored = shapely.affinity.scale(plane.outline, xfact=-1, origin=(0, 0))
+    return replace(plane, axes=plane.axes * np.array([[-1.0], [1], [-1]]), outline=mirrored)
+
+
+def thickness(plane: Plane, shell: Surface) -> float:
+    """How far parts may reach behind a plane until they come out of the building somewhere."""
+    points = plane.samples(max(0.1, np.sqrt(plane.outline.area) / 20))
+    back = np.broadcast_to(-plane.normal, points.shape)
+    t, hit = shell.cast(points + 0.01 * back, back)
+    leaves = (hit >= 0) & (shell.normals[hit] @ plane.normal < -0.2)
+    if not leaves.any():
+        return THICKNESS
+    free = np.where(leaves, t + 0.01, np.inf)
+    return float(np.clip(np.quantile(free, 0.1), THINNEST, THICKNESS))
+
+
+def uncovered(parts: Sequence[Part]) -> list[Part]:
+    """The parts that stand out of the others somewhere; small ones are asked first."""
+    kept = sorted(parts, key=_size)
+    for part in list(kept):
+        others = [other for other in kept if other is not part]
+        points, hidden = _face_points(part), np.zeros(0, bool)
+        hidden = np.zeros(len(points), bool)
+        for other in others:
+            if not hidden.all():
+                hidden[~hidden] = other.contains(points[~hidden], COVERED)
+        if hidden.all():
+            kept = others
+    return kept
+
+
+def _face_points(part: Part) -> Float64[np.ndarray, "N 3"]:
+    """Points all over a part's faces."""
+    corners = part.vertices[part.faces]
+    weights = _WEIGHTS
+    return np.concatenate([np.einsum("kw,fwc->fkc", weights, corners).reshape(-1, 3)])
+
+
+_WEIGHTS = np.array([[i, j, 6 - i - j] for i in range(7) for j in range(7 - i)]) / 6
+
+
+def connected(faces: Int64[np.ndarray, "F 3"], chosen: Int64[np.ndarray, " C"]) -> list[Int64[np.ndarray, " G"]]:
+    """The chosen triangles in groups that share corners."""
+    if not len(chosen):
+        return []
+    corners = faces[chosen]
+    used, numbered = np.unique(corners, return_inverse=True)
+    numbered = numbered.reshape(-1, 3)
+    rows, columns = numbered[:, [0, 1]].ravel(), numbered[:, [1, 2]].ravel()
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(used), len(used)))
+    label = connected_components(graph, directed=False)[1][numbered[:, 0]]
+    order = np.argsort(label, kind="stable")
+    return np.split(chosen[order], np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def leaks(
+    collider: Surface, shell: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 20_000
+) -> tuple[float, Bool[np.ndarray, " N"]]:
+    """Share of the rays from the eyes to the shell, as far as these reach it, that pass the collider by 10 cm."""
+    points, _ = shell.samples(count)
+    origins = eyes[np.arange(count) % len(eyes)]
+    away = points - origins
+    length = np.linalg.norm(away, axis=1)
+    directions = away / length[:, None]
+    reached = shell.cast(origins, directions)[0]
+    visible = reached > length - 0.01
+    through = collider.cast(origins, directions)[0] > length + 0.1
+    return float((visible & through).sum() / max(visible.sum(), 1)), visible & through
