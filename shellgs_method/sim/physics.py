@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from shellgs_method.sim.rays import Surface
 GRAVITY = 9.81
 PROJECTILES = 2, 1
 """contype and conaffinity of what is thrown: it meets the world, and nothing else that is thrown."""
+BEAMS = -22.5, 22.5
+"""Degrees above the horizon between which a lidar looks: those of an Ouster OS1."""
 SINKING = 0.01
 """Metres of penetration that count as stuck: contacts are soft."""
 GAIN = 0.02
@@ -102,13 +105,16 @@ class Front:
         seen = np.zeros(len(points), bool)
         for eye in eyes[np.unique(np.linspace(0, len(eyes) - 1, 12).astype(int))]:
             seen |= surface.sees(np.broadcast_to(eye, points.shape), points, 0.01)
-        upright = np.abs(surface.normals[triangle, 2]) < 0.3
-        wall = points[seen & upright] if (seen & upright).sum() > 10 else points
+        normals = surface.normals[triangle] * [1, 1, 0]
+        upright = seen & (np.linalg.norm(normals, axis=1) > 0.9)
+        wall, normals = (points[upright], normals[upright]) if upright.any() else (points, normals)
+        alike = normals @ normals.T > np.cos(np.radians(10))
+        outwards = normals[alike[alike.sum(axis=1).argmax()]].mean(axis=0)
+        outwards = outwards / np.linalg.norm(outwards) if np.linalg.norm(outwards) > 0 else np.array([0.0, -1, 0])
         middle = np.median(wall, axis=0)
-        along = np.append(np.linalg.svd((wall - wall.mean(0))[:, :2], full_matrices=False)[2][0], 0.0)
-        outwards = np.array([-along[1], along[0], 0.0])
         if (np.median(eyes, axis=0) - middle) @ outwards < 0:
-            outwards, along = -outwards, -along
+            outwards = -outwards
+        along = np.array([-outwards[1], outwards[0], 0.0])
         first, last = np.quantile(wall @ along, [0.01, 0.99])
         foot = middle + ((first + last) / 2 - middle @ along) * along
         return cls(along, outwards, foot * [1, 1, 0], float(last - first))
@@ -116,9 +122,9 @@ class Front:
     def before(self, surface: Surface, share: float, distance: float, height: float) -> Float64[np.ndarray, " 3"]:
         """The place so far before the surface and above the ground, at a share of the length."""
         far = self.foot + (share - 0.5) * self.length * self.along + [0, 0, height] + 30 * self.outwards
-        t, _ = surface.cast(far, -self.outwards)
-        reached = float(t) if np.isfinite(t) else 30.0
-        return far - max(reached - distance, 0.0) * self.outwards
+        wide = far + np.linspace(-0.5, 0.5, 11)[:, None] * self.along
+        reached = float(surface.cast(wide, np.broadcast_to(-self.outwards, wide.shape))[0].min())
+        return far - max(min(reached, 30.0) - distance, 0.0) * self.outwards
 
 
 def load(path: Path):
@@ -127,7 +133,7 @@ def load(path: Path):
     Raises:
         SceneError: MuJoCo refuses it, or warns.
     """
-    return _compiled(_spec(path), path)
+    return compiled(read_spec(path), path)
 
 
 def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarray, "R 3"], group: int) -> np.ndarray:
@@ -155,9 +161,9 @@ def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarr
 
 
 def beams(elevations: int = 24, azimuths: int = 180) -> Float64[np.ndarray, "R 3"]:
-    """Directions of a lidar that looks all around, from 15 degrees below the horizon to 60 above it."""
+    """Directions of a lidar that looks all around."""
     up, around = np.meshgrid(
-        np.radians(np.linspace(-15, 60, elevations)), np.linspace(0, 2 * np.pi, azimuths, endpoint=False), indexing="ij"
+        np.radians(np.linspace(*BEAMS, elevations)), np.linspace(0, 2 * np.pi, azimuths, endpoint=False), indexing="ij"
     )
     return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1).reshape(-1, 3)
 
@@ -178,7 +184,7 @@ def throw(path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count:
         count: of bodies, which do not meet each other.
         seconds: that they have.
     """
-    mujoco, spec = import_mujoco(), _spec(path)
+    mujoco, spec = import_mujoco(), read_spec(path)
     rng = np.random.default_rng(0)
     starts, velocities = _aimed(surface, eyes, count, rng)
     for number, start in enumerate(starts):
@@ -188,7 +194,7 @@ def throw(path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count:
         contype, conaffinity = PROJECTILES
         size = rng.uniform(0.05, 0.15, 3)
         body.add_geom(type=kind, size=size, density=300, contype=contype, conaffinity=conaffinity, group=1)
-    model = _compiled(spec, path)
+    model = compiled(spec, path)
     data = mujoco.MjData(model)
     bodies = np.array([model.body(f"thrown_{number}").id for number in range(count)])
     data.qvel.reshape(-1, 6)[:, :3] = velocities
@@ -218,23 +224,22 @@ def throw(path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count:
     return Throws(count, int(hit.sum()), int(through.sum()), int((held | (depth > SINKING)).sum()), int(gained.sum()), deepest)
 
 
-def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4, push: float = 30.0) -> Walk:
+def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4) -> Walk:
     """Send an upright capsule along a facade, pushed against it; where something stops it, it steps back.
 
     Args:
         path: of the model.
         surface: its colliders.
         front: the facade.
-        speed: wanted, in metres per second.
-        push: force towards the facade, in newtons.
+        speed: wanted along it, in metres per second; 0.5 towards it.
     """
-    mujoco, spec = import_mujoco(), _spec(path)
-    body = spec.worldbody.add_body(pos=front.before(surface, 0.0, 0.8, 0.91), name="walker")
+    mujoco, spec = import_mujoco(), read_spec(path)
+    body = spec.worldbody.add_body(pos=front.before(surface, 0.05, 0.35, 0.91), name="walker")
     for name, axis in (("along", front.along), ("out", front.outwards), ("up", np.array([0.0, 0, 1]))):
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, name=name)
     capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
     body.add_geom(type=capsule, size=[0.25, 0.65, 0], mass=70, friction=[0.3, 0.005, 0.0001], group=1)
-    model = _compiled(spec, path)
+    model = compiled(spec, path)
     data = mujoco.MjData(model)
     steps = round(2 * front.length / speed / model.opt.timestep)
     ground, touching, deepest, back = model.geom("ground").id, 0, 0.0, 0
@@ -244,8 +249,8 @@ def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4, push: f
         if back == 0 and step > 500 and along < 0.1 * speed:
             back = 150
         back = max(back - 1, 0)
-        data.qfrc_applied[0] = 400 * ((0.0 if back > 75 else speed) - along)
-        data.qfrc_applied[1] = 400 * (0.8 - out) if back else -push - 40 * out
+        data.qfrc_applied[0] = 2000 * ((0.0 if back > 75 else speed) - along)
+        data.qfrc_applied[1] = 2000 * (0.8 - out) if back else -2000 * (0.5 + out)
         started = time.perf_counter()
         mujoco.mj_step(model, data)
         stepping += time.perf_counter() - started
@@ -253,7 +258,7 @@ def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4, push: f
         others = (data.contact.geom != ground).all(axis=1)
         touching += bool(others.any())
         deepest = max(deepest, *(-data.contact.dist[others]), 0.0)
-        if data.qpos[0] > front.length:
+        if data.qpos[0] > 0.9 * front.length:
             break
     second = stepping / done
     return Walk(
@@ -272,6 +277,8 @@ def import_mujoco() -> ModuleType:
     Raises:
         SceneError: it is not installed.
     """
+    if not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # read once, when MuJoCo is imported
     try:
         import mujoco
     except ImportError as error:
@@ -279,7 +286,7 @@ def import_mujoco() -> ModuleType:
     return mujoco
 
 
-def _spec(path: Path):
+def read_spec(path: Path):
     """MuJoCo's editable form of a model, its files found from anywhere."""
     mujoco = import_mujoco()
     try:
@@ -288,7 +295,7 @@ def _spec(path: Path):
         raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
 
 
-def _compiled(spec, path: Path):
+def compiled(spec, path: Path):
     mujoco, warnings = import_mujoco(), []
     mujoco.set_mju_user_warning(warnings.append)
     try:
