@@ -16,6 +16,7 @@ from rich.table import Table
 from dataparsers.errors import SceneError, refusals_end_the_program
 from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
+from shellgs_method.sim.settings import SimSettings
 
 if TYPE_CHECKING:
     from dataparsers.cue_maps import CueMaps
@@ -38,6 +39,7 @@ MonoSource = Annotated[
 _MOGE = MoGe2()
 UpAxis = Literal["y", "z"]
 _CAPTURE = CaptureConfig()
+_SIM = SimSettings()
 
 
 def demo(
@@ -362,6 +364,32 @@ def splats(
     console.print(f"{output}: {count} Gaussians. {_place(run.frame)}")
 
 
+def sim(
+    configs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.Positional],
+    settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
+    up: Optional[UpAxis] = None,
+) -> None:
+    """A folder that MuJoCo, Isaac Sim and Gazebo load: convex colliders, a textured look, splats, and a report.
+
+    With several runs, whose shells are in the same national coordinates, they stand in one world.
+
+    Args:
+        configs: The runs' config.yml.
+        out: The folder.
+        settings: Settings.
+        up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
+    """
+    from shellgs_method.sim.simulate import simulate
+
+    def tell(sentence: str) -> None:
+        console.print(sentence, highlight=False)
+
+    for sentence in simulate(configs, out, settings, tell, up)["summary"]:
+        tell(sentence)
+    console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how far off it is.")
+
+
 def compare(
     scenes: Annotated[tuple[Path, ...], tyro.conf.Positional],
     methods: tuple[str, ...] = ("photo-gs", "mono-gs", "2dgs", "shellgs"),
@@ -484,6 +512,7 @@ def main() -> None:
         "evaluate": evaluate,
         "mesh": mesh,
         "splats": splats,
+        "sim": sim,
         "doctor": doctor,
     }
     with refusals_end_the_program():

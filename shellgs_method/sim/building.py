@@ -102,7 +102,7 @@ class Reconstruction:
         for view, hidden in zip(self.views, self.hidden, strict=True):
             image, kept = np.ascontiguousarray(load_photograph(view)[..., :3]), load_mask(view)
             rows, columns = (
-                (np.arange(n) * m // n for n, m in zip(image.shape[:2], hidden.shape, strict=True))
+                np.arange(n) * m // n for n, m in zip(image.shape[:2], hidden.shape, strict=True)
             )  # nearest
             clear = ~hidden[np.ix_(rows, columns)]
             yield Photo(image, self.frame.camera(view.camera), clear if kept is None else clear & kept)
@@ -141,7 +141,7 @@ def _moved(
     away = float(np.linalg.norm(between[:3, 3]))
     if away > TOGETHER:
         raise SceneError(
-            f"{scene} is {away / 1000:.0f} km from the first building: are both shells in the same national coordinates?"
+            f"{scene} is {away / 1000:.0f} km from the first building: are both shells in one system of coordinates?"
         )
     to_scene = frame.to_scene @ np.linalg.inv(between)
     return SimFrame(frame.name, to_scene, home.offset, True, "z", home.to_national), between @ motion

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import shapely
@@ -16,7 +17,7 @@ from shellgs_method.sim.convex import convex_pieces, fewer_pieces
 from shellgs_method.sim.parts import Part, joined, prism
 from shellgs_method.sim.patches import convex_patches
 from shellgs_method.sim.planes import Plane, find_planes, grid_in, polygons_of
-from shellgs_method.sim.rays import Surface, outward_faces
+from shellgs_method.sim.rays import Surface, spread
 
 THICKNESS = 0.3
 """Metres that parts reach behind a surface, where nothing says that the building ends before."""
@@ -38,88 +39,74 @@ SPECK = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Collider:
-    """Convex parts, and what they were made from.
+    """Convex parts that together are a building's outside.
 
     Attributes:
         parts: convex, overlapping; in metres, in the simulation's frame.
-        shell: the shell, wound so that the cameras see its outside; None where there is none.
-        before: triangles of the fused surface that stand before the shell, wound in the same way.
         filled: cubic metres of air, in openings and notches, that the budget of parts covers up.
     """
 
     parts: list[Part]
-    shell: Surface | None
-    before: Surface | None
     filled: float
 
-    @property
+    @cached_property
     def surface(self) -> Surface:
         """All parts as one mesh."""
         return Surface(*joined(self.parts))
 
 
-def make_collider(
-    shell: Surface | None,
-    fused: Surface,
-    eyes: Float64[np.ndarray, "E 3"],
-    most: int = 256,
-    before: float = 0.05,
-) -> Collider:
-    """The collider of a building.
+def make_collider(shell: Surface | None, fused: Surface, standing: Bool[np.ndarray, " F"], most: int = 256) -> Collider:
+    """The collider of a building: prisms behind the shell's planes, patches of what else stands out.
 
     Args:
-        shell: of any winding; None where the scene has none: all of the fused surface counts then.
-        fused: the surface that was reconstructed; what of it lies behind the shell does not count.
-        eyes: the cameras' places, which are outside.
+        shell: wound outwards; None where the scene has none.
+        fused: the surface that was reconstructed, wound outwards.
+        standing: which of its triangles stand on their own, as :func:`standing_before` says.
         most: convex parts.
-        before: metres before the shell from which the fused surface stands on its own: it is noisy up to there.
 
     Raises:
         SceneError: there is nothing to collide with.
     """
     if most < 1:
         raise SceneError(f"a collider cannot have {most} parts: give --parts above 0")
-    planes: list[Plane] = []
-    surfaces, filled = [], 0.0
-    if shell is not None:
-        faces, _ = outward_faces(shell, eyes)
-        shell = Surface(shell.vertices, faces)
-        planes, rest = find_planes(shell.vertices, shell.faces)
-        planes = [_facing(plane, shell) for plane in planes]
-        surfaces = [(shell, group) for group in connected(shell.faces, rest)]
-    faces, seen = outward_faces(fused, eyes)
-    fused = Surface(fused.vertices, faces)
-    above = fused.vertices[fused.faces].mean(axis=1)[:, 2] > GROUND
-    standing = np.flatnonzero(seen & above if shell is None else standing_before(shell, fused, eyes, before) & above)
-    groups = [group for group in connected(fused.faces, standing) if fused.areas[group].sum() >= SPECK]
-    standing = np.concatenate(groups) if groups else np.empty(0, np.int64)
-    parts = _patched([*surfaces, *((fused, group) for group in groups)], max(1, int(FOR_SURFACES * most)) if planes else most)
+    planes, rest = ([], np.empty(0, np.int64)) if shell is None else find_planes(shell.vertices, shell.faces)
+    surfaces = [] if shell is None else [(shell, group) for group in connected(shell.faces, rest)]
+    groups = connected(fused.faces, np.flatnonzero(standing))
+    surfaces += [(fused, group) for group in groups if fused.areas[group].sum() >= SPECK]
+    parts, filled = _patched(surfaces, max(1, int(FOR_SURFACES * most)) if planes else most), 0.0
     if planes and shell is not None:
-        solid, filled = _behind(planes, shell, max(1, most - len(parts)))
+        solid, filled = _behind([_facing(plane, shell) for plane in planes], shell, max(1, most - len(parts)))
         parts = [*solid, *parts]
     parts = uncovered(parts)
     if not parts:
         raise SceneError("the collider is empty: neither shell nor reconstruction has a surface that cameras see")
-    return Collider(parts, shell, Surface(fused.vertices, fused.faces[standing]) if len(standing) else None, filled)
+    return Collider(parts, filled)
 
 
 def standing_before(
     shell: Surface, fused: Surface, eyes: Float64[np.ndarray, "E 3"], least: float, count: int = 24
 ) -> Bool[np.ndarray, " F"]:
-    """Which triangles of a surface stand before the shell by ``least`` metres, as the eyes see it.
+    """Which triangles of a surface stand before the shell by ``least`` metres, and above the ground, as eyes see it.
 
     Nearly all eyes that see them must have the shell behind them: beside a building's outline, a reconstruction goes
     on where the shell ends.
+
+    Args:
+        shell: wound outwards.
+        fused: wound outwards.
+        eyes: the cameras' places.
+        least: metres; a reconstruction is noisy up to there.
+        count: of eyes to ask.
     """
-    centres = fused.vertices[fused.faces].mean(axis=1)
-    near = np.flatnonzero(shell.signed_distance(centres) > least)
+    near = np.flatnonzero((shell.signed_distance(fused.centres) > least) & (fused.centres[:, 2] > GROUND))
+    places = fused.centres[near]
     seeing, backed = np.zeros(len(near)), np.zeros(len(near))
-    for eye in eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]:
-        visible = fused.sees(np.broadcast_to(eye, (len(near), 3)), centres[near], 0.02)
-        _, behind = shell.cast(np.broadcast_to(eye, (len(near), 3)), centres[near] - eye)
+    for eye in spread(eyes, count):
+        visible = fused.sees(np.broadcast_to(eye, places.shape), places, 0.02)
+        _, behind = shell.cast(np.broadcast_to(eye, places.shape), places - eye)
         seeing += visible
         backed += visible & (behind >= 0)
-    standing = np.zeros(len(centres), bool)
+    standing = np.zeros(len(fused.faces), bool)
     standing[near] = (seeing > 0) & (backed >= BACKED * seeing)
     return standing
 
@@ -194,7 +181,7 @@ def uncovered(parts: Sequence[Part]) -> list[Part]:
     kept = sorted(parts, key=_size)
     for part in list(kept):
         others = [other for other in kept if other is not part]
-        points, hidden = _face_points(part), np.zeros(0, bool)
+        points = _face_points(part)
         hidden = np.zeros(len(points), bool)
         for other in others:
             if not hidden.all():
@@ -206,9 +193,7 @@ def uncovered(parts: Sequence[Part]) -> list[Part]:
 
 def _face_points(part: Part) -> Float64[np.ndarray, "N 3"]:
     """Points all over a part's faces."""
-    corners = part.vertices[part.faces]
-    weights = _WEIGHTS
-    return np.concatenate([np.einsum("kw,fwc->fkc", weights, corners).reshape(-1, 3)])
+    return np.einsum("kw,fwc->fkc", _WEIGHTS, part.vertices[part.faces]).reshape(-1, 3)
 
 
 _WEIGHTS = np.array([[i, j, 6 - i - j] for i in range(7) for j in range(7 - i)]) / 6
@@ -228,9 +213,7 @@ def connected(faces: Int64[np.ndarray, "F 3"], chosen: Int64[np.ndarray, " C"]) 
     return np.split(chosen[order], np.flatnonzero(np.diff(label[order])) + 1)
 
 
-def leaks(
-    collider: Surface, shell: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 20_000
-) -> tuple[float, Bool[np.ndarray, " N"]]:
+def leaks(collider: Surface, shell: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 20_000) -> float:
     """Share of the rays from the eyes to the shell, as far as these reach it, that pass the collider by 10 cm."""
     points, _ = shell.samples(count)
     origins = eyes[np.arange(count) % len(eyes)]
@@ -240,4 +223,4 @@ def leaks(
     reached = shell.cast(origins, directions)[0]
     visible = reached > length - 0.01
     through = collider.cast(origins, directions)[0] > length + 0.1
-    return float((visible & through).sum() / max(visible.sum(), 1)), visible & through
+    return float((visible & through).sum() / max(visible.sum(), 1))

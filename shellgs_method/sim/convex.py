@@ -61,8 +61,8 @@ def fewer_pieces(
                 pairs |= {(first + min(a, b), first + max(a, b)) for b in nearest.tolist() if b != a}
         first += len(plane)
 
-    def price(hull: shapely.Polygon, one: shapely.Polygon, other: tuple[shapely.Polygon, int]) -> float:
-        return cost(owner[other[1]], hull.difference(shapely.union(one, other[0])))
+    def price(hull: shapely.Geometry, one: shapely.Polygon, other: tuple[shapely.Polygon, int]) -> float:
+        return cost(owner[other[1]], shapely.difference(hull, shapely.union(one, other[0])))
 
     left, spent = _join(pieces, pairs, price, most)
     cut: list[list[shapely.Polygon]] = [[] for _ in planes]
@@ -74,7 +74,7 @@ def fewer_pieces(
 def _join(
     start: Sequence[shapely.Polygon],
     pairs: set[tuple[int, int]],
-    price: Callable[[shapely.Polygon, shapely.Polygon, tuple[shapely.Polygon, int]], float],
+    price: Callable[[shapely.Geometry, shapely.Polygon, tuple[shapely.Polygon, int]], float],
     most: int,
 ) -> tuple[list[tuple[shapely.Polygon, int]], float]:
     """Join pairs of pieces into their hulls: all that cost nothing, then the cheapest while there are too many.
@@ -105,7 +105,9 @@ def _join(
         if cost == np.inf or (cost > 0 and len(pieces) <= most):
             break
         new, spent = next(numbers), spent + cost
-        pieces[new], origin[new] = shapely.union(pieces[a], pieces[b]).convex_hull, origin[a]
+        hull = shapely.union(pieces[a], pieces[b]).convex_hull
+        assert isinstance(hull, shapely.Polygon)
+        pieces[new], origin[new] = hull, origin[a]
         neighbours[new] = (neighbours.pop(a) | neighbours.pop(b)) - {a, b}
         del pieces[a], pieces[b]
         for other in neighbours[new]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from shellgs_method.sim.collider import connected
 from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo, project
 
-EDGE = 0.08
+EDGE = 0.15
 """Metres between the places of the shell that are compared."""
 REACH = 0.5
 """Metres before and behind the shell in which the building is looked for."""
@@ -46,10 +46,6 @@ class Region:
     centre: tuple[float, float, float]
     photograph: str
 
-    def record(self) -> dict:
-        """Its fields, for json."""
-        return asdict(self)
-
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
@@ -69,8 +65,9 @@ class Deviations:
 
     def write(self, path: Path) -> None:
         """The shell as a ply with colours: red before it, blue behind it, grey where not seen."""
-        mesh = trimesh.Trimesh(self.surface.vertices, self.surface.faces, process=False)
-        mesh.visual.face_colors = coloured(self.distance)  # pyright: ignore[reportAttributeAccessIssue]
+        mesh = trimesh.Trimesh(
+            self.surface.vertices, self.surface.faces, face_colors=coloured(self.distance), process=False
+        )
         content = mesh.export(file_type="ply")
         with atomic_write(path) as file:
             file.write(content if isinstance(content, bytes) else str(content).encode())
@@ -94,9 +91,8 @@ def find_deviations(
         contradicted: what the photographs themselves say, which goes before the reconstruction where it says anything.
         least: square metres of a region.
     """
-    vertices, faces = trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)
-    small = Surface(vertices, faces)
-    centres = small.vertices[small.faces].mean(axis=1)
+    small = Surface(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
+    centres = small.centres
     views = [(name, photo.camera.position.double().numpy(), *project(photo.camera, centres)) for name, photo in photos]
     best, score = np.full(len(centres), -1), np.zeros(len(centres))
     for number, ((_, eye, pixels, depth), (_, photo)) in enumerate(zip(views, photos, strict=True)):
@@ -122,9 +118,7 @@ def find_deviations(
     return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
 
 
-def along_normals(
-    small: Surface, places: Float64[np.ndarray, "F 3"], other: Surface
-) -> Float64[np.ndarray, " F"]:
+def along_normals(small: Surface, places: Float64[np.ndarray, "F 3"], other: Surface) -> Float64[np.ndarray, " F"]:
     """How far another surface stands before each triangle, looked at from outside; NaN where there is none near."""
     t, _ = other.cast(places + REACH * small.normals, -small.normals)
     return np.where(t < 2 * REACH, REACH - t, np.nan)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.sim.rays import Surface
+from shellgs_method.sim.rays import Surface, spread
 
 COUNT = 40_000
 
@@ -33,10 +33,6 @@ class Distances:
             return None
         median, p95 = np.quantile(distances, [0.5, 0.95])
         return cls(float(median), float(p95), float((distances < 0.1).mean()))
-
-    def record(self) -> dict:
-        """Its fields, for json."""
-        return asdict(self)
 
 
 def both_ways(
@@ -67,6 +63,6 @@ def visible(surface: Surface, eyes: Float64[np.ndarray, "E 3"]) -> Float64[np.nd
     """Points spread over what some of the eyes see of a surface, above the ground."""
     points, _ = surface.samples(COUNT)
     seen = np.zeros(len(points), bool)
-    for eye in eyes[np.unique(np.linspace(0, len(eyes) - 1, 16).astype(int))]:
+    for eye in spread(eyes, 16):
         seen |= surface.sees(np.broadcast_to(eye, points.shape), points, 5e-3)
     return points[seen & (points[:, 2] > 0.02)]

@@ -15,7 +15,7 @@ from dataparsers.errors import SceneError
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.report import shell_edges
-from shellgs_method.sim.physics import compiled, import_mujoco, read_spec
+from shellgs_method.sim.engine import compiled, import_mujoco, read_spec
 from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo
 

@@ -49,7 +49,9 @@ class Plane:
 def grid_in(piece: shapely.Polygon, step: float) -> Float64[np.ndarray, "N 2"]:
     """Points on a grid inside a polygon; where none is, a point inside."""
     x0, y0, x1, y1 = piece.bounds
-    grid = np.stack(np.meshgrid(*(np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(*(np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))), -1).reshape(
+        -1, 2
+    )
     inside = grid[shapely.contains_xy(piece, grid)]
     return inside if len(inside) else np.array(piece.representative_point().coords)
 

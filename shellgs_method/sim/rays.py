@@ -14,6 +14,7 @@ class Surface:
     Attributes:
         vertices: in metres.
         faces: three vertices each, which wind counter-clockwise seen from outside where the caller needs sides.
+        centres: middle of each triangle.
         normals: unit normal of each triangle.
         areas: of each triangle.
     """
@@ -24,6 +25,7 @@ class Surface:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         crosses = np.cross(b - a, c - a)
         doubled = np.linalg.norm(crosses, axis=1)
+        self.centres = (a + b + c) / 3
         self.normals, self.areas = crosses / np.maximum(doubled, 1e-300)[:, None], doubled / 2
         self._scene = import_open3d().t.geometry.RaycastingScene()
         self._scene.add_triangles(
@@ -71,10 +73,10 @@ class Surface:
         return self._tensor(rays)
 
 
-def outward_faces(
+def outward(
     surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 24
-) -> tuple[Int64[np.ndarray, "F 3"], Bool[np.ndarray, " F"]]:
-    """The faces, wound so that their normals point to where the eyes are that see them; and which of them are seen.
+) -> tuple[Surface, Bool[np.ndarray, " F"]]:
+    """The surface wound so that normals point to where the eyes are that see them; and which triangles any eye sees.
 
     What no eye sees keeps its winding.
 
@@ -83,13 +85,15 @@ def outward_faces(
         eyes: places outside, cameras' say.
         count: of eyes to ask, spread over all.
     """
-    chosen = eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]
-    centres = surface.vertices[surface.faces].mean(axis=1)
-    votes = np.zeros(len(centres))
-    seen = np.zeros(len(centres), bool)
-    for eye in chosen:
-        side = np.einsum("fc,fc->f", eye - centres, surface.normals)
+    centres = surface.centres
+    votes, seen = np.zeros(len(centres)), np.zeros(len(centres), bool)
+    for eye in spread(eyes, count):
         visible = surface.sees(np.broadcast_to(eye, centres.shape), centres, slack=5e-3)
-        votes += np.where(visible, np.sign(side), 0.0)
+        votes += visible * np.sign(np.einsum("fc,fc->f", eye - centres, surface.normals))
         seen |= visible
-    return np.where(votes[:, None] < 0, surface.faces[:, ::-1], surface.faces), seen
+    return Surface(surface.vertices, np.where(votes[:, None] < 0, surface.faces[:, ::-1], surface.faces)), seen
+
+
+def spread(eyes: Float64[np.ndarray, "E 3"], count: int) -> Float64[np.ndarray, "C 3"]:
+    """At most so many of the eyes, evenly in their order."""
+    return eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]

@@ -23,7 +23,7 @@ scene's cameras (`to_scene`) and to national coordinates (`to_national`), whose 
 | `{folder}visual.obj`, `.mtl`, `.png` | the look, with a texture from the photographs |
 | `{folder}visual.glb` | the same for browsers; y-up, as glTF wants it |
 | `{folder}splats.ply` | the Gaussians |
-| `{folder}deviations.ply`, `.json` | where the building differs from its shell (red before it, blue behind it, grey not seen) |
+| `{folder}deviations.ply`, `.json` | the shell: red where the building stands before it, blue behind, grey not seen |
 | `report.html`, `figures.json` | how far off all of it is, and pictures |
 
 {summary}

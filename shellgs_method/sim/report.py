@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 
@@ -12,15 +12,17 @@ import numpy as np
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write
 from shellgs_method.html import data_uri, encoded
-from shellgs_method.sim import physics
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collider import Collider, leaks
 from shellgs_method.sim.deviations import Deviations
 from shellgs_method.sim.distances import Distances
+from shellgs_method.sim.engine import beams, lidar
+from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.parts import joined
 from shellgs_method.sim.pictures import overlaid, rendered, shown
 from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo
+from shellgs_method.sim.trials import throw, walk
 from shellgs_method.sim.world import Building
 
 PICTURES = 3
@@ -44,6 +46,7 @@ class Chapter:
 
     Attributes:
         made: the reconstruction.
+        shell: wound outwards; None where there is none.
         collider: its collider.
         facts: of its files.
         photos: of it, in the order of the reconstruction's views.
@@ -54,6 +57,7 @@ class Chapter:
     """
 
     made: Reconstruction
+    shell: Surface | None
     collider: Collider
     facts: dict
     photos: list[Photo]
@@ -74,9 +78,9 @@ def write_report(
     world = out / "facade.xml"
     everything = Surface(*joined([part for chapter in chapters for part in chapter.collider.parts]))
     eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
-    thrown = physics.throw(world, everything, eyes)
+    thrown = throw(world, everything, eyes)
     summary = [str(thrown)]
-    figures = {"summary": summary, "throws": physics.record(thrown), "buildings": {}}
+    figures = {"summary": summary, "throws": asdict(thrown), "buildings": {}}
     page = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Simulation</title><style>{_STYLE}</style>',
         f"<h1>{escape(', '.join(chapter.made.scene for chapter in chapters))}</h1>",
@@ -96,27 +100,27 @@ def write_report(
 def _figures(world: Path, building: Building, chapter: Chapter) -> tuple[dict, list[str]]:
     """A building's figures, and the sentences that say them."""
     collider, surface = chapter.collider, chapter.collider.surface
-    front = physics.Front.of(surface, chapter.made.eyes)
-    walked = physics.walk(world, surface, front)
+    front = Front.of(surface, chapter.made.eyes)
+    walked = walk(world, surface, front)
     sources = [part.source for part in collider.parts]
     made = {
         "scene": chapter.made.scene,
         "parts": len(collider.parts),
         "parts_of_surfaces": sources.count("surface"),
         "filled_m3": collider.filled,
-        "walk": physics.record(walked),
+        "walk": asdict(walked),
         "visual": chapter.facts,
         "distances": {
-            name: {way: figures.record() for way, figures in ways.items()} for name, ways in chapter.distances.items()
+            name: {way: asdict(figures) for way, figures in ways.items()} for name, ways in chapter.distances.items()
         },
     }
     sentences = [
-        f"{building.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; the budget "
-        f"of parts costs {collider.filled:.2g} m³ of air.",
+        f"{building.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; "
+        f"their budget costs {collider.filled:.2g} m³ of air.",
         str(walked),
     ]
-    if collider.shell is not None:
-        made["leaks"], _ = leaks(surface, collider.shell, chapter.made.eyes)
+    if chapter.shell is not None:
+        made["leaks"] = leaks(surface, chapter.shell, chapter.made.eyes)
         sentences.append(f"{made['leaks']:.2%} of the rays from the cameras to the shell pass the collider by 10 cm.")
     if chapter.truth is not None:
         made["lidar"] = lidar_errors(world, surface, front, chapter.truth)
@@ -124,9 +128,9 @@ def _figures(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
     return made, sentences
 
 
-def lidar_errors(world: Path, collider: Surface, front: physics.Front, truth: Surface) -> dict[str, dict]:
+def lidar_errors(world: Path, collider: Surface, front: Front, truth: Surface) -> dict[str, dict]:
     """Errors of a lidar in MuJoCo, from 20 places before a building, of the rays that meet the true one."""
-    places, rays = physics.places_before(collider, front), physics.beams()
+    places, rays = places_before(collider, front), beams()
     origins = np.repeat(places, len(rays), axis=0)
     true, _ = truth.cast(origins, np.tile(rays, (len(places), 1)))
     with np.errstate(divide="ignore"):
@@ -134,7 +138,7 @@ def lidar_errors(world: Path, collider: Surface, front: physics.Front, truth: Su
     meets = true < ground
     found = {}
     for name, group in (("collider", 3), ("visual mesh", 2)):
-        measured = physics.lidar(world, places, rays, group).ravel()
+        measured = lidar(world, places, rays, group).ravel()
         error = np.abs(measured - true)[meets]
         median, p95 = np.quantile(np.where(np.isfinite(error), error, 1e3), [0.5, 0.95])
         found[name] = {
@@ -152,8 +156,8 @@ def text(errors: Mapping[str, float]) -> str:
     """A lidar's errors in words."""
     return (
         f"median {100 * errors['median']:.1f} cm, 95 % within {100 * errors['p95']:.1f} cm, "
-        f"{errors['within_10cm']:.1%} within 10 cm of {errors['rays']} rays; {errors['from_nothing']:.2%} of the others "
-        "see what is not there."
+        f"{errors['within_10cm']:.1%} within 10 cm of {errors['rays']} rays; {errors['from_nothing']:.2%} of the "
+        "others see what is not there."
     )
 
 
@@ -161,8 +165,9 @@ def _section(
     world: Path, building: Building, chapter: Chapter, figures: dict, tell: Callable[[str], None]
 ) -> Iterator[str]:
     yield f"<h2>{escape(building.name)}</h2>"
-    yield f"<p>{chapter.facts['triangles']} triangles with a texture of {' x '.join(map(str, chapter.facts['texture']))} "
-    yield f"pixels; visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB.</p>"
+    width, height = chapter.facts["texture"]
+    yield f"<p>{chapter.facts['triangles']} triangles with a texture of {width} x {height} pixels; "
+    yield f"visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB.</p>"
     yield from _pictures(world, chapter, tell)
     yield "<h3>Distances of the collider</h3>"
     rows = [

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write
@@ -17,13 +16,14 @@ from shellgs_method.export import write_splats
 from shellgs_method.export.frame import UpAxis
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collider import Collider, make_collider, standing_before
+from shellgs_method.sim.collider import GROUND, Collider, make_collider, standing_before
 from shellgs_method.sim.deviations import Deviations, find_deviations
 from shellgs_method.sim.distances import both_ways
-from shellgs_method.sim.physics import import_mujoco
-from shellgs_method.sim.rays import Surface, outward_faces
+from shellgs_method.sim.engine import import_mujoco
+from shellgs_method.sim.rays import Surface, outward
 from shellgs_method.sim.readme import write_readme
 from shellgs_method.sim.report import Chapter, write_report
+from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.texture import bake
 from shellgs_method.sim.usd import write_usd_layers, write_usd_world
 from shellgs_method.sim.visual import write_visual
@@ -35,28 +35,10 @@ NEIGHBOURING = 2.0
 """Metres between pieces of a collider from which it is said to be in several."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How a folder for simulators is made."""
-
-    parts: int = 256
-    """Convex parts of each building's collider, at most."""
-    faces: int = 50_000
-    """Triangles that the reconstruction is thinned to."""
-    voxel: float | None = None
-    """Size in metres of a voxel that views are fused in. If not set: a pixel's size on the facade."""
-    texel: float | None = None
-    """Size in metres of a pixel of the texture. If not set: a little finer than the photographs."""
-    megabytes: float = 30.0
-    """Size of visual.glb at most; its texture is made smaller for it."""
-    ground: float | None = None
-    """Height of the ground in the shell's coordinates. If not set: the shell's lower edge."""
-
-
 def simulate(
     configs: Sequence[Path],
     out: Path,
-    settings: Settings,
+    settings: SimSettings,
     tell: Callable[[str], None] = print,
     up: UpAxis | None = None,
     truths: Sequence[Callable[[np.ndarray], Surface]] = (),
@@ -74,6 +56,8 @@ def simulate(
     Raises:
         SceneError: a run cannot be used, or the runs have no common frame.
     """
+    if not configs or out.suffix in (".yml", ".yaml") or out.is_file():
+        raise SceneError(f"give the config.yml of one run or more, and last a folder to write: {out} is none")
     import_mujoco()  # refused before hours of work
     out.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
@@ -102,49 +86,47 @@ def simulate(
 
 
 def _building(
-    made: Reconstruction, folder: Path, settings: Settings, tell: Callable[[str], None], truth: Surface | None
+    made: Reconstruction, folder: Path, settings: SimSettings, tell: Callable[[str], None], truth: Surface | None
 ) -> Chapter:
     """Write the files of one building."""
     folder.mkdir(parents=True, exist_ok=True)
     stands = max(STANDS, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
-    fused = Surface(np.asarray(made.fused.vertices), np.asarray(made.fused.faces))
-    collider = make_collider(made.shell, fused, made.eyes, settings.parts, stands)
+    eyes = made.eyes
+    fused, seen = outward(Surface(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
+    shell, standing, beside = None, seen & (fused.centres[:, 2] > GROUND), np.zeros(len(seen), bool)
+    if made.shell is not None:
+        shell, _ = outward(made.shell, eyes)
+        standing = standing_before(shell, fused, eyes, stands)
+        beside = (shell.signed_distance(fused.centres) > stands) & ~standing
+    collider = make_collider(shell, fused, standing, settings.parts)
+    # Beside the shell's outline and below its foot the reconstruction goes on: nothing that follows is about that.
+    mesh = made.fused
+    mesh.update_faces(~beside)
+    mesh.remove_unreferenced_vertices()
+    fused, _ = outward(Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
     _say_pieces(collider, made.scene, tell)
     write_parts(folder, collider.parts)
     photos = list(made.photos)
-    look = bake(_trimmed(made.fused, fused, collider, made.eyes, stands), photos, settings.texel)
+    colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
+    look = bake(fused, colours, photos, settings.texel)
     facts = write_visual(folder, look, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
     with_splats = write_usd_layers(folder, look, collider.parts, made.splats, 1.0 if made.frame.metric else None)
     deviations: Deviations | None = None
-    if collider.shell is not None:
+    if shell is not None:
         named = list(zip([view.name for view in made.views], photos, strict=True))
         # What photographs themselves contradict goes in here, as ``contradicted``, where it is known.
-        deviations = find_deviations(collider.shell, fused, named, stands)
+        deviations = find_deviations(shell, fused, named, stands)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
-            file.write((json.dumps([region.record() for region in deviations.regions], indent=1) + "\n").encode())
-    surfaces = {"shell": collider.shell, "fused surface": fused, "truth": truth}
+            file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
+    surfaces = {"shell": shell, "fused surface": fused, "truth": truth}
     distances = {
-        name: both_ways(collider.surface, other, collider.shell, made.eyes, stands)
+        name: both_ways(collider.surface, other, shell, eyes, stands)
         for name, other in surfaces.items()
         if other is not None
     }
-    return Chapter(made, collider, facts, photos, deviations, distances, truth, with_splats)
-
-
-def _trimmed(
-    mesh: trimesh.Trimesh, fused: Surface, collider: Collider, eyes: np.ndarray, stands: float
-) -> trimesh.Trimesh:
-    """The mesh without what goes on beside the shell's outline, as reconstructions do."""
-    if collider.shell is None:
-        return mesh
-    faces, _ = outward_faces(fused, eyes)
-    ahead = collider.shell.signed_distance(fused.vertices[fused.faces].mean(axis=1)) > stands
-    kept = mesh.copy()
-    kept.update_faces(~ahead | standing_before(collider.shell, Surface(fused.vertices, faces), eyes, stands))
-    kept.remove_unreferenced_vertices()
-    return kept
+    return Chapter(made, shell, collider, facts, photos, deviations, distances, truth, with_splats)
 
 
 def _say_pieces(collider: Collider, scene: str, tell: Callable[[str], None]) -> None:
@@ -157,7 +139,7 @@ def _say_pieces(collider: Collider, scene: str, tell: Callable[[str], None]) -> 
         near = np.unique(group[gaps[k] < NEIGHBOURING])
         group[np.isin(group, near)] = near.min()
     if (count := len(np.unique(group))) > 1:
-        tell(f"The collider of {scene} is in {count} pieces, more than {NEIGHBOURING:g} m apart; nothing is between them.")
+        tell(f"The collider of {scene} is in {count} pieces, more than {NEIGHBOURING:g} m apart, with nothing between.")
 
 
 def _name(scene: str, taken: Sequence[str]) -> str:
@@ -165,6 +147,3 @@ def _name(scene: str, taken: Sequence[str]) -> str:
     name = re.sub(r"\W", "_", scene, flags=re.ASCII)
     name = name if re.match(r"[A-Za-z]", name) else f"building_{name}"
     return next(made for made in (name, *(f"{name}_{k}" for k in range(2, 100))) if made not in taken)
-
-
-__all__ = ["SceneError", "Settings", "simulate"]

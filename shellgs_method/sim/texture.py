@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from PIL import Image
 from scipy.ndimage import distance_transform_edt, map_coordinates
@@ -37,18 +37,40 @@ class Photo(NamedTuple):
     """True where a pixel counts; None where all do."""
 
 
-def bake(mesh: trimesh.Trimesh, photos: Iterable[Photo], texel: float | None = None) -> trimesh.Trimesh:
-    """The mesh with an atlas and a texture from photographs; where none sees it, its own colours.
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """Triangles with a texture.
+
+    Attributes:
+        vertices: in metres; one for each place in the texture.
+        faces: three vertices each.
+        uv: places in the texture, in [0, 1], v upwards.
+        image: the texture.
+        seen: share of the vertices that some photograph sees.
+    """
+
+    vertices: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    uv: Float64[np.ndarray, "V 2"]
+    image: Image.Image
+    seen: float
+
+
+def bake(
+    surface: Surface, colours: Float64[np.ndarray, "V 3"], photos: Iterable[Photo], texel: float | None = None
+) -> TexturedMesh:
+    """The surface with an atlas and a texture from photographs; where none sees it, its own colours.
 
     Each view's weight at a vertex is the area that a piece of surface has in it, 0 where it is hidden; raised to a
     power, weights are interpolated over triangles, so that views blend across the seams between them.
 
     Args:
-        mesh: with colours at its vertices.
-        photos: in the mesh's frame.
+        surface: the mesh.
+        colours: of its vertices, in [0, 255].
+        photos: in its frame.
         texel: size of the texture's pixels, in metres; that of the photographs' pixels on the mesh if not set.
     """
-    photos, surface = list(photos), Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    photos = list(photos)
     weights = np.stack([_weights(surface, photo) for photo in photos], axis=1)
     best = weights.max(axis=1)
     if texel is None:  # a weight is pixels per square metre
@@ -58,8 +80,7 @@ def bake(mesh: trimesh.Trimesh, photos: Iterable[Photo], texel: float | None = N
     pixels, corners, barycentric = _texels(uv, faces, size)
     at = vertex[faces[corners]]  # the mesh's vertices around each texel
     points = np.einsum("nk,nkc->nc", barycentric, surface.vertices[at])
-    colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore[reportAttributeAccessIssue]
-    own = 1e-3  # what no photograph sees has the mesh's colour, and what hardly one does passes over into it
+    own = 1e-3  # what no photograph sees has its own colour, and what hardly one does passes over into it
     total = np.full(len(points), own)
     blend = own * np.einsum("nk,nkc->nc", barycentric, colours[at])
     for number, photo in enumerate(photos):
@@ -67,19 +88,14 @@ def bake(mesh: trimesh.Trimesh, photos: Iterable[Photo], texel: float | None = N
         seeing = np.flatnonzero(weight > 1e-4)
         total[seeing] += weight[seeing]
         blend[seeing] += weight[seeing, None] * _looked_up(photo, points[seeing])
-    picture = np.zeros((*size, 3))
-    known = np.zeros(size, bool)
-    picture[tuple(pixels.T)], known[tuple(pixels.T)] = blend / total[:, None], True
+    picture, known = np.zeros((*size, 3)), np.zeros(size, bool)
+    rows, columns = pixels.T
+    picture[rows, columns], known[rows, columns] = blend / total[:, None], True
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    image = Image.fromarray(picture[tuple(nearest)].round().clip(0, 255).astype(np.uint8)[::-1])  # v points up
-    visual = trimesh.visual.TextureVisuals(uv=uv, image=image)
-    return trimesh.Trimesh(
-        surface.vertices[vertex],
-        faces,
-        visual=visual,
-        process=False,
-        metadata={"texel": texel, "texture": list(size), "seen": float((best > 0).mean())},
-    )
+    assert isinstance(nearest, np.ndarray)
+    filled = picture[nearest[0], nearest[1]].round().clip(0, 255).astype(np.uint8)
+    image = Image.fromarray(filled[::-1])  # its first row is at the top, and v points up
+    return TexturedMesh(surface.vertices[vertex], faces, uv, image, float((best > 0).mean()))
 
 
 def _weights(surface: Surface, photo: Photo) -> Float64[np.ndarray, " V"]:

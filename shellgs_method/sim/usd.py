@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-import trimesh
 
 from dataparsers.errors import SceneError
 from shellgs_method.export.splats import Splats
 from shellgs_method.sim.parts import Part
+from shellgs_method.sim.texture import TexturedMesh
 from shellgs_method.sim.visual import TEXTURE
 from shellgs_method.sim.world import Building
 
@@ -22,7 +22,7 @@ LAYERS = "usd"
 
 
 def write_usd_layers(
-    folder: Path, mesh: trimesh.Trimesh, parts: Sequence[Part], splats: Splats, unit: float | None
+    folder: Path, mesh: TexturedMesh, parts: Sequence[Part], splats: Splats, unit: float | None
 ) -> bool:
     """Write look, colliders and splats of a building as a layer each.
 
@@ -82,12 +82,12 @@ def write_usd_world(path: Path, buildings: Sequence[Building], unit: float | Non
 def compliance_errors(path: Path) -> list[str]:
     """What usd-core's own validators, ``usdchecker``'s, have against a stage; a line each."""
     pxr = _pxr()
-    from pxr import UsdValidation
+    from pxr import UsdValidation  # compiled, without types
 
-    registry = UsdValidation.ValidationRegistry()
+    registry = UsdValidation.ValidationRegistry()  # pyright: ignore
     validators = registry.GetOrLoadAllValidators()
     stage = pxr.Usd.Stage.Open(str(path))
-    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)  # pyright: ignore
     return [f"{error.GetName()}: {error.GetMessage()}" for error in errors]
 
 
@@ -121,12 +121,12 @@ class _Stage:
             self._temporary.unlink(missing_ok=True)
 
 
-def _look(pxr: SimpleNamespace, stage, mesh: trimesh.Trimesh) -> None:
+def _look(pxr: SimpleNamespace, stage, mesh: TexturedMesh) -> None:
     root = pxr.UsdGeom.Xform.Define(stage, "/visual")
     stage.SetDefaultPrim(root.GetPrim())
     prim = _mesh(pxr, stage, "/visual/mesh", mesh.vertices, mesh.faces)
     prim.CreateDoubleSidedAttr(True)
-    uv = np.ascontiguousarray(mesh.visual.uv, np.float32)  # pyright: ignore[reportAttributeAccessIssue]
+    uv = np.ascontiguousarray(mesh.uv, np.float32)
     primvars = pxr.UsdGeom.PrimvarsAPI(prim)
     st = primvars.CreatePrimvar("st", pxr.Sdf.ValueTypeNames.TexCoord2fArray, pxr.UsdGeom.Tokens.vertex)
     st.Set(pxr.Vt.Vec2fArray.FromNumpy(uv))

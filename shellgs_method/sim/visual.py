@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from dataparsers.files import atomic_write
 from shellgs_method.export.mesh_files import Y_UP
+from shellgs_method.sim.texture import TexturedMesh
 
 TEXTURE = "visual.png"
 
 
-def write_visual(folder: Path, mesh: trimesh.Trimesh, megabytes: float) -> dict:
+def write_visual(folder: Path, mesh: TexturedMesh, megabytes: float) -> dict:
     """Write ``visual.glb`` (y-up, as glTF wants it), and ``visual.obj`` with ``visual.mtl`` and ``visual.png``.
 
     Args:
@@ -26,7 +29,7 @@ def write_visual(folder: Path, mesh: trimesh.Trimesh, megabytes: float) -> dict:
     Returns:
         Size of the glb in bytes and of the texture in pixels.
     """
-    image: Image.Image = mesh.visual.material.image  # pyright: ignore[reportAttributeAccessIssue]
+    image = mesh.image
     while True:
         content = _glb(mesh, image)
         if len(content) <= 1e6 * megabytes or min(image.size) < 64:
@@ -45,25 +48,24 @@ def write_visual(folder: Path, mesh: trimesh.Trimesh, megabytes: float) -> dict:
     return {"glb_bytes": len(content), "texture": list(image.size), "triangles": len(mesh.faces)}
 
 
-def _glb(mesh: trimesh.Trimesh, image: Image.Image) -> bytes:
+def _glb(mesh: TexturedMesh, image: Image.Image) -> bytes:
     """The glb with its texture as JPEG; matt, since the light is in the photographs."""
     buffer = io.BytesIO()
     image.save(buffer, "JPEG", quality=90)
-    material = trimesh.visual.material.PBRMaterial(
+    material = PBRMaterial(
         baseColorTexture=Image.open(buffer), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
     )
-    visual = trimesh.visual.TextureVisuals(uv=mesh.visual.uv, material=material)  # pyright: ignore
+    visual = TextureVisuals(uv=mesh.uv, material=material)
     turned = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False).apply_transform(Y_UP)
     content = turned.export(file_type="glb")
     assert isinstance(content, bytes)
     return content
 
 
-def _obj(mesh: trimesh.Trimesh) -> str:
+def _obj(mesh: TexturedMesh) -> str:
     """An obj whose vertices have one place in the texture each."""
-    uv = np.asarray(mesh.visual.uv)  # pyright: ignore[reportAttributeAccessIssue]
     lines = ["mtllib visual.mtl", "o visual", "usemtl visual"]
     lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"vt {u:.6f} {v:.6f}" for u, v in uv.tolist()]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in mesh.uv.tolist()]
     lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
     return "\n".join(lines) + "\n"

@@ -83,12 +83,23 @@ def mjcf(buildings: Sequence[Building]) -> ET.Element:
     default = ET.SubElement(root, "default")
     for name, attributes in (
         ("visual", {"group": "2", "contype": "0", "conaffinity": "0", "mass": "0"}),
-        ("collision", {"group": "3", "solref": f"{STIFF} 1", "solmix": "100", "friction": "0.7 0.005 0.0001", "rgba": "0.6 0.7 0.8 1"}),
+        (
+            "collision",
+            {
+                "group": "3",
+                "solref": f"{STIFF} 1",
+                "solmix": "100",
+                "friction": "0.7 0.005 0.0001",
+                "rgba": "0.6 0.7 0.8 1",
+            },
+        ),
     ):
         ET.SubElement(ET.SubElement(default, "default", {"class": name}), "geom", attributes)
     asset, world = ET.SubElement(root, "asset"), ET.SubElement(root, "worldbody")
     ET.SubElement(
-        world, "geom", {"name": "ground", "class": "collision", "type": "plane", "size": "0 0 1", "rgba": "0.4 0.4 0.4 1"}
+        world,
+        "geom",
+        {"name": "ground", "class": "collision", "type": "plane", "size": "0 0 1", "rgba": "0.4 0.4 0.4 1"},
     )
     for building in buildings:
         name = building.name

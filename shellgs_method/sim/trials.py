@@ -1,24 +1,22 @@
-"""Trials of a world in MuJoCo: does it load, hold, look right to a lidar, and how fast is it."""
+"""Trials of a world in MuJoCo: bodies thrown at it, and a walk along it."""
 
 from __future__ import annotations
 
-import os
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 from jaxtyping import Float64
 
 from dataparsers.errors import SceneError
+from shellgs_method.sim.engine import compiled, import_mujoco, read_spec
+from shellgs_method.sim.front import Front
 from shellgs_method.sim.rays import Surface
 
 GRAVITY = 9.81
 PROJECTILES = 2, 1
 """contype and conaffinity of what is thrown: it meets the world, and nothing else that is thrown."""
-BEAMS = -22.5, 22.5
-"""Degrees above the horizon between which a lidar looks: those of an Ouster OS1."""
 SINKING = 0.01
 """Metres of penetration that count as stuck: contacts are soft."""
 GAIN = 0.02
@@ -76,105 +74,15 @@ class Walk:
     def __str__(self) -> str:
         """One sentence."""
         return (
-            f"A capsule walked {self.metres:.1f} m along {self.length:.1f} m of facade, {self.touching:.0%} of the steps "
-            f"in contact, at most {100 * self.deepest:.1f} cm deep; {self.faster:.0f} times real time "
+            f"A capsule walked {self.metres:.1f} m along {self.length:.1f} m of facade, {self.touching:.0%} of the "
+            f"steps in contact, at most {100 * self.deepest:.1f} cm deep; {self.faster:.0f} times real time "
             f"({self.microseconds:.0f} µs a step)."
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Front:
-    """The facade's length and its outside, on the ground.
-
-    Attributes:
-        along: horizontal unit vector along it.
-        outwards: horizontal unit vector away from it.
-        foot: its middle.
-        length: from end to end.
-    """
-
-    along: Float64[np.ndarray, " 3"]
-    outwards: Float64[np.ndarray, " 3"]
-    foot: Float64[np.ndarray, " 3"]
-    length: float
-
-    @classmethod
-    def of(cls, surface: Surface, eyes: Float64[np.ndarray, "E 3"]) -> Front:
-        """That of the upright surfaces that eyes see."""
-        points, triangle = surface.samples(4000)
-        seen = np.zeros(len(points), bool)
-        for eye in eyes[np.unique(np.linspace(0, len(eyes) - 1, 12).astype(int))]:
-            seen |= surface.sees(np.broadcast_to(eye, points.shape), points, 0.01)
-        normals = surface.normals[triangle] * [1, 1, 0]
-        upright = seen & (np.linalg.norm(normals, axis=1) > 0.9)
-        wall, normals = (points[upright], normals[upright]) if upright.any() else (points, normals)
-        alike = normals @ normals.T > np.cos(np.radians(10))
-        outwards = normals[alike[alike.sum(axis=1).argmax()]].mean(axis=0)
-        outwards = outwards / np.linalg.norm(outwards) if np.linalg.norm(outwards) > 0 else np.array([0.0, -1, 0])
-        middle = np.median(wall, axis=0)
-        if (np.median(eyes, axis=0) - middle) @ outwards < 0:
-            outwards = -outwards
-        along = np.array([-outwards[1], outwards[0], 0.0])
-        first, last = np.quantile(wall @ along, [0.01, 0.99])
-        foot = middle + ((first + last) / 2 - middle @ along) * along
-        return cls(along, outwards, foot * [1, 1, 0], float(last - first))
-
-    def before(self, surface: Surface, share: float, distance: float, height: float) -> Float64[np.ndarray, " 3"]:
-        """The place so far before the surface and above the ground, at a share of the length."""
-        far = self.foot + (share - 0.5) * self.length * self.along + [0, 0, height] + 30 * self.outwards
-        wide = far + np.linspace(-0.5, 0.5, 11)[:, None] * self.along
-        reached = float(surface.cast(wide, np.broadcast_to(-self.outwards, wide.shape))[0].min())
-        return far - max(min(reached, 30.0) - distance, 0.0) * self.outwards
-
-
-def load(path: Path):
-    """The compiled model of an MJCF file.
-
-    Raises:
-        SceneError: MuJoCo refuses it, or warns.
-    """
-    return compiled(read_spec(path), path)
-
-
-def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarray, "R 3"], group: int) -> np.ndarray:
-    """Distances [P, R] in metres that a lidar measures in MuJoCo; inf where nothing is hit.
-
-    Args:
-        path: of the model.
-        places: where the lidar stands.
-        rays: unit directions.
-        group: of geoms that count: 3 the colliders, 2 what is to be seen.
-    """
-    mujoco, model = import_mujoco(), load(path)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    groups = np.zeros(6, np.uint8)
-    groups[group] = 1
-    distances = np.empty((len(places), len(rays)))
-    geoms, normals = np.empty(len(rays), np.int32), np.empty((len(rays), 3))
-    for place, row in zip(places, distances, strict=True):
-        mujoco.mj_multiRay(
-            model, data, place[:, None], rays.reshape(-1, 1), groups, 1, -1, geoms, row, normals.reshape(-1, 1),
-            len(rays), 1e3,
-        )  # fmt: skip
-    return np.where(distances < 0, np.inf, distances)
-
-
-def beams(elevations: int = 24, azimuths: int = 180) -> Float64[np.ndarray, "R 3"]:
-    """Directions of a lidar that looks all around."""
-    up, around = np.meshgrid(
-        np.radians(np.linspace(*BEAMS, elevations)), np.linspace(0, 2 * np.pi, azimuths, endpoint=False), indexing="ij"
-    )
-    return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1).reshape(-1, 3)
-
-
-def places_before(surface: Surface, front: Front, count: int = 20, height: float = 0.6) -> Float64[np.ndarray, "P 3"]:
-    """Places where a robot could stand: along the facade, from one to five metres before it."""
-    shares = np.linspace(0.02, 0.98, count)
-    return np.stack([front.before(surface, share, 1.0 + k % 5, height) for k, share in enumerate(shares)])
-
-
-def throw(path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 200, seconds: float = 4) -> Throws:
+def throw(
+    path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 200, seconds: float = 4
+) -> Throws:
     """Throw spheres and boxes at 5 to 15 m/s at what eyes see of a world: half anywhere on it, half at its corners.
 
     Args:
@@ -211,17 +119,20 @@ def throw(path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count:
         through |= (surface.cast(before, now - before)[0] <= 1) | (now[:, 2] < 0)
         before = now
         depth[:], support[:] = 0, 0
-        for k in range(data.ncon):
-            first, second = data.contact.geom[k]
-            mover = max(model.geom_bodyid[first], model.geom_bodyid[second]) - bodies[0]
-            normal = data.contact.frame[k, :3] * (1 if model.geom_bodyid[first] < bodies[0] else -1)
-            depth[mover], support[mover] = max(depth[mover], -data.contact.dist[k]), support[mover] + normal
-            if ground not in (first, second):
-                hit[mover], deepest = True, max(deepest, -float(data.contact.dist[k]))
+        touching = model.geom_bodyid[data.contact.geom]
+        mover, into = touching.max(axis=1) - bodies[0], -data.contact.dist
+        towards = np.where(touching[:, :1] < touching[:, 1:], 1, -1) * data.contact.frame[:, :3]
+        np.maximum.at(depth, mover, into)
+        np.add.at(support, mover, towards)
+        building = (data.contact.geom != ground).all(axis=1)
+        hit[mover[building]] = True
+        deepest = max(deepest, *into[building])
     speed = np.linalg.norm(data.qvel.reshape(-1, 6)[:, :3], axis=1)
     held = (speed < 0.05) & (before[:, 2] > 0.3) & (support[:, 2] < 0.3 * np.linalg.norm(support, axis=1))
     gained = energy > GAIN * launched
-    return Throws(count, int(hit.sum()), int(through.sum()), int((held | (depth > SINKING)).sum()), int(gained.sum()), deepest)
+    return Throws(
+        count, int(hit.sum()), int(through.sum()), int((held | (depth > SINKING)).sum()), int(gained.sum()), deepest
+    )
 
 
 def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4) -> Walk:
@@ -266,49 +177,6 @@ def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4) -> Walk
     )
 
 
-def record(trial: Throws | Walk) -> dict:
-    """A trial's figures, for json."""
-    return asdict(trial)
-
-
-def import_mujoco() -> ModuleType:
-    """MuJoCo.
-
-    Raises:
-        SceneError: it is not installed.
-    """
-    if not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # read once, when MuJoCo is imported
-    try:
-        import mujoco
-    except ImportError as error:
-        raise SceneError("trials need MuJoCo, which is not installed: pip install 'shellgs[sim]'") from error
-    return mujoco
-
-
-def read_spec(path: Path):
-    """MuJoCo's editable form of a model, its files found from anywhere."""
-    mujoco = import_mujoco()
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except (ValueError, OSError) as error:
-        raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
-
-
-def compiled(spec, path: Path):
-    mujoco, warnings = import_mujoco(), []
-    mujoco.set_mju_user_warning(warnings.append)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
-    finally:
-        mujoco.set_mju_user_warning(None)
-    if warnings:
-        raise SceneError(f"{path}: MuJoCo warns: {warnings[0]}")
-    return model
-
-
 def _energy(model, data, bodies: np.ndarray) -> Float64[np.ndarray, " N"]:
     """Kinetic and potential energy of free bodies, in joules."""
     velocity = data.qvel.reshape(-1, 6)
@@ -335,7 +203,11 @@ def _aimed(
             continue
         towards = (eye - target) / np.linalg.norm(eye - target) + rng.normal(0, 0.5, 3)
         start = target + rng.uniform(1.5, 4) * towards / np.linalg.norm(towards)
-        if start[2] > 0.3 and surface.sees(start[None], target[None], 0.02)[0] and surface.distance(start[None])[0] > 0.3:
+        if (
+            start[2] > 0.3
+            and surface.sees(start[None], target[None], 0.02)[0]
+            and surface.distance(start[None])[0] > 0.3
+        ):
             away = target - start
             starts.append(start)
             velocities.append(rng.uniform(5, 15) * away / np.linalg.norm(away))
