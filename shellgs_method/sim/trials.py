@@ -126,7 +126,7 @@ def throw(
         np.add.at(support, mover, towards)
         building = (data.contact.geom != ground).all(axis=1)
         hit[mover[building]] = True
-        deepest = max(deepest, *into[building])
+        deepest = max([deepest, *into[building]])
     speed = np.linalg.norm(data.qvel.reshape(-1, 6)[:, :3], axis=1)
     held = (speed < 0.05) & (before[:, 2] > 0.3) & (support[:, 2] < 0.3 * np.linalg.norm(support, axis=1))
     gained = energy > GAIN * launched
