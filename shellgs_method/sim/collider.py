@@ -170,9 +170,7 @@ def thickness(plane: Plane, shell: Surface) -> float:
     back = np.broadcast_to(-plane.normal, points.shape)
     t, hit = shell.cast(points + 0.01 * back, back)
     leaves = (hit >= 0) & (shell.normals[hit] @ plane.normal < -0.2)
-    if not leaves.any():
-        return THICKNESS
-    free = np.where(leaves, t + 0.01, np.inf)
+    free = np.where(leaves, t + 0.01, THICKNESS)
     return float(np.clip(np.quantile(free, 0.1), THINNEST, THICKNESS))
 
 

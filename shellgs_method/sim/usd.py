@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from shellgs_method.sim.parts import Part
 from shellgs_method.sim.texture import TexturedMesh
 from shellgs_method.sim.visual import TEXTURE
 from shellgs_method.sim.world import Building
+
+if TYPE_CHECKING:
+    from pxr import Usd
 
 LAYERS = "usd"
 """Folder of the binary layers that ``facade.usda`` refers to, beside the building's other files."""
@@ -79,14 +83,15 @@ def write_usd_world(path: Path, buildings: Sequence[Building], unit: float | Non
             looks.SetVariantSelection("mesh")
 
 
-def compliance_errors(path: Path) -> list[str]:
-    """What usd-core's own validators, ``usdchecker``'s, have against a stage; a line each."""
+def compliance_errors(stage: Path | Usd.Stage) -> list[str]:
+    """What usd-core's own validators, ``usdchecker``'s, have against a stage or its file; a line each."""
     pxr = _pxr()
     from pxr import UsdValidation  # compiled, without types
 
     registry = UsdValidation.ValidationRegistry()  # pyright: ignore
     validators = registry.GetOrLoadAllValidators()
-    stage = pxr.Usd.Stage.Open(str(path))
+    if isinstance(stage, Path):
+        stage = pxr.Usd.Stage.Open(str(stage))
     errors = UsdValidation.ValidationContext(validators).Validate(stage)  # pyright: ignore
     return [f"{error.GetName()}: {error.GetMessage()}" for error in errors]
 
