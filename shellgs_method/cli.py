@@ -385,7 +385,8 @@ def sim(
     def tell(sentence: str) -> None:
         console.print(sentence, highlight=False)
 
-    for sentence in simulate(configs, out, settings, tell, up)["summary"]:
+    figures, _ = simulate(configs, out, settings, tell, up)
+    for sentence in figures["summary"]:
         tell(sentence)
     console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how far off it is.")
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 import shapely
@@ -14,6 +17,7 @@ from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.export import Frame
 from shellgs_method.shell.similarity import transformed
+from shellgs_method.sim.building import moved_into
 from shellgs_method.sim.collider import Collider, leaks, make_collider, standing_before, thickness
 from shellgs_method.sim.convex import convex_pieces, fewer_pieces
 from shellgs_method.sim.deviations import find_deviations
@@ -29,7 +33,8 @@ from shellgs_method.synthetic.path import walk
 LAYOUT = Layout(bays=2, storeys=2)
 
 
-def surface_of(mesh: trimesh.Trimesh) -> Surface:
+def surface_of(mesh: Any) -> Surface:
+    """A mesh of trimesh's, which hardly knows its own types."""
     return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
@@ -160,7 +165,7 @@ def test_parts_stay_inside_what_they_are_behind():
 
 def test_what_stands_before_the_shell_is_in_the_collider_and_what_is_beside_it_is_not(facade, eyes):
     """A flower box on the wall, and a flap that goes on where the building ends."""
-    left, right = LAYOUT.ends
+    right = LAYOUT.ends[1]
     planter = trimesh.creation.box(bounds=[[2.6, -0.4, 1], [3.4, -0.001, 1.4]]).subdivide_to_size(0.1)
     flap = trimesh.creation.box(bounds=[[right + 0.12, -0.02, 1], [right + 0.5, 0, 5]]).subdivide_to_size(0.1)
     ground = trimesh.creation.box(bounds=[[0, -0.4, -0.02], [6, -0.05, 0.0]]).subdivide_to_size(0.1)
@@ -248,6 +253,24 @@ def test_the_ground_can_be_told():
     made, _ = sim_frame(frame, points, cameras_of_scene(), ground=215.0)
     assert made.to_national[2, 3] == 215.0
     assert isinstance(made, SimFrame)
+
+
+def test_a_second_building_comes_into_the_frame_of_the_first():
+    """Through national coordinates; not from another country, nor without any."""
+    frame, points = metric_frame()
+    home, to_home = sim_frame(frame, points, cameras_of_scene())
+    moved = np.eye(4)
+    moved[:3, 3] = [250, 40, 3]
+    other, motion = sim_frame(replace(frame, offset=frame.offset + moved[:3, 3]), points, cameras_of_scene())
+    placed, into = moved_into(other, motion, home, "b")
+    np.testing.assert_allclose(transformed(points, into), transformed(points, to_home) + moved[:3, 3], atol=1e-6)
+    there = np.linalg.inv(placed.to_scene) @ other.to_scene  # from its own frame to the world's
+    np.testing.assert_allclose(there @ motion, into, atol=1e-6)
+    far = sim_frame(replace(frame, offset=frame.offset + 9000), points, cameras_of_scene())
+    with pytest.raises(SceneError, match=r"b is \d+ km from the first building"):
+        moved_into(*far, home, "b")
+    with pytest.raises(SceneError, match="no common frame"):
+        moved_into(replace(other, metric=False), motion, home, "b")
 
 
 def frontal(x: float, distance: float = 4.0, size: int = 120) -> Camera:

@@ -18,8 +18,9 @@ from runs import trainer_of
 from dataparsers.errors import SceneError
 from shellgs_method import cli
 from shellgs_method.export import Splats
-from shellgs_method.shell import ALIGNMENT
+from shellgs_method.export.runs import TrainedRun
 from shellgs_method.shell.similarity import transformed
+from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collider import Collider, make_collider
 from shellgs_method.sim.engine import beams, lidar, load
 from shellgs_method.sim.front import Front, places_before
@@ -30,7 +31,7 @@ from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
 from shellgs_method.sim.texture import TexturedMesh
 from shellgs_method.sim.trials import throw, walk
-from shellgs_method.sim.usd import compliance_errors, write_usd_layers, write_usd_world
+from shellgs_method.sim.usd import compliance_errors, import_pxr, write_usd_layers, write_usd_world
 from shellgs_method.sim.visual import write_visual
 from shellgs_method.sim.world import Building, write_parts, write_worlds
 from shellgs_method.synthetic.building import Layout, shell
@@ -195,41 +196,37 @@ def test_the_sdf_is_a_static_world(world, collider):
 
 @pytest.mark.parametrize("look", ["mesh", "splats"])
 def test_the_usd_complies(world, look):
-    from pxr import Usd, UsdGeom
-
-    stage = Usd.Stage.Open(str(world / "facade.usda"))
-    assert UsdGeom.GetStageUpAxis(stage) == "Z"
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    pxr = import_pxr()
+    stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
+    assert pxr.UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert stage.GetPrimAtPath("/World/facade").GetVariantSet("look").SetVariantSelection(look)
     assert compliance_errors(stage) == []
     assert not [asset for asset in world.rglob(".*") if asset.is_file()]  # no leftovers
 
 
 def test_the_compliance_checker_finds_faults(tmp_path):
-    from pxr import Usd
-
-    stage = Usd.Stage.CreateNew(str(tmp_path / "bad.usda"))
+    pxr = import_pxr()
+    stage = pxr.Usd.Stage.CreateNew(str(tmp_path / "bad.usda"))
     stage.DefinePrim("/a", "Mesh")
     stage.GetRootLayer().Save()
     assert compliance_errors(stage)
 
 
 def test_usd_colliders_are_the_parts(world, collider):
-    from pxr import Usd, UsdGeom, UsdPhysics
-
-    stage = Usd.Stage.Open(str(world / "facade.usda"))
-    prims = [prim for prim in stage.Traverse() if prim.HasAPI(UsdPhysics.MeshCollisionAPI)]
+    pxr = import_pxr()
+    stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
+    prims = [prim for prim in stage.Traverse() if prim.HasAPI(pxr.UsdPhysics.MeshCollisionAPI)]
     assert len(prims) == len(collider.parts)
     for prim, part in zip(prims, collider.parts, strict=True):
-        np.testing.assert_allclose(UsdGeom.Mesh(prim).GetPointsAttr().Get(), part.vertices, atol=1e-5)
-        assert UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get() == "convexHull"
+        np.testing.assert_allclose(pxr.UsdGeom.Mesh(prim).GetPointsAttr().Get(), part.vertices, atol=1e-5)
+        assert pxr.UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get() == "convexHull"
 
 
 def test_splats_in_usd_are_the_gaussians(world):
-    from pxr import Usd
-
+    pxr = import_pxr()
     splats = some_splats()
-    stage = Usd.Stage.Open(str(world / "usd" / "splats.usdc"))
+    stage = pxr.Usd.Stage.Open(str(world / "usd" / "splats.usdc"))
     prim = stage.GetDefaultPrim()
     assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
     np.testing.assert_allclose(prim.GetAttribute("positions").Get(), splats.means, atol=1e-6)
@@ -249,7 +246,7 @@ def test_the_glb_is_upright_textured_and_small_enough(collider, tmp_path):
     look = TexturedMesh(look.vertices, look.faces, look.uv, Image.fromarray(noise), 1.0)
     facts = write_visual(tmp_path, look, megabytes=0.1)
     assert (tmp_path / "visual.glb").stat().st_size == facts["glb_bytes"] <= 1e5
-    scene = trimesh.load(tmp_path / "visual.glb")
+    scene = trimesh.load_scene(tmp_path / "visual.glb")
     assert scene.extents[1] == pytest.approx(np.ptp(look.vertices[:, 2]), rel=1e-4)  # glTF is y-up
     (mesh,) = scene.geometry.values()
     assert list(mesh.visual.material.baseColorTexture.size) == facts["texture"]
@@ -263,7 +260,7 @@ def test_an_older_colliders_parts_are_removed(collider, tmp_path):
 
 def test_two_buildings_are_one_world(collider, tmp_path):
     away = Collider(
-        [part for part in (Part.hull(p.vertices + [20, 0, 0], p.source) for p in collider.parts) if part], 0
+        [part for part in (Part.hull(p.vertices + np.array([20, 0, 0]), p.source) for p in collider.parts) if part], 0
     )
     buildings = [made(tmp_path, one, name, name) for one, name in ((collider, "left"), (away, "right"))]
     write_worlds(tmp_path, buildings)
@@ -276,11 +273,13 @@ def test_two_buildings_are_one_world(collider, tmp_path):
 
 @pytest.fixture(scope="module")
 def config(pristine_scene: Path, tmp_path_factory) -> Path:
-    """A short run on the tiny scene, with some colours and little geometry."""
-    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "shellgs_metric", iterations=40)
-    trainer.train()
-    trainer.save_checkpoint(40)
-    trainer.config.save_config()
+    """A short run on the tiny scene."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SHELLGS_COMPILE", "0")
+        trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "shellgs_metric", iterations=10)
+        trainer.train()
+        trainer.save_checkpoint(10)
+        trainer.config.save_config()
     return trainer.base_dir / "config.yml"
 
 
@@ -295,7 +294,7 @@ def quick(monkeypatch) -> None:
 SMALL = SimSettings(faces=4000)
 
 
-def test_the_command_writes_the_whole_folder(config, tmp_path, quick, capsys):
+def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, capsys):
     out = tmp_path / "facade sim"
     cli.sim((config,), out, SMALL)
     said = capsys.readouterr().out
@@ -320,37 +319,20 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, capsys):
 
 
 def joined_file(out: Path) -> tuple[np.ndarray, np.ndarray]:
-    mesh = trimesh.util.concatenate([trimesh.load(path) for path in sorted((out / "collision").glob("*.obj"))])
+    mesh = trimesh.util.concatenate([trimesh.load_mesh(path) for path in sorted((out / "collision").glob("*.obj"))])
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def test_two_runs_stand_in_one_frame(config, tmp_path, quick):
-    """The same building twice: both in one place."""
-    simulate([config, config], tmp_path, SMALL, lambda _: None)
-    folders = sorted(path.name for path in tmp_path.iterdir() if path.is_dir())
-    assert folders == ["scene", "scene_2"]
-    one, other = (joined_file(tmp_path / folder)[0] for folder in folders)
-    np.testing.assert_allclose(np.stack([one.min(0), one.max(0)]), np.stack([other.min(0), other.max(0)]), atol=1e-6)
-    assert load(tmp_path / "facade.xml").nbody == 3
-    assert compliance_errors(tmp_path / "facade.usda") == []
-
-
-def test_a_run_without_a_shell_says_what_its_frame_is(config, pristine_scene, tmp_path, quick):
-    """And two of them have no common frame."""
-    bare = tmp_path / "bare"
-    shutil.copytree(pristine_scene, bare)
-    (bare / ALIGNMENT).unlink()
-    text = config.read_text().replace(str(pristine_scene), str(bare))
-    run = tmp_path / "run"
-    shutil.copytree(config.parent, run)
-    (run / "config.yml").write_text(text)
+def test_a_run_without_a_shell_says_what_its_frame_is(config, eager, monkeypatch):
+    monkeypatch.setattr(TrainedRun, "shell", None)
+    built = Reconstruction.of(TrainedRun.load(config), SMALL.faces, None, None, None)
     said: list[str] = []
-    try:
-        simulate([run / "config.yml"], tmp_path / "out", SMALL, said.append)
-    finally:
-        print(said)
-    assert any("has no aligned shell" in sentence for sentence in said)
-    assert json.loads((tmp_path / "out" / "frame.json").read_text())["unit"] == "unknown"
+    built.say(said.append)
+    assert "has no aligned shell: the frame is the scene's own" in said[0]
+    assert built.shell is None
+    assert not built.frame.metric
+    fused, seen = outward(Surface(np.asarray(built.fused.vertices), np.asarray(built.fused.faces)), built.eyes)
+    assert len(make_collider(None, fused, seen, most=20).parts) <= 20
 
 
 def test_without_a_config_or_a_folder_there_is_one_sentence(tmp_path):
@@ -362,7 +344,7 @@ def test_without_a_config_or_a_folder_there_is_one_sentence(tmp_path):
 def test_walls_far_apart_are_said_to_be(collider):
     from shellgs_method.sim.simulate import _say_pieces
 
-    away = [part for part in (Part.hull(p.vertices + [30, 0, 0], p.source) for p in collider.parts) if part]
+    away = [part for part in (Part.hull(p.vertices + np.array([30, 0, 0]), p.source) for p in collider.parts) if part]
     said: list[str] = []
     _say_pieces(Collider(collider.parts, 0.0), "street", said.append)
     assert not said

@@ -78,7 +78,7 @@ class Reconstruction:
         frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground)
         scene = Path(run.datamanager.config.dataparser.data).name
         if home is not None:
-            frame, motion = _moved(frame, motion, home, scene)
+            frame, motion = moved_into(frame, motion, home, scene)
         shell = Surface(transformed(known, motion), run.shell_in_frame.faces) if run.shell else None
         return cls(
             scene,
@@ -131,7 +131,7 @@ def _watched(run: TrainedRun, hidden: list[np.ndarray]) -> Iterator[DepthView]:
         yield view
 
 
-def _moved(
+def moved_into(
     frame: SimFrame, motion: np.ndarray, home: SimFrame, scene: str
 ) -> tuple[SimFrame, Float64[np.ndarray, "4 4"]]:
     """A frame and the motion into it, exchanged for those of a world that is georeferenced in the same way."""

@@ -27,6 +27,8 @@ FOR_SURFACES = 0.4
 """Share of the parts for what is no plane, at most."""
 COVERED = 0.01
 """Metres before other parts up to which a part adds nothing to them."""
+MANY = 4
+"""Times as many parts as wanted from which outlines are joined by area alone."""
 DEEP = 1.0
 """Metres of air behind a plane that count at most, where parts are joined over an opening."""
 GROUND = 0.1
@@ -130,7 +132,10 @@ def _behind(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Pa
         made = {prism(planes[index], piece, depths[index]): (index, piece) for index, piece in pieces}
         return {part: made[part] for part in uncovered([part for part in made if part is not None])}
 
-    parts, spent = solid([convex_pieces(plane.outline) for plane in planes]), 0.0
+    cut, spent = [convex_pieces(plane.outline) for plane in planes], 0.0
+    if sum(map(len, cut)) > MANY * most:  # ragged outlines: bring them down before anything is cast
+        cut, _ = fewer_pieces(cut, MANY * most, lambda _, area: area.area)
+    parts = solid(cut)
     if len(parts) > most:
         cut = [[piece for index, piece in parts.values() if index == k] for k in range(len(planes))]
         cut, spent = fewer_pieces(cut, most, lambda k, area: _air(planes[k], area, shell))
@@ -176,17 +181,20 @@ def thickness(plane: Plane, shell: Surface) -> float:
 
 def uncovered(parts: Sequence[Part]) -> list[Part]:
     """The parts that stand out of the others somewhere; small ones are asked first."""
-    kept = sorted(parts, key=_size)
-    for part in list(kept):
-        others = [other for other in kept if other is not part]
+    parts = sorted(parts, key=_size)
+    low, high = (np.array([end(part.vertices, axis=0) for part in parts]).reshape(-1, 3) for end in (np.min, np.max))
+    kept = np.ones(len(parts), bool)
+    for number, part in enumerate(parts):
+        near = kept & ((low <= high[number] + COVERED) & (high >= low[number] - COVERED)).all(axis=1)
+        near[number] = False
         points = _face_points(part)
         hidden = np.zeros(len(points), bool)
-        for other in others:
-            if not hidden.all():
-                hidden[~hidden] = other.contains(points[~hidden], COVERED)
-        if hidden.all():
-            kept = others
-    return kept
+        for other in np.flatnonzero(near):
+            hidden[~hidden] = parts[other].contains(points[~hidden], COVERED)
+            if hidden.all():
+                kept[number] = False
+                break
+    return [part for part, is_kept in zip(parts, kept, strict=True) if is_kept]
 
 
 def _face_points(part: Part) -> Float64[np.ndarray, "N 3"]:

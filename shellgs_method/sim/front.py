@@ -30,14 +30,17 @@ class Front:
     def of(cls, surface: Surface, eyes: Float64[np.ndarray, "E 3"]) -> Front:
         """That of the upright surfaces that eyes see."""
         points, triangle = surface.samples(4000)
-        seen = np.zeros(len(points), bool)
+        normals, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
         for eye in spread(eyes, 12):
-            seen |= surface.sees(np.broadcast_to(eye, points.shape), points, 0.01)
-        normals = surface.normals[triangle] * [1, 1, 0]
-        upright = seen & (np.linalg.norm(normals, axis=1) > 0.9)
-        wall, normals = (points[upright], normals[upright]) if upright.any() else (points, normals)
+            away = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
+            seen = surface.sees(np.broadcast_to(eye, points.shape), points, 0.01)
+            facing += seen * np.einsum("nc,nc->n", away, normals).clip(0)
+        upright = (facing > 0) & (np.linalg.norm(normals, axis=1) > 0.9)
+        if not upright.any():
+            upright, facing = np.ones(len(points), bool), np.ones(len(points))
+        wall, normals = points[upright], normals[upright]
         alike = normals @ normals.T > np.cos(np.radians(10))
-        outwards = normals[alike[alike.sum(axis=1).argmax()]].mean(axis=0)
+        outwards = normals[alike[(alike @ facing[upright]).argmax()]].mean(axis=0)
         outwards = outwards / np.linalg.norm(outwards) if np.linalg.norm(outwards) > 0 else np.array([0.0, -1, 0])
         middle = np.median(wall, axis=0)
         if (np.median(eyes, axis=0) - middle) @ outwards < 0:

@@ -14,6 +14,10 @@ AGREEMENT = np.cos(np.radians(20))
 """Of a triangle's normal with its plane's: scans are noisy."""
 LEAST_AREA = 0.02
 """Of a plane, in square metres."""
+LEAST_SHARE = 1e-3
+"""Of the mesh's area that a plane has in a mesh of many small triangles: what is smaller is ornament or noise."""
+SMALL = 0.01
+"""Square metres that the triangles of a scan have, on average, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +80,17 @@ def find_planes(
     normals, areas = crosses / np.maximum(doubled, 1e-300)[:, None], doubled / 2
     rng, planes = np.random.default_rng(0), []
     left, rest = np.flatnonzero(areas > 1e-8), []
+    scanned = len(left) > 0 and areas[left].mean() < SMALL
+    least = LEAST_SHARE * areas.sum() if scanned else 0.0
+    even = max(tolerance, float(np.sqrt(2 * areas[left].mean()))) if scanned else tolerance  # of ragged outlines
     while len(left):
         chosen = _largest(corners[left], normals[left], areas[left], tolerance, rng)
         members = left[chosen]
+        if areas[members].sum() < least:
+            rest.append(left)
+            break
         left = left[~chosen]
-        plane = _outlined(corners[members], normals[members], areas[members], members, tolerance, gap)
+        plane = _outlined(corners[members], normals[members], areas[members], members, even, gap)
         if plane is None:
             rest.append(members)
         else:
@@ -125,7 +135,7 @@ def _fit(corners: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _outlined(
-    corners: np.ndarray, normals: np.ndarray, areas: np.ndarray, faces: np.ndarray, tolerance: float, gap: float
+    corners: np.ndarray, normals: np.ndarray, areas: np.ndarray, faces: np.ndarray, even: float, gap: float
 ) -> Plane | None:
     """The plane of triangles with their union as its outline; None where that is too small."""
     if areas.sum() < LEAST_AREA:
@@ -136,7 +146,7 @@ def _outlined(
     axes = upright_axes(normal)
     flat = (corners - origin) @ axes[:2].T
     triangles = shapely.buffer(shapely.polygons(flat), gap / 2, join_style="mitre", mitre_limit=2)
-    union = shapely.union_all(triangles).buffer(-gap / 2, join_style="mitre", mitre_limit=2).simplify(tolerance)
+    union = shapely.union_all(triangles).buffer(-gap / 2, join_style="mitre", mitre_limit=2).simplify(even)
     outline = _pieces(union, LEAST_AREA / 4)
     return None if outline.area < LEAST_AREA else Plane(origin, axes, outline, faces)
 

@@ -42,8 +42,8 @@ def simulate(
     tell: Callable[[str], None] = print,
     up: UpAxis | None = None,
     truths: Sequence[Callable[[np.ndarray], Surface]] = (),
-) -> dict:
-    """Write one folder with everything that simulators load of the buildings of trained runs; returns its figures.
+) -> tuple[dict, list[Chapter]]:
+    """Write one folder with everything that simulators load of the buildings of trained runs.
 
     Args:
         configs: config.yml of each run; the first one's frame is the world's.
@@ -52,6 +52,9 @@ def simulate(
         tell: told what a user should know, a sentence each.
         up: axis of the shells' frames that points up; that of their format if None.
         truths: for each run, its true geometry by the similarity from the scene to the world, where it is known.
+
+    Returns:
+        The figures of ``figures.json``, and what they were taken from.
 
     Raises:
         SceneError: a run cannot be used, or the runs have no common frame.
@@ -82,7 +85,7 @@ def simulate(
     write_readme(out, buildings, home, figures)
     with atomic_write(out / "figures.json") as file:
         file.write((json.dumps(figures, indent=1) + "\n").encode())
-    return figures
+    return figures, chapters
 
 
 def _building(

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,9 +17,6 @@ from shellgs_method.sim.parts import Part
 from shellgs_method.sim.texture import TexturedMesh
 from shellgs_method.sim.visual import TEXTURE
 from shellgs_method.sim.world import Building
-
-if TYPE_CHECKING:
-    from pxr import Usd
 
 LAYERS = "usd"
 """Folder of the binary layers that ``facade.usda`` refers to, beside the building's other files."""
@@ -40,7 +37,7 @@ def write_usd_layers(
     Returns:
         Whether this USD knows splats: their schema is standard since 26.03.
     """
-    pxr = _pxr()
+    pxr = import_pxr()
     (folder / LAYERS).mkdir(exist_ok=True)
     with _Stage(pxr, folder / LAYERS / "visual.usdc", unit) as stage:
         _look(pxr, stage, mesh)
@@ -58,7 +55,7 @@ def write_usd_world(path: Path, buildings: Sequence[Building], unit: float | Non
 
     The splats and the mesh are the same thing twice: a variant ``look`` of each building shows the mesh or the splats.
     """
-    pxr = _pxr()
+    pxr = import_pxr()
     with _Stage(pxr, path, unit, root="World") as stage:
         scene = pxr.UsdPhysics.Scene.Define(stage, "/World/physics")
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0, 0, -1))
@@ -83,16 +80,14 @@ def write_usd_world(path: Path, buildings: Sequence[Building], unit: float | Non
             looks.SetVariantSelection("mesh")
 
 
-def compliance_errors(stage: Path | Usd.Stage) -> list[str]:
+def compliance_errors(stage: Path | Any) -> list[str]:
     """What usd-core's own validators, ``usdchecker``'s, have against a stage or its file; a line each."""
-    pxr = _pxr()
-    from pxr import UsdValidation  # compiled, without types
-
-    registry = UsdValidation.ValidationRegistry()  # pyright: ignore
+    pxr = import_pxr()
+    registry = pxr.UsdValidation.ValidationRegistry()
     validators = registry.GetOrLoadAllValidators()
     if isinstance(stage, Path):
         stage = pxr.Usd.Stage.Open(str(stage))
-    errors = UsdValidation.ValidationContext(validators).Validate(stage)  # pyright: ignore
+    errors = pxr.UsdValidation.ValidationContext(validators).Validate(stage)
     return [f"{error.GetName()}: {error.GetMessage()}" for error in errors]
 
 
@@ -204,11 +199,24 @@ def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
         field.CreateExtentAttr([tuple((means - reach).amin(0).tolist()), tuple((means + reach).amax(0).tolist())])
 
 
-def _pxr() -> SimpleNamespace:
+def import_pxr() -> SimpleNamespace:
+    """The modules of usd-core.
+
+    Raises:
+        SceneError: it is not installed.
+    """
     try:
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdVol, Vt
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation, UsdVol, Vt
     except ImportError as error:
         raise SceneError("USD needs a library that is not installed: pip install 'shellgs[sim]'") from error
     return SimpleNamespace(
-        Gf=Gf, Sdf=Sdf, Usd=Usd, UsdGeom=UsdGeom, UsdPhysics=UsdPhysics, UsdShade=UsdShade, UsdVol=UsdVol, Vt=Vt
+        Gf=Gf,
+        Sdf=Sdf,
+        Usd=Usd,
+        UsdGeom=UsdGeom,
+        UsdPhysics=UsdPhysics,
+        UsdShade=UsdShade,
+        UsdValidation=UsdValidation,
+        UsdVol=UsdVol,
+        Vt=Vt,
     )
