@@ -24,7 +24,7 @@ THICKNESS = 0.3
 THINNEST = 0.03
 """Metres; what is thinner, fast bodies pass between two steps of a simulation."""
 FOR_SURFACES = 0.4
-"""Share of the parts for what is no plane, at most."""
+"""Share of the parts for what is no plane, at most; that of its area if this is more."""
 COVERED = 0.01
 """Metres before other parts up to which a part adds nothing to them."""
 MANY = 4
@@ -35,6 +35,8 @@ GROUND = 0.1
 """Metres above the ground up to which the fused surface is taken for it: simulators have a plane there."""
 BACKED = 0.9
 """Share of the eyes that see something before the shell which must see the shell behind it."""
+ROUNDS = 3
+"""Of filling the budget up with patches."""
 SPECK = 0.01
 """Square metres below which a separate piece of surface before the shell is noise."""
 
@@ -75,11 +77,17 @@ def make_collider(shell: Surface | None, fused: Surface, standing: Bool[np.ndarr
     surfaces = [] if shell is None else [(shell, group) for group in connected(shell.faces, rest)]
     groups = connected(fused.faces, np.flatnonzero(standing))
     surfaces += [(fused, group) for group in groups if fused.areas[group].sum() >= SPECK]
-    parts, filled = _patched(surfaces, max(1, int(FOR_SURFACES * most)) if planes else most), 0.0
+    flat, rough = (sum(areas) for areas in ([p.outline.area for p in planes], [s.areas[g].sum() for s, g in surfaces]))
+    share = 1.0 if not planes else max(FOR_SURFACES, rough / (flat + rough)) if surfaces else 0.0
+    solid, filled = [], 0.0
     if planes and shell is not None:
-        solid, filled = _behind([_facing(plane, shell) for plane in planes], shell, max(1, most - len(parts)))
-        parts = [*solid, *parts]
-    parts = uncovered(parts)
+        solid, filled = _behind([_facing(plane, shell) for plane in planes], shell, max(1, round((1 - share) * most)))
+    parts, asked = uncovered(solid), most - len(solid)
+    for _ in range(ROUNDS if surfaces else 0):  # planes hide some patches, and leave room for others
+        tried = uncovered([*solid, *_patched(surfaces, asked)])
+        if len(tried) > most or len(tried) <= len(parts):
+            break
+        parts, asked = tried, round(asked * most / max(len(tried), 1))
     if not parts:
         raise SceneError("the collider is empty: neither shell nor reconstruction has a surface that cameras see")
     return Collider(parts, filled)
@@ -114,13 +122,13 @@ def standing_before(
 
 
 def _patched(groups: Sequence[tuple[Surface, np.ndarray]], most: int) -> list[Part]:
-    """Parts of pieces of surfaces, each surface getting its share by area."""
+    """Parts of pieces of surfaces, each surface getting its share by area; ``most`` at most."""
     parts, areas = [], [surface.areas[group].sum() for surface, group in groups]
     for surface in dict.fromkeys(surface for surface, _ in groups):
         own = [group for other, group in groups if other is surface]
         share = sum(surface.areas[group].sum() for group in own) / max(sum(areas), 1e-9)
         parts += convex_patches(surface, own, max(1, round(share * most)), THICKNESS / 3)
-    return parts
+    return sorted(parts, key=_size, reverse=True)[:most]
 
 
 def _behind(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Part], float]:

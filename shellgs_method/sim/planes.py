@@ -82,7 +82,10 @@ def find_planes(
     left, rest = np.flatnonzero(areas > 1e-8), []
     scanned = len(left) > 0 and areas[left].mean() < SMALL
     least = LEAST_SHARE * areas.sum() if scanned else 0.0
-    even = max(tolerance, float(np.sqrt(2 * areas[left].mean()))) if scanned else tolerance  # of ragged outlines
+    # A scan's outlines are ragged by its triangles' size: they are smoothed, and crumbs are left to the rest.
+    even, crumb = (
+        (float(np.clip(1.5 * np.sqrt(2 * areas[left].mean()), tolerance, 0.1)), 0.1) if scanned else (0.0, 0.005)
+    )
     while len(left):
         chosen = _largest(corners[left], normals[left], areas[left], tolerance, rng)
         members = left[chosen]
@@ -90,11 +93,14 @@ def find_planes(
             rest.append(left)
             break
         left = left[~chosen]
-        plane = _outlined(corners[members], normals[members], areas[members], members, even, gap)
+        plane = _outlined(corners[members], normals[members], areas[members], members, tolerance, even, gap, crumb)
         if plane is None:
             rest.append(members)
-        else:
-            planes.append(plane)
+            continue
+        planes.append(plane)
+        if scanned:
+            flat = (corners[members].mean(axis=1) - plane.origin) @ plane.axes[:2].T
+            rest.append(members[~shapely.contains_xy(plane.outline.buffer(even), flat)])
     return planes, np.sort(np.concatenate(rest)) if rest else np.empty(0, np.int64)
 
 
@@ -135,7 +141,14 @@ def _fit(corners: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _outlined(
-    corners: np.ndarray, normals: np.ndarray, areas: np.ndarray, faces: np.ndarray, even: float, gap: float
+    corners: np.ndarray,
+    normals: np.ndarray,
+    areas: np.ndarray,
+    faces: np.ndarray,
+    tolerance: float,
+    even: float,
+    gap: float,
+    crumb: float,
 ) -> Plane | None:
     """The plane of triangles with their union as its outline; None where that is too small."""
     if areas.sum() < LEAST_AREA:
@@ -146,8 +159,9 @@ def _outlined(
     axes = upright_axes(normal)
     flat = (corners - origin) @ axes[:2].T
     triangles = shapely.buffer(shapely.polygons(flat), gap / 2, join_style="mitre", mitre_limit=2)
-    union = shapely.union_all(triangles).buffer(-gap / 2, join_style="mitre", mitre_limit=2).simplify(even)
-    outline = _pieces(union, LEAST_AREA / 4)
+    union = shapely.union_all(triangles).buffer(-gap / 2 - even, join_style="mitre", mitre_limit=2)
+    smooth = union.buffer(even, join_style="mitre", mitre_limit=2).simplify(max(tolerance, even))
+    outline = _pieces(smooth, crumb)
     return None if outline.area < LEAST_AREA else Plane(origin, axes, outline, faces)
 
 
