@@ -6,6 +6,7 @@ import json
 import shutil
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -319,7 +320,8 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, cap
 
 
 def joined_file(out: Path) -> tuple[np.ndarray, np.ndarray]:
-    mesh = trimesh.util.concatenate([trimesh.load_mesh(path) for path in sorted((out / "collision").glob("*.obj"))])
+    meshes = [trimesh.load_mesh(path) for path in sorted((out / "collision").glob("*.obj"))]
+    mesh: Any = trimesh.util.concatenate(meshes)
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
