@@ -18,6 +18,7 @@ from dataparsers.errors import SceneError, check_output, refusals_end_the_progra
 from dataparsers.layout import ScenePaths
 from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
+from shellgs_method.sim.settings import SimSettings
 
 if TYPE_CHECKING:
     from dataparsers.cue_maps import CueMap, CueMaps
@@ -43,6 +44,7 @@ Mesher = Literal["planes", "bpa", "poisson"]
 _CAPTURE = CaptureConfig()
 Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
 _PATHS = ScenePaths()
+_SIM = SimSettings()
 
 
 def demo(
@@ -416,6 +418,33 @@ def splats(
     console.print(f"{output}: {count} Gaussians. {_place(run.frame)}")
 
 
+def sim(
+    configs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.Positional],
+    settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
+    up: Optional[UpAxis] = None,
+) -> None:
+    """A folder that MuJoCo, Isaac Sim and Gazebo load: convex colliders, a textured look, splats, and a report.
+
+    With several runs, whose shells are in the same national coordinates, they stand in one world.
+
+    Args:
+        configs: The runs' config.yml.
+        out: The folder.
+        settings: Settings.
+        up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
+    """
+    from shellgs_method.sim.simulate import simulate
+
+    def tell(sentence: str) -> None:
+        console.print(sentence, highlight=False)
+
+    figures, _ = simulate(configs, out, settings, tell, up)
+    for sentence in figures["summary"]:
+        tell(sentence)
+    console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how far off it is.")
+
+
 def compare(
     scenes: Annotated[tuple[Path, ...], tyro.conf.Positional],
     methods: tuple[str, ...] = ("photo-gs", "mono-gs", "2dgs", "shellgs"),
@@ -541,6 +570,7 @@ def main() -> None:
         "evaluate": evaluate,
         "mesh": mesh,
         "splats": splats,
+        "sim": sim,
         "doctor": doctor,
     }
     with refusals_end_the_program():

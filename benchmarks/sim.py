@@ -1,0 +1,133 @@
+"""The figures of `shellgs sim` on the synthetic facade, whose true geometry is known.
+
+    python -m benchmarks.sim outputs/scene/shellgs-metric/TIME/config.yml facade-sim/
+
+writes the folder, and prints lidar, budgets of parts, and how well the list of deviations names what the shell lacks.
+The run must be of the scene that `shellgs demo` makes. ``--coacd`` also decomposes the shell with CoACD (minutes).
+"""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import open3d  # noqa: F401  # before CoACD, after which it cannot be imported
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from shellgs_method.shell.similarity import transformed
+from shellgs_method.sim import engine
+from shellgs_method.sim.collider import Collider, leaks, make_collider
+from shellgs_method.sim.deviations import along_normals
+from shellgs_method.sim.distances import both_ways
+from shellgs_method.sim.front import Front
+from shellgs_method.sim.parts import Part
+from shellgs_method.sim.rays import Surface
+from shellgs_method.sim.report import Chapter, lidar_errors, text
+from shellgs_method.sim.settings import SimSettings
+from shellgs_method.sim.simulate import simulate
+from shellgs_method.synthetic.building import Layout, building
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING
+from shellgs_method.synthetic.geometry import Material
+from shellgs_method.synthetic.scene import FacadeConfig
+
+BUDGETS = 256, 128, 64, 32, 16
+FANS = {"Ouster OS1, ±22.5°": (-22.5, 22.5), "Velodyne VLP-16, ±15°": (-15, 15), "Livox Mid-360, -7 to 52°": (-7, 52)}
+BEFORE = 0.03
+"""Metres that the true building stands before its shell where a deviation is one."""
+_LAYOUT = Layout(FacadeConfig.bays, FacadeConfig.storeys)
+
+
+def main(
+    config: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro.conf.Positional], coacd: bool = False
+) -> None:
+    """Make the folder and print its figures.
+
+    Args:
+        config: config.yml of a run of the demo's scene.
+        out: the folder.
+        coacd: decompose the shell with CoACD too.
+    """
+    console, started = Console(width=150), time.perf_counter()
+    figures, (chapter,) = simulate([config], out, SimSettings(), console.print, truths=[true_building])
+    console.print(f"{time.perf_counter() - started:.0f} s")
+    for sentence in figures["summary"]:
+        console.print(sentence, highlight=False)
+    _fans(console, out, chapter)
+    _budgets(console, chapter, coacd)
+    _named(console, chapter)
+
+
+def true_building(to_world: np.ndarray, materials: tuple[Material, ...] = ()) -> Surface:
+    """The synthetic building, or what of it is made of some materials, in the simulation's frame."""
+    mesh = building(_LAYOUT)
+    chosen = np.isin(mesh.material, materials) if materials else np.ones(len(mesh.triangles), bool)
+    return Surface(transformed(mesh.vertices, to_world @ SCENE_FROM_BUILDING), mesh.triangles[chosen])
+
+
+def _fans(console: Console, out: Path, chapter: Chapter) -> None:
+    """Lidars of several fields of view."""
+    assert chapter.truth is not None
+    front, usual = Front.of(chapter.collider.surface, chapter.made.eyes), engine.BEAMS
+    for name, engine.BEAMS in FANS.items():
+        for group, errors in lidar_errors(out / "facade.xml", chapter.collider.surface, front, chapter.truth).items():
+            console.print(f"{name}, {group}: {text(errors)}", highlight=False)
+    engine.BEAMS = usual
+
+
+def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
+    """Colliders of the shell alone, by their number of parts."""
+    shell, eyes = chapter.shell, chapter.made.eyes
+    assert shell is not None
+    table = Table("collider", "parts", "s", "m³ of air", "to it, 95 % (cm)", "from it, 95 % (cm)", "leaks")
+    makers = {f"planes, --parts {most}": partial(_of_planes, shell, most) for most in BUDGETS}
+    if coacd:
+        makers |= {f"CoACD, resolution {k}": partial(_of_coacd, shell, k) for k in (50, 100)}
+    for name, make in makers.items():
+        started = time.perf_counter()
+        made = make()
+        seconds = time.perf_counter() - started
+        ways = both_ways(made.surface, shell, shell, eyes, 0.05)
+        errors = [f"{100 * ways[way].p95:.1f}" for way in ("to the collider", "from the collider")]
+        share = f"{leaks(made.surface, shell, eyes):.2%}"
+        table.add_row(name, str(len(made.parts)), f"{seconds:.1f}", f"{made.filled:.2f}", *errors, share)
+    console.print(table)
+
+
+def _of_planes(shell: Surface, most: int) -> Collider:
+    return make_collider(shell, shell, np.zeros(len(shell.faces), bool), most)
+
+
+def _of_coacd(shell: Surface, resolution: int) -> Collider:
+    import coacd
+
+    coacd.set_log_level("error")
+    mesh = coacd.Mesh(shell.vertices, shell.faces)
+    hulls = coacd.run_coacd(mesh, threshold=0.05, max_convex_hull=256, preprocess_resolution=resolution)
+    parts = [Part.hull(np.asarray(vertices), "surface") for vertices, _ in hulls]
+    return Collider([part for part in parts if part is not None], float("nan"))
+
+
+def _named(console: Console, chapter: Chapter) -> None:
+    """Precision and recall, by area, of what the deviations say the shell lacks."""
+    found = chapter.deviations
+    assert found is not None
+    assert chapter.truth is not None
+    small, to_world = found.surface, np.linalg.inv(chapter.made.frame.to_scene)
+    seen = np.isfinite(found.distance)
+    claimed = seen & found.flagged & (found.distance > 0)
+    lacking = np.nan_to_num(along_normals(small, small.centres, chapter.truth)) > BEFORE
+    precision = small.areas[claimed & lacking].sum() / max(small.areas[claimed].sum(), 1e-9)
+    console.print(f"{len(found.regions)} regions; {precision:.0%} of what is said to stand before the shell does.")
+    for name, material in (("railings", Material.RAILING), ("flower boxes", Material.FLOWERS)):
+        there = seen & np.isfinite(along_normals(small, small.centres, true_building(to_world, (material,))))
+        recall = small.areas[there & claimed].sum() / max(small.areas[there].sum(), 1e-9)
+        console.print(f"{recall:.0%} of the wall behind {name} ({small.areas[there].sum():.1f} m²) is named.")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

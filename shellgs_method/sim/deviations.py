@@ -1,0 +1,147 @@
+"""Where the building and its shell differ, as the photographs have it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float64, Int64, UInt8
+
+from dataparsers.files import atomic_write
+from shellgs_method.sim.collider import connected
+from shellgs_method.sim.rays import Surface
+from shellgs_method.sim.texture import Photo, project
+
+EDGE = 0.15
+"""Metres between the places of the shell that are compared."""
+REACH = 0.5
+"""Metres before and behind the shell in which the building is looked for."""
+GREY = (150, 150, 150)
+FULL = 0.2
+"""Metres at which colours are full: red before the shell, blue behind it."""
+
+Contradicted = Callable[[Float64[np.ndarray, "N 3"]], Float64[np.ndarray, " N"]]
+"""For places of the shell, in the simulation's frame, how far the photographs say that the building stands before them
+(positive) or behind them, in metres; NaN where they say nothing."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A piece of the shell that the building differs from.
+
+    Attributes:
+        what: "before", the scan lacks something, or "behind", something is gone or deeper.
+        area: of the shell, in square metres.
+        distance: median signed distance in metres, positive before the shell.
+        centre: in the simulation's frame.
+        photograph: that shows it best.
+    """
+
+    what: str
+    area: float
+    distance: float
+    centre: tuple[float, float, float]
+    photograph: str
+
+
+@dataclass(frozen=True, eq=False)
+class Deviations:
+    """The shell in small triangles, and the building's distance at each.
+
+    Attributes:
+        surface: the shell, subdivided.
+        distance: metres that the building stands before the shell at each triangle; NaN where that was not seen.
+        flagged: triangles that differ by more than the threshold.
+        regions: of these, that hang together, the largest first.
+    """
+
+    surface: Surface
+    distance: Float64[np.ndarray, " F"]
+    flagged: Bool[np.ndarray, " F"]
+    regions: list[Region]
+
+    def write(self, path: Path) -> None:
+        """The shell as a ply with colours: red before it, blue behind it, grey where not seen."""
+        mesh = trimesh.Trimesh(
+            self.surface.vertices, self.surface.faces, face_colors=coloured(self.distance), process=False
+        )
+        content = mesh.export(file_type="ply")
+        with atomic_write(path) as file:
+            file.write(content if isinstance(content, bytes) else str(content).encode())
+
+
+def find_deviations(
+    shell: Surface,
+    fused: Surface,
+    photos: Sequence[tuple[str, Photo]],
+    threshold: float,
+    contradicted: Contradicted | None = None,
+    least: float = 0.05,
+) -> Deviations:
+    """Compare the shell with what was reconstructed, along its normals.
+
+    Args:
+        shell: wound so that normals point outside.
+        fused: the reconstruction.
+        photos: with their names.
+        threshold: metres from which they differ.
+        contradicted: what the photographs themselves say, which goes before the reconstruction where it says anything.
+        least: square metres of a region.
+    """
+    small = Surface(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
+    centres = small.centres
+    views = [(name, photo.camera.position.double().numpy(), *project(photo.camera, centres)) for name, photo in photos]
+    best, score = np.full(len(centres), -1), np.zeros(len(centres))
+    for number, ((_, eye, pixels, depth), (_, photo)) in enumerate(zip(views, photos, strict=True)):
+        size = np.array([photo.camera.width, photo.camera.height])
+        inside = np.flatnonzero((depth > 0.1) & ((pixels > 0) & (pixels < size)).all(axis=1))
+        away = eye - centres[inside]
+        length = np.linalg.norm(away, axis=1)
+        facing = np.einsum("nc,nc->n", away, small.normals[inside]) / length
+        visible = (facing > 0.05) & shell.sees(np.broadcast_to(eye, away.shape), centres[inside], 0.02)
+        quality = np.where(visible, facing / length**2, 0.0)
+        better = quality > score[inside]
+        score[inside[better]], best[inside[better]] = quality[better], number
+    distance = np.where(best >= 0, along_normals(small, centres, fused), np.nan)
+    if contradicted is not None:
+        said = contradicted(centres)
+        distance = np.where(np.isfinite(said), said, distance)
+    flagged = np.abs(np.nan_to_num(distance)) > threshold
+    regions = []
+    for what, chosen in (("before", flagged & (distance > 0)), ("behind", flagged & (distance < 0))):
+        for group in connected(small.faces, np.flatnonzero(chosen)):
+            if (area := small.areas[group].sum()) >= least:
+                regions.append(_region(what, float(area), group, centres, distance, best, [name for name, *_ in views]))
+    return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
+
+
+def along_normals(small: Surface, places: Float64[np.ndarray, "F 3"], other: Surface) -> Float64[np.ndarray, " F"]:
+    """How far another surface stands before each triangle, looked at from outside; NaN where there is none near."""
+    t, _ = other.cast(places + REACH * small.normals, -small.normals)
+    return np.where(t < 2 * REACH, REACH - t, np.nan)
+
+
+def coloured(distance: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 4"]:
+    """White at 0, red before the shell, blue behind it, grey where nothing is known."""
+    strength = np.clip(np.nan_to_num(distance) / FULL, -1, 1)[:, None]
+    colours = 255 - 255 * np.where(strength > 0, strength * [0.1, 1, 1], -strength * [1, 1, 0.1])
+    colours = np.where(np.isnan(distance)[:, None], GREY, colours)
+    return np.concatenate([colours, np.full((len(colours), 1), 255)], axis=1).round().astype(np.uint8)
+
+
+def _region(
+    what: str,
+    area: float,
+    group: Int64[np.ndarray, " G"],
+    centres: np.ndarray,
+    distance: np.ndarray,
+    best: np.ndarray,
+    names: Sequence[str],
+) -> Region:
+    shown = np.bincount(best[group][best[group] >= 0], minlength=len(names))
+    x, y, z = np.median(centres[group], axis=0).round(3).tolist()
+    photograph = names[int(shown.argmax())] if shown.any() else ""
+    return Region(what, round(area, 3), round(float(np.median(distance[group])), 3), (x, y, z), photograph)

@@ -1,0 +1,89 @@
+"""The frame of a simulation: metres, z up, the origin on the ground before the facade."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from dataparsers.camera import Camera, positions, upwards
+from shellgs_method.export.frame import Frame
+from shellgs_method.shell.similarity import transformed
+
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""Turns y-up coordinates into z-up ones."""
+LOWEST = 0.002
+"""Share of a shell's points that may lie below the ground: its edge is never quite even."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimFrame(Frame):
+    """A frame for simulators. Its axes are those of the shell, turned upright only where that has another one up.
+
+    Attributes:
+        to_national: rigid motion to the shell's own coordinates in metres, which are national ones if the shell is
+            georeferenced; the identity where there is no shell.
+    """
+
+    to_national: Float64[np.ndarray, "4 4"]
+
+    def write(self, folder: Path, facts: dict) -> None:
+        """Write ``frame.json``: unit, axes, the offset of georeferenced coordinates, both matrices, and ``facts``."""
+        self.describe(folder / "frame.json", {"to_national": self.to_national.tolist(), **facts})
+
+
+def sim_frame(
+    frame: Frame,
+    surface: Float64[np.ndarray, "N 3"],
+    cameras: Sequence[Camera],
+    ground: float | None = None,
+) -> tuple[SimFrame, Float64[np.ndarray, "4 4"]]:
+    """The simulation's frame for what is in ``frame``, and the rigid motion there.
+
+    The origin is where the cameras stand, on the median and on whole metres of the shell's coordinates, at the height
+    of the surface's lower edge.
+
+    Args:
+        frame: of the exported results; z up, y up, or the scene's, which is turned upright as the cameras are held.
+        surface: points of the shell, or else of the reconstruction, in that frame.
+        cameras: of the photographs, in the scene.
+        ground: height of the ground in the shell's own coordinates, in metres; the surface's lower edge if None.
+    """
+    from_scene = np.linalg.inv(frame.to_scene)
+    turn = np.eye(4)
+    if frame.name == "scene":
+        turn[:3, :3] = _upright(from_scene[:3, :3] @ upwards(cameras))
+    elif frame.up == "y":
+        turn[:3, :3] = UPRIGHT
+    offset = turn[:3, :3] @ frame.offset
+    upright = transformed(surface, turn) + offset
+    origin = np.median(transformed(transformed(positions(cameras), from_scene), turn), axis=0) + offset
+    origin[2] = np.quantile(upright[:, 2], LOWEST) if ground is None else ground
+    origin[:2] = np.round(origin[:2]) if frame.metric else origin[:2]
+    motion = turn.copy()
+    motion[:3, 3] = offset - origin
+    back = np.linalg.inv(motion)
+    to_national = np.eye(4)
+    to_national[:3, :3], to_national[:3, 3] = turn[:3, :3].T, turn[:3, :3].T @ origin
+    made = SimFrame(
+        frame.name,
+        frame.to_scene @ back,
+        to_national[:3, 3],
+        frame.metric,
+        "z",
+        to_national if frame.metric else np.eye(4),
+    )
+    return made, motion
+
+
+def _upright(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The smallest rotation that turns a direction upwards (Rodrigues)."""
+    up = up / np.linalg.norm(up)
+    axis, cosine = np.cross(up, [0.0, 0, 1]), up[2]
+    if cosine < -1 + 1e-9:
+        return np.diag([1.0, -1, -1])
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)

@@ -1,0 +1,64 @@
+"""The facade as a robot finds it: how long it is, where its outside is, where one can stand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.sim.rays import Surface, spread
+
+
+@dataclass(frozen=True, eq=False)
+class Front:
+    """The facade's length and its outside, on the ground.
+
+    Attributes:
+        along: horizontal unit vector along it.
+        outwards: horizontal unit vector away from it.
+        foot: its middle.
+        length: from end to end.
+    """
+
+    along: Float64[np.ndarray, " 3"]
+    outwards: Float64[np.ndarray, " 3"]
+    foot: Float64[np.ndarray, " 3"]
+    length: float
+
+    @classmethod
+    def of(cls, surface: Surface, eyes: Float64[np.ndarray, "E 3"]) -> Front:
+        """That of the upright surfaces that eyes see."""
+        points, triangle = surface.samples(4000)
+        normals, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
+        for eye in spread(eyes, 12):
+            away = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
+            seen = surface.sees(np.broadcast_to(eye, points.shape), points, 0.01)
+            facing += seen * np.einsum("nc,nc->n", away, normals).clip(0)
+        upright = (facing > 0) & (np.linalg.norm(normals, axis=1) > 0.9)
+        if not upright.any():
+            upright, facing = np.ones(len(points), bool), np.ones(len(points))
+        wall, normals = points[upright], normals[upright]
+        alike = normals @ normals.T > np.cos(np.radians(10))
+        outwards = normals[alike[(alike @ facing[upright]).argmax()]].mean(axis=0)
+        outwards = outwards / np.linalg.norm(outwards) if np.linalg.norm(outwards) > 0 else np.array([0.0, -1, 0])
+        middle = np.median(wall, axis=0)
+        if (np.median(eyes, axis=0) - middle) @ outwards < 0:
+            outwards = -outwards
+        along = np.array([-outwards[1], outwards[0], 0.0])
+        first, last = np.quantile(wall @ along, [0.01, 0.99])
+        foot = middle + ((first + last) / 2 - middle @ along) * along
+        return cls(along, outwards, foot * [1, 1, 0], float(last - first))
+
+    def before(self, surface: Surface, share: float, distance: float, height: float) -> Float64[np.ndarray, " 3"]:
+        """The place so far before the surface and above the ground, at a share of the length."""
+        far = self.foot + (share - 0.5) * self.length * self.along + [0, 0, height] + 30 * self.outwards
+        wide = far + np.linspace(-0.5, 0.5, 11)[:, None] * self.along
+        reached = float(surface.cast(wide, np.broadcast_to(-self.outwards, wide.shape))[0].min())
+        return far - max(min(reached, 30.0) - distance, 0.0) * self.outwards
+
+
+def places_before(surface: Surface, front: Front, count: int = 20, height: float = 0.6) -> Float64[np.ndarray, "P 3"]:
+    """Places where a robot could stand: along the facade, from one to five metres before it."""
+    shares = np.linspace(0.02, 0.98, count)
+    return np.stack([front.before(surface, share, 1.0 + k % 5, height) for k, share in enumerate(shares)])

@@ -1,0 +1,86 @@
+"""Pictures of a world: MuJoCo's beside the photographs, and the collider over these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from dataparsers.camera import Camera
+from dataparsers.errors import SceneError
+from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.report import shell_edges
+from shellgs_method.sim.engine import compiled, import_mujoco, read_spec
+from shellgs_method.sim.rays import Surface
+from shellgs_method.sim.texture import Photo
+
+LARGEST = 1280
+"""Pixels of a picture's longer side."""
+EDGE = (255, 0, 140)
+
+
+def rendered(path: Path, cameras: Sequence[Camera], group: int = 2) -> list[UInt8[np.ndarray, "H W 3"]]:
+    """What cameras see of a world in MuJoCo's own renderer, off screen.
+
+    Args:
+        path: of the model.
+        cameras: in its frame.
+        group: of geoms to draw: 2 what is to be seen, 3 the colliders.
+
+    Raises:
+        SceneError: there is no OpenGL to draw with.
+    """
+    mujoco, spec = import_mujoco(), read_spec(path)
+    # A camera of MuJoCo's looks through the middle of its picture: around another middle, a larger one is drawn.
+    sizes = [tuple(int(np.ceil(2 * max(c, n - c))) for c, n in _centres(camera)) for camera in cameras]
+    for number, (camera, (_, height)) in enumerate(zip(cameras, sizes, strict=True)):
+        pose = np.linalg.inv(camera.viewmat.double().numpy())
+        fovy = 2 * np.degrees(np.arctan(height / 2 / float(camera.K[1, 1])))
+        turned = Rotation.from_matrix(pose[:3, :3] * [1, -1, -1]).as_quat()[[3, 0, 1, 2]]  # OpenGL's axes
+        spec.worldbody.add_camera(name=f"photograph_{number}", pos=pose[:3, 3], quat=turned, fovy=fovy)
+    spec.visual.global_.offwidth = max(width for width, _ in sizes)
+    spec.visual.global_.offheight = max(height for _, height in sizes)
+    model = compiled(spec, path)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = 0
+    option.geomgroup[group] = 1
+    pictures = []
+    for number, (camera, (width, height)) in enumerate(zip(cameras, sizes, strict=True)):
+        try:
+            renderer = mujoco.Renderer(model, height, width)
+        except Exception as error:  # each GL library fails in its own way
+            raise SceneError(f"MuJoCo found no OpenGL to draw with ({error}): install libegl1 or libosmesa6") from error
+        with renderer:
+            renderer.update_scene(data, f"photograph_{number}", option)
+            picture = renderer.render()
+        (cx, w), (cy, h) = _centres(camera)
+        left, top = round(width / 2 - cx), round(height / 2 - cy)
+        pictures.append(picture[top : top + h, left : left + w].copy())
+    return pictures
+
+
+def overlaid(photo: Photo, collider: Surface) -> UInt8[np.ndarray, "H W 3"]:
+    """A photograph with the edges of the collider drawn on it."""
+    mesh = ShellMesh(collider.vertices, collider.faces)
+    picture = photo.image.copy()
+    picture[shell_edges(ShellCaster(mesh, np.eye(4)).cast(photo.camera), 1.0)] = EDGE
+    return picture
+
+
+def shown(photo: Photo) -> Photo:
+    """A photograph as large as a report needs it."""
+    camera = photo.camera.shrunk(LARGEST)
+    image = Image.fromarray(photo.image).resize((camera.width, camera.height), Image.Resampling.BOX)
+    return Photo(np.asarray(image), camera, None)
+
+
+def _centres(camera: Camera) -> tuple[tuple[float, int], tuple[float, int]]:
+    """Principal point and size along x and y."""
+    return (float(camera.K[0, 2]), camera.width), (float(camera.K[1, 2]), camera.height)

@@ -1,0 +1,99 @@
+"""Rays against triangles and distances from them, near the origin."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from shellgs_method.open3d import import_open3d
+
+
+class Surface:
+    """A triangle mesh to cast rays at and to measure from; in float32, so its frame must be near it.
+
+    Attributes:
+        vertices: in metres.
+        faces: three vertices each, which wind counter-clockwise seen from outside where the caller needs sides.
+        centres: middle of each triangle.
+        normals: unit normal of each triangle.
+        areas: of each triangle.
+    """
+
+    def __init__(self, vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> None:
+        self._tensor = import_open3d().core.Tensor
+        self.vertices, self.faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        crosses = np.cross(b - a, c - a)
+        doubled = np.linalg.norm(crosses, axis=1)
+        self.centres = (a + b + c) / 3
+        self.normals, self.areas = crosses / np.maximum(doubled, 1e-300)[:, None], doubled / 2
+        self._scene = import_open3d().t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(self.vertices.astype(np.float32)), self._tensor(self.faces.astype(np.uint32))
+        )
+
+    def cast(
+        self, origins: Float64[np.ndarray, "*N 3"], directions: Float64[np.ndarray, "*N 3"]
+    ) -> tuple[Float32[np.ndarray, " *N"], Int64[np.ndarray, " *N"]]:
+        """Multiple of its direction at which each ray first hits, inf where it does not, and the triangle, else -1."""
+        answer = self._scene.cast_rays(self._rays(origins, directions))
+        t = answer["t_hit"].numpy()
+        return t, np.where(np.isfinite(t), answer["primitive_ids"].numpy().astype(np.int64), -1)
+
+    def sees(
+        self, points: Float64[np.ndarray, "*N 3"], targets: Float64[np.ndarray, "*N 3"], slack: float = 1e-3
+    ) -> Bool[np.ndarray, " *N"]:
+        """Whether nothing stands between points and targets, but for the ``slack`` metres before these."""
+        away = targets - points
+        length = np.linalg.norm(away, axis=-1, keepdims=True)
+        t, _ = self.cast(np.broadcast_to(points, away.shape), away / np.maximum(length, 1e-9))
+        return t >= length[..., 0] - slack
+
+    def distance(self, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
+        """Unsigned distances of points, in metres."""
+        return self._scene.compute_distance(self._tensor(points.astype(np.float32))).numpy()
+
+    def signed_distance(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+        """Distances of points, in metres: positive on the side that the nearest triangle's normal points to."""
+        answer = self._scene.compute_closest_points(self._tensor(points.astype(np.float32)))
+        away = points - answer["points"].numpy()
+        side = np.einsum("nc,nc->n", away, self.normals[answer["primitive_ids"].numpy().astype(np.int64)])
+        return np.where(side < 0, -1.0, 1.0) * np.linalg.norm(away, axis=1)
+
+    def samples(self, count: int, seed: int = 0) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
+        """Points spread evenly by area, and the triangle that each lies on; the same ones each time."""
+        rng = np.random.default_rng(seed)
+        chosen = rng.choice(len(self.areas), count, p=self.areas / self.areas.sum())
+        weights = rng.dirichlet(np.ones(3), count)
+        return np.einsum("nk,nkd->nd", weights, self.vertices[self.faces[chosen]]), chosen
+
+    def _rays(self, origins: np.ndarray, directions: np.ndarray):
+        rays = np.empty((*directions.shape[:-1], 6), np.float32)
+        rays[..., :3], rays[..., 3:] = origins, directions
+        return self._tensor(rays)
+
+
+def outward(
+    surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 24
+) -> tuple[Surface, Bool[np.ndarray, " F"]]:
+    """The surface wound so that normals point to where the eyes are that see them; and which triangles any eye sees.
+
+    What no eye sees keeps its winding.
+
+    Args:
+        surface: of any winding.
+        eyes: places outside, cameras' say.
+        count: of eyes to ask, spread over all.
+    """
+    centres = surface.centres
+    votes, seen = np.zeros(len(centres)), np.zeros(len(centres), bool)
+    for eye in spread(eyes, count):
+        visible = surface.sees(np.broadcast_to(eye, centres.shape), centres, slack=5e-3)
+        votes += visible * np.sign(np.einsum("fc,fc->f", eye - centres, surface.normals))
+        seen |= visible
+    return Surface(surface.vertices, np.where(votes[:, None] < 0, surface.faces[:, ::-1], surface.faces)), seen
+
+
+def spread(eyes: Float64[np.ndarray, "E 3"], count: int) -> Float64[np.ndarray, "C 3"]:
+    """At most so many of the eyes, evenly in their order."""
+    return eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]

@@ -1,0 +1,224 @@
+"""The report on a folder for simulators: pictures, distances, trials, deviations; one HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from dataparsers.errors import SceneError
+from dataparsers.files import atomic_write
+from shellgs_method.html import data_uri, encoded
+from shellgs_method.sim.building import Reconstruction
+from shellgs_method.sim.collider import Collider, leaks
+from shellgs_method.sim.deviations import Deviations
+from shellgs_method.sim.distances import Distances
+from shellgs_method.sim.engine import beams, lidar
+from shellgs_method.sim.front import Front, places_before
+from shellgs_method.sim.parts import joined
+from shellgs_method.sim.pictures import overlaid, rendered, shown
+from shellgs_method.sim.rays import Surface
+from shellgs_method.sim.texture import Photo
+from shellgs_method.sim.trials import throw, walk
+from shellgs_method.sim.world import Building
+
+PICTURES = 3
+"""Photographs of each building that are shown."""
+REGIONS = 20
+"""Deviations that are listed."""
+_STYLE = """
+:root { color-scheme: light }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1f2328; max-width: 80rem; margin: 2rem auto; padding: 0 1rem }
+h1 { font-size: 1.6rem } h2 { font-size: 1.2rem; margin-top: 2.5rem }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums }
+th, td { text-align: left; padding: .3rem 1rem .3rem 0; border-bottom: 1px solid #d1d9e0 }
+.row { display: grid; grid-template-columns: repeat(3, 1fr); gap: .5rem; margin-bottom: .5rem }
+img { width: 100%; display: block } figure { margin: 0 } figcaption { color: #59636e; font-size: .85rem }
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Chapter:
+    """What is reported of a building.
+
+    Attributes:
+        made: the reconstruction.
+        shell: wound outwards; None where there is none.
+        collider: its collider.
+        facts: of its files.
+        photos: of it, in the order of the reconstruction's views.
+        deviations: from the shell; None where there is none.
+        distances: of the collider from other surfaces.
+        truth: true geometry, where it is known.
+        with_splats: whether they are in the USD.
+    """
+
+    made: Reconstruction
+    shell: Surface | None
+    collider: Collider
+    facts: dict
+    photos: list[Photo]
+    deviations: Deviations | None
+    distances: Mapping[str, Mapping[str, Distances]]
+    truth: Surface | None
+    with_splats: bool
+
+
+def write_report(
+    out: Path, buildings: Sequence[Building], chapters: Sequence[Chapter], tell: Callable[[str], None]
+) -> dict:
+    """Try the world in MuJoCo, draw it, and write ``report.html``; returns the figures.
+
+    Raises:
+        SceneError: MuJoCo refuses the world.
+    """
+    world = out / "facade.xml"
+    everything = Surface(*joined([part for chapter in chapters for part in chapter.collider.parts]))
+    eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
+    thrown = throw(world, everything, eyes)
+    summary = [str(thrown)]
+    figures = {"summary": summary, "throws": asdict(thrown), "buildings": {}}
+    page = [
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Simulation</title><style>{_STYLE}</style>',
+        f"<h1>{escape(', '.join(chapter.made.scene for chapter in chapters))}</h1>",
+    ]
+    sections: list[str] = []
+    for building, chapter in zip(buildings, chapters, strict=True):
+        made, sentences = _figures(world, building, chapter)
+        figures["buildings"][building.name] = made
+        summary += sentences
+        sections += _section(world, building, chapter, made, tell)
+    page += [f"<p>{escape(sentence)}</p>" for sentence in summary]
+    with atomic_write(out / "report.html") as file:
+        file.write("".join([*page, *sections]).encode())
+    return figures
+
+
+def _figures(world: Path, building: Building, chapter: Chapter) -> tuple[dict, list[str]]:
+    """A building's figures, and the sentences that say them."""
+    collider, surface = chapter.collider, chapter.collider.surface
+    front = Front.of(surface, chapter.made.eyes)
+    walked = walk(world, surface, front)
+    sources = [part.source for part in collider.parts]
+    made = {
+        "scene": chapter.made.scene,
+        "parts": len(collider.parts),
+        "parts_of_surfaces": sources.count("surface"),
+        "filled_m3": collider.filled,
+        "walk": asdict(walked),
+        "visual": chapter.facts,
+        "distances": {
+            name: {way: asdict(figures) for way, figures in ways.items()} for name, ways in chapter.distances.items()
+        },
+    }
+    sentences = [
+        f"{building.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; "
+        f"their budget costs {collider.filled:.2g} m³ of air.",
+        str(walked),
+    ]
+    if chapter.shell is not None:
+        made["leaks"] = leaks(surface, chapter.shell, chapter.made.eyes)
+        sentences.append(f"{made['leaks']:.2%} of the rays from the cameras to the shell pass the collider by 10 cm.")
+    if chapter.truth is not None:
+        made["lidar"] = lidar_errors(world, surface, front, chapter.truth)
+        sentences += [f"Lidar of the {name} against the truth: {text(e)}" for name, e in made["lidar"].items()]
+    return made, sentences
+
+
+def lidar_errors(world: Path, collider: Surface, front: Front, truth: Surface) -> dict[str, dict]:
+    """Errors of a lidar in MuJoCo, from 20 places before a building, of the rays that meet the true one."""
+    places, rays = places_before(collider, front), beams()
+    origins = np.repeat(places, len(rays), axis=0)
+    true, _ = truth.cast(origins, np.tile(rays, (len(places), 1)))
+    with np.errstate(divide="ignore"):
+        ground = np.where(rays[:, 2] < 0, np.repeat(places[:, 2:], len(rays), axis=1) / -rays[:, 2], np.inf).ravel()
+    meets = true < ground
+    found = {}
+    for name, group in (("collider", 3), ("visual mesh", 2)):
+        measured = lidar(world, places, rays, group).ravel()
+        error = np.abs(measured - true)[meets]
+        median, p95 = np.quantile(np.where(np.isfinite(error), error, 1e3), [0.5, 0.95])
+        found[name] = {
+            "rays": int(meets.sum()),
+            "median": float(median),
+            "p95": float(p95),
+            "within_10cm": float((error < 0.1).mean()),
+            "missed": float(np.isinf(measured[meets]).mean()),
+            "from_nothing": float((measured < np.minimum(true, ground) - 0.1)[~meets].mean()),
+        }
+    return found
+
+
+def text(errors: Mapping[str, float]) -> str:
+    """A lidar's errors in words."""
+    return (
+        f"median {100 * errors['median']:.1f} cm, 95 % within {100 * errors['p95']:.1f} cm, "
+        f"{errors['within_10cm']:.1%} within 10 cm of {errors['rays']} rays; {errors['from_nothing']:.2%} of the "
+        "others see what is not there."
+    )
+
+
+def _section(
+    world: Path, building: Building, chapter: Chapter, figures: dict, tell: Callable[[str], None]
+) -> Iterator[str]:
+    yield f"<h2>{escape(building.name)}</h2>"
+    width, height = chapter.facts["texture"]
+    yield f"<p>{chapter.facts['triangles']} triangles with a texture of {width} x {height} pixels; "
+    yield f"visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB.</p>"
+    yield from _pictures(world, chapter, tell)
+    yield "<h3>Distances of the collider</h3>"
+    rows = [
+        (name, way, f"{100 * d.median:.1f}", f"{100 * d.p95:.1f}", f"{d.within:.1%}")
+        for name, ways in chapter.distances.items()
+        for way, d in ways.items()
+    ]
+    yield _table(("surface", "points", "median (cm)", "95 % (cm)", "within 10 cm"), rows)
+    if chapter.deviations is not None:
+        regions = chapter.deviations.regions
+        yield f"<h3>Where the building and its shell differ</h3><p>{len(regions)} regions"
+        yield f", the largest {REGIONS}:</p>" if len(regions) > REGIONS else ":</p>"
+        rows = [
+            (
+                "missing in the scan" if region.what == "before" else "gone, or deeper",
+                f"{region.area:.2f}",
+                f"{100 * region.distance:+.0f}",
+                " ".join(f"{value:.2f}" for value in region.centre),
+                region.photograph,
+            )
+            for region in regions[:REGIONS]
+        ]
+        yield _table(("what", "area (m²)", "distance (cm)", "place (m)", "photograph"), rows)
+
+
+def _pictures(world: Path, chapter: Chapter, tell: Callable[[str], None]) -> Iterator[str]:
+    """Photographs, what MuJoCo draws from their cameras, and the collider's edges on them."""
+    held_out = [k for k, view in enumerate(chapter.made.views) if view.name in chapter.made.held_out]
+    chosen = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, PICTURES).round().astype(int))]
+    photos = [shown(chapter.photos[k]) for k in chosen]
+    try:
+        drawn = rendered(world, [photo.camera for photo in photos])
+    except SceneError as error:
+        tell(f"{error}; the report has no pictures of MuJoCo.")
+        drawn = [None] * len(photos)
+    surface = chapter.collider.surface
+    for k, photo, picture in zip(chosen, photos, drawn, strict=True):
+        yield '<div class="row">'
+        yield _figure(photo.image, chapter.made.views[k].name)
+        if picture is not None:
+            yield _figure(picture, "MuJoCo")
+        yield _figure(overlaid(photo, surface), "the collider's edges")
+        yield "</div>"
+
+
+def _figure(picture: np.ndarray, caption: str) -> str:
+    source = data_uri(encoded(np.ascontiguousarray(picture), "JPEG"))
+    return f'<figure><img src="{source}" alt=""><figcaption>{escape(caption)}</figcaption></figure>'
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    cells = ["".join(f"<th>{escape(cell)}</th>" for cell in head)]
+    cells += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
