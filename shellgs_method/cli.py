@@ -239,7 +239,7 @@ def cast(
     """
     from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
-    from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, check_views
+    from shellgs_method.shell import ALIGNMENT, MANY, Alignment, cast_views, check_views, shell_verdicts
 
     if (shell is None) != (matrix is None):
         raise SceneError("--shell and --matrix go together: which mesh, and where it stands in the scene")
@@ -266,6 +266,14 @@ def cast(
             f"Photographs contradict {found.contradicted:.1%} of these pixels: something stands before the shell there "
             f"({found.checked} views compared, {found.skipped} there already, in {found.seconds:.1f} s)."
         )
+        verdicts = shell_verdicts(scene, views)
+        places = scene / "cues/checked/contradicted.ply"
+        verdicts.write(places)
+        if verdicts.share > 0:
+            console.print(
+                f"{verdicts.share:.1%} of the shell is contradicted by {MANY} photographs or more, and half of "
+                f"those that see it: look at {verdicts.witness}, and at {places}, red where the building differs."
+            )
         checked = _save_check_panel(CueMaps.open(scene, "checked"), views)
         console.print(f"Look at {checked}: red is what stands before the shell, green is where they confirm it.")
     panel = _save_panel(CueMaps.open(scene, "shell"), views)

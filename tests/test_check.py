@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 from dataparsers.camera import Camera
+from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
+from dataparsers.photograph import View
 from shellgs_method.batches import reference_maps, regions
-from shellgs_method.shell import check_views
+from shellgs_method.shell import MANY, check_views, shell_verdicts
 from shellgs_method.shell.contradiction import (
     CONFIRMED,
     CONTRADICTED,
@@ -173,3 +176,34 @@ def test_a_contradicted_shell_is_no_reference_and_supervises_only_where_asked():
     assert parts["before_shell"] == [False, True] + [False] * 6
     assert parts["on_shell"] == [True, False] + [True] * 5 + [False]
     assert parts["off_shell"] == [False] * 7 + [True]
+
+
+def test_verdicts_are_those_of_the_views_that_see_a_place(tmp_path: Path):
+    """A wall at z = 8, of which 8 of 10 cameras show a box, 1 m before it, in the middle of the wall."""
+    views = [View(f"{k}.png", tmp_path / f"{k}.png", camera_at(0.1 * k)) for k in range(10)]
+    shell, checked = (CueMaps.create(tmp_path, kind, command="cast") for kind in ("shell", "checked"))
+    normal = np.zeros((HEIGHT, WIDTH, 3), np.float16)
+    for k, view in enumerate(views):
+        x = (view.camera.rays().numpy() * WALL)[..., 0] + 0.1 * k
+        box = (np.abs(x) < 0.4) & (k < 8)
+        wall = np.full((HEIGHT, WIDTH), WALL, np.float32)
+        shell.write(view.name, CueMap(wall, normal, wall > 0), view.camera)
+        checked.write(view.name, CueMap(np.where(box, 7, 0).astype(np.float32), normal, box), view.camera)
+    places = np.array([[0.0, 0, WALL], [1.0, 0, WALL], [0.0, 0, 7.0], [0.0, 100.0, WALL]])
+    verdicts = shell_verdicts(tmp_path, views, places)
+    assert verdicts.seen.tolist() == [10, 10, 0, 0]  # one is not on the shell, one is in no picture
+    assert verdicts.contradicted.tolist() == [8, 0, 0, 0]
+    slant = np.hypot(1, 0.35 / WALL)  # of the median camera's ray
+    assert verdicts.distance[0] == pytest.approx(slant, rel=1e-3)
+    assert np.isnan(verdicts.distance[1:]).all()
+    assert verdicts.share == 0.5
+    assert verdicts.witness in [view.name for view in views[:8]]
+    assert verdicts.contradicted[0] >= MANY
+
+    spread = shell_verdicts(tmp_path, views)
+    contradicted = np.abs(spread.places[:, 0]) < 0.35
+    assert (spread.contradicted[contradicted] > 0).all()
+    spread.write(tmp_path / "places.ply")
+    cloud = trimesh.load(tmp_path / "places.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert np.asarray(cloud.colors)[contradicted, 1].max() < 100

@@ -17,9 +17,11 @@ from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.refinement import refine
 from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.shell.validation import Validation, validate
+from shellgs_method.shell.verdicts import MANY, Verdicts, shell_verdicts
 
 __all__ = [
     "ALIGNMENT",
+    "MANY",
     "MASKS",
     "Alignment",
     "CastSummary",
@@ -30,6 +32,7 @@ __all__ = [
     "ShellMesh",
     "ShellSurface",
     "Validation",
+    "Verdicts",
     "align_picks",
     "cast_views",
     "check_panel",
@@ -38,6 +41,7 @@ __all__ = [
     "mesh_cloud",
     "propose",
     "refine",
+    "shell_verdicts",
     "supervision_panel",
     "validate",
 ]
