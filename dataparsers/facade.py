@@ -97,9 +97,10 @@ def read_views(layout: SceneLayout) -> list[View]:
 
 
 def held_out_names(config: FacadeDataParserConfig) -> set[str]:
-    """Names of the views that are held out for evaluation."""
+    """Names of the views that are held out for evaluation; none in a scene of one photograph."""
     recording = config.read()
-    return {recording.shots[k].name for k in _of_split(recording, "test", config)}
+    held_out = _of_split(recording, "test", config) if len(recording.shots) > 1 else []
+    return {recording.shots[k].name for k in held_out}
 
 
 def _views(shots: Sequence[Shot], layout: SceneLayout) -> list[View]:

@@ -6,11 +6,12 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Optional
+from typing import TYPE_CHECKING, Optional
 
-from dataparsers import colmap_model, transforms
 from dataparsers.errors import SceneError
-from dataparsers.shots import Recording, Shot
+
+if TYPE_CHECKING:  # they import nerfstudio, which takes seconds, and the command line has these paths
+    from dataparsers.shots import Recording, Shot
 
 MASKS = Path("masks")
 """Where masks are looked for, in the scene."""
@@ -58,6 +59,8 @@ class SceneLayout(ScenePaths):
             FileNotFoundError: the scene has no cameras.
             SceneError: they are damaged, or those of no camera.
         """
+        from dataparsers import colmap_model, transforms
+
         folder = self.colmap_folder()
         if folder is None:
             return transforms.read_recording(self.data)
@@ -69,6 +72,8 @@ class SceneLayout(ScenePaths):
         Raises:
             FileNotFoundError: the scene has neither.
         """
+        from dataparsers import colmap_model, transforms
+
         if not self.data.is_dir():
             raise FileNotFoundError(f"{self.data} is not a folder; --data takes a scene folder.")
         if (self.data / transforms.NAME).is_file() and self.colmap_path is None:

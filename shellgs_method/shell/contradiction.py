@@ -28,9 +28,9 @@ MOVES = 5.5
 needs the depth more exactly than the offsets have it."""
 A_SIDE = 4
 """Neighbours on either side of a view: of what is hidden on one side, more is seen from the other."""
-CONTRADICTED = 0.08
-"""Least score of a pixel that is contradicted. With 0.14 more of these are right but fewer are found, for which
-shellgs-metric pays for in what stands before the shell."""
+CONTRADICTED = 0.14
+"""Least score of a pixel that is contradicted. With 0.08 more are found, and pictures of what stands before the shell
+are better, but mirrors contradict it too, and what is left to the photographs alone is farther from the truth."""
 CONFIRMED = -0.03
 """Largest score of the best nearer depth where the shell is confirmed."""
 

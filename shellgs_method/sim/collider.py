@@ -142,7 +142,7 @@ def _behind(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Pa
 
     cut, spent = [convex_pieces(plane.outline) for plane in planes], 0.0
     if sum(map(len, cut)) > MANY * most:  # ragged outlines: bring them down before anything is cast
-        cut, _ = fewer_pieces(cut, MANY * most, lambda _, area: shapely.area(area))
+        cut, _ = fewer_pieces(cut, MANY * most, lambda _, area: float(shapely.area(area)))
     parts = solid(cut)
     if len(parts) > most:
         cut = [[piece for index, piece in parts.values() if index == k] for k in range(len(planes))]
