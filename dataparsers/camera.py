@@ -69,6 +69,16 @@ def positions(cameras: Iterable[Camera]) -> Float64[np.ndarray, "V 3"]:
     return np.array([camera.position.detach().cpu().double().numpy() for camera in cameras]).reshape(-1, 3)
 
 
+def project(
+    camera: Camera, points: Float64[np.ndarray, "N 3"]
+) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, " N"]]:
+    """Pixels and z-depths of points in the camera's world."""
+    viewmat, K = (each.detach().cpu().double().numpy() for each in (camera.viewmat, camera.K))
+    seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = seen[:, 2]
+    return (seen / np.where(np.abs(depth) > 1e-9, depth, 1e-9)[:, None] @ K.T)[:, :2], depth
+
+
 def upwards(cameras: Iterable[Camera]) -> Float64[np.ndarray, " 3"]:
     """Unit vector up in the world, as the cameras are held; tilted where they look up or down."""
     up = -np.mean([camera.viewmat[1, :3].detach().cpu().double().numpy() for camera in cameras], axis=0)

@@ -24,6 +24,7 @@ from shellgs_method.shell.contradiction import (
     ShellView,
     Sweep,
     agreed_score,
+    sides,
     sweep,
 )
 
@@ -149,13 +150,10 @@ class _Known:
         if not (seen.depth > 0).any():
             return []
         reach = 0.9 * float(seen.depth[seen.depth > 0].median())
-        sides: tuple[list[tuple[float, str]], list[tuple[float, str]]] = ([], [])
-        for name, other in self.views.items():
-            step = other.camera.position - seen.camera.position
-            alike = float(seen.camera.viewmat[2, :3] @ other.camera.viewmat[2, :3]) > 0.5
-            if other is not seen and alike and float(step.norm()) < reach:
-                sides[int(seen.camera.viewmat[0, :3] @ step > 0)].append((float(step.norm()), name))
-        return [name for side in sides for _, name in sorted(side)[:WITNESSES]]
+        names = [name for name, other in self.views.items() if other is not seen]
+        found = sides(seen.camera, [self.views[name].camera for name in names])
+        near = [sorted(each for each in side if each[0] < reach)[:WITNESSES] for side in found]
+        return [names[index] for side in near for _, index in side]
 
 
 def _read(shell: CueMaps, view: View) -> CueMap:

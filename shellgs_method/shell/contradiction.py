@@ -82,14 +82,23 @@ def neighbours(view: Camera, others: Sequence[Camera], depth: float, offset: flo
         The index of each, and its side: 0 on the left, 1 on the right.
     """
     wanted = MOVES * depth / (offset * float(view.K[0, 0]))
-    sides: tuple[list[tuple[float, int]], list[tuple[float, int]]] = ([], [])
+    found = [
+        sorted(
+            (max(baseline / wanted, wanted / baseline), index) for baseline, index in side if baseline > 1e-6 * depth
+        )
+        for side in sides(view, others)
+    ]
+    return [(index, side) for side in (0, 1) for _, index in found[side][:A_SIDE]]
+
+
+def sides(view: Camera, others: Sequence[Camera]) -> tuple[list[tuple[float, int]], list[tuple[float, int]]]:
+    """Distances and indices of the cameras on the left and on the right of a view that look about the same way."""
+    found: tuple[list[tuple[float, int]], list[tuple[float, int]]] = ([], [])
     for index, other in enumerate(others):
         step = other.position - view.position
-        baseline = float(step.norm())
-        if baseline > 1e-6 * depth and float(view.viewmat[2, :3] @ other.viewmat[2, :3]) > 0.5:
-            misfit = max(baseline / wanted, wanted / baseline)
-            sides[int(view.viewmat[0, :3] @ step > 0)].append((misfit, index))
-    return [(index, side) for side in (0, 1) for _, index in sorted(sides[side])[:A_SIDE]]
+        if float(view.viewmat[2, :3] @ other.viewmat[2, :3]) > 0.5:
+            found[int(view.viewmat[0, :3] @ step > 0)].append((float(step.norm()), index))
+    return found
 
 
 def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
@@ -107,7 +116,7 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
     for index, asked in roles.items():
         beside = _Beside(pixels, others[index])
         for rung, side in asked:
-            nearer = beside.disagreement(pixels.surface / (1 + OFFSETS[rung]))
+            nearer = beside.disagreement(beside.look(pixels.surface / (1 + OFFSETS[rung])))
             sums[rung, side] += beside.visible * torch.stack([beside.visible, beside.on_shell, nearer])
     weight, on_shell, nearer = sums.unbind(dim=2)
     on_shell, nearer = ((each / weight).nan_to_num(1.0).amin(dim=1) for each in (on_shell, nearer))
@@ -130,19 +139,18 @@ def agreed_score(
         found_there: what they found.
     """
     pixels = _Pixels(view)
-    nearer_depth = pixels.surface / (1 + found.offset)
     shell, nearer, trust, support = [], [], [], []
     for other, sweep_there in zip(others, found_there, strict=True):
         beside = _Beside(pixels, other)
-        before = beside.look(nearer_depth)
+        before = beside.look(pixels.surface / (1 + found.offset))
         hidden = (beside.visible == 0) | ~before.inside
         probability = torch.sigmoid((sweep_there.score.float() - 0.4 * CONTRADICTED) / 0.02)
-        of_shell = _sampled(probability, beside.look(pixels.surface).grid)
+        of_shell = _sampled(probability, beside.shell.grid)
         of_nearer = _sampled(probability, before.grid)
         offset = _sampled(other.depth, before.grid, "nearest") / before.z - 1
         alike = (_sampled(sweep_there.offset, before.grid, "nearest") - offset).abs() < 0.3 * offset.abs() + 0.004
         shell.append(beside.on_shell.masked_fill(hidden, torch.nan))
-        nearer.append(beside.disagreement(nearer_depth).masked_fill(hidden, torch.nan))
+        nearer.append(beside.disagreement(before).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
         support.append((of_nearer * torch.where(alike, 1.0, 0.4)).masked_fill(hidden, torch.nan))
     if len(shell) < 2:
@@ -184,13 +192,14 @@ class _Beside:
         self._start = (K @ motion[:3, 3]).float()
         self._size = other.camera.width, other.camera.height
         self._features, self._there = pixels.features, _features(other)
-        on_shell = self.look(pixels.surface)
-        surface = _sampled(other.depth, on_shell.grid, "nearest")
-        hidden = ~on_shell.inside | ((surface > 0) & (on_shell.z > 1.01 * surface))
+        self.shell = self.look(pixels.surface)
+        """Where the pixels are if they lie on the shell."""
+        surface = _sampled(other.depth, self.shell.grid, "nearest")
+        hidden = ~self.shell.inside | ((surface > 0) & (self.shell.z > 1.01 * surface))
         self.visible = (~hidden).float()
         """1 where the other view shows the shell: in its picture, and not behind another part of the shell."""
-        self.on_shell = self.disagreement(pixels.surface)
-        """Disagreement of the two photographs if the pixels lie on the shell."""
+        self.on_shell = self.disagreement(self.shell)
+        """Disagreement of the two photographs there."""
 
     def look(self, depth: Float[Tensor, "h w"]) -> _Look:
         """Where pixels of these depths are."""
@@ -199,9 +208,9 @@ class _Beside:
         u, v = (2 / size * along / near - 1 for size, along in zip(self._size, (x, y), strict=True))
         return _Look(torch.stack([u, v], dim=-1)[None], z, (z > 0) & (u.abs() < 1) & (v.abs() < 1))
 
-    def disagreement(self, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """From 0 to 1: truncated differences of colours and of gradients, if the pixels have these depths."""
-        there = grid_sample(self._there[None], self.look(depth).grid, padding_mode="border", align_corners=False)[0]
+    def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
+        """From 0 to 1: truncated differences of colours and of gradients, if the pixels are there."""
+        there = grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
         apart = (self._features - there).abs_()
         colours, gradients = apart[:3].mean(dim=0) / _COLOUR, apart[3:].mean(dim=0) / _GRADIENT
         return (colours.clamp_max_(1) + gradients.clamp_max_(1)) / 2

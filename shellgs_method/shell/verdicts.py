@@ -11,6 +11,7 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float64, Int64
 
+from dataparsers.camera import project
 from dataparsers.cue_maps import CueMaps
 from dataparsers.files import atomic_write
 from dataparsers.photograph import View
@@ -87,20 +88,15 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         cue, said = shell.read(view.name, camera), checked.read(view.name, camera)
         assert cue is not None
         assert said is not None
-        viewmat, K = (each.double().numpy() for each in (camera.viewmat, camera.K))
-        points = places @ viewmat[:3, :3].T + viewmat[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            columns, rows = (points @ K.T)[:, :2].T / points[:, 2]
-            inside = (
-                (points[:, 2] > 0) & (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
-            )
+        pixels, z = project(camera, places)
+        inside = (z > 0) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
         k = np.flatnonzero(inside)
-        pixels = rows[k].astype(int), columns[k].astype(int)
-        visible = np.abs(cue.depth[pixels] / points[k, 2] - 1) < _SAME
+        columns, rows = pixels[k].astype(int).T
+        visible = np.abs(cue.depth[rows, columns] / z[k] - 1) < _SAME
         seen[k] += visible
-        before = visible & said.mask[pixels]
-        along = np.linalg.norm(points[k], axis=1) / points[k, 2]  # the ray's length for a depth of 1
-        distance[k[before]] = ((cue.depth - said.depth)[pixels] * along)[before]
+        before = visible & said.mask[rows, columns]
+        along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z[k]  # for a depth of 1
+        distance[k[before]] = ((cue.depth - said.depth)[rows, columns] * along)[before]
     contradicted = np.isfinite(distances).sum(axis=0)
     median = np.full(len(places), np.nan)
     some = contradicted > 0

@@ -10,10 +10,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float64, Int64, UInt8
 
+from dataparsers.camera import project
 from dataparsers.files import atomic_write
 from shellgs_method.sim.collider import connected
 from shellgs_method.sim.rays import Surface
-from shellgs_method.sim.texture import Photo, project
+from shellgs_method.sim.texture import Photo
 
 EDGE = 0.15
 """Metres between the places of the shell that are compared."""

@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.sparse import coo_matrix
 
-from dataparsers.camera import Camera
+from dataparsers.camera import Camera, project
 from dataparsers.errors import SceneError
 from shellgs_method.sim.rays import Surface
 
@@ -129,14 +129,6 @@ def _vertex_normals(surface: Surface) -> Float64[np.ndarray, "V 3"]:
     gather = coo_matrix((np.repeat(surface.areas, 3), (rows, columns)), shape=(count, len(surface.faces)))
     normals = gather @ surface.normals
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
-def project(camera: Camera, points: Float64[np.ndarray, "N 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels and depths of points in a camera's frame."""
-    viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
-    seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depth = seen[:, 2]
-    return (seen / np.where(np.abs(depth) > 1e-9, depth, 1e-9)[:, None] @ K.T)[:, :2], depth
 
 
 def _looked_up(photo: Photo, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
