@@ -23,7 +23,7 @@ from shellgs_method.export.runs import TrainedRun
 from shellgs_method.shell.similarity import transformed
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collider import Collider, make_collider
-from shellgs_method.sim.engine import beams, lidar, load
+from shellgs_method.sim.engine import beams, lidar, load, warnings_kept
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.parts import Part
 from shellgs_method.sim.pictures import rendered
@@ -102,7 +102,9 @@ def test_a_world_that_mujoco_refuses_is_one_sentence(world, tmp_path):
 
 
 def test_nothing_that_is_thrown_gets_through_sticks_or_gains_energy(world, collider, eyes):
-    thrown = throw(world / "facade.xml", collider.surface, eyes, count=60, seconds=2.5)
+    with warnings_kept() as warnings:
+        thrown = throw(world / "facade.xml", collider.surface, eyes, count=60, seconds=2.5)
+    assert not warnings
     assert thrown.hits > 50
     assert (thrown.through, thrown.stuck, thrown.gained) == (0, 0, 0)
     assert thrown.deepest < 0.05

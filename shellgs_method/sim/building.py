@@ -12,12 +12,13 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
 
 from dataparsers.camera import positions
+from dataparsers.cue_maps import find_cues
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.export import DepthView, decimate, fuse
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
-from shellgs_method.shell import ShellCaster
+from shellgs_method.shell import ShellCaster, shell_verdicts
 from shellgs_method.shell.similarity import transformed
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.rays import Surface
@@ -36,7 +37,7 @@ class Reconstruction:
     """What a trained run knows of a building, in the frame of a simulation.
 
     Attributes:
-        scene: name of the scene's folder.
+        folder: the scene's.
         frame: the simulation's.
         fused: the surface that the run renders, with colours at its vertices.
         shell: the shell, of any winding; None where the scene has none.
@@ -46,7 +47,7 @@ class Reconstruction:
         held_out: names of the held-out ones.
     """
 
-    scene: str
+    folder: Path
     frame: SimFrame
     fused: trimesh.Trimesh
     shell: Surface | None
@@ -76,12 +77,12 @@ class Reconstruction:
         fused = decimate(run.facade(fuse(_watched(run, hidden), run.box(MARGIN), voxel), MARGIN), faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
         frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground)
-        scene = Path(run.datamanager.config.dataparser.data).name
+        folder = Path(run.datamanager.config.dataparser.data)
         if home is not None:
-            frame, motion = moved_into(frame, motion, home, scene)
+            frame, motion = moved_into(frame, motion, home, folder.name)
         shell = Surface(transformed(known, motion), run.shell_in_frame.faces) if run.shell else None
         return cls(
-            scene,
+            folder,
             frame,
             fused.apply_transform(motion),
             shell,
@@ -90,6 +91,11 @@ class Reconstruction:
             hidden,
             {view.name for view in run.datasets[1].views},
         )
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene's folder."""
+        return self.folder.name
 
     @property
     def eyes(self) -> Float64[np.ndarray, "V 3"]:
@@ -106,6 +112,17 @@ class Reconstruction:
             )  # nearest
             clear = ~hidden[np.ix_(rows, columns)]
             yield Photo(image, self.frame.camera(view.camera), clear if kept is None else clear & kept)
+
+    def contradicted(self, places: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+        """Metres before places of the shell at which photographs show something else; NaN where they do not.
+
+        Places in the simulation's frame. Half of the photographs that see a place must say so: what stands on its own
+        before the wall hides another place in each.
+        """
+        if "checked" not in find_cues(self.folder):
+            return np.full(len(places), np.nan)
+        verdicts = shell_verdicts(self.folder, self.views, transformed(places, self.frame.to_scene))
+        return np.where(verdicts.differs, verdicts.distance / self.frame.scale, np.nan)
 
     def say(self, tell: Callable[[str], None]) -> None:
         """What a user must know of the input."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -39,15 +41,23 @@ def read_spec(path: Path):
         raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
 
 
-def compiled(spec, path: Path):
+@contextmanager
+def warnings_kept() -> Iterator[list[str]]:
+    """What MuJoCo warns of meanwhile; without it, warnings go to MUJOCO_LOG.TXT in the working directory."""
     mujoco, warnings = import_mujoco(), []
     mujoco.set_mju_user_warning(warnings.append)
     try:
-        model = spec.compile()
-    except ValueError as error:
-        raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
+        yield warnings
     finally:
         mujoco.set_mju_user_warning(None)
+
+
+def compiled(spec, path: Path):
+    with warnings_kept() as warnings:
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
     if warnings:
         raise SceneError(f"{path}: MuJoCo warns: {warnings[0]}")
     return model

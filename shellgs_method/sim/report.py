@@ -16,7 +16,7 @@ from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collider import Collider, leaks
 from shellgs_method.sim.deviations import Deviations
 from shellgs_method.sim.distances import Distances
-from shellgs_method.sim.engine import beams, lidar
+from shellgs_method.sim.engine import beams, lidar, warnings_kept
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.parts import joined
 from shellgs_method.sim.pictures import overlaid, rendered, shown
@@ -78,9 +78,10 @@ def write_report(
     world = out / "facade.xml"
     everything = Surface(*joined([part for chapter in chapters for part in chapter.collider.parts]))
     eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
-    thrown = throw(world, everything, eyes)
-    summary = [str(thrown)]
-    figures = {"summary": summary, "throws": asdict(thrown), "buildings": {}}
+    with warnings_kept() as warnings:
+        thrown = throw(world, everything, eyes)
+    summary = [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
+    figures = {"summary": summary, "throws": asdict(thrown), "warnings": warnings, "buildings": {}}
     page = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Simulation</title><style>{_STYLE}</style>',
         f"<h1>{escape(', '.join(chapter.made.scene for chapter in chapters))}</h1>",
@@ -101,7 +102,8 @@ def _figures(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
     """A building's figures, and the sentences that say them."""
     collider, surface = chapter.collider, chapter.collider.surface
     front = Front.of(surface, chapter.made.eyes)
-    walked = walk(world, surface, front)
+    with warnings_kept() as warnings:
+        walked = walk(world, surface, front)
     sources = [part.source for part in collider.parts]
     made = {
         "scene": chapter.made.scene,
@@ -118,6 +120,7 @@ def _figures(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
         f"{building.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; "
         f"their budget costs {collider.filled:.2g} m³ of air.",
         str(walked),
+        *(f"MuJoCo warns: {warning}" for warning in warnings),
     ]
     if chapter.shell is not None:
         made["leaks"] = leaks(surface, chapter.shell, chapter.made.eyes)

@@ -118,8 +118,7 @@ def _building(
     deviations: Deviations | None = None
     if shell is not None:
         named = list(zip([view.name for view in made.views], photos, strict=True))
-        # What photographs themselves contradict goes in here, as ``contradicted``, where it is known.
-        deviations = find_deviations(shell, fused, named, stands)
+        deviations = find_deviations(shell, fused, named, stands, made.contradicted)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
