@@ -210,6 +210,21 @@ def test_how_tiles_are_batched_changes_neither_picture_nor_gradients(batches, mo
     torch.testing.assert_close(differentiated(), expected)
 
 
+def test_a_few_deep_tiles_are_not_packed_again_after_each_chunk(monkeypatch):
+    """On real scenes a handful of tiles have hundreds of chunks more than the others."""
+    plans, plan = [], compositing._plan
+    monkeypatch.setattr(compositing, "_plan", lambda *args: plans.append(plan(*args)) or plans[-1])
+    shallow, n_deep = make_splats(200, 3, seed=14), 400
+    camera = make_camera(93, 78)
+    centre = torch.linalg.inv(camera.viewmat)[:3] @ torch.tensor([0.0, 0.0, 2.0, 1.0]).double()
+    faint = torch.full((n_deep,), 0.006).double()
+    deep = [centre.expand(n_deep, 3), torch.ones(n_deep, 4).double(), torch.full((n_deep, 3), 1e-3).double(), faint]
+    splats = [torch.cat(pair) for pair in zip(shallow, [*deep, torch.ones(n_deep, 3).double()], strict=True)]
+    rasterize(*splats, camera=camera)
+    assert max(len(each.ends) for each in plans) > 40
+    assert len(plans) <= 4
+
+
 def test_cropping_is_shifting_the_principal_point():
     *splats, features = make_splats(100, 3, seed=7)
     splats[0] *= 0.2  # all within the field of view, or the clamped slopes of the projection would follow the crop

@@ -23,6 +23,7 @@ CPU_BATCHES = (1024, 1)
 GPU_BATCHES = (1 << 14, 4)
 MAX_SUMMED = 24 << 20  # bytes of gradients summed at once; from 32 MB, memory is new and slow each time it is allocated
 REPACK_BELOW = 0.25  # share of tiles still at work; moving them costs as much as some chunks
+MIN_GROUPS = 2  # a kernel compiled for one would not do for more
 
 
 def composite(
@@ -155,7 +156,8 @@ def _follow(
         )
         if (i + 1) % chunks_per_look == 0 or i + 1 == len(plan.ends):
             at_work = (brightest > 0) & (counts[:n] > (plan.first_chunk + i + 1) * CHUNK)
-            if int(at_work.sum()) < REPACK_BELOW * len(brightest) * LANES:
+            n_at_work = int(at_work.sum())
+            if n_at_work == 0 or (n > MIN_GROUPS and n_at_work < REPACK_BELOW * n * LANES):
                 break
     canvas.index_copy_(0, plan.tiles.flatten(), torch.stack(totals, -1).permute(0, 2, 3, 1).flatten(0, 1))
     n = len(at_work)
@@ -225,7 +227,7 @@ def _in_groups(plans: list[_Plan], max_rows: int) -> Iterator[list[_Plan]]:
 
 def _plan(tiles: Int[Tensor, "n"], first_chunk: int, bins: Bins, table: Float[Tensor, "N+1 K"]) -> _Plan:
     """Put tiles into lanes, filled up with the tile that does not exist, and look up their splats."""
-    n_groups = max(2, -(-len(tiles) // LANES))  # a kernel compiled for one would not do for more
+    n_groups = max(MIN_GROUPS, -(-len(tiles) // LANES))
     tiles = F.pad(tiles, (0, n_groups * LANES - len(tiles)), value=len(bins.counts) - 1).view(-1, LANES)
     centres = torch.stack([tiles % bins.columns, tiles // bins.columns], dim=1) * TILE + TILE / 2
     starts, counts = bins.starts[tiles], bins.counts[tiles]
