@@ -239,7 +239,15 @@ def cast(
     """
     from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
-    from shellgs_method.shell import ALIGNMENT, MANY, Alignment, cast_views, check_views, shell_verdicts
+    from shellgs_method.shell import (
+        ALIGNMENT,
+        CONTRADICTED_PLACES,
+        MANY,
+        Alignment,
+        cast_views,
+        check_views,
+        shell_verdicts,
+    )
 
     if (shell is None) != (matrix is None):
         raise SceneError("--shell and --matrix go together: which mesh, and where it stands in the scene")
@@ -267,7 +275,7 @@ def cast(
             f"({found.checked} views compared, {found.skipped} there already, in {found.seconds:.1f} s)."
         )
         verdicts = shell_verdicts(scene, views)
-        places = scene / "cues/checked/contradicted.ply"
+        places = scene / CONTRADICTED_PLACES
         verdicts.write(places)
         if verdicts.share > 0:
             console.print(

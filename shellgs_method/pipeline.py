@@ -9,6 +9,7 @@ from time import perf_counter
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import torch
 import torchvision
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -20,6 +21,7 @@ from shellgs_method.checkpoints import check_gaussians
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.model import FacadeModel
+from shellgs_method.viewer import ContradictedShell
 
 
 @dataclass
@@ -53,6 +55,9 @@ class FacadePipeline(VanillaPipeline):
             super().__init__(config, *args, **kwargs)
             model, datamanager = self.model, self.datamanager
             assert isinstance(datamanager, FacadeDataManager)
+            parsed = datamanager.train_dataparser_outputs
+            from_scene = np.vstack([parsed.dataparser_scale * parsed.dataparser_transform.double(), [0, 0, 0, 1]])
+            self.contradicted_shell = ContradictedShell(Path(datamanager.config.dataparser.data), from_scene)
             if self.test_mode == "val":
                 datamanager.train_on(model.training_cues)
             if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run brings all its Gaussians

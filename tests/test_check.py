@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
+from runs import trainer_of
+from scipy.spatial import KDTree
+from viser import SceneApi
 
-from dataparsers.camera import Camera
+from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from dataparsers.photograph import View
 from shellgs_method.batches import reference_maps, regions
-from shellgs_method.shell import MANY, check_views, shell_verdicts
+from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 from shellgs_method.shell.contradiction import (
     CONFIRMED,
     CONTRADICTED,
@@ -27,6 +32,7 @@ from shellgs_method.shell.contradiction import (
     neighbours,
     sweep,
 )
+from shellgs_method.viewer import ContradictedShell
 
 WIDTH, HEIGHT = 144, 64
 K = torch.tensor([[160.0, 0, WIDTH / 2], [0, 160, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
@@ -207,3 +213,34 @@ def test_verdicts_are_those_of_the_views_that_see_a_place(tmp_path: Path):
     cloud = trimesh.load(tmp_path / "places.ply")
     assert isinstance(cloud, trimesh.PointCloud)
     assert np.asarray(cloud.colors)[contradicted, 1].max() < 100
+
+
+def test_the_viewer_has_the_contradicted_places_where_the_cameras_are(pristine_scene, tmp_path, monkeypatch):
+    """Places at the cameras themselves, which nerfstudio has moved to its own world."""
+    scene = tmp_path / "scene"
+    shutil.copytree(pristine_scene, scene)
+    views = read_views(FacadeDataParserConfig(data=scene))
+    (scene / CONTRADICTED_PLACES).parent.mkdir(parents=True)
+    places, red = positions(view.camera for view in views), np.tile(np.uint8([255, 0, 0]), (len(views), 1))
+    trimesh.PointCloud(places, red).export(scene / CONTRADICTED_PLACES)
+
+    def with_viewer(config):
+        config.vis = "viewer"
+        config.get_base_dir().mkdir(parents=True)
+
+    add, shown = SceneApi.add_point_cloud, {}
+
+    def noting(self, name, points, *args, **kwargs):
+        shown[name] = points, kwargs
+        return add(self, name, points, *args, **kwargs)
+
+    monkeypatch.setattr(SceneApi, "add_point_cloud", noting)
+    trainer = trainer_of(scene, tmp_path, "photo_gs", change=with_viewer)
+    points, settings = shown[ContradictedShell.LAYER]
+    data = trainer.pipeline.datamanager
+    poses = [dataset.cameras.camera_to_worlds for dataset in (data.train_dataset, data.eval_dataset)]
+    trainer.shutdown()
+    distance, _ = KDTree(points / VISER_NERFSTUDIO_SCALE_RATIO).query(torch.cat(poses)[..., 3].numpy())
+    assert len(points) == len(views)
+    assert distance.max() < 1e-3
+    assert not settings["visible"]

@@ -45,7 +45,7 @@ def config(demo: Path) -> Path:
 def test_the_demo_ends_with_a_table_and_pictures(demo):
     table = (demo / "results.md").read_text()
     assert all(word in table for word in ("photo-gs", "shellgs", "PSNR", "Normal (°)", "CD (m)"))
-    for picture in (demo / "strip.png", demo / "scene" / "cues" / "shell" / "panel.png"):
+    for picture in (demo / "strip.png", demo / "contradicted.png", demo / "scene" / "cues" / "shell" / "panel.png"):
         with Image.open(picture) as image:
             assert np.asarray(image).std() > 10
 

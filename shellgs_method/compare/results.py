@@ -21,6 +21,11 @@ from shellgs_method.folders import held
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finishes runs; returns those that failed, with the reason."""
+PANELS = (
+    ("shell", "supervision", "what supervises a view."),
+    ("checked", "contradicted", "where photographs contradict the shell (red) and where they confirm it (green)."),
+)
+"""Of a scene's maps: their kind, the file that the panel beside them is copied to, and its caption."""
 WRITING = "Writing tables, pictures and report ..."
 
 
@@ -123,10 +128,11 @@ def _shown(runs: Sequence[Run]) -> list[Run]:
 def _figures(scene: Path, runs: Sequence[Run], output: Path, suffix: str) -> dict[str, Path]:
     """Draw what can be drawn of one scene's methods; captions and files."""
     figures: dict[str, Path] = {}
-    panel = output / f"supervision{suffix}.png"
-    if (scene / "cues" / "shell" / "panel.png").exists():
-        shutil.copyfile(scene / "cues" / "shell" / "panel.png", panel)
-        figures[f"{scene.name}: what supervises a view."] = panel
+    for kind, name, caption in PANELS:
+        panel = output / f"{name}{suffix}.png"
+        if (scene / "cues" / kind / "panel.png").exists():
+            shutil.copyfile(scene / "cues" / kind / "panel.png", panel)
+            figures[f"{scene.name}: {caption}"] = panel
     shown = _shown(runs)
     if views := common_views(shown):
         path = output / f"strip{suffix}.png"

@@ -17,10 +17,11 @@ from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.refinement import refine
 from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.shell.validation import Validation, validate
-from shellgs_method.shell.verdicts import MANY, Verdicts, shell_verdicts
+from shellgs_method.shell.verdicts import CONTRADICTED_PLACES, MANY, Verdicts, shell_verdicts
 
 __all__ = [
     "ALIGNMENT",
+    "CONTRADICTED_PLACES",
     "MANY",
     "MASKS",
     "Alignment",

@@ -17,6 +17,8 @@ from dataparsers.files import atomic_write
 from dataparsers.photograph import View
 from shellgs_method.evaluation import cell_means, voxel_cells
 
+CONTRADICTED_PLACES = "cues/checked/contradicted.ply"
+"""Where in a scene :meth:`Verdicts.write` puts the places for viewers."""
 MANY = 6
 """Photographs, and at least half of those that see it, that contradict a place where the building differs from its
 shell. What stands farther before it hides another place in each."""

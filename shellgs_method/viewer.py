@@ -1,0 +1,49 @@
+"""What nerfstudio's viewer shows beside renderings."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float64
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from nerfstudio.viewer.viewer_elements import ViewerControl
+
+from shellgs_method.shell import CONTRADICTED_PLACES
+from shellgs_method.shell.similarity import transformed
+
+POINT = 0.004
+"""Size of a point as a share of the cloud's longest side."""
+
+logger = logging.getLogger(__name__)
+
+
+class ContradictedShell(ViewerControl):
+    """Places of the shell, the redder the more photographs contradict them: a layer of the scene tree, hidden at first.
+
+    Args:
+        scene: the scene's folder, whose shell was cast.
+        from_scene: the similarity from the scene to the viewer's world.
+    """
+
+    LAYER = "/shell_contradicted"
+
+    def __init__(self, scene: Path, from_scene: Float64[np.ndarray, "4 4"]) -> None:
+        self._file, self._from_scene = scene / CONTRADICTED_PLACES, from_scene
+
+    def _setup(self, viewer: Viewer) -> None:
+        super()._setup(viewer)
+        if not self._file.is_file():
+            return
+        try:
+            cloud = trimesh.load(self._file, file_type="ply", process=False)
+            assert isinstance(cloud, trimesh.PointCloud)
+            points = transformed(np.asarray(cloud.vertices), self._from_scene) * VISER_NERFSTUDIO_SCALE_RATIO
+            colours = np.asarray(cloud.colors)[:, :3]
+        except Exception as error:
+            logger.warning("%s is not shown: it cannot be read (%s).", self._file, error)
+            return
+        size = POINT * float(np.ptp(points, axis=0).max())
+        viewer.viser_server.scene.add_point_cloud(self.LAYER, points, colours, point_size=size, visible=False)
