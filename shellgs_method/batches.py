@@ -58,7 +58,7 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
     if "shell_depth" not in batch:
         return {"seen": seen, "off_shell": seen}
     shell, on_shell = (batch[f"shell_{name}"].to(device) for name in ("depth", "mask"))
-    before = seen & batch["contradicted"].to(device) if "contradicted" in batch else torch.zeros_like(seen)
+    before = seen & contradicted(batch, device)
     if "truth_depth" in batch:
         truth = batch["truth_depth"].to(device)
         gap = 0.05 / metres_per_unit if metres_per_unit else shell / 200
@@ -80,12 +80,19 @@ def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: boo
     Nor is the shell where photographs contradict it, and beside, unless it is asked for ``everywhere``.
     """
     depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
-    if kind == "shell" and "contradicted" in batch and not everywhere:
-        before = batch["contradicted"].to(device, torch.float32).permute(2, 0, 1)
+    if kind == "shell" and not everywhere:
+        before = contradicted(batch, device).float().permute(2, 0, 1)
         mask = mask & ~max_pool2d(before, 2 * MARGIN + 1, 1, MARGIN).bool().permute(1, 2, 0)
     if "mask" in batch:
         mask = mask & batch["mask"].to(device)
     return Reference(depth, normal.float(), mask)
+
+
+def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
+    """Where photographs show something before the shell; nowhere if they were not compared."""
+    if "nearer_depth" not in batch:
+        return torch.zeros(batch["shell_mask"].shape, dtype=torch.bool, device=device)
+    return batch["nearer_depth"].to(device) > 0
 
 
 def pinhole_camera(camera: Cameras) -> Camera:

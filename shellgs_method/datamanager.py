@@ -17,14 +17,16 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
-from shellgs_method.batches import REFERENCES, pinhole_camera, reference_maps
+from shellgs_method.batches import REFERENCES, kept_pixels, pinhole_camera, reference_maps
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
+from shellgs_method.evaluation import Reference
 from shellgs_method.seeding import SeededView, Seeds, shell_seeds
 
 logger = logging.getLogger(__name__)
@@ -42,10 +44,10 @@ class FacadeDataset(InputDataset):
     """Photographs at the size of their cameras, with ``K``, ``{cue}_depth``, ``{cue}_normal`` and ``{cue}_mask``.
 
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
-    kind lacks that kind's keys. ``contradicted`` is where photographs show something before the shell. With ``bands``,
-    all masks are those of pixels whose wall lies in them. ``seen_by`` tells of the training views: then ``seen`` is
-    true where these have seen what a pixel shows. ``kinds`` are the maps that are read, all that the scene has if not
-    set, and with ``any_size`` they are resampled where they do not fit.
+    kind lacks that kind's keys. ``nearer_depth`` is that of what photographs show before the shell, 0 where they show
+    nothing there. With ``bands``, all masks are those of pixels whose wall lies in them. ``seen_by`` tells of the
+    training views: then ``seen`` is true where these have seen what a pixel shows. ``kinds`` are the maps that are
+    read, all that the scene has if not set, and with ``any_size`` they are resampled where they do not fit.
     """
 
     bands: Bands | None = None
@@ -101,7 +103,8 @@ class FacadeDataset(InputDataset):
         maps = {}
         checked = self._dataparser_outputs.metadata["cues"].get("checked")
         if "shell" in cues and checked and (found := self._read(checked, view)):
-            maps["contradicted"] = torch.from_numpy(found.mask)[..., None]
+            before = torch.from_numpy(found.mask & inside)[..., None]
+            maps["nearer_depth"] = self._rescaled_depth(found).where(before, 0.0)
         for kind, cue in cues.items():
             maps[f"{kind}_depth"] = self._rescaled_depth(cue)
             maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
@@ -244,7 +247,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         Args:
             spacing: in pixels of the closest view.
             most: number of seeds beyond which they are spread more widely.
-            everywhere: also behind what photographs show before the shell.
+            everywhere: on the shell also where photographs show something before it; else there, where they show it.
         """
         maps, views = self.train_dataset.cues["shell"], self.train_dataset.views
         batches = [batch for batch in self.cached_train if maps.record(views[batch["image_idx"]].name)]
@@ -254,7 +257,17 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     def _seeded_view(self, batch: dict, everywhere: bool) -> SeededView:
         index, cpu, batch = batch["image_idx"], torch.device("cpu"), self._with_maps(batch)
         image = batch["image"][..., :3].to(cpu) / (255 if batch["image"].dtype == torch.uint8 else 1)
-        return SeededView(self.train_dataset.camera(index), image, reference_maps(batch, "shell", cpu, everywhere))
+        camera, shell = self.train_dataset.camera(index), reference_maps(batch, "shell", cpu, everywhere)
+        if not everywhere and "nearer_depth" in batch:
+            nearer = batch["nearer_depth"].to(cpu)
+            towards_camera = -normalize(camera.rays().float(), dim=-1)
+            before = (nearer > 0) & kept_pixels(batch, image)
+            shell = Reference(
+                torch.where(before, nearer, shell.depth),
+                torch.where(before, towards_camera, shell.normal),
+                shell.mask | before,
+            )
+        return SeededView(camera, image, shell)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """The next training view, with its maps."""

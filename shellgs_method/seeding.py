@@ -28,7 +28,7 @@ class SeededView(NamedTuple):
     image: Float[Tensor, "H W 3"]
     """Colours in [0, 1]."""
     shell: Reference
-    """In units and axes of the camera's world; its mask is where seeds may be."""
+    """In units and axes of the camera's world, or what photographs show before it; its mask is where seeds may be."""
 
 
 class Seeds(NamedTuple):

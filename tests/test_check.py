@@ -172,9 +172,9 @@ def test_the_maps_of_training_views_know_nothing_of_held_out_photographs(scene: 
 
 def test_a_contradicted_shell_is_no_reference_and_supervises_only_where_asked():
     mask = torch.tensor([True] * 7 + [False]).view(1, 8, 1)
-    contradicted = torch.tensor([False, True] + [False] * 6).view(1, 8, 1)
+    nearer = torch.tensor([0.0, 1.5] + [0.0] * 6).view(1, 8, 1)
     batch = {"shell_depth": torch.full((1, 8, 1), 2.0), "shell_normal": torch.zeros(1, 8, 3), "shell_mask": mask}
-    batch |= {"contradicted": contradicted, "seen": torch.ones(1, 8, 1, dtype=torch.bool)}
+    batch |= {"nearer_depth": nearer, "seen": torch.ones(1, 8, 1, dtype=torch.bool)}
     cpu = torch.device("cpu")
     assert reference_maps(batch, "shell", cpu).mask.view(-1).tolist() == [False] * 4 + [True] * 3 + [False]
     assert (reference_maps(batch, "shell", cpu, everywhere=True).mask == mask).all()
@@ -221,7 +221,7 @@ def test_the_viewer_has_the_contradicted_places_where_the_cameras_are(pristine_s
     shutil.copytree(pristine_scene, scene)
     views = read_views(FacadeDataParserConfig(data=scene))
     (scene / CONTRADICTED_PLACES).parent.mkdir(parents=True)
-    places, red = positions(view.camera for view in views), np.tile(np.uint8([255, 0, 0]), (len(views), 1))
+    places, red = positions(view.camera for view in views), np.full((len(views), 3), [255, 0, 0], np.uint8)
     trimesh.PointCloud(places, red).export(scene / CONTRADICTED_PLACES)
 
     def with_viewer(config):

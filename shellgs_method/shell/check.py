@@ -32,7 +32,7 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared."""
 WITNESSES = 6
 """Neighbours on either side of a view that must agree on what stands where."""
-VERSION = 1
+VERSION = 2
 """Of the maps: those of another one are made again."""
 
 
@@ -120,12 +120,11 @@ class _Known:
         for index, (name, view) in enumerate(track(shell_views.items(), "looking before the shell", len(views))):
             file = kept / f"{index}.npy"
             if not file.is_file():
-                score, rung = sweep(view, [other for other in shell_views.values() if other is not view])
+                found = sweep(view, [other for other in shell_views.values() if other is not view])
                 file.parent.mkdir(exist_ok=True)
                 with atomic_write(file) as stream:
-                    np.save(stream, np.stack([score.numpy(), rung.half().numpy()]), allow_pickle=False)
-            score, rung = torch.from_numpy(np.load(file, allow_pickle=False))
-            sweeps[name] = Sweep(score, rung.byte())
+                    np.save(stream, torch.stack(found).numpy(), allow_pickle=False)
+            sweeps[name] = Sweep(*torch.from_numpy(np.load(file, allow_pickle=False)))
         return cls(shell_views, sweeps)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
@@ -141,7 +140,7 @@ class _Known:
         size, hit = cue.depth.shape, cue.depth > 0
         before = _resized(score, size).numpy() > CONTRADICTED
         confirmed = ~before & (_resized(found.score.float(), size).numpy() < CONFIRMED)
-        nearer = cue.depth / (1 + _nearest(found.offset, size).numpy())
+        nearer = cue.depth / (1 + _nearest(found.offset.float(), size).numpy())
         depth = np.where(before, nearer, np.where(confirmed, cue.depth, 0)) * hit
         return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), before & hit)
 

@@ -13,14 +13,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Float16, UInt8
+from jaxtyping import Bool, Float, Float16, Int64, UInt8
 from kornia.filters import guided_blur
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from dataparsers.camera import Camera
 
-OFFSETS = tuple(0.0125 * 1.4**k for k in range(15))
+_NEAREST, _STEP = 0.0125, 1.4
+OFFSETS = tuple(_NEAREST * _STEP**k for k in range(15))
 """Depths that are tried, as the share by which their inverse exceeds that of the shell: 10 cm before a wall that is 8 m
 away, and from there to a third of its depth."""
 MOVES = 5.5
@@ -60,13 +61,8 @@ class Sweep(NamedTuple):
     score: Float16[Tensor, "h w"]
     """How much better photographs agree there than on the shell, as a share of the worst disagreement; -1 where there
     is no shell."""
-    rung: UInt8[Tensor, "h w"]
-    """Where they do: which of :data:`OFFSETS`."""
-
-    @property
-    def offset(self) -> Float[Tensor, "h w"]:
-        """Share by which the inverse depth there exceeds the shell's."""
-        return torch.tensor(OFFSETS)[self.rung.long()]
+    offset: Float16[Tensor, "h w"]
+    """Where they do: the share by which the inverse depth there exceeds the shell's, between those that are tried."""
 
 
 def neighbours(view: Camera, others: Sequence[Camera], depth: float, offset: float) -> list[tuple[int, int]]:
@@ -120,8 +116,10 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
             sums[rung, side] += beside.visible * torch.stack([beside.visible, beside.on_shell, nearer])
     weight, on_shell, nearer = sums.unbind(dim=2)
     on_shell, nearer = ((each / weight).nan_to_num(1.0).amin(dim=1) for each in (on_shell, nearer))
-    score, best = _smooth(pixels, on_shell - nearer).max(dim=0)
-    return Sweep(score.where(view.depth > 0, -1.0).half(), best.byte())
+    scores = _smooth(pixels, on_shell - nearer)
+    score, best = scores.max(dim=0)
+    offset = _NEAREST * _STEP ** (best + _vertex(scores, best))
+    return Sweep(score.where(view.depth > 0, -1.0).half(), offset.half())
 
 
 def agreed_score(
@@ -142,13 +140,15 @@ def agreed_score(
     shell, nearer, trust, support = [], [], [], []
     for other, sweep_there in zip(others, found_there, strict=True):
         beside = _Beside(pixels, other)
-        before = beside.look(pixels.surface / (1 + found.offset))
+        before = beside.look(pixels.surface / (1 + found.offset.float()))
         hidden = (beside.visible == 0) | ~before.inside
         probability = torch.sigmoid((sweep_there.score.float() - 0.4 * CONTRADICTED) / 0.02)
         of_shell = _sampled(probability, beside.shell.grid)
         of_nearer = _sampled(probability, before.grid)
         offset = _sampled(other.depth, before.grid, "nearest") / before.z - 1
-        alike = (_sampled(sweep_there.offset, before.grid, "nearest") - offset).abs() < 0.3 * offset.abs() + 0.004
+        alike = (
+            _sampled(sweep_there.offset.float(), before.grid, "nearest") - offset
+        ).abs() < 0.3 * offset.abs() + 0.004
         shell.append(beside.on_shell.masked_fill(hidden, torch.nan))
         nearer.append(beside.disagreement(before).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
@@ -227,6 +227,14 @@ def _features(view: ShellView) -> Float[Tensor, "5 h w"]:
     colours = view.image.permute(2, 0, 1).float() / 255
     down, across = torch.gradient(colours.mean(dim=0))
     return torch.cat([colours, across[None], down[None]])
+
+
+def _vertex(scores: Float[Tensor, "K h w"], best: Int64[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Where the parabola through the best score and those beside it has its top, from -1/2 to 1/2 steps from it."""
+    inside = best.clamp(1, len(scores) - 2)
+    below, at, above = (scores.gather(0, (inside + k)[None])[0] for k in (-1, 0, 1))
+    top = 0.5 * (below - above) / (below - 2 * at + above).clamp_max(-1e-6)
+    return top.clamp(-0.5, 0.5).where(inside == best, 0.0)
 
 
 def _better_half(costs: Float[Tensor, "V h w"], weights: Float[Tensor, "V h w"]) -> Float[Tensor, "h w"]:
