@@ -36,11 +36,21 @@ def picture_errors(
 def reference_errors(
     rendering: Rendering, camera: Camera, batch: dict, metres_per_unit: float | None
 ) -> dict[str, float]:
-    """Figures of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``."""
-    figures = {}
-    for prefix, reference in references(batch, rendering.depth.device).items():
+    """Figures of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``.
+
+    Where metres are known there is ``truth_f_score_5cm_…`` too, for two of the :func:`regions`: on the shell and before
+    it.
+    """
+    figures, found = {}, references(batch, rendering.depth.device)
+    for prefix, reference in found.items():
         errors = geometry_errors(rendering, camera, reference, metres_per_unit)
         figures |= {prefix + name: value for name, value in errors.items()}
+    parts = regions(batch, metres_per_unit, rendering.depth.device)
+    if truth := found.get(REFERENCES["truth"]):
+        for name in parts.keys() & {"on_shell", "before_shell"}:
+            reference = truth._replace(mask=truth.mask & parts[name])
+            errors = geometry_errors(rendering, camera, reference, metres_per_unit)
+            figures |= {f"truth_{key}_{name}": errors[key] for key in errors.keys() & {"f_score_5cm"}}
     return figures
 
 

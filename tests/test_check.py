@@ -19,7 +19,8 @@ from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from dataparsers.photograph import View
-from shellgs_method.batches import reference_maps, regions
+from shellgs_method.batches import reference_errors, reference_maps, regions
+from shellgs_method.evaluation import Rendering
 from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 from shellgs_method.shell.contradiction import (
     CONFIRMED,
@@ -244,3 +245,19 @@ def test_the_viewer_has_the_contradicted_places_where_the_cameras_are(pristine_s
     assert len(points) == len(views)
     assert distance.max() < 1e-3
     assert not settings["visible"]
+
+
+def test_surfaces_are_measured_on_the_shell_and_before_it():
+    """A wall of which the right half has something 1 m before it, that the rendering leaves out."""
+    camera, size = camera_at(0.0), (HEIGHT, WIDTH, 1)
+    wall, everywhere = torch.full(size, WALL), torch.ones(size, dtype=torch.bool)
+    truth = torch.where(torch.arange(WIDTH)[None, :, None] < WIDTH // 2, wall, wall - 1)
+    normal = torch.tensor([0.0, 0, -1]).expand(HEIGHT, WIDTH, 3)
+    batch = {"seen": everywhere}
+    for kind, depth in (("shell", wall), ("truth", truth)):
+        batch |= {f"{kind}_depth": depth, f"{kind}_normal": normal, f"{kind}_mask": everywhere}
+    figures = reference_errors(Rendering(wall, wall, torch.ones(size), normal), camera, batch, 1.0)
+    assert figures["truth_f_score_5cm_on_shell"] == pytest.approx(1)
+    assert figures["truth_f_score_5cm_before_shell"] == 0
+    assert 0.4 < figures["truth_f_score_5cm"] < 0.6
+    assert not [name for name in figures if name.startswith("f_score") and name.endswith("shell")]

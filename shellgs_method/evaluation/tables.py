@@ -59,8 +59,10 @@ REGION_COLUMNS = (
     Column("psnr_off_shell", "PSNR off the shell", max, ".2f"),
     Column("ssim_off_shell", "SSIM off the shell", max),
     Column("psnr_before_shell", "PSNR before it", max, ".2f"),
+    Column("truth_f_score_5cm_on_shell", "F5 to the truth, on the shell", max),
+    Column("truth_f_score_5cm_before_shell", "F5 to the truth, before it", max),
 )
-"""Pictures by their parts; pixels that no training view has seen are left out."""
+"""Images and surfaces by their parts; pixels that no training view has seen are left out."""
 
 SURFACE_COLUMNS = (
     Column("accuracy_m", "Acc. (m)", min),
