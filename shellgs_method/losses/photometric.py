@@ -21,7 +21,9 @@ class PhotometricLoss:
 
     @cached_property
     def _ssim_target(self) -> SsimTarget:
-        return SsimTarget.of(self.target)
+        made = SsimTarget.of(self.target)
+        self.target = made.photograph  # one copy in memory
+        return made
 
     def __call__(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """The loss of one rendering."""

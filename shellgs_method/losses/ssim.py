@@ -38,6 +38,11 @@ class SsimTarget:
     mean: Float[Tensor, "H X"]
     variance: Float[Tensor, "H X"]
 
+    @property
+    def photograph(self) -> Float[Tensor, "H W 3"]:
+        """The photograph, without its reflection; a view of ``padded``."""
+        return self.padded.unflatten(1, (-1, 3))[RADIUS:-RADIUS, RADIUS:-RADIUS]
+
     @classmethod
     def of(cls, photograph: Float[Tensor, "H W 3"]) -> SsimTarget:
         """Compute the moments."""
