@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from dataparsers.camera import Camera
-from shellgs_method.evaluation import Reference, Rendering, geometry_errors, image_errors
+from shellgs_method.evaluation import Rendering, geometry_errors, image_errors
+from shellgs_method.reference import Reference
 
 REFERENCES = {"shell": "", "truth": "truth_"}
 """Kinds of maps that geometry is measured against, and what the names of their figures begin with."""

@@ -26,7 +26,7 @@ from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
 from shellgs_method.batches import REFERENCES, kept_pixels, pinhole_camera, reference_maps
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
-from shellgs_method.evaluation import Reference
+from shellgs_method.reference import Reference
 from shellgs_method.seeding import SeededView, Seeds, shell_seeds
 
 logger = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.evaluation import normals_from_depth
+from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer import quats_to_rotations
 from shellgs_method.rasterizer.projection import to_camera, turn

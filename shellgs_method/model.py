@@ -35,12 +35,7 @@ from shellgs_method.batches import (
     references,
 )
 from shellgs_method.densification import MCMCConfig, MCMCStrategy
-from shellgs_method.evaluation import (
-    Rendering,
-    colours_to_normals,
-    geometry_pictures,
-    normals_to_colours,
-)
+from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_pictures, normals_to_colours
 from shellgs_method.geometry import (
     DISC_LOG_THICKNESS,
     DepthKind,

@@ -13,7 +13,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.evaluation import Reference, cell_means, voxel_cells
+from shellgs_method.reference import Reference
+from shellgs_method.voxels import cell_means, voxel_cells
 
 GRAZING = 0.2
 """Least cosine of the shell's normal and the ray at which a pixel is a sample: below it, colours and depth smear."""

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from shellgs_method.evaluation import Reference
 from shellgs_method.geometry import Geometry
 from shellgs_method.losses import (
     PAPER_ITERATIONS,
@@ -25,6 +24,7 @@ from shellgs_method.losses import (
     vid2sim_ncc_loss,
 )
 from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.reference import Reference
 
 TOLERANCES = (0.05, 0.15)
 """Least and largest tolerance in metres: with less, pictures of Herz-Jesu lost more than its surface gained."""

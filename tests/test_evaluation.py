@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
 from dataparsers.camera import Camera
+from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.evaluation import (
-    Reference,
     Rendering,
     angular_error,
     back_project,
@@ -32,12 +32,12 @@ from shellgs_method.evaluation import (
     image_errors,
     mean_over_views,
     normal_errors,
-    normals_from_depth,
-    voxel_means,
 )
 from shellgs_method.evaluation.colours import GREY
 from shellgs_method.evaluation.figures import Panel, save_strip
 from shellgs_method.evaluation.tables import Column, markdown_table, rich_table
+from shellgs_method.reference import Reference
+from shellgs_method.voxels import voxel_means
 
 WIDTH, HEIGHT = 48, 40
 CAMERA = Camera(torch.eye(4), torch.tensor([[60.0, 0, 24.5], [0, 62, 19], [0, 0, 1]]), WIDTH, HEIGHT)

@@ -21,10 +21,10 @@ from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.runs import PAPER
-from shellgs_method.evaluation import Reference
 from shellgs_method.geometry import DISC_LOG_THICKNESS
 from shellgs_method.losses import ExponentialDecay
 from shellgs_method.rasterizer import quats_to_rotations
+from shellgs_method.reference import Reference
 from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses
 
 pytestmark = pytest.mark.usefixtures("eager")

@@ -12,9 +12,9 @@ from runs import data_of, model_of, trainer_of
 from scipy.spatial import KDTree
 
 from dataparsers.camera import Camera
-from shellgs_method.evaluation import Reference
 from shellgs_method.geometry import DISC_LOG_THICKNESS
 from shellgs_method.rasterizer import quats_to_rotations
+from shellgs_method.reference import Reference
 from shellgs_method.seeding import SeededView, shell_seeds
 
 FOCAL, WIDTH, HEIGHT = 60.0, 80, 60

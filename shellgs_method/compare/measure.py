@@ -25,14 +25,8 @@ from dataparsers.layout import SceneLayout
 from shellgs_method.batches import picture_errors, pinhole_camera, reference_errors, reference_maps
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
-from shellgs_method.evaluation import (
-    Rendering,
-    angular_error,
-    colours_to_normals,
-    geometry_errors,
-    mean_over_views,
-    normals_from_depth,
-)
+from shellgs_method.depth_normals import normals_from_depth
+from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.model import FacadeModel
 from shellgs_method.trained import load_run

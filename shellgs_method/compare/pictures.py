@@ -18,10 +18,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from dataparsers.camera import upwards
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.runs import Run
-from shellgs_method.evaluation import back_project, voxel_means
+from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
+from shellgs_method.voxels import voxel_means
 
 CURVES = tuple(
     c for c in (*MAIN_COLUMNS, *SURFACE_COLUMNS) if c.key in ("psnr", "normal_deg", "depth_mae_m", "chamfer_m")

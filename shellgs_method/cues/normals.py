@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
+from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.evaluation.geometry import angular_error
-from shellgs_method.evaluation.normals import normals_from_depth
 
 Convention = Literal["opencv", "opengl", "dsine", "stablenormal", "metric3d", "omnidata"]
 """Axes of a normal map: opencv is x right, y down, z forward, facing the camera; opengl is x right, y up, z back."""

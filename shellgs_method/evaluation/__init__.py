@@ -6,26 +6,16 @@
 from shellgs_method.evaluation.colours import colours_to_normals, normal_colours, normals_to_colours
 from shellgs_method.evaluation.geometry import NormalErrors, angular_error, depth_mae, normal_errors
 from shellgs_method.evaluation.image import image_errors, lpips_network
-from shellgs_method.evaluation.normals import normals_from_depth
 from shellgs_method.evaluation.pictures import geometry_pictures
-from shellgs_method.evaluation.surface import (
-    SurfaceComparison,
-    back_project,
-    cell_means,
-    compare_surfaces,
-    voxel_cells,
-    voxel_means,
-)
-from shellgs_method.evaluation.view import Reference, Rendering, evaluate_view, geometry_errors, mean_over_views
+from shellgs_method.evaluation.surface import SurfaceComparison, back_project, compare_surfaces
+from shellgs_method.evaluation.view import Rendering, evaluate_view, geometry_errors, mean_over_views
 
 __all__ = [
     "NormalErrors",
-    "Reference",
     "Rendering",
     "SurfaceComparison",
     "angular_error",
     "back_project",
-    "cell_means",
     "colours_to_normals",
     "compare_surfaces",
     "depth_mae",
@@ -37,8 +27,5 @@ __all__ = [
     "mean_over_views",
     "normal_colours",
     "normal_errors",
-    "normals_from_depth",
     "normals_to_colours",
-    "voxel_cells",
-    "voxel_means",
 ]

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from shellgs_method.evaluation.colours import depth_colours, error_colours, normal_colours
 from shellgs_method.evaluation.geometry import angular_error
-from shellgs_method.evaluation.view import OPAQUE, Reference, Rendering
+from shellgs_method.evaluation.view import OPAQUE, Rendering
+from shellgs_method.reference import Reference
 
 
 def geometry_pictures(rendering: Rendering, reference: Reference | None = None) -> dict[str, Float[Tensor, "H _ 3"]]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from shellgs_method.voxels import voxel_means
 
 
 @dataclass(frozen=True)
@@ -70,27 +70,6 @@ def compare_surfaces(
 def back_project(depth: Float[Tensor, "H W 1"], camera: Camera, mask: Bool[Tensor, "H W 1"]) -> Float[ndarray, "N 3"]:
     """Points of the masked pixels in the camera frame, in float64."""
     return (depth.double() * camera.rays().to(depth.device).double())[mask[..., 0]].cpu().numpy()
-
-
-def voxel_means(points: Float[ndarray, "N 3"], voxel: float) -> Float[ndarray, "M 3"]:
-    """Mean of the points in each occupied cell of a grid through the origin."""
-    return cell_means(points, voxel_cells(points, voxel))
-
-
-def cell_means(values: Float[ndarray, "N C"], cells: Int[ndarray, " N"]) -> Float[ndarray, "M C"]:
-    """Mean of the values in each cell, by the cells' numbers from :func:`voxel_cells`."""
-    count = np.bincount(cells)
-    return np.stack([np.bincount(cells, weights=column) / count for column in values.T], axis=1)
-
-
-def voxel_cells(points: Float[ndarray, "N 3"], voxel: float) -> Int[ndarray, " N"]:
-    """Number of the occupied cell of a grid through the origin that each point lies in."""
-    cell = np.zeros(len(points), dtype=np.int64)
-    for column in np.floor(points / voxel).astype(np.int64).T if len(points) else ():
-        # Renumbered after each axis, so that no product of three extents can overflow.
-        column = column - column.min()
-        cell = np.unique(cell * (column.max() + 1) + column, return_inverse=True)[1]
-    return cell
 
 
 def _nearest(points: Float[ndarray, "N 3"], others: Float[ndarray, "M 3"]) -> Float[ndarray, " N"]:

@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 from dataparsers.camera import Camera
+from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.evaluation.geometry import depth_mae, normal_errors, share
 from shellgs_method.evaluation.image import image_errors
-from shellgs_method.evaluation.normals import normals_from_depth
 from shellgs_method.evaluation.surface import back_project, compare_surfaces
+from shellgs_method.reference import Reference
 
 VOXEL_METRES = 0.02
 """Voxel of both point clouds; 0.4 of the smallest threshold."""
@@ -37,17 +38,6 @@ class Rendering(NamedTuple):
     """Accumulated opacity."""
     normal: Float[Tensor, "H W 3"] | None = None
     """Composited normals in the camera frame, of any length; None for a method that has none."""
-
-
-class Reference(NamedTuple):
-    """Maps of the true geometry for a view: the shell's, or another's."""
-
-    depth: Float[Tensor, "H W 1"]
-    """Forward z-depth in scene units, 0 where there is none."""
-    normal: Float[Tensor, "H W 3"]
-    """Normals in the camera frame."""
-    mask: Bool[Tensor, "H W 1"]
-    """True where the geometry counts."""
 
 
 def evaluate_view(

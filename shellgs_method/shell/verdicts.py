@@ -15,7 +15,7 @@ from dataparsers.camera import project
 from dataparsers.cue_maps import CueMaps
 from dataparsers.files import atomic_write
 from dataparsers.photograph import View
-from shellgs_method.evaluation import cell_means, voxel_cells
+from shellgs_method.voxels import cell_means, voxel_cells
 
 CONTRADICTED_PLACES = "cues/checked/contradicted.ply"
 """Where in a scene :meth:`Verdicts.write` puts the places for viewers."""
