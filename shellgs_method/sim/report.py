@@ -142,7 +142,7 @@ def lidar_errors(world: Path, collider: Surface, front: Front, truth: Surface) -
     found = {}
     for name, group in (("collider", 3), ("visual mesh", 2)):
         measured = lidar(world, places, rays, group).ravel()
-        error = np.abs(measured - true)[meets]
+        error = np.abs(measured[meets] - true[meets])
         median, p95 = np.quantile(np.where(np.isfinite(error), error, 1e3), [0.5, 0.95])
         found[name] = {
             "rays": int(meets.sum()),
