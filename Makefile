@@ -1,23 +1,35 @@
 PYTHON ?= python3
 BIN := .venv/bin
-.PHONY: demo test install
+.PHONY: demo test docs libraries
+.NOTPARALLEL:
 
-demo: install  ## make the synthetic facade, train photo-gs and shellgs on it, compare
+demo: .venv/checked  ## install; make the synthetic facade, train photo-gs, shellgs and shellgs-metric on it, compare
 	$(BIN)/shellgs demo
 
 # OpenMP's threads spin while they wait; training adapts to what else runs (threads.py), but these tests are short.
 test: export OMP_WAIT_POLICY ?= passive
-test: install  ## format, lint, types, tests
+test: .venv/dev .venv/checked  ## install; format, lint, types, tests
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/pytest
 
-install: .venv/installed
+docs: .venv/docs  ## the pages, in build/docs; broken links are errors
+	$(BIN)/sphinx-build -W --keep-going -q docs build/docs
 
-.venv/installed: pyproject.toml
+libraries: .venv/shellgs  ## let apt-get install the system libraries that Open3D misses; asks nothing else
+	$(BIN)/shellgs doctor --install-libraries
+
+.venv/checked: .venv/shellgs  # not written where something is missing
+	$(BIN)/shellgs doctor
+	@touch $@
+
+.venv/shellgs: pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
-	$(BIN)/shellgs doctor --install-libraries
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+.venv/dev .venv/docs: .venv/%: .venv/shellgs
+	$(BIN)/python -m pip install --quiet --editable '.[$*]'
 	@touch $@

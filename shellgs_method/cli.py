@@ -570,7 +570,8 @@ def doctor(install_libraries: bool = False) -> None:
         mark = "[green]✓" if finding.works else "[red]✗" if finding.needed else "[yellow]–"
         table.add_row(mark, finding.subject, finding.detail)
     console.print(table)
-    sys.exit(any(finding.needed and not finding.works for finding in findings))
+    if missing := [f"{found.subject}: {found.detail}" for found in findings if found.needed and not found.works]:
+        sys.exit(f"shellgs: nothing runs here before this is mended: {'; '.join(missing)}")
 
 
 def main() -> None:

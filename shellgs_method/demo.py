@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 from rich.console import Console
 
 from dataparsers.errors import SceneError
-from shellgs_method.compare.launch import CommandError, follow, launch_locally
+from shellgs_method.compare.launch import BIN, CommandError, follow, launch_locally
 from shellgs_method.compare.results import compare
 from shellgs_method.compare.runs import grid
 from shellgs_method.synthetic import FacadeConfig, settings_of, write_scene
@@ -35,6 +36,8 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
             what = ", ".join(f"--{name} {made[name]}, not {asked[name]}" for name in other)
             raise SceneError(f"{scene} was made with {what}: name another folder for this demo, or remove {folder}")
     else:
+        size = f"{config.width} x {config.height}"
+        console.print(f"A synthetic facade, {config.views} photographs of {size} pixels: {scene}", highlight=False)
         write_scene(scene, config)
     console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
     try:
@@ -46,8 +49,13 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
     jobs = 1 if torch.cuda.is_available() else 2
     if compare(runs, partial(launch_locally, jobs=jobs, console=console), folder, console).failures:
         raise SystemExit("shellgs: a run of the demo failed; its last lines are above.")
+    viewer = "ns-viewer" if shutil.which("ns-viewer") else BIN / "ns-viewer"
     console.print(
-        f"Pictures: {folder / 'strip.png'}, {scene / 'cues/shell/panel.png'}. Tables: {folder / 'results.md'}. "
-        f"All of it, with sliders: {folder / 'report.html'}."
+        "Look first at\n"
+        f"  1. {folder / 'strip.png'}: a held-out view of each method, its normals and their error\n"
+        f"  2. {folder / 'report.html'}: all held-out views with sliders between the methods\n"
+        f"  3. {viewer} --load-config {runs[-1].config}: walk around {runs[-1].variant.name} in a browser\n"
+        f"The tables above are in {folder / 'results.md'}, what the shell teaches in {scene / 'cues/shell/panel.png'}.",
+        highlight=False,
+        soft_wrap=True,
     )
-    console.print(f"Look around with: ns-viewer --load-config {runs[-1].config}")

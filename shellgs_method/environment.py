@@ -29,7 +29,7 @@ def examine() -> Iterator[Finding]:
 
 
 def install_system_libraries() -> None:
-    """Install what Open3D's wheel takes for granted, if it fails to load and apt-get may be used."""
+    """Install what Open3D takes for granted, if asked to, and if it fails to load and apt-get may be used."""
     if not _open3d().works and hasattr(os, "geteuid") and os.geteuid() == 0 and shutil.which("apt-get"):
         environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
         for command in (["update", "-qq"], ["install", "-qq", "-y", *OPEN3D_LIBRARIES.split()]):
@@ -46,7 +46,7 @@ def _torchvision() -> Finding:
 
 
 def _open3d() -> Finding:
-    return _import("Open3D", "open3d", f"apt-get install {OPEN3D_LIBRARIES}")
+    return _import("Open3D", "open3d", f"as root, apt-get install {OPEN3D_LIBRARIES}")
 
 
 def _import(subject: str, module: str, remedy: str) -> Finding:

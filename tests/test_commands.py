@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from shellgs_method import environment
 from shellgs_method.cli import main
 
 BIN = Path(sys.executable).parent
@@ -32,9 +33,9 @@ def run(*words: object, cwd: Path, status: int = 0) -> str:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a small `shellgs demo` leaves behind."""
+    """What a small `shellgs demo` leaves behind; what it said is in log.txt beside it."""
     folder = tmp_path_factory.mktemp("demo")
-    run("shellgs", *DEMO, cwd=folder)
+    (folder / "log.txt").write_text(run("shellgs", *DEMO, cwd=folder))
     return folder / "demo"
 
 
@@ -50,11 +51,20 @@ def test_the_demo_ends_with_a_table_and_pictures(demo):
             assert np.asarray(image).std() > 10
 
 
+def test_a_log_of_the_demo_says_what_is_done_and_what_to_look_at_first(demo):
+    said = demo.with_name("log.txt").read_text()
+    assert "A synthetic facade, 10 photographs of 64 x 48 pixels: demo/scene" in said
+    assert "seed-0 finished, 3 of 3." in said
+    first = said[said.index("Look first at") :].splitlines()[1:4]
+    assert [(demo.parent / line.split(": ")[0].split()[-1]).exists() for line in first[:2]] == [True, True]
+    assert "ns-viewer --load-config" in first[2]
+
+
 def test_a_second_demo_keeps_what_the_first_finished(demo):
     finished = [next(config(demo).parent.glob("nerfstudio_models/*.ckpt")), *demo.glob("scene/cues/shell/images/*.npz")]
     before = [path.stat().st_mtime_ns for path in finished]
     output = run("shellgs", *DEMO, cwd=demo.parent)
-    assert "ns-train" not in output
+    assert "$ ns-train" not in output
     assert [path.stat().st_mtime_ns for path in finished] == before
 
 
@@ -154,3 +164,17 @@ def test_a_users_mistake_is_answered_with_one_sentence(tmp_path, words, sentence
 def test_the_doctor_finds_this_machine_fit(tmp_path):
     output = run("shellgs", "doctor", cwd=tmp_path)
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_apt_get_runs_when_asked_to_and_is_named_otherwise(shellgs, monkeypatch, asked):
+    commands = []
+    missing = environment.Finding("Open3D", False, "no libGL; remedy: as root, apt-get install libgl1")
+    monkeypatch.setattr(environment, "_open3d", lambda: missing)
+    monkeypatch.setattr(environment.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(environment.shutil, "which", lambda _: "/usr/bin/apt-get")
+    monkeypatch.setattr(environment.subprocess, "run", lambda words, **_: commands.append(words[:2]))
+    said = shellgs("doctor", *["--install-libraries"] * asked)
+    assert commands == [["apt-get", "update"], ["apt-get", "install"]] * asked
+    assert said.startswith("refused: shellgs: nothing runs here before this is mended: Open3D: no libGL")
+    assert "as root, apt-get install libgl1" in said

@@ -197,7 +197,7 @@ def test_wandb_gets_each_table_with_mean_and_deviation_and_each_figure(pristine_
 # runs are kept
 
 FAKE_TRAIN = """
-import os, pathlib, signal, sys
+import os, pathlib, signal, sys, time
 words = dict(zip(sys.argv[2::2], sys.argv[3::2]))
 folder = pathlib.Path(words["--output-dir"], words["--experiment-name"], sys.argv[1], words["--timestamp"])
 last = int(words["--max-num-iterations"]) - 1
@@ -213,6 +213,7 @@ killed = folder.parent.name == "photo-gs" and "--load-dir" not in words
 checkpoint = folder / "nerfstudio_models" / f"step-{2 if killed else last:09d}.ckpt"
 checkpoint.write_text(" ".join(sys.argv[1:]))
 print("10 (50.00%)", flush=True)
+time.sleep(float(os.environ.get("FAKE_SECONDS", 0)))
 if killed:
     os.kill(os.getppid() if "KILL_PARENT" in os.environ else os.getpid(), signal.SIGKILL)
 """
@@ -263,6 +264,21 @@ def test_the_console_says_that_results_are_written(pristine_scene, tmp_path, ter
     runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
     compare(runs, partial(launch_locally, jobs=1, console=console), tmp_path / "out", console)
     assert WRITING in said.getvalue()
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_log_says_where_a_run_is(pristine_scene, tmp_path, monkeypatch, terminal):
+    monkeypatch.setattr(launch, "EVERY", 0.05)
+    monkeypatch.setenv("FAKE_SECONDS", "0.5")
+    said = io.StringIO()
+    launch_locally(
+        fake_grid([pristine_scene], ["shellgs", "mono-gs"], tmp_path), 1, Console(file=said, force_terminal=terminal)
+    )
+    standing = "scene/shellgs/seed-0: 10 of 20 iterations" in said.getvalue()
+    assert standing == (not terminal)
+    assert "scene/shellgs/seed-0 finished, 1 of 2." in said.getvalue()
+    assert "scene/mono-gs/seed-0 failed, 2 of 2." in said.getvalue()
 
 
 @pytest.mark.usefixtures("fake_commands")

@@ -29,7 +29,7 @@ from rich.console import Console
 
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash, fingerprint
-from shellgs_method.compare.launch import BIN, CommandError, finish
+from shellgs_method.compare.launch import BIN, EVERY, CommandError, finish
 from shellgs_method.compare.runs import Run
 from shellgs_method.config_file import load_config
 from shellgs_method.folders import replace_folder
@@ -88,8 +88,12 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
                 pending[task.remote(run, key, scene_key, scene, _packed(run.folder, ray.put))] = run
                 if run.scene not in {later.scene for later in waiting}:
                     del scenes[run.scene]
-            (done, *_), _ = ray.wait(list(pending))
-            run = pending.pop(done)
+            ended, _ = ray.wait(list(pending), timeout=EVERY)
+            if not ended:
+                under_way = ", ".join(run.label for run in pending.values())
+                console.print(f"Under way: {under_way}; waiting: {len(waiting)}.", highlight=False)
+                continue
+            run = pending.pop(done := ended[0])
             try:
                 folder, why = ray.get(done)
                 _take_back(folder, run)

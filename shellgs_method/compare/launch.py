@@ -6,20 +6,24 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
+from rich.progress import Progress, Task
 
 from shellgs_method.compare.runs import Run
 from shellgs_method.fusion import nothing_compiled_yet
 
 BIN = Path(sys.executable).parent
 LAST_LINES = 30
+EVERY = 30.0
+"""Seconds between two words on progress where no terminal shows it."""
 _STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
@@ -33,14 +37,21 @@ def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run
     failures: dict[Run, str] = {}
     if runs and not torch.cuda.is_available() and nothing_compiled_yet():
         console.print("The first run compiles the kernels, which takes a minute or two; all others load them.")
-    with Progress(console=console, transient=True) as progress, ThreadPoolExecutor(max(jobs, 1)) as pool:
+    progress = Progress(console=console, transient=True, speed_estimate_period=4 * EVERY)
+    with (
+        progress,
+        told_in_a_log(console, lambda: map(_standing, progress.tasks)),
+        ThreadPoolExecutor(max(jobs, 1)) as pool,
+    ):
         futures = {pool.submit(_finish_visibly, run, console, progress): run for run in runs}
         try:
-            for future in as_completed(futures):
+            for done, future in enumerate(as_completed(futures), 1):
+                run, outcome = futures[future], "finished"
                 if isinstance(error := future.exception(), (CommandError, OSError)):
-                    failures[futures[future]] = str(error)
+                    failures[run], outcome = str(error), "failed"
                 else:
                     future.result()
+                console.print(f"{run.label} {outcome}, {done} of {len(runs)}.", highlight=False)
         except BaseException:  # Ctrl-C, which the commands get too: they end, and nothing new begins
             pool.shutdown(wait=True, cancel_futures=True)
             raise
@@ -98,11 +109,45 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
         raise CommandError(f"{command[0]} failed:\n{''.join(output[-LAST_LINES:])}")
 
 
+@contextmanager
+def told_in_a_log(console: Console, standing: Callable[[], Iterable[str]]) -> Iterator[None]:
+    """Every :data:`EVERY` seconds, print where things stand if the console is no terminal, which shows no bars."""
+    stop = threading.Event()
+
+    def tell() -> None:
+        while not stop.wait(EVERY):
+            for sentence in standing():
+                console.print(sentence, highlight=False, soft_wrap=True)
+
+    thread = threading.Thread(target=tell, daemon=True)
+    if not console.is_terminal:
+        thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        if thread.is_alive():
+            thread.join()
+
+
+def _standing(task: Task) -> str:
+    """Where a run is, in words."""
+    minutes, left = (task.elapsed or 0) / 60, task.time_remaining
+    if task.finished:
+        return f"{task.description}: trained, {minutes:.1f} min; measuring"
+    if not task.completed:
+        return f"{task.description}: starting, {minutes:.1f} min"
+    ahead = "" if left is None else f", about {left / 60:.1f} min left"
+    return f"{task.description}: {task.completed:.0f} of {task.total:.0f} iterations, {minutes:.1f} min{ahead}"
+
+
 def _finish_visibly(run: Run, console: Console, progress: Progress) -> None:
     task = progress.add_task(run.label, total=run.iterations)
 
     def announce(command: Sequence[str]) -> None:
         console.print(f"[bold]$ {escape(shlex.join(command))}", highlight=False, soft_wrap=True)
+        if command[0] != "ns-train":
+            progress.update(task, completed=run.iterations)
 
     try:
         finish(run, announce, lambda iteration: progress.update(task, completed=iteration))

@@ -61,7 +61,7 @@ def rasterize(
         gsplat's densification strategies need: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained,
         ``radii``, …. The pictures of a sequence of cameras are stacked.
 
-        Of discs there are also, differentiable, [*B, height, width, 1]: ``inverse_depth``, the sum of weight over z of
+        Of discs there are also, differentiable, ``[*B, H, W, 1]``: ``inverse_depth``, the sum of weight over z of
         the ray's intersection, so that alpha / inverse_depth is the expected depth (the mean is taken of 1/z, which is
         affine on the screen, as every backend can composite it exactly); ``median_depth``, the z of the splat at which
         the transmittance falls to 1/2 or less, 0 where it does not, with a gradient to that splat alone;

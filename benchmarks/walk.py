@@ -1,0 +1,59 @@
+"""The synthetic building as its owner would have it: a video by a phone, and a scan in national coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import av
+import numpy as np
+import tyro
+from rich.progress import track
+
+from dataparsers.errors import check_output, refusals_end_the_program
+from shellgs_method.open3d import import_open3d
+from shellgs_method.shell.similarity import transformed
+from shellgs_method.synthetic.appearance import photograph
+from shellgs_method.synthetic.building import shell
+from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
+from shellgs_method.synthetic.scene import Facade, FacadeConfig
+
+RATE = 5
+"""Frames a second: as many as `shellgs capture` takes at most."""
+
+
+def walk(
+    folder: Annotated[Path, tyro.conf.Positional], frames: int = 120, width: int = 960, height: int = 540, seed: int = 0
+) -> None:
+    """Write FOLDER/walk.mp4 and FOLDER/scan.ply, from which the tutorial in docs/tutorial.md starts.
+
+    Args:
+        folder: Where they go.
+        frames: Frames of the video, 5 a second.
+        width: Of the video, in pixels.
+        height: Of the video, in pixels.
+        seed: Of the building and the walk.
+    """
+    facade = Facade.build(FacadeConfig(width, height, frames, seed))
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("walk.mp4", "scan.ply"):
+        check_output(folder / name)
+    o3d, surface = import_open3d(), shell(facade.layout)
+    scan = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(transformed(surface.vertices, SHELL_FROM_BUILDING)),
+        o3d.utility.Vector3iVector(surface.triangles.astype(np.int32)),
+    )
+    o3d.io.write_triangle_mesh(str(folder / "scan.ply"), scan)
+    noise = np.random.default_rng(seed)
+    with av.open(str(folder / "walk.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=RATE, options={"crf": "18"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for camera in track(facade.cameras, "video", transient=True):
+            image = photograph(facade.daylight, camera, 2, noise)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+if __name__ == "__main__":
+    with refusals_end_the_program():
+        tyro.cli(walk)
