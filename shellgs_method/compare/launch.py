@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -20,6 +22,8 @@ from shellgs_method.fusion import nothing_compiled_yet
 
 BIN = Path(sys.executable).parent
 LAST_LINES = 30
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
 _STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
@@ -80,6 +84,7 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
+        preexec_fn=_end_with_parent if _LIBC else None,
     ) as process:
         assert process.stdout is not None
         try:
@@ -96,6 +101,12 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
                     file.writelines([f"$ {shlex.join(command)}\n", *output])
     if process.returncode:
         raise CommandError(f"{command[0]} failed:\n{''.join(output[-LAST_LINES:])}")
+
+
+def _end_with_parent() -> None:
+    """Let the kernel end this process with its parent: a killed comparison's would train on beside the next."""
+    assert _LIBC is not None
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _finish_visibly(run: Run, console: Console, progress: Progress) -> None:
