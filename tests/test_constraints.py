@@ -19,5 +19,5 @@ def test_every_dependency_has_a_version_that_is_allowed():
         Requirement(text) for text in re.findall(r'"([a-z][^"]*[=<>][^"]*)"', project.partition("dependencies")[2])
     ]
     assert len(needed) > 20
-    for each in needed:
+    for each in (each for each in needed if each.marker is None or each.marker.evaluate({"python_version": "3.11"})):
         assert each.specifier.contains(tested[canonicalize_name(each.name)]), each
