@@ -5,8 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
@@ -14,11 +17,13 @@ import psutil
 
 from dataparsers.errors import SceneError
 
+_UNFINISHED = re.compile(r"\.(.+)\.(\d{1,9})\.tmp(\.\w+)?")
+
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[IO[bytes]]:
     """A file opened for writing that takes the name ``path`` only once it is complete."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = unfinished(path)
     try:
         with temporary.open("wb") as file:
             yield file
@@ -30,12 +35,43 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         temporary.unlink(missing_ok=True)
 
 
+def unfinished(path: Path, suffix: str = "") -> Path:
+    """Where a file or folder is made before it takes its name; what killed processes left of it there is deleted.
+
+    Args:
+        path: the name that it takes.
+        suffix: for a library that tells formats by it.
+    """
+    for left in _left_in(path.parent):
+        if _name_of(left) == path.name:
+            _delete(left)
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp{suffix}")
+
+
 def remove_leftovers(folder: Path) -> None:
-    """Delete what processes that were killed in the middle of an :func:`atomic_write` left in a folder and below it."""
-    for path in folder.rglob(".*.tmp"):
-        process = path.name.split(".")[-2]
-        if process.isdigit() and not psutil.pid_exists(int(process)):
-            path.unlink(missing_ok=True)
+    """Delete what killed processes left :func:`unfinished` in a folder and below it."""
+    for path in folder.rglob(".*.tmp*"):
+        if _name_of(path):
+            _delete(path)
+
+
+@cache
+def _left_in(folder: Path) -> list[Path]:
+    """What killed processes had left in a folder when this one first wrote to it."""
+    return [path for path in folder.glob(".*.tmp*") if _name_of(path)]
+
+
+def _name_of(left: Path) -> str | None:
+    """The name that a file or folder was to take which a process left unfinished that is no more."""
+    match = _UNFINISHED.fullmatch(left.name)
+    return match[1] if match and not psutil.pid_exists(int(match[2])) else None
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def content_hash(path: Path) -> str:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, refusals_end_the_program
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+    from nerfstudio.pipelines.base_pipeline import Pipeline
 
 # Nerfstudio's own scheduler puts np.float64 into checkpoints, which torch >= 2.6 refuses to load
 # (https://github.com/nerfstudio-project/nerfstudio/issues/3683). Ours writes float; this lets older files load.
@@ -61,6 +65,42 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     except SceneError as error:
         raise SceneError(f"{path}: {error}; {remedy}") from error
     return state
+
+
+def load_into(pipeline: Pipeline, path: Path, state: Mapping[str, Any]) -> None:
+    """Give a pipeline what its checkpoint holds.
+
+    Args:
+        pipeline: made with the run's settings.
+        path: of the checkpoint, for the refusal.
+        state: of :func:`load_checkpoint`.
+
+    Raises:
+        SceneError: it is of another method, or of other settings.
+    """
+    try:
+        pipeline.load_pipeline(state["pipeline"], state["step"])
+    except (KeyError, RuntimeError) as error:  # torch lists all that is missing, unexpected and of another shape
+        words = " ".join(str(error).split())[:300]
+        raise SceneError(f"{path} is no checkpoint of this method with these settings ({words})") from error
+
+
+def guard_nerfstudio() -> None:
+    """Let nerfstudio's own commands load checkpoints as ours do.
+
+    Theirs tell of a damaged one with a page of torch's, and run what a pickle wants where torch is older than 2.6.
+    """
+    from nerfstudio.utils import eval_utils  # imports the methods, and so this module
+
+    def load(config: TrainerConfig, pipeline: Pipeline) -> tuple[Path, int]:
+        assert config.load_dir is not None
+        with refusals_end_the_program():
+            path = find_checkpoint(config.load_dir, config.load_step)
+            state = load_checkpoint(path)
+            load_into(pipeline, path, state)
+        return path, state["step"]
+
+    eval_utils.eval_load_checkpoint = load
 
 
 def check_gaussians(state: Mapping[str, Any]) -> None:

@@ -17,7 +17,7 @@ from rich.progress import track
 from torch import Tensor
 
 from dataparsers.errors import SceneError, refusals_end_the_program
-from shellgs_method.checkpoints import check_gaussians
+from shellgs_method.checkpoints import check_gaussians, guard_nerfstudio
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.model import FacadeModel
@@ -51,6 +51,7 @@ class FacadePipeline(VanillaPipeline):
         return model
 
     def __init__(self, config: FacadePipelineConfig, *args, **kwargs):
+        guard_nerfstudio()
         with refusals_end_the_program():
             super().__init__(config, *args, **kwargs)
             model, datamanager = self.model, self.datamanager

@@ -11,7 +11,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import Pipeline
 
 from dataparsers.errors import SceneError
-from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.checkpoints import find_checkpoint, load_checkpoint, load_into
 from shellgs_method.config_file import load_config
 
 
@@ -34,9 +34,5 @@ def load_run(config_path: Path, test_mode: Literal["test", "inference"]) -> tupl
     config.load_dir = checkpoint.parent
     pipeline = config.pipeline.setup(device="cuda" if torch.cuda.is_available() else "cpu", test_mode=test_mode)
     pipeline.eval()
-    try:
-        pipeline.load_pipeline(state["pipeline"], state["step"])
-    except RuntimeError as error:  # torch lists what is missing, unexpected and of another shape
-        words = str(error).strip().splitlines()
-        raise SceneError(f"{checkpoint} does not fit {config_path}: {' '.join(words[:2])[:300]}") from error
+    load_into(pipeline, checkpoint, state)
     return config, pipeline, checkpoint

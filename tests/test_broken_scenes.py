@@ -24,11 +24,13 @@ from test_shell_clouds import scan
 from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
+from dataparsers.files import atomic_write
 from dataparsers.photograph import load_photograph
 from dataparsers.sparse_points import read_sparse_points
 from shellgs_method import cli
 from shellgs_method.cues.maps import Fits
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
+from shellgs_method.synthetic import FacadeConfig, write_scene
 
 Command = Callable[..., str]
 
@@ -591,3 +593,15 @@ def test_what_a_killed_cast_left_is_removed_by_the_next(scene, shellgs):
     cli.cast(scene)
     assert not dead.exists()
     assert alive.exists()
+
+
+def test_what_a_killed_process_left_of_a_file_or_folder_is_removed_when_it_is_written_again(tmp_path):
+    panel, scene, other = (tmp_path / f".{name}.{2**22 - 3}.tmp" for name in ("panel.png", "scene", "other.png"))
+    panel.touch()
+    other.touch()
+    scene.mkdir()
+    panel.with_suffix(".tmp.png").touch()
+    with atomic_write(tmp_path / "panel.png") as file:
+        file.write(b"whole")
+    write_scene(tmp_path / "scene", FacadeConfig(width=16, height=16, views=3, points=1, supersampling=1))
+    assert {path.name for path in tmp_path.iterdir()} == {"panel.png", "scene", other.name}

@@ -6,6 +6,7 @@ import csv
 import filecmp
 import io
 import json
+import multiprocessing
 import os
 import re
 import shutil
@@ -13,10 +14,12 @@ import socket
 import stat
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import torch
 import trimesh
@@ -26,11 +29,12 @@ from rich.console import Console
 from runs import Method, trainer_of
 
 from dataparsers.camera import Camera
+from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.layout import SceneLayout, ScenePaths
 from shellgs_method import cli
 from shellgs_method.compare import cluster, launch
-from shellgs_method.compare.launch import launch_locally
+from shellgs_method.compare.launch import follow, launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_figures
 from shellgs_method.compare.pictures import DOT, dotted, recorded_figures
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
@@ -299,6 +303,19 @@ def test_a_killed_run_goes_on_from_its_checkpoint(pristine_scene, tmp_path):
     assert f"--load-dir {runs[0].checkpoints}" in resumed
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's doing")
+def test_a_killed_comparison_takes_its_commands_with_it(tmp_path):
+    sleep = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    comparison = multiprocessing.get_context("fork").Process(target=follow, args=(["python", "-c", sleep],))
+    comparison.start()
+    while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+        time.sleep(0.05)
+    command = psutil.Process(int((tmp_path / "pid").read_text()))
+    comparison.kill()
+    comparison.join()
+    command.wait(timeout=10)
+
+
 @pytest.mark.usefixtures("fake_commands")
 def test_a_changed_setting_is_refused_before_anything_starts(pristine_scene, tmp_path):
     finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
@@ -317,11 +334,13 @@ def test_a_run_that_failed_before_its_first_checkpoint_may_change(pristine_scene
 
 
 @pytest.mark.usefixtures("fake_commands")
-def test_other_maps_make_another_run(scene, tmp_path):
+@pytest.mark.parametrize("kind", ["shell", "checked"])
+def test_other_maps_make_another_run(scene, tmp_path, kind):
+    CueMaps.create(scene, "checked", command="shellgs cast {scene}")
     finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
-    manifest = scene / "cues" / "shell" / "manifest.json"
+    manifest = scene / "cues" / kind / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"max_image_size": null', '"max_image_size": 32'))
-    with pytest.raises(SceneError, match="shell maps"):
+    with pytest.raises(SceneError, match=f"{kind} maps"):
         finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
 
 

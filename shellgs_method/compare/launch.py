@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import threading
@@ -24,6 +26,8 @@ BIN = Path(sys.executable).parent
 LAST_LINES = 30
 EVERY = 30.0
 """Seconds between two words on progress where no terminal shows it."""
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
 _STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
@@ -91,6 +95,7 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
+        preexec_fn=_end_with_parent if _LIBC else None,
     ) as process:
         assert process.stdout is not None
         try:
@@ -139,6 +144,12 @@ def _standing(task: Task) -> str:
         return f"{task.description}: starting, {minutes:.1f} min"
     ahead = "" if left is None else f", about {left / 60:.1f} min left"
     return f"{task.description}: {task.completed:.0f} of {task.total:.0f} iterations, {minutes:.1f} min{ahead}"
+
+
+def _end_with_parent() -> None:
+    """Let the kernel end this process with its parent: a killed comparison's would train on beside the next."""
+    assert _LIBC is not None
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _finish_visibly(run: Run, console: Console, progress: Progress) -> None:

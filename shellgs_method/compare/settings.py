@@ -89,7 +89,8 @@ def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:
         "masks": fingerprint(*([view.name, _hash(view.mask)] for view in views if view.mask)),
     }
     model = config.pipeline.model
-    kinds = {"shell", "truth", getattr(model, "cues", "none"), getattr(model, "seeds", "none")}
+    # What every method is measured against, checked maps included, and what this one is trained on.
+    kinds = {"shell", "checked", "truth", getattr(model, "cues", "none"), getattr(model, "seeds", "none")}
     for kind in find_cues(scene):
         if kind in kinds:
             manifest = CueMaps.open(scene, kind).manifest

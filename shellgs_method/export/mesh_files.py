@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dataparsers.errors import SceneError, check_output
-from dataparsers.files import atomic_write
+from dataparsers.files import atomic_write, unfinished
 from shellgs_method.export.frame import Frame
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
     A convex hull, which engines take where nothing is said, would close the windows and doors.
     """
     Usd, UsdGeom, UsdPhysics, Vt = _usd_modules(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = unfinished(path, path.suffix)
     try:
         stage = Usd.Stage.CreateNew(str(temporary))
         UsdGeom.SetStageUpAxis(stage, frame.up.upper())

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from inspect import signature
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float16, Int64, UInt8
@@ -36,6 +37,7 @@ CONFIRMED = -0.03
 """Largest score of the best nearer depth where the shell is confirmed."""
 
 _WINDOW, _EDGES = 13, 1e-3  # of the guided filter: side in pixels, variance of what it takes for an edge
+_SEPARABLE: Any = {"separable": True} if "separable" in signature(guided_blur).parameters else {}  # kornia 0.9
 _COLOUR, _GRADIENT = 0.12, 0.06  # differences of colours and gradients in [0, 1] from which all are the same
 _SUPPORT = 0.2  # weight of other views' verdicts beside the photographs
 
@@ -249,4 +251,4 @@ def _better_half(costs: Float[Tensor, "V h w"], weights: Float[Tensor, "V h w"])
 
 def _smooth(pixels: _Pixels, maps: Float[Tensor, "C h w"]) -> Float[Tensor, "C h w"]:
     colours = pixels.features[None, :3]
-    return guided_blur(colours, maps[None], _WINDOW, _EDGES, border_type="replicate", separable=True)[0]
+    return guided_blur(colours, maps[None], _WINDOW, _EDGES, border_type="replicate", **_SEPARABLE)[0]

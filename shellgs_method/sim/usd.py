@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from dataparsers.errors import SceneError
+from dataparsers.files import unfinished
 from shellgs_method.export.splats import Splats
 from shellgs_method.sim.parts import Part
 from shellgs_method.sim.texture import TexturedMesh
@@ -101,7 +102,7 @@ class _Stage:
     """A stage with metres and z up, whose file takes its name once it is whole."""
 
     def __init__(self, pxr: SimpleNamespace, path: Path, unit: float | None, root: str = "") -> None:
-        self._path, self._temporary = path, path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+        self._path, self._temporary = path, unfinished(path, path.suffix)
         self._stage = pxr.Usd.Stage.CreateNew(str(self._temporary))
         pxr.UsdGeom.SetStageUpAxis(self._stage, "Z")
         if unit is not None:

@@ -15,6 +15,7 @@ from rich.progress import track
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
+from dataparsers.files import unfinished
 from shellgs_method.open3d import import_open3d
 from shellgs_method.shell import ALIGNMENT, Alignment
 from shellgs_method.shell.similarity import transformed
@@ -108,13 +109,13 @@ def write_scene(scene: Path, config: FacadeConfig) -> None:
     scene = Path(scene)
     if scene.exists() and not (scene.is_dir() and not any(scene.iterdir())):
         raise ValueError(f"{scene} exists and is not an empty folder: give another one, or remove it first")
-    unfinished = scene.with_name(f".{scene.name}.{os.getpid()}.tmp")
-    unfinished.mkdir(parents=True)
+    made = unfinished(scene)
+    made.mkdir(parents=True)
     try:
-        _write(unfinished, config)
-        os.replace(unfinished, scene)
+        _write(made, config)
+        os.replace(made, scene)
     except BaseException:
-        shutil.rmtree(unfinished)
+        shutil.rmtree(made)
         raise
 
 
