@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import KDTree
 
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.sim import engine
 from shellgs_method.sim.collider import Collider, leaks, make_collider
 from shellgs_method.sim.deviations import EDGE, along_normals

@@ -12,7 +12,7 @@ from rich.progress import track
 
 from dataparsers.errors import check_output, refusals_end_the_program
 from shellgs_method.open3d import import_open3d
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.synthetic.appearance import photograph
 from shellgs_method.synthetic.building import shell
 from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING

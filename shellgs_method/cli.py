@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from dataparsers.cue_maps import CueMap, CueMaps
     from dataparsers.photograph import View
     from shellgs_method.export import Frame
-    from shellgs_method.shell.align import Placement
-    from shellgs_method.shell.validation import Validation
+    from shellgs_method.shell.registration.align import Placement
+    from shellgs_method.shell.validation.validation import Validation
 
 console = Console()
 
@@ -146,7 +146,7 @@ def align(
     from dataparsers.facade import read_views
     from dataparsers.sparse_points import read_sparse_points
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
-    from shellgs_method.shell.align import (
+    from shellgs_method.shell.registration.align import (
         PROPOSAL,
         Placement,
         judge,
@@ -185,8 +185,8 @@ def align(
 
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
     """What the user needs to know of a judged alignment; a refused one ends the program."""
-    from shellgs_method.shell.align import REPORT
-    from shellgs_method.shell.report import residual_table
+    from shellgs_method.shell.registration.align import REPORT
+    from shellgs_method.shell.validation.report import residual_table
 
     for sentence in placement.history:
         console.print(sentence, highlight=False)

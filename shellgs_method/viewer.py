@@ -12,7 +12,7 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from shellgs_method.shell import CONTRADICTED_PLACES
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 
 POINT = 0.004
 """Size of a point as a share of the cloud's longest side."""

@@ -24,9 +24,9 @@ from dataparsers.photograph import View, load_photograph
 from dataparsers.sparse_points import SparsePoints, read_sparse_points
 from shellgs_method.datamanager import FacadeDataset
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface, load_shell, validate
-from shellgs_method.shell.picks import align_picks, read_picks
-from shellgs_method.shell.positions import align_positions, read_positions
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.shell.registration.picks import align_picks, read_picks
+from shellgs_method.shell.registration.positions import align_positions, read_positions
 
 SECONDS = 20
 """That a case may take before it counts as a hang."""

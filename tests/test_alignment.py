@@ -22,17 +22,17 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, to_camera
 from dataparsers.sparse_points import SparsePoints
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
-from shellgs_method.shell import alignment as alignment_module
-from shellgs_method.shell.align import PROPOSAL, REPORT, place_by_guess
-from shellgs_method.shell.bays import facade_axes, scan_shifts
-from shellgs_method.shell.picks import Pick, align_picks, read_picks, triangulate
-from shellgs_method.shell.positions import SurveyedPositions, align_positions, read_positions
-from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.refinement import refine
-from shellgs_method.shell.report import shell_edges, write_report
-from shellgs_method.shell.similarity import fit_similarity, transformed
-from shellgs_method.shell.surface import ShellSurface
-from shellgs_method.shell.validation import LIMITS, Limit, validate
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.geometry.similarity import fit_similarity, transformed
+from shellgs_method.shell.geometry.surface import ShellSurface
+from shellgs_method.shell.registration import alignment as alignment_module
+from shellgs_method.shell.registration.align import PROPOSAL, REPORT, place_by_guess
+from shellgs_method.shell.registration.bays import facade_axes, scan_shifts
+from shellgs_method.shell.registration.picks import Pick, align_picks, read_picks, triangulate
+from shellgs_method.shell.registration.positions import SurveyedPositions, align_positions, read_positions
+from shellgs_method.shell.registration.refinement import refine
+from shellgs_method.shell.validation.report import shell_edges, write_report
+from shellgs_method.shell.validation.validation import LIMITS, Limit, validate
 from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera
 from shellgs_method.synthetic.path import walk

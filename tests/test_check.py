@@ -22,7 +22,7 @@ from dataparsers.photograph import View
 from shellgs_method.batches import reference_errors, reference_maps, regions
 from shellgs_method.evaluation import Rendering
 from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
-from shellgs_method.shell.contradiction import (
+from shellgs_method.shell.checking.contradiction import (
     CONFIRMED,
     CONTRADICTED,
     MOVES,

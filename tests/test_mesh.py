@@ -19,7 +19,7 @@ from shellgs_method.batches import pinhole_camera
 from shellgs_method.export import Box, DepthView, Frame, decimate, fuse, scene_frame, shell_frame, write_mesh
 from shellgs_method.export.runs import TrainedRun, mesh_errors
 from shellgs_method.shell import Alignment, ShellCaster, ShellMesh, load_shell
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.synthetic.building import Layout, building
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 

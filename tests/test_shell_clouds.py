@@ -214,7 +214,7 @@ def test_every_cloud_format_keeps_survey_coordinates(tmp_path: Path, suffix: str
         seen.append(points)
         raise SceneError("seen")
 
-    monkeypatch.setattr("shellgs_method.shell.mesh.mesh_cloud", note)
+    monkeypatch.setattr("shellgs_method.shell.geometry.mesh.mesh_cloud", note)
     with pytest.raises(SceneError, match="seen"):
         load_shell(path)
     np.testing.assert_allclose(seen[0], points, rtol=0, atol=tolerance)
@@ -270,7 +270,7 @@ def cloud(tmp_path: Path) -> Path:
 
 def test_a_cloud_is_meshed_once(cloud: Path, monkeypatch: pytest.MonkeyPatch):
     first = load_shell(cloud, cache=cloud.parent)
-    monkeypatch.delattr("shellgs_method.shell.mesh.mesh_cloud")
+    monkeypatch.delattr("shellgs_method.shell.geometry.mesh.mesh_cloud")
     again = load_shell(cloud, cache=cloud.parent)
     np.testing.assert_array_equal(again.vertices, first.vertices)
     np.testing.assert_array_equal(again.faces, first.faces)

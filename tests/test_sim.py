@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.export import Frame
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.sim.building import moved_into
 from shellgs_method.sim.collider import Collider, leaks, make_collider, standing_before, thickness
 from shellgs_method.sim.convex import convex_pieces, fewer_pieces

@@ -20,7 +20,7 @@ from dataparsers.errors import SceneError
 from shellgs_method import cli
 from shellgs_method.export import Splats
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collider import Collider, make_collider
 from shellgs_method.sim.engine import beams, lidar, load, warnings_kept

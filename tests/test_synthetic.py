@@ -17,9 +17,9 @@ from scipy.stats import theilslopes
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps
 from shellgs_method.shell import Alignment
-from shellgs_method.shell.mesh import load_shell
-from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.mesh import load_shell
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.synthetic import FacadeConfig, write_scene
 from shellgs_method.synthetic.appearance import rays
 from shellgs_method.synthetic.building import RECESS, Layout, building, shell

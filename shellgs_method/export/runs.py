@@ -24,7 +24,7 @@ from shellgs_method.export.splats import Splats
 from shellgs_method.export.tsdf import DepthView
 from shellgs_method.model import FacadeModel, reference_errors
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.trained import load_run
 
 if TYPE_CHECKING:

@@ -5,19 +5,19 @@
 are made of can be used alone.
 """
 
-from shellgs_method.shell.alignment import ALIGNMENT, Alignment
-from shellgs_method.shell.cast import MASKS, CastSummary, cast_views
-from shellgs_method.shell.check import CheckSummary, check_views
-from shellgs_method.shell.clouds import Mesher, Meshing, mesh_cloud
-from shellgs_method.shell.mesh import ShellMesh, load_shell
-from shellgs_method.shell.panel import check_panel, supervision_panel
-from shellgs_method.shell.picks import align_picks
-from shellgs_method.shell.proposal import propose
-from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.refinement import refine
-from shellgs_method.shell.surface import ShellSurface
-from shellgs_method.shell.validation import Validation, validate
-from shellgs_method.shell.verdicts import CONTRADICTED_PLACES, MANY, Verdicts, shell_verdicts
+from shellgs_method.shell.casting.cast import MASKS, CastSummary, cast_views
+from shellgs_method.shell.casting.panel import check_panel, supervision_panel
+from shellgs_method.shell.checking.check import CheckSummary, check_views
+from shellgs_method.shell.checking.verdicts import CONTRADICTED_PLACES, MANY, Verdicts, shell_verdicts
+from shellgs_method.shell.geometry.clouds import Mesher, Meshing, mesh_cloud
+from shellgs_method.shell.geometry.mesh import ShellMesh, load_shell
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.geometry.surface import ShellSurface
+from shellgs_method.shell.registration.alignment import ALIGNMENT, Alignment
+from shellgs_method.shell.registration.picks import align_picks
+from shellgs_method.shell.registration.proposal import propose
+from shellgs_method.shell.registration.refinement import refine
+from shellgs_method.shell.validation.validation import Validation, validate
 
 __all__ = [
     "ALIGNMENT",

@@ -19,7 +19,7 @@ from shellgs_method.export import DepthView, decimate, fuse
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
 from shellgs_method.shell import ShellCaster, shell_verdicts
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo

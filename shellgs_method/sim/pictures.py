@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
-from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.report import shell_edges
+from shellgs_method.shell.geometry.mesh import ShellMesh
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.validation.report import shell_edges
 from shellgs_method.sim.engine import compiled, import_mujoco, read_spec
 from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo

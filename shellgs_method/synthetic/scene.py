@@ -18,7 +18,7 @@ from dataparsers.errors import SceneError
 from dataparsers.files import unfinished
 from shellgs_method.open3d import import_open3d
 from shellgs_method.shell import ALIGNMENT, Alignment
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.synthetic.appearance import Daylight, photograph, rays
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.frames import (

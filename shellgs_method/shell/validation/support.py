@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dataparsers.photograph import View, load_mask
-from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.geometry.similarity import transformed
 
 if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints

@@ -17,9 +17,9 @@ from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask
-from shellgs_method.shell.alignment import ALIGNMENT, Alignment
-from shellgs_method.shell.clouds import VERSION, Meshing
-from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.geometry.clouds import VERSION, Meshing
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.registration.alignment import ALIGNMENT, Alignment
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64
 
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, to_camera
-from shellgs_method.shell.correspondences import (
+from shellgs_method.shell.registration.correspondences import (
     Correspondence,
     are_numbers,
     fit_robustly,

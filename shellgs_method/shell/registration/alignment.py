@@ -15,9 +15,9 @@ from dataparsers.camera import positions
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, read_json, remove_leftovers
 from dataparsers.photograph import View
-from shellgs_method.shell.clouds import Mesher
-from shellgs_method.shell.mesh import ShellMesh, load_shell
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.clouds import Mesher
+from shellgs_method.shell.geometry.mesh import ShellMesh, load_shell
+from shellgs_method.shell.geometry.similarity import transformed
 
 ALIGNMENT = Path("shell/alignment.json")
 """In the scene's folder."""

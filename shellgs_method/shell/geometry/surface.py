@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from shellgs_method.open3d import import_open3d
-from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.similarity import centred, transformed
+from shellgs_method.shell.geometry.mesh import ShellMesh
+from shellgs_method.shell.geometry.similarity import centred, transformed
 
 _FEW = 2000
 """Points below which waking other threads costs more than it saves, manyfold where other programs hold the cores."""

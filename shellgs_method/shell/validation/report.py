@@ -18,13 +18,13 @@ from dataparsers.cue_maps import CueMap
 from dataparsers.files import atomic_write
 from dataparsers.photograph import load_photograph
 from shellgs_method.html import data_uri, encoded
-from shellgs_method.shell.bays import RIVALRY
-from shellgs_method.shell.correspondences import Correspondence
-from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.picks import PickedPoint
-from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.support import representative
-from shellgs_method.shell.validation import Validation
+from shellgs_method.shell.geometry.mesh import ShellMesh
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.registration.bays import RIVALRY
+from shellgs_method.shell.registration.correspondences import Correspondence
+from shellgs_method.shell.registration.picks import PickedPoint
+from shellgs_method.shell.validation.support import representative
+from shellgs_method.shell.validation.validation import Validation
 
 COLOURS = {"good": "#1a7f37", "doubtful": "#9a6700", "refused": "#cf222e"}
 _EDGE = (255, 0, 140)

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from dataparsers.camera import positions
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
-from shellgs_method.shell.correspondences import (
+from shellgs_method.shell.registration.correspondences import (
     MAX_ERROR,
     Correspondence,
     are_numbers,

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import argrelmax, fftconvolve
 
-from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.shell.geometry.surface import ShellSurface
 
 FIT = 0.10
 """Metres from the shell at which a point stops counting as a fit: three to five times the scatter of SfM points, and

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from dataparsers.errors import SceneError
-from shellgs_method.shell.similarity import transformed
-from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.shell.geometry.surface import ShellSurface
 
 FINAL_GATE = 0.05
 """Metres from the shell beyond which a point has no say in the end: SfM points of a wall scatter by 1 to 3 cm, and

@@ -8,8 +8,8 @@ from jaxtyping import Float16, Float32, Float64
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
 from shellgs_method.open3d import import_open3d
-from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.similarity import transformed
+from shellgs_method.shell.geometry.mesh import ShellMesh
+from shellgs_method.shell.geometry.similarity import transformed
 
 
 class ShellCaster:

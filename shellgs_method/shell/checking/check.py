@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.files import atomic_write, content_hash, fingerprint
 from dataparsers.photograph import View, load_photograph
-from shellgs_method.shell.contradiction import (
+from shellgs_method.shell.checking.contradiction import (
     CONFIRMED,
     CONTRADICTED,
     ShellView,

@@ -14,17 +14,17 @@ from dataparsers.camera import positions, upwards
 from dataparsers.cue_maps import CueMaps, source_hash
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
-from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.bays import facade_axes
-from shellgs_method.shell.correspondences import Correspondence, measured_again
-from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.picks import align_picks, read_picks
-from shellgs_method.shell.positions import align_positions, read_positions
-from shellgs_method.shell.proposal import propose
-from shellgs_method.shell.refinement import refine
-from shellgs_method.shell.report import write_report
-from shellgs_method.shell.surface import ShellSurface
-from shellgs_method.shell.validation import Validation, validate
+from shellgs_method.shell.geometry.mesh import ShellMesh
+from shellgs_method.shell.geometry.surface import ShellSurface
+from shellgs_method.shell.registration.alignment import Alignment
+from shellgs_method.shell.registration.bays import facade_axes
+from shellgs_method.shell.registration.correspondences import Correspondence, measured_again
+from shellgs_method.shell.registration.picks import align_picks, read_picks
+from shellgs_method.shell.registration.positions import align_positions, read_positions
+from shellgs_method.shell.registration.proposal import propose
+from shellgs_method.shell.registration.refinement import refine
+from shellgs_method.shell.validation.report import write_report
+from shellgs_method.shell.validation.validation import Validation, validate
 
 if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints

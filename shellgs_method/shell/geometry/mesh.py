@@ -13,8 +13,8 @@ from jaxtyping import Float64, Int64
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash
 from dataparsers.strays import sound
-from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
-from shellgs_method.shell.files import read_geometry
+from shellgs_method.shell.geometry.clouds import VERSION, Mesher, Meshing, mesh_cloud
+from shellgs_method.shell.geometry.files import read_geometry
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ def load_shell(
     """Read a shell, a triangle mesh or a point cloud, in full double precision where the file has it.
 
     Triangles with a vertex, and points, that are NaN, infinite or absurdly far away are dropped, and counted. A
-    point cloud is meshed by :func:`~shellgs_method.shell.clouds.mesh_cloud`, and its mesh kept, as
+    point cloud is meshed by :func:`~shellgs_method.shell.geometry.clouds.mesh_cloud`, and its mesh kept, as
     ``<cache>/<file name>.<mesher>.ply``, until the cloud changes.
 
     Args:

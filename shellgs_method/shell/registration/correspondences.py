@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float64
 
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
-from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.similarity import centred, fit_similarity, transformed
+from shellgs_method.shell.geometry.similarity import centred, fit_similarity, transformed
+from shellgs_method.shell.registration.alignment import Alignment
 
 MAX_ERROR = 0.15
 """Metres between a point on the shell and the same one in the scene from which it counts as a mistake: five times the

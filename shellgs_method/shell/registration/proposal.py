@@ -19,10 +19,10 @@ from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
 from shellgs_method.open3d import import_open3d
-from shellgs_method.shell.bays import wall_axes
-from shellgs_method.shell.refinement import FINAL_GATE, refine
-from shellgs_method.shell.similarity import transformed
-from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.shell.geometry.surface import ShellSurface
+from shellgs_method.shell.registration.bays import wall_axes
+from shellgs_method.shell.registration.refinement import FINAL_GATE, refine
 
 AMBIGUOUS = 0.90
 """Share of the best score from which another place is named beside it."""

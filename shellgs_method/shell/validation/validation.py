@@ -16,15 +16,15 @@ from scipy.spatial import KDTree
 from dataparsers.camera import positions, upwards
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
-from shellgs_method.shell.alignment import Alignment
-from shellgs_method.shell.bays import BETTER, RIVALRY, ShiftScan, facade_axes, scan_shifts
-from shellgs_method.shell.correspondences import Correspondence
-from shellgs_method.shell.mesh import ShellMesh
-from shellgs_method.shell.raycast import ShellCaster
-from shellgs_method.shell.refinement import Refinement, refine
-from shellgs_method.shell.similarity import transformed
-from shellgs_method.shell.support import NEAR, OCCLUDING, ViewSupport, look
-from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.shell.geometry.mesh import ShellMesh
+from shellgs_method.shell.geometry.raycast import ShellCaster
+from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.shell.geometry.surface import ShellSurface
+from shellgs_method.shell.registration.alignment import Alignment
+from shellgs_method.shell.registration.bays import BETTER, RIVALRY, ShiftScan, facade_axes, scan_shifts
+from shellgs_method.shell.registration.correspondences import Correspondence
+from shellgs_method.shell.registration.refinement import Refinement, refine
+from shellgs_method.shell.validation.support import NEAR, OCCLUDING, ViewSupport, look
 
 if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints

@@ -1,0 +1,1 @@
+"""What each camera sees of the shell."""

@@ -1,0 +1,1 @@
+"""What the photographs say of the shell."""

@@ -1,0 +1,1 @@
+"""The shell itself: files, point clouds, triangles, rays."""

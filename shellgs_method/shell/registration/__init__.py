@@ -1,0 +1,1 @@
+"""Where the shell stands in the scene."""
