@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 import trimesh
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
-from runs import trainer_of
+from runs import small_disk, trainer_of
 from scipy.spatial import KDTree
 from viser import SceneApi
 
@@ -155,6 +156,13 @@ def test_maps_are_made_once_and_again_only_where_they_are_missing(scene: Path):
     mended = check(scene)
     assert (mended.checked, mended.skipped) == (1, 9)
     assert contents(scene) == before
+
+
+def test_a_full_disk_is_an_error_that_tells_so(scene: Path):
+    with small_disk(3_000), pytest.raises(OSError, match="File too large") as refusal:
+        check(scene)
+    assert refusal.value.errno == errno.EFBIG
+    assert check(scene).checked == 10
 
 
 def test_the_maps_of_training_views_know_nothing_of_held_out_photographs(scene: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import time
 from collections.abc import Collection, Sequence
@@ -122,8 +123,10 @@ class _Known:
             if not file.is_file():
                 found = sweep(view, [other for other in shell_views.values() if other is not view])
                 file.parent.mkdir(exist_ok=True)
+                content = io.BytesIO()  # numpy's own writing to a full disk raises no error that tells of a disk
+                np.save(content, torch.stack(found).numpy(), allow_pickle=False)
                 with atomic_write(file) as stream:
-                    np.save(stream, torch.stack(found).numpy(), allow_pickle=False)
+                    stream.write(content.getvalue())
             sweeps[name] = Sweep(*torch.from_numpy(np.load(file, allow_pickle=False)))
         return cls(shell_views, sweeps)
 
