@@ -26,6 +26,7 @@ import trimesh
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from rich.console import Console
+from rich.progress import Progress
 from runs import Method, trainer_of
 
 from dataparsers.camera import Camera
@@ -283,6 +284,17 @@ def test_a_log_says_where_a_run_is(pristine_scene, tmp_path, monkeypatch, termin
     assert standing == (not terminal)
     assert "scene/shellgs/seed-0 finished, 1 of 2." in said.getvalue()
     assert "scene/mono-gs/seed-0 failed, 2 of 2." in said.getvalue()
+
+
+def test_what_is_left_of_a_run_is_reckoned_from_the_time_so_far():
+    now = 0.0
+    progress = Progress(get_time=lambda: now)
+    task = progress.add_task("scene/shellgs/seed-0", total=1500)
+    for now, iterations in ((60.0, 100), (60.1, 200), (60.2, 300), (90.0, 400), (90.1, 500)):
+        progress.update(task, completed=iterations)
+    now = 120.0
+    (standing,) = map(launch._standing, progress.tasks)
+    assert standing == "scene/shellgs/seed-0: 500 of 1500 iterations, 2.0 min, at most about 4.0 min left"
 
 
 @pytest.mark.usefixtures("fake_commands")

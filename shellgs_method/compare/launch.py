@@ -41,7 +41,7 @@ def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run
     failures: dict[Run, str] = {}
     if runs and not torch.cuda.is_available() and nothing_compiled_yet():
         console.print("The first run compiles the kernels, which takes a minute or two; all others load them.")
-    progress = Progress(console=console, transient=True, speed_estimate_period=4 * EVERY)
+    progress = Progress(console=console, transient=True)
     with (
         progress,
         told_in_a_log(console, lambda: map(_standing, progress.tasks)),
@@ -136,14 +136,19 @@ def told_in_a_log(console: Console, standing: Callable[[], Iterable[str]]) -> It
 
 
 def _standing(task: Task) -> str:
-    """Where a run is, in words."""
-    minutes, left = (task.elapsed or 0) / 60, task.time_remaining
+    """Where a run is, in words.
+
+    What is left is reckoned from the whole time so far: iterations are told in bursts, of which rich's own estimate
+    makes a multiple of the speed, and too long is the better error.
+    """
+    minutes, total = (task.elapsed or 0) / 60, task.total or 0
     if task.finished:
         return f"{task.description}: trained, {minutes:.1f} min; measuring"
     if not task.completed:
         return f"{task.description}: starting, {minutes:.1f} min"
-    ahead = "" if left is None else f", about {left / 60:.1f} min left"
-    return f"{task.description}: {task.completed:.0f} of {task.total:.0f} iterations, {minutes:.1f} min{ahead}"
+    left = minutes * (total / task.completed - 1)
+    at = f"{task.completed:.0f} of {total:.0f} iterations"
+    return f"{task.description}: {at}, {minutes:.1f} min, at most about {left:.1f} min left"
 
 
 def _end_with_parent() -> None:
