@@ -198,6 +198,11 @@ class Peace:
     unsteady: Collection[str]
     loose: Collection[str]
 
+    @property
+    def not_compared(self) -> set[str]:
+        """Results that are not even alike."""
+        return set(self.unsteady) - set(self.loose)
+
 
 def leave(command: str, before: Path, after: Path) -> Peace:
     """Give a command twice, and let it end."""
@@ -233,7 +238,7 @@ def kill(command: str, peace: Peace, tally: Tally, moment: float, trial: Path, s
     again.join()
     tally.finished += again.exitcode == 0
     compared = set(differences(command, trial, peace.after, peace.loose))
-    wrong = sorted(compared - (set(peace.unsteady) - set(peace.loose)))
+    wrong = sorted(compared - peace.not_compared)
     tally.same += not wrong
     litter = {name for name in files(trial) - files(peace.after) if not is_record(name)}
     tally.litter += bool(litter)
@@ -265,8 +270,8 @@ def main(config: Kills, folder: Path, console: Console) -> Sequence[Tally]:
         peace = leave(command, before, folder / str(number))
         if peace.unsteady:
             console.print(f"{command}, left in peace twice, differs in {', '.join(sorted(peace.unsteady))}")
-        if not_compared := sorted(set(peace.unsteady) - set(peace.loose)):
-            console.print(f"{command}: not compared are {', '.join(not_compared)}")
+        if peace.not_compared:
+            console.print(f"{command}: not compared are {', '.join(sorted(peace.not_compared))}")
         if command in config.commands:
             tally = Tally()
             for each in range(3 * config.kills):  # some moments come too late

@@ -11,12 +11,9 @@ import tyro
 from rich.progress import track
 
 from dataparsers.errors import check_output, refusals_end_the_program
-from shellgs_method.open3d import import_open3d
-from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.synthetic.appearance import photograph
 from shellgs_method.synthetic.building import shell
-from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
-from shellgs_method.synthetic.scene import Facade, FacadeConfig
+from shellgs_method.synthetic.scene import Facade, FacadeConfig, write_scan
 
 RATE = 5
 """Frames a second: as many as `shellgs capture` takes at most."""
@@ -38,12 +35,7 @@ def walk(
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("walk.mp4", "scan.ply"):
         check_output(folder / name)
-    o3d, surface = import_open3d(), shell(facade.layout)
-    scan = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(transformed(surface.vertices, SHELL_FROM_BUILDING)),
-        o3d.utility.Vector3iVector(surface.triangles.astype(np.int32)),
-    )
-    o3d.io.write_triangle_mesh(str(folder / "scan.ply"), scan)
+    write_scan(folder / "scan.ply", shell(facade.layout))
     noise = np.random.default_rng(seed)
     with av.open(str(folder / "walk.mp4"), "w") as container:
         stream = container.add_stream("libx264", rate=RATE, options={"crf": "18"})

@@ -46,8 +46,8 @@ def reference_errors(
     for prefix, reference in found.items():
         errors = geometry_errors(rendering, camera, reference, metres_per_unit)
         figures |= {prefix + name: value for name, value in errors.items()}
-    parts = regions(batch, metres_per_unit, rendering.depth.device)
     if truth := found.get(REFERENCES["truth"]):
+        parts = regions(batch, metres_per_unit, rendering.depth.device)
         for name in parts.keys() & {"on_shell", "before_shell"}:
             reference = truth._replace(mask=truth.mask & parts[name])
             errors = geometry_errors(rendering, camera, reference, metres_per_unit)

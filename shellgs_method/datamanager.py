@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import psutil
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -24,7 +24,7 @@ from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
-from shellgs_method.batches import REFERENCES, kept_pixels, pinhole_camera, reference_maps
+from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.reference import Reference
 from shellgs_method.seeding import SeededView, Seeds, shell_seeds
@@ -219,6 +219,13 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         held_out.kinds = {*REFERENCES, *kinds}
         held_out.kinds = [kind for kind, maps in held_out.cues.items() if self._can_be_measured(kind, maps)]
 
+    @property
+    def scene_to_world(self) -> Float64[np.ndarray, "4 4"]:
+        """The similarity from the scene to nerfstudio's rescaled world: scale · (transform @ scene)."""
+        parsed, similarity = self.train_dataparser_outputs, np.eye(4)
+        similarity[:3] = parsed.dataparser_scale * parsed.dataparser_transform.double().numpy()
+        return similarity
+
     @cached_property
     def _seen_by(self) -> SeenBy:
         """What the training views see."""
@@ -261,7 +268,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         if not everywhere and "nearer_depth" in batch:
             nearer = batch["nearer_depth"].to(cpu)
             towards_camera = -normalize(camera.rays().float(), dim=-1)
-            before = (nearer > 0) & kept_pixels(batch, image)
+            before = contradicted(batch, cpu) & kept_pixels(batch, image)
             shell = Reference(
                 torch.where(before, nearer, shell.depth),
                 torch.where(before, towards_camera, shell.normal),

@@ -9,7 +9,6 @@ from time import perf_counter
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import torch
 import torchvision
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -56,9 +55,8 @@ class FacadePipeline(VanillaPipeline):
             super().__init__(config, *args, **kwargs)
             model, datamanager = self.model, self.datamanager
             assert isinstance(datamanager, FacadeDataManager)
-            parsed = datamanager.train_dataparser_outputs
-            from_scene = np.vstack([parsed.dataparser_scale * parsed.dataparser_transform.double(), [0, 0, 0, 1]])
-            self.contradicted_shell = ContradictedShell(Path(datamanager.config.dataparser.data), from_scene)
+            scene = Path(datamanager.config.dataparser.data)
+            self.contradicted_shell = ContradictedShell(scene, datamanager.scene_to_world)
             if self.test_mode == "val":
                 datamanager.train_on(model.training_cues)
             if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run brings all its Gaussians

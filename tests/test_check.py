@@ -32,6 +32,7 @@ from shellgs_method.shell.checking.contradiction import (
     _better_half,
     agreed_score,
     neighbours,
+    sides,
     sweep,
 )
 from shellgs_method.viewer import ContradictedShell
@@ -114,7 +115,7 @@ def test_what_a_mirror_shows_is_farther_and_contradicts_nothing():
 @pytest.mark.parametrize("offset", [OFFSETS[3], OFFSETS[8]])
 def test_neighbours_on_both_sides_see_an_offset_move_by_some_pixels(offset: float):
     view, others = camera_at(0.0), [camera_at(x) for x in np.linspace(-12, 12, 200)]
-    chosen = neighbours(view, others, WALL, offset)
+    chosen = neighbours(view, sides(view, others), WALL, offset)
     assert {side for _, side in chosen} == {0, 1}
     for index, side in chosen:
         x = float(others[index].position[0])

@@ -23,7 +23,7 @@ from shellgs_method.export.runs import TrainedRun
 from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collider import Collider, make_collider
-from shellgs_method.sim.engine import beams, lidar, load, warnings_kept
+from shellgs_method.sim.engine import beams, compiled, import_mujoco, lidar, load, warnings_kept
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.parts import Part
 from shellgs_method.sim.pictures import rendered
@@ -99,6 +99,22 @@ def test_a_world_that_mujoco_refuses_is_one_sentence(world, tmp_path):
     (tmp_path / "world" / "collision" / "part_000.obj").write_text("v 0 0 0\n")
     with pytest.raises(SceneError, match="MuJoCo refuses it"):
         load(tmp_path / "world" / "facade.xml")
+
+
+def test_what_mujoco_warns_of_in_a_simulation_is_kept_after_a_model_was_compiled(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    mujoco = import_mujoco()
+    spec = mujoco.MjSpec.from_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    with warnings_kept() as warnings:
+        model = compiled(spec, tmp_path)
+        data = mujoco.MjData(model)
+        data.qvel[0] = np.nan
+        mujoco.mj_step(model, data)
+    assert len(warnings) == 1
+    assert "QVEL" in warnings[0]
+    assert not list(tmp_path.iterdir())
 
 
 def test_nothing_that_is_thrown_gets_through_sticks_or_gains_energy(world, collider, eyes):

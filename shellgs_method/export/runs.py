@@ -101,11 +101,8 @@ class TrainedRun:
 
     @property
     def model_to_scene(self) -> Float64[np.ndarray, "4 4"]:
-        """The similarity that undoes nerfstudio's: its world is scale · (transform @ scene)."""
-        rescaled = np.eye(4)
-        rescaled[:3] = self.datamanager.train_dataparser_outputs.dataparser_transform.double().numpy()
-        rescaled[:3] *= self.model_scale
-        return np.linalg.inv(rescaled)
+        """The similarity from nerfstudio's rescaled world to the scene."""
+        return np.linalg.inv(self.datamanager.scene_to_world)
 
     def box(self, margin: float) -> Box:
         """Where the facade is: the shell's box, wider by ``margin`` metres, else that of most SfM points."""

@@ -43,13 +43,17 @@ def read_spec(path: Path):
 
 @contextmanager
 def warnings_kept() -> Iterator[list[str]]:
-    """What MuJoCo warns of meanwhile; without it, warnings go to MUJOCO_LOG.TXT in the working directory."""
+    """What MuJoCo warns of meanwhile; without it, warnings go to MUJOCO_LOG.TXT in the working directory.
+
+    Within another one, as where a trial compiles its model, what is warned of is kept by the inner alone.
+    """
     mujoco, warnings = import_mujoco(), []
+    outer = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(warnings.append)
     try:
         yield warnings
     finally:
-        mujoco.set_mju_user_warning(None)
+        mujoco.set_mju_user_warning(outer)
 
 
 def compiled(spec, path: Path):

@@ -182,15 +182,25 @@ def _write_points(path: Path, points: Points) -> None:
     o3d.io.write_point_cloud(str(path), cloud)
 
 
-def _write_shell(scene: Path, mesh: Mesh) -> None:
-    """The shell in its own georeferenced frame, which only a file in double precision can hold."""
+def write_scan(path: Path, mesh: Mesh) -> None:
+    """Write the shell in its own georeferenced frame, which only a file in double precision can hold.
+
+    Args:
+        path: of a ply file.
+        mesh: in the building's frame.
+    """
     o3d = import_open3d()
-    path = scene / SHELL
-    path.parent.mkdir(parents=True)
     vertices = transformed(mesh.vertices, SHELL_FROM_BUILDING)
     solid = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(mesh.triangles.astype(np.int32))
     )
     o3d.io.write_triangle_mesh(str(path), solid)
+
+
+def _write_shell(scene: Path, mesh: Mesh) -> None:
+    """The shell, and where it stands."""
+    path = scene / SHELL
+    path.parent.mkdir(parents=True)
+    write_scan(path, mesh)
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
     Alignment(matrix, SHELL, 1.0, source="the synthetic facade's own frames").save(scene / ALIGNMENT)

@@ -36,6 +36,9 @@ are better, but mirrors contradict it too, and what is left to the photographs a
 CONFIRMED = -0.03
 """Largest score of the best nearer depth where the shell is confirmed."""
 
+Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
+"""Distances and indices of cameras on the left and on the right of a view."""
+
 _WINDOW, _EDGES = 13, 1e-3  # of the guided filter: side in pixels, variance of what it takes for an edge
 _SEPARABLE: Any = {"separable": True} if "separable" in signature(guided_blur).parameters else {}  # kornia 0.9
 _COLOUR, _GRADIENT = 0.12, 0.06  # differences of colours and gradients in [0, 1] from which all are the same
@@ -67,12 +70,12 @@ class Sweep(NamedTuple):
     """Where they do: the share by which the inverse depth there exceeds the shell's, between those that are tried."""
 
 
-def neighbours(view: Camera, others: Sequence[Camera], depth: float, offset: float) -> list[tuple[int, int]]:
+def neighbours(view: Camera, beside: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
     """The cameras in which what is ``offset`` nearer than the shell moves by some pixels, on either side of a view.
 
     Args:
         view: the camera whose neighbours are wanted.
-        others: the cameras to choose from.
+        beside: the cameras to choose from, as :func:`sides` has them.
         depth: of the shell in the view.
         offset: one of :data:`OFFSETS`.
 
@@ -84,14 +87,14 @@ def neighbours(view: Camera, others: Sequence[Camera], depth: float, offset: flo
         sorted(
             (max(baseline / wanted, wanted / baseline), index) for baseline, index in side if baseline > 1e-6 * depth
         )
-        for side in sides(view, others)
+        for side in beside
     ]
     return [(index, side) for side in (0, 1) for _, index in found[side][:A_SIDE]]
 
 
-def sides(view: Camera, others: Sequence[Camera]) -> tuple[list[tuple[float, int]], list[tuple[float, int]]]:
+def sides(view: Camera, others: Sequence[Camera]) -> Sides:
     """Distances and indices of the cameras on the left and on the right of a view that look about the same way."""
-    found: tuple[list[tuple[float, int]], list[tuple[float, int]]] = ([], [])
+    found: Sides = ([], [])
     for index, other in enumerate(others):
         step = other.position - view.position
         if float(view.viewmat[2, :3] @ other.viewmat[2, :3]) > 0.5:
@@ -104,11 +107,11 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
 
     A side's neighbours speak with their mean, and for the shell or what is nearer speaks the side that knows it better.
     """
-    pixels, cameras = _Pixels(view), [other.camera for other in others]
+    pixels, near = _Pixels(view), sides(view.camera, [other.camera for other in others])
     depth = float(pixels.surface.median())
     roles: dict[int, list[tuple[int, int]]] = {}
     for rung, offset in enumerate(OFFSETS):
-        for index, side in neighbours(view.camera, cameras, depth, offset):
+        for index, side in neighbours(view.camera, near, depth, offset):
             roles.setdefault(index, []).append((rung, side))
     sums = torch.zeros(len(OFFSETS), 2, 3, *view.depth.shape)
     for index, asked in roles.items():
@@ -148,9 +151,8 @@ def agreed_score(
         of_shell = _sampled(probability, beside.shell.grid)
         of_nearer = _sampled(probability, before.grid)
         offset = _sampled(other.depth, before.grid, "nearest") / before.z - 1
-        alike = (
-            _sampled(sweep_there.offset.float(), before.grid, "nearest") - offset
-        ).abs() < 0.3 * offset.abs() + 0.004
+        found_offset = _sampled(sweep_there.offset.float(), before.grid, "nearest")
+        alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
         shell.append(beside.on_shell.masked_fill(hidden, torch.nan))
         nearer.append(beside.disagreement(before).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
