@@ -1,0 +1,30 @@
+"""What several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from dataparsers.layout import ScenePaths
+
+if TYPE_CHECKING:
+    from shellgs_method.export import Frame
+
+console = Console()
+
+Scene = Annotated[Path, tyro.conf.Positional]
+Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
+PATHS = ScenePaths()
+UpAxis = Literal["y", "z"]
+Mesher = Literal["planes", "bpa", "poisson"]
+
+
+def place(frame: Frame) -> str:
+    """Where a result stands, in words."""
+    shift = f" less {' '.join(f'{value:.0f}' for value in frame.offset)}" if frame.offset.any() else ""
+    if not frame.metric:
+        return f"The scene has no aligned shell: this is its own frame{shift}, and the size of its unit is unknown."
+    return f"In metres, in the shell's frame{shift}."

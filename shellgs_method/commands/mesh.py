@@ -1,0 +1,53 @@
+"""`shellgs mesh`: a triangle mesh of a trained method."""
+
+from __future__ import annotations
+
+from math import inf
+from pathlib import Path
+from typing import Annotated, Optional
+
+import tyro
+
+from dataparsers.errors import SceneError
+from shellgs_method.commands.common import UpAxis, console, place
+
+
+def mesh(
+    config: Annotated[Path, tyro.conf.Positional],
+    output: Optional[Path] = None,
+    voxel: Optional[float] = None,
+    faces: int = 200_000,
+    margin: float = 0.5,
+    up: Optional[UpAxis] = None,
+) -> None:
+    """Triangle mesh of a trained method, in metres in the shell's frame, and how far it is from shell and truth.
+
+    Beside it, a json says where it stands: a georeferenced shell's large offset is there, not in the coordinates.
+
+    Args:
+        config: The run's config.yml.
+        output: The mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
+        voxel: Size of a voxel in metres. If not set: a pixel's size on the facade.
+        faces: Number of triangles that the mesh is thinned to.
+        margin: What is farther than this from the shell, in metres, is left out.
+        up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
+    """
+    from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
+    from shellgs_method.export import check_mesh_format, decimate, fuse, write_mesh
+    from shellgs_method.export.runs import TrainedRun, mesh_errors
+
+    output = output or config.with_name("mesh.ply")
+    check_mesh_format(output)
+    if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
+        raise SceneError("a mesh has at least 4 --faces, a --voxel above 0 and a --margin from 0")
+    run = TrainedRun.load(config, up)
+    made = decimate(run.facade(fuse(run.views(), run.box(margin), voxel), margin), faces)
+    figures = mesh_errors(run, made)
+    write_mesh(output, made, run.frame, figures)
+    truth = {name.removeprefix("truth_"): value for name, value in figures.items() if name.startswith("truth_")}
+    rows = {name: row for name, row in (("shell", figures), ("truth", truth)) if "rendered" in row}
+    console.print(f"{output}: {len(made.faces)} triangles, voxels of {made.metadata['voxel']:.3g}. {place(run.frame)}")
+    if rows:
+        console.print(rich_table(rows, SURFACE_COLUMNS, "Mesh in the held-out views, against"))
+    if "area_near_shell" in figures:
+        console.print(f"{figures['area_near_shell']:.0%} of its area is within 20 cm of the shell.")

@@ -1,0 +1,66 @@
+"""`shellgs mono`: monocular depth and normals of every view."""
+
+from __future__ import annotations
+
+from typing import Annotated, Optional, Union
+
+import tyro
+
+from dataparsers.errors import SceneError
+from shellgs_method.commands.common import PATHS, Paths, Scene, console
+from shellgs_method.commands.panels import save_panel
+from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
+
+MonoSource = Annotated[
+    Union[
+        Annotated[MoGe2, tyro.conf.subcommand("moge")],
+        Annotated[DepthAnything, tyro.conf.subcommand("depth-anything")],
+        Annotated[tyro.conf.PositionalRequiredArgs[Precomputed], tyro.conf.subcommand("from")],
+    ],
+    tyro.conf.arg(name=""),
+]
+_MOGE = MoGe2()
+
+
+def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int] = None, paths: Paths = PATHS) -> None:
+    """Monocular depth and normals of every view, aligned to the SfM points, in scene/cues/mono.
+
+    They come from a network (moge, depth-anything) or from maps made elsewhere (from FOLDER). A view whose depth does
+    not fit its SfM points gets no map. An interrupted run goes on where it stopped.
+
+    Args:
+        scene: Scene folder.
+        source: What predicts.
+        max_image_size: Longer side in pixels that photographs are resized to for training. If not set: the size that
+            the shell maps were cast at, else full size.
+        paths: Where in the scene its files are.
+    """
+    from dataparsers.cue_maps import CueMaps, find_cues
+    from dataparsers.facade import read_views
+    from dataparsers.sparse_points import read_sparse_points
+    from shellgs_method.cues.maps import make_maps
+
+    if max_image_size is not None and max_image_size < 1:
+        raise SceneError(f"the longer side of the maps must be at least 1 pixel, not {max_image_size}")
+    layout = paths.of(scene)
+    views, points, predictor = read_views(layout), read_sparse_points(layout), source.load()
+    if max_image_size is None and "shell" in find_cues(scene):
+        max_image_size = CueMaps.open(scene, "shell").manifest.max_image_size
+    licence = f", licence {predictor.licence}" if predictor.licence else ""
+    console.print(f"{predictor.name}, revision {predictor.revision[:12]}{licence}.", highlight=False)
+    if predictor.non_commercial:
+        console.print("[yellow]The licence of these weights forbids commercial use.")
+    if points.observed is None:
+        console.print("The scene does not say which points a view observes: all that project into it are used.")
+    size = f" --max-image-size {max_image_size}" if max_image_size else ""
+    command = f"shellgs mono {{scene}}{size}{paths.flags} {source.command}"
+    summary = make_maps(scene, views, points, predictor, command=command, max_image_size=max_image_size)
+    console.print(
+        f"{summary.made} maps made, {summary.skipped} views decided before, in {summary.seconds:.1f} s; "
+        f"{len(views) - len(summary.problems)} of {len(views)} views have a map, whose depth is {summary.residual:.1%} "
+        "off the SfM points (median)."
+    )
+    for name, problem in summary.problems.items():
+        console.print(f"No map for {name}: {problem}.", highlight=False)
+    panel = save_panel(CueMaps.open(scene, "mono"), views)
+    console.print(f"Look at {panel}: depth and normals must follow the photograph.")

@@ -1,0 +1,37 @@
+"""Images of some views beside their maps, for the user to look at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from dataparsers.cue_maps import CueMap, CueMaps
+    from dataparsers.photograph import View
+
+
+def save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
+    """The picture of the view whose map supports most pixels, among some spread over the scene."""
+    from dataparsers.photograph import load_photograph
+    from shellgs_method.evaluation.figures import save_figure
+    from shellgs_method.shell import supervision_panel
+
+    view, cue = max(views_with_maps(maps, views, 8), key=lambda pair: pair[1].mask.mean())
+    panel = maps.folder / "panel.png"
+    figure = supervision_panel(load_photograph(view)[..., :3], cue, maps.manifest.metres_per_unit, maps.kind)
+    save_figure(panel, figure)
+    return panel
+
+
+def views_with_maps(maps: CueMaps, views: Sequence[View], count: int) -> list[tuple[View, CueMap]]:
+    """About so many views, spread over the scene, at the size of their maps, and these."""
+    mapped = [view for view in views if maps.record(view.name)]
+    shrunk = [
+        replace(view, camera=view.camera.shrunk(maps.manifest.max_image_size))
+        for view in mapped[:: max(len(mapped) // count, 1)]
+    ]
+    read = ((view, maps.read(view.name, view.camera)) for view in shrunk)
+    return [(view, cue) for view, cue in read if cue is not None]

@@ -1,0 +1,36 @@
+"""`shellgs splats`: the Gaussians of a trained method as a ply."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import tyro
+
+from dataparsers.errors import check_output
+from shellgs_method.commands.common import UpAxis, console, place
+
+
+def splats(
+    config: Annotated[Path, tyro.conf.Positional],
+    output: Optional[Path] = None,
+    up: Optional[UpAxis] = None,
+) -> None:
+    """The Gaussians of a trained method as the ply that viewers open, in metres in the shell's frame.
+
+    `ns-export gaussian-splat` writes the same in nerfstudio's own frame.
+
+    Args:
+        config: The run's config.yml.
+        output: The ply. If not set: splats.ply beside the config.
+        up: Axis of the shell's frame that points up, for the json. If not set: y for a glTF shell, else z.
+    """
+    from shellgs_method.export import write_splats
+    from shellgs_method.export.runs import TrainedRun
+
+    output = output or config.with_name("splats.ply")
+    check_output(output)
+    run = TrainedRun.load(config, up)
+    count = write_splats(output, run.splats())
+    run.frame.describe(output, {"splats": count})
+    console.print(f"{output}: {count} Gaussians. {place(run.frame)}")
