@@ -1,6 +1,6 @@
 """Vertical bands of a facade, alternating A and B, so that what is supervised and what is measured are apart.
 
-A band belongs to the wall, not to the picture: it is cut by planes that stand in the scene, across the facade, so that
+A band belongs to the wall, not to the image: it is cut by planes that stand in the scene, across the facade, so that
 it is the same piece of wall in every view.
 """
 

@@ -13,50 +13,50 @@ from shellgs_method.evaluation import Rendering, geometry_errors, image_errors
 from shellgs_method.reference import Reference
 
 REFERENCES = {"shell": "", "truth": "truth_"}
-"""Kinds of maps that geometry is measured against, and what the names of their figures begin with."""
+"""Kinds of maps that geometry is measured against, and what the names of their metrics begin with."""
 
 
 MARGIN = 2
 """Pixels around what stands before the shell in which its splats are seen, too."""
 
 
-def kept_pixels(batch: dict, picture: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"]:
-    """What the user's mask keeps of a picture; all of it where there is none."""
+def kept_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"]:
+    """What the user's mask keeps of an image; all of it where there is none."""
     if "mask" in batch:
-        return batch["mask"].to(picture.device)
-    return torch.ones_like(picture[..., :1], dtype=torch.bool)
+        return batch["mask"].to(image.device)
+    return torch.ones_like(image[..., :1], dtype=torch.bool)
 
 
-def picture_errors(
+def masked_image_errors(
     rgb: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], batch: dict, metres_per_unit: float | None
 ) -> dict[str, float]:
-    """Figures of :func:`image_errors` over what the user's mask keeps, and in the :func:`regions` of it."""
+    """Metrics of :func:`image_errors` over what the user's mask keeps, and in the :func:`regions` of it."""
     return image_errors(rgb, target, regions(batch, metres_per_unit, rgb.device), kept_pixels(batch, target))
 
 
 def reference_errors(
     rendering: Rendering, camera: Camera, batch: dict, metres_per_unit: float | None
 ) -> dict[str, float]:
-    """Figures of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``.
+    """Metrics of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``.
 
     Where metres are known there is ``truth_f_score_5cm_…`` too, for two of the :func:`regions`: on the shell and before
     it.
     """
-    figures, found = {}, references(batch, rendering.depth.device)
+    metrics, found = {}, references(batch, rendering.depth.device)
     for prefix, reference in found.items():
         errors = geometry_errors(rendering, camera, reference, metres_per_unit)
-        figures |= {prefix + name: value for name, value in errors.items()}
+        metrics |= {prefix + name: value for name, value in errors.items()}
     if truth := found.get(REFERENCES["truth"]):
         parts = regions(batch, metres_per_unit, rendering.depth.device)
         for name in parts.keys() & {"on_shell", "before_shell"}:
             reference = truth._replace(mask=truth.mask & parts[name])
             errors = geometry_errors(rendering, camera, reference, metres_per_unit)
-            figures |= {f"truth_{key}_{name}": errors[key] for key in errors.keys() & {"f_score_5cm"}}
-    return figures
+            metrics |= {f"truth_{key}_{name}": errors[key] for key in errors.keys() & {"f_score_5cm"}}
+    return metrics
 
 
 def regions(batch: dict, metres_per_unit: float | None, device: torch.device) -> dict[str, Bool[Tensor, "H W 1"]]:
-    """Parts of a held-out view that pictures are measured in, by name, all of pixels that training views have seen.
+    """Parts of a held-out view that images are measured in, by name, all of pixels that training views have seen.
 
     * ``seen``: all of these.
     * ``on_shell``, ``off_shell``: on the shell, or where it is not or does not count.
@@ -79,7 +79,7 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
 
 
 def references(batch: dict, device: torch.device) -> dict[str, Reference]:
-    """The maps that a batch has to measure against, by what the names of their figures begin with."""
+    """The maps that a batch has to measure against, by what the names of their metrics begin with."""
     return {
         prefix: reference_maps(batch, kind, device) for kind, prefix in REFERENCES.items() if f"{kind}_depth" in batch
     }

@@ -35,10 +35,10 @@ class SeenBy:
     points: Float[Tensor, "N 3"]
 
     def mask(self, camera: Camera, depth: Float[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
-        """Pixels of a view that at least two training views have in their picture, not hidden by the shell.
+        """Pixels of a view that at least two training views have in their image, not hidden by the shell.
 
         This is the co-visibility of Gao et al. 2022, from geometry instead of optical flow. A pixel's place is that of
-        the shell or, where there is none, as far away as the nearest SfM point in the picture.
+        the shell or, where there is none, as far away as the nearest SfM point in the image.
 
         Args:
             camera: of the view.
@@ -54,7 +54,7 @@ class SeenBy:
         return seen[: camera.height, : camera.width, None]
 
     def _depth_of_points(self, camera: Camera, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
-        """Depth of the SfM point that is nearest in the picture; as far as the sky where none is in it."""
+        """Depth of the SfM point that is nearest in the image; as far as the sky where none is in it."""
         pixels, z = _project(camera, self.points)
         inside = _inside(camera, pixels, z)
         if not inside.any():

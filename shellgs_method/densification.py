@@ -39,7 +39,7 @@ class MCMCConfig:
 class MCMCStrategy(Strategy):
     """Gaussians too faint to see are moved to where others are, some are added up to a cap, and all are shaken.
 
-    The numbers are the authors'. Neither moving nor adding changes the picture: a Gaussian is divided into copies in
+    The numbers are the authors'. Neither moving nor adding changes the image: a Gaussian is divided into copies in
     its place that together are what it was.
     """
 

@@ -10,10 +10,10 @@ from jaxtyping import UInt8
 from PIL import Image
 
 
-def encoded(picture: UInt8[np.ndarray, "H W C"], form: str = "PNG") -> bytes:
-    """The bytes of a picture's file; JPEG for what the eye will forgive."""
+def encoded(image: UInt8[np.ndarray, "H W C"], form: str = "PNG") -> bytes:
+    """The bytes of an image's file; JPEG for what the eye will forgive."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, form, quality=88)
+    Image.fromarray(image).save(buffer, form, quality=88)
     return buffer.getvalue()
 
 

@@ -28,14 +28,14 @@ from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.batches import (
     kept_pixels,
-    picture_errors,
+    masked_image_errors,
     pinhole_camera,
     reference_errors,
     reference_maps,
     references,
 )
 from shellgs_method.densification import MCMCConfig, MCMCStrategy
-from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_pictures, normals_to_colours
+from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
 from shellgs_method.geometry import (
     DISC_LOG_THICKNESS,
     DepthKind,
@@ -357,7 +357,7 @@ class FacadeModel(SplatfactoModel):
         return (spherical_harmonics(degree, directions, *coefficients) + 0.5).clamp_min(0)
 
     def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
-        """Figures of a training view."""
+        """Metrics of a training view."""
         target = self._view_losses(batch, outputs["background"]).photometric.target
         error = (outputs["rgb"].detach() - target).square()
         psnr = -10 * weighted_mean(error, kept_pixels(batch, target)).log10()
@@ -407,7 +407,7 @@ class FacadeModel(SplatfactoModel):
 
     @torch.no_grad()
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """All figures of a held-out view, against the shell and, as ``truth_…``, the true geometry; and its pictures.
+        """All metrics of a held-out view, against the shell and, as ``truth_…``, the true geometry; and its images.
 
         Both are there for every method: the shell is a reference even where it is no cue.
         """
@@ -416,12 +416,11 @@ class FacadeModel(SplatfactoModel):
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
         rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
-        figures = picture_errors(rendering.rgb, target, batch, self.metres_per_unit)
-        figures |= reference_errors(rendering, camera, batch, self.metres_per_unit)
+        metrics = masked_image_errors(rendering.rgb, target, batch, self.metres_per_unit)
+        metrics |= reference_errors(rendering, camera, batch, self.metres_per_unit)
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}
         if "shell_depth" not in batch:
-            images |= geometry_pictures(rendering)
+            images |= geometry_images(rendering)
         for prefix, reference in references(batch, self.device).items():
-            pictures = geometry_pictures(rendering, reference)
-            images |= {prefix + name: picture for name, picture in pictures.items()}
-        return figures, images
+            images |= {prefix + name: image for name, image in geometry_images(rendering, reference).items()}
+        return metrics, images

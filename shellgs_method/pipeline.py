@@ -1,4 +1,4 @@
-"""Nerfstudio's pipeline, with averages over the views that have a figure."""
+"""Nerfstudio's pipeline, with averages over the views that have a metric."""
 
 from __future__ import annotations
 
@@ -133,25 +133,25 @@ class FacadePipeline(VanillaPipeline):
     def get_average_image_metrics(
         self, data_loader, image_prefix: str, step: int | None = None, output_path: Path | None = None, get_std=False
     ) -> dict[str, float]:
-        """Mean (and standard deviation) of each figure over the views that have it."""
+        """Mean (and standard deviation) of each metric over the views that have it."""
         del step
         self.eval()
         if output_path is not None:
             output_path.mkdir(parents=True, exist_ok=True)
-        figures = []
+        views = []
         for index, (camera, batch) in enumerate(track(data_loader, "Evaluating all images", transient=True)):
             start = perf_counter()
             outputs = self.model.get_outputs_for_camera(camera)
             seconds = perf_counter() - start
             metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
             rays = int(camera.height) * int(camera.width)
-            figures.append(metrics | {"num_rays_per_sec": rays / seconds, "fps": 1 / seconds})
+            views.append(metrics | {"num_rays_per_sec": rays / seconds, "fps": 1 / seconds})
             if output_path is not None:
                 for key, image in images.items():
                     path = output_path / f"{image_prefix}_{key}_{index:04d}.png"
                     torchvision.utils.save_image(image.permute(2, 0, 1).cpu(), path)
         self.train()
-        return mean_over_views(figures, deviation=get_std)
+        return mean_over_views(views, deviation=get_std)
 
 
 def _listed(value: Any) -> Any:

@@ -70,7 +70,7 @@ class ExtraLossConfig:
     empty_space_from: int = 0
     """First iteration of that term."""
     tolerance: Optional[float] = None
-    """Distance from the plane that costs nothing, in metres. If not set: how far the shell may be off by the figures of
+    """Distance from the plane that costs nothing, in metres. If not set: how far the shell may be off by the metrics of
     its alignment, from 5 to 15 cm; 5 cm where it was not validated."""
     occlusion_gate: float = 0.0
     """Metres that a pixel's rendered depth may be in front of the cue before it is taken for an occluder's."""

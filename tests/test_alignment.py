@@ -600,7 +600,7 @@ def test_a_matrix_is_judged_reported_and_written(scene, shellgs):
         written.apply(load_shell(shell).vertices), true.apply(load_shell(shell).vertices), atol=1e-4
     )
     assert written.verdict in output
-    assert (written.figures["within_10cm"] or 0) > 0.5
+    assert (written.metrics["within_10cm"] or 0) > 0.5
     page = (scene / REPORT / "index.html").read_text()
     assert f"Verdict: <b>{written.verdict}</b>" in page
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
@@ -723,7 +723,7 @@ def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
     judged.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
     assert set(used) == {"bpa"}
     assert "judged with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
-    assert Alignment.load(scanned / ALIGNMENT) == replace(judged, mesher="planes", verdict="", figures={})
+    assert Alignment.load(scanned / ALIGNMENT) == replace(judged, mesher="planes", verdict="", metrics={})
 
 
 def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
@@ -777,7 +777,7 @@ def test_an_alignment_without_a_verdict_is_still_read(tmp_path):
     fields = {"shell_to_scene": np.eye(4).tolist(), "shell": "a.ply", "metres_per_shell_unit": 1.0, "source": "matrix"}
     (tmp_path / "alignment.json").write_text(json.dumps(fields))
     assert Alignment.load(tmp_path / "alignment.json") == Alignment(np.eye(4), "a.ply")
-    judged = Alignment(np.eye(4), "a.ply", verdict="good", figures={"bias_m": 0.01, "pull_m": None})
+    judged = Alignment(np.eye(4), "a.ply", verdict="good", metrics={"bias_m": 0.01, "pull_m": None})
     judged.save(tmp_path / "alignment.json")
     assert Alignment.load(tmp_path / "alignment.json") == judged
 

@@ -124,8 +124,8 @@ def test_a_holdout_trains_and_is_measured(pristine_scene, tmp_path):
     whole = trainer_of(pristine_scene, tmp_path / "whole", iterations=3)
     half = trainer_of(pristine_scene, tmp_path / "half", iterations=3, change=hold_out)
     half.train()
-    figures = [trainer.pipeline.get_average_eval_image_metrics() for trainer in (whole, half)]
-    assert 0 < figures[1]["supported"] < 0.8 * figures[0]["supported"]
+    metrics = [trainer.pipeline.get_average_eval_image_metrics() for trainer in (whole, half)]
+    assert 0 < metrics[1]["supported"] < 0.8 * metrics[0]["supported"]
     assert model_of(half).step == 2
 
 

@@ -444,8 +444,8 @@ def test_absurd_settings_are_refused_in_a_sentence(scene, shellgs, words, messag
     [
         {"shell_to_scene": np.eye(4).tolist(), "shell": "shell/facade.ply", "metres_per_shell_unit": "one"},
         {"shell_to_scene": [["a"] * 4] * 4, "shell": "shell/facade.ply"},
-        {"shell_to_scene": np.eye(4).tolist(), "shell": "shell/facade.ply", "figures": 3},
-        {"shell_to_scene": np.eye(4).tolist(), "shell": "shell/facade.ply", "figures": {"bias_m": "much"}},
+        {"shell_to_scene": np.eye(4).tolist(), "shell": "shell/facade.ply", "metrics": 3},
+        {"shell_to_scene": np.eye(4).tolist(), "shell": "shell/facade.ply", "metrics": {"bias_m": "much"}},
         {"shell_to_scene": np.eye(4).tolist(), "shell": "shell/facade.ply", "mesher": "marching"},
         {"shell_to_scene": np.eye(4).tolist(), "shell": "shell/facade.ply", "metres_per_shell_unit": -1},
         {"shell_to_scene": np.full((4, 4), 1e400).tolist(), "shell": "shell/facade.ply"},

@@ -265,8 +265,8 @@ def test_surfaces_are_measured_on_the_shell_and_before_it():
     batch = {"seen": everywhere}
     for kind, depth in (("shell", wall), ("truth", truth)):
         batch |= {f"{kind}_depth": depth, f"{kind}_normal": normal, f"{kind}_mask": everywhere}
-    figures = reference_errors(Rendering(wall, wall, torch.ones(size), normal), camera, batch, 1.0)
-    assert figures["truth_f_score_5cm_on_shell"] == pytest.approx(1)
-    assert figures["truth_f_score_5cm_before_shell"] == 0
-    assert 0.4 < figures["truth_f_score_5cm"] < 0.6
-    assert not [name for name in figures if name.startswith("f_score") and name.endswith("shell")]
+    metrics = reference_errors(Rendering(wall, wall, torch.ones(size), normal), camera, batch, 1.0)
+    assert metrics["truth_f_score_5cm_on_shell"] == pytest.approx(1)
+    assert metrics["truth_f_score_5cm_before_shell"] == 0
+    assert 0.4 < metrics["truth_f_score_5cm"] < 0.6
+    assert not [name for name in metrics if name.startswith("f_score") and name.endswith("shell")]

@@ -87,7 +87,7 @@ def test_a_demo_of_another_facade_is_not_shown_as_this_one(demo, monkeypatch, fl
 
 
 def test_ns_eval_writes_all_figures(demo):
-    figures = json.loads((config(demo).parent / "eval.json").read_text())["results"]
+    metrics = json.loads((config(demo).parent / "eval.json").read_text())["results"]
     assert {
         "psnr",
         "ssim",
@@ -96,7 +96,7 @@ def test_ns_eval_writes_all_figures(demo):
         "chamfer_m",
         "f_score_10cm",
         "truth_normal_deg",
-    } <= figures.keys()
+    } <= metrics.keys()
 
 
 def test_ns_export_writes_the_gaussians(demo, tmp_path):

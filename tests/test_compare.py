@@ -36,8 +36,8 @@ from dataparsers.layout import SceneLayout, ScenePaths
 from shellgs_method import cli
 from shellgs_method.compare import cluster, launch
 from shellgs_method.compare.launch import follow, launch_locally
-from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_figures
-from shellgs_method.compare.pictures import DOT, dotted, recorded_figures
+from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_metrics
+from shellgs_method.compare.plots import DOT, dotted, recorded_metrics
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
 from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
@@ -96,9 +96,9 @@ def test_csv_has_all_digits():
 # the grid
 
 
-def fabricate(run: Run, half=None, **figures: float) -> None:
+def fabricate(run: Run, half=None, **metrics: float) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
-    run.figures(half).write_text(json.dumps({"results": figures}))
+    run.metrics(half).write_text(json.dumps({"results": metrics}))
 
 
 def fake_grid(scenes: list[Path], names: list[str], folder: Path, seeds=(0,), iterations: int = 20) -> list[Run]:
@@ -521,9 +521,9 @@ def test_two_comparisons_do_not_work_in_one_folder(pristine_scene, tmp_path):
 
 
 DAMAGED = {
-    "cut figures": ("eval.json", b'{"results": {"psnr": 2'),
-    "figures of another kind": ("eval.json", b'{"results": {"psnr": "good"}}'),
-    "no figures": ("eval.json", b"[]"),
+    "cut metrics": ("eval.json", b'{"results": {"psnr": 2'),
+    "metrics of another kind": ("eval.json", b'{"results": {"psnr": "good"}}'),
+    "no metrics": ("eval.json", b"[]"),
     "a cut view": ("views/0000-frame_00001.npz", b"PK\x03\x04"),
     "an empty view": ("views/0000-frame_00001.npz", b""),
     "cut settings": ("settings.json", b'{"method"'),
@@ -538,7 +538,7 @@ def test_a_damaged_file_of_one_run_stops_no_other_and_is_made_again(pristine_sce
     names = ["shellgs", "2dgs"]
     damaged, other = fake_grid([pristine_scene], names, tmp_path / "out")
     finish_all([damaged, other])
-    before = other.figures().stat().st_mtime_ns
+    before = other.metrics().stat().st_mtime_ns
     (damaged.folder / name).parent.mkdir(exist_ok=True)
     (damaged.folder / name).write_bytes(content)
     failures = finish_all(fake_grid([pristine_scene], names, tmp_path / "out"))
@@ -547,9 +547,9 @@ def test_a_damaged_file_of_one_run_stops_no_other_and_is_made_again(pristine_sce
         assert (damaged.folder / name).read_bytes() == content
     else:
         assert not failures
-        assert json.loads(damaged.figures().read_text()) == {"results": {"psnr": 20.0}}
+        assert json.loads(damaged.metrics().read_text()) == {"results": {"psnr": 20.0}}
     assert "2dgs" in (tmp_path / "out" / "results.md").read_text()
-    assert other.figures().stat().st_mtime_ns == before
+    assert other.metrics().stat().st_mtime_ns == before
 
 
 def test_a_folder_is_replaced_whole_and_what_a_kill_put_aside_comes_back(tmp_path):
@@ -606,7 +606,7 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
             trainer = trainer_of(pristine_scene, run.output, method, 4, change=place)
             trainer.config.save_config()
             trainer.train()
-            write_figures(run.config, run.figures(), pictures=run.pictures)
+            write_metrics(run.config, run.metrics(), renders=run.renders)
     return runs
 
 
@@ -615,7 +615,7 @@ def test_our_figures_are_those_of_ns_eval(measured):
     _, pipeline, _, _ = eval_setup(measured[1].config)
     assert isinstance(pipeline, FacadePipeline)
     theirs = pipeline.get_average_eval_image_metrics(get_std=True)
-    ours = json.loads(measured[1].figures().read_text())["results"]
+    ours = json.loads(measured[1].metrics().read_text())["results"]
     timing = {"fps", "fps_std", "num_rays_per_sec", "num_rays_per_sec_std"}
     assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})
 
@@ -644,7 +644,7 @@ def test_our_figures_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_
 
 @pytest.mark.usefixtures("eager")
 def test_a_half_is_measured_of_a_run_that_knows_no_halves(measured):
-    whole = json.loads(measured[0].figures().read_text())["results"]
+    whole = json.loads(measured[0].metrics().read_text())["results"]
     halves = [measure(measured[0].config, half)["results"]["supported"] for half in ("A", "B")]
     assert sum(halves) == pytest.approx(whole["supported"], rel=1e-5)
     assert min(halves) > 0.1 * whole["supported"]
@@ -660,7 +660,7 @@ def test_snapshots_are_pictures_of_the_views(measured):
 def test_a_thinned_picture_has_the_rays_of_the_pixels_it_keeps(measured, tmp_path, monkeypatch):
     """Every third pixel: pixel (i, j) of the picture is pixel (3 i, 3 j) of the view."""
     monkeypatch.setattr("shellgs_method.compare.measure.PICTURE_SIZE", 16)
-    measure(measured[0].config, pictures=tmp_path)
+    measure(measured[0].config, renders=tmp_path)
     thin, full = (Snapshot.load(sorted(folder.glob("*.npz"))[0]) for folder in (tmp_path, measured[0].pictures))
     cameras = [
         Camera(torch.from_numpy(shot.viewmat), torch.from_numpy(shot.K), *shot.mask.shape[1::-1])
@@ -702,4 +702,4 @@ def test_ablations_without_their_method_have_a_report(measured, tmp_path):
 
 
 def test_curves_are_of_all_held_out_views(measured):
-    assert sorted(recorded_figures(measured[1])["normal_deg"]) == [2]
+    assert sorted(recorded_metrics(measured[1])["normal_deg"]) == [2]

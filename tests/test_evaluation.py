@@ -1,4 +1,4 @@
-"""The figures against closed forms: planes, known rotations, parallel walls."""
+"""The metrics against closed forms: planes, known rotations, parallel walls."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from shellgs_method.evaluation import (
     compare_surfaces,
     depth_mae,
     evaluate_view,
-    geometry_pictures,
+    geometry_images,
     image,
     image_errors,
     mean_over_views,
@@ -241,12 +241,12 @@ def test_pictures_are_measured_in_regions_as_if_there_were_nothing_else():
     rgb = (target + 0.2 * noise - 0.1).clamp(0, 1)
     left = torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool)
     left[:, :7] = True
-    figures = image_errors(rgb, target, {"left": left, "nowhere": ~left & left})
+    metrics = image_errors(rgb, target, {"left": left, "nowhere": ~left & left})
     mse = (rgb - target)[:, :7].square().mean().item()
-    assert figures["psnr_left"] == pytest.approx(-10 * np.log10(mse), abs=1e-3)
+    assert metrics["psnr_left"] == pytest.approx(-10 * np.log10(mse), abs=1e-3)
     similarity = ssim(rgb.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], 11)[0, :, :, :7]
-    assert figures["ssim_left"] == pytest.approx(similarity.mean().item(), abs=1e-5)
-    assert figures.keys() == {"psnr", "ssim", "psnr_left", "ssim_left"}
+    assert metrics["ssim_left"] == pytest.approx(similarity.mean().item(), abs=1e-5)
+    assert metrics.keys() == {"psnr", "ssim", "psnr_left", "ssim_left"}
 
 
 def test_ssim_equals_the_formula_on_constant_pictures():
@@ -260,8 +260,8 @@ def test_lpips_without_weights_is_left_out_and_said_once(caplog, monkeypatch):
     monkeypatch.setattr(image, "_reachable", asked.append)
     target = torch.rand(HEIGHT, WIDTH, 3)
     with caplog.at_level(logging.WARNING):
-        figures = [image_errors(target, target) for _ in range(3)]
-    assert all("lpips" not in view for view in figures)
+        metrics = [image_errors(target, target) for _ in range(3)]
+    assert all("lpips" not in view for view in metrics)
     assert len(asked) == 1
     assert [record.message.startswith("LPIPS is not available") for record in caplog.records] == [True]
 
@@ -289,11 +289,11 @@ def test_lpips_with_weights_is_zero_for_the_same_picture_and_positive_for_anothe
 
 def test_a_perfect_rendering_has_perfect_geometry():
     rendering, photograph, reference = seen()
-    figures = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=2.0)
+    metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=2.0)
     for key in ("depth_mae_m", "normal_deg", "depth_normal_deg", "accuracy_m", "completeness_m", "chamfer_m"):
-        assert figures[key] == pytest.approx(0.0, abs=1e-5), key
+        assert metrics[key] == pytest.approx(0.0, abs=1e-5), key
     for key in ("supported", "rendered", "normal_below_10deg", "f_score_5cm", "f_score_20cm"):
-        assert figures[key] == 1.0, key
+        assert metrics[key] == 1.0, key
 
 
 def test_lengths_are_in_metres():
@@ -301,27 +301,27 @@ def test_lengths_are_in_metres():
     depth, normals = plane((0, 0, -1))
     photograph = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64)
     rendering = Rendering(photograph, depth + 0.1, torch.ones_like(depth), normals)
-    figures = evaluate_view(rendering, photograph, CAMERA, Reference(depth, normals, EVERYWHERE), 0.5)
-    assert figures["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
-    assert figures["accuracy_m"] == pytest.approx(0.05 * CAMERA.rays().norm(dim=-1).mean().item(), rel=1e-5)
-    assert (figures["f_score_5cm"], figures["f_score_10cm"]) == (0.0, 1.0)
+    metrics = evaluate_view(rendering, photograph, CAMERA, Reference(depth, normals, EVERYWHERE), 0.5)
+    assert metrics["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["accuracy_m"] == pytest.approx(0.05 * CAMERA.rays().norm(dim=-1).mean().item(), rel=1e-5)
+    assert (metrics["f_score_5cm"], metrics["f_score_10cm"]) == (0.0, 1.0)
 
 
 def test_lengths_without_a_known_metre_do_not_pretend_to_be_metres():
-    figures = evaluate_view(*seen()[:2], CAMERA, seen()[2])
-    assert {"depth_mae_units", "accuracy_units", "completeness_units", "chamfer_units"} <= figures.keys()
-    assert not any(key.endswith(("_m", "cm")) for key in figures)
+    metrics = evaluate_view(*seen()[:2], CAMERA, seen()[2])
+    assert {"depth_mae_units", "accuracy_units", "completeness_units", "chamfer_units"} <= metrics.keys()
+    assert not any(key.endswith(("_m", "cm")) for key in metrics)
 
 
 def test_a_hole_costs_normals_and_completeness_but_is_no_depth_error():
     rendering, photograph, reference = seen()
     alpha = rendering.alpha.clone()
     alpha[:, : WIDTH // 2] = 0.2
-    figures = evaluate_view(rendering._replace(alpha=alpha), photograph, CAMERA, reference, metres_per_unit=1.0)
-    assert figures["rendered"] == 0.5
-    assert figures["normal_deg"] == pytest.approx(45.0, abs=1e-5)
-    assert figures["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
-    assert figures["completeness_m"] > 0.1 > figures["accuracy_m"]
+    metrics = evaluate_view(rendering._replace(alpha=alpha), photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert metrics["rendered"] == 0.5
+    assert metrics["normal_deg"] == pytest.approx(45.0, abs=1e-5)
+    assert metrics["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["completeness_m"] > 0.1 > metrics["accuracy_m"]
 
 
 def test_a_view_where_nothing_was_rendered_scores_zero_and_has_no_nan():
@@ -329,11 +329,11 @@ def test_a_view_where_nothing_was_rendered_scores_zero_and_has_no_nan():
     empty = Rendering(
         rendering.rgb, *(torch.zeros_like(t) for t in (rendering.depth, rendering.alpha, reference.normal))
     )
-    figures = evaluate_view(empty, photograph, CAMERA, reference, metres_per_unit=1.0)
-    assert figures["rendered"] == figures["f_score_20cm"] == figures["surface_points"] == 0.0
-    assert figures["normal_deg"] == figures["depth_normal_deg"] == 90.0
-    assert "depth_mae_m" not in figures
-    assert all(math.isfinite(value) for value in figures.values())
+    metrics = evaluate_view(empty, photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert metrics["rendered"] == metrics["f_score_20cm"] == metrics["surface_points"] == 0.0
+    assert metrics["normal_deg"] == metrics["depth_normal_deg"] == 90.0
+    assert "depth_mae_m" not in metrics
+    assert all(math.isfinite(value) for value in metrics.values())
 
 
 def test_what_lies_outside_the_mask_does_not_count():
@@ -342,24 +342,24 @@ def test_what_lies_outside_the_mask_does_not_count():
     mask[:, :10] = False
     wrong = rendering.depth.clone()
     wrong[:, :9] *= 3
-    figures = evaluate_view(rendering._replace(depth=wrong), photograph, CAMERA, reference._replace(mask=mask), 1.0)
-    assert figures["depth_normal_deg"] == pytest.approx(0.0, abs=1e-5)
-    assert figures["accuracy_m"] == figures["completeness_m"] == 0.0
+    metrics = evaluate_view(rendering._replace(depth=wrong), photograph, CAMERA, reference._replace(mask=mask), 1.0)
+    assert metrics["depth_normal_deg"] == pytest.approx(0.0, abs=1e-5)
+    assert metrics["accuracy_m"] == metrics["completeness_m"] == 0.0
 
 
 @pytest.mark.parametrize("supported", [False, True], ids=["empty mask", "with a mask"])
 def test_a_view_without_support_has_image_figures_only(supported):
     rendering, photograph, reference = seen()
     reference = reference._replace(mask=EVERYWHERE & supported)
-    figures = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
-    assert ("depth_mae_m" in figures) == supported
+    metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert ("depth_mae_m" in metrics) == supported
     assert evaluate_view(rendering, photograph, CAMERA).keys() == {"psnr", "ssim"}
 
 
 def test_figures_are_plain_floats():
     rendering, photograph, reference = seen()
-    figures = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
-    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
+    metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
+    assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
 
 
 def test_means_are_over_the_views_that_have_a_figure():
@@ -372,7 +372,7 @@ def test_deviation_is_over_the_views():
     assert means == {"psnr": 25.0, "psnr_std": 5.0}
 
 
-# tables and figures
+# tables and metrics
 
 COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("chamfer_m", "CD (m)", min, ".3f"))
 ROWS = {"shellgs": {"psnr": 24.96, "chamfer_m": 0.052}, "photo-gs": {"psnr": 25.04}}
@@ -414,14 +414,14 @@ def test_error_picture_is_black_where_exact_yellow_where_nothing_is_rendered_and
     rendering, _, reference = seen()
     alpha, mask = rendering.alpha.clone(), EVERYWHERE.clone()
     alpha[:10], mask[-10:] = 0.2, False
-    error = geometry_pictures(rendering._replace(alpha=alpha), reference._replace(mask=mask))["normal_error"]
+    error = geometry_images(rendering._replace(alpha=alpha), reference._replace(mask=mask))["normal_error"]
     rows = [(255 * error[row]).round().unique(dim=0).tolist() for row in (5, 20, HEIGHT - 5)]
     assert rows == [[[252, 255, 164]], [[0, 0, 4]], [[GREY] * 3]]  # both ends of inferno, and grey
 
 
 def test_depth_and_normal_pictures_put_a_perfect_rendering_beside_the_same():
     rendering, _, reference = seen()
-    pictures = geometry_pictures(rendering, reference)
+    pictures = geometry_images(rendering, reference)
     for name in ("depth", "normal"):
         assert pictures[name].shape == (HEIGHT, 2 * WIDTH, 3)
         assert torch.equal(pictures[name][:, :WIDTH], pictures[name][:, WIDTH:])
@@ -429,10 +429,10 @@ def test_depth_and_normal_pictures_put_a_perfect_rendering_beside_the_same():
 
 def test_pictures_stay_in_range_for_normals_that_half_precision_made_longer_than_one():
     rendering, _, reference = seen((0, 0, -1))
-    pictures = geometry_pictures(rendering, reference._replace(normal=1.001 * reference.normal))
+    pictures = geometry_images(rendering, reference._replace(normal=1.001 * reference.normal))
     assert all(picture.min() >= 0 and picture.max() <= 1 for picture in pictures.values())
 
 
 def test_a_view_without_reference_has_pictures_of_what_was_rendered_alone():
-    shapes = {name: tuple(picture.shape) for name, picture in geometry_pictures(seen()[0]).items()}
+    shapes = {name: tuple(picture.shape) for name, picture in geometry_images(seen()[0]).items()}
     assert shapes == {"depth": (HEIGHT, WIDTH, 3), "normal": (HEIGHT, WIDTH, 3)}

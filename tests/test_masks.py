@@ -109,12 +109,12 @@ def test_masked_pixels_are_in_no_figure_of_a_picture(monkeypatch):
             return (one - other).abs().mean()
 
     monkeypatch.setattr(image, "lpips_network", Mean)
-    figures = image_errors(rgb, target, {"on_shell": torch.ones_like(kept)}, kept)
+    metrics = image_errors(rgb, target, {"on_shell": torch.ones_like(kept)}, kept)
     inside = (rgb - target)[:, 20:]
-    assert figures["psnr"] == pytest.approx(-10 * inside.square().mean().log10().item(), abs=1e-3)
-    assert figures["lpips"] == pytest.approx(inside.abs().mean().item(), rel=1e-4)
-    assert figures["psnr_on_shell"] == figures["psnr"]
-    assert image_errors(torch.where(kept, rgb, 1 - rgb), target, None, kept)["ssim"] == pytest.approx(figures["ssim"])
+    assert metrics["psnr"] == pytest.approx(-10 * inside.square().mean().log10().item(), abs=1e-3)
+    assert metrics["lpips"] == pytest.approx(inside.abs().mean().item(), rel=1e-4)
+    assert metrics["psnr_on_shell"] == metrics["psnr"]
+    assert image_errors(torch.where(kept, rgb, 1 - rgb), target, None, kept)["ssim"] == pytest.approx(metrics["ssim"])
     assert image_errors(rgb, target, None, torch.zeros_like(kept)) == {}
 
 
@@ -143,9 +143,9 @@ def test_a_masked_view_is_measured_where_it_is_kept(scene, tmp_path):
     trainer.pipeline.eval()
     camera, batch = held_out(trainer)
     model, outputs = model_of(trainer), model_of(trainer).get_outputs_for_camera(camera)
-    figures, _ = model.get_image_metrics_and_images(outputs, batch)
+    metrics, _ = model.get_image_metrics_and_images(outputs, batch)
     spoilt = outputs | {"rgb": torch.where(batch["mask"], outputs["rgb"], 1 - outputs["rgb"])}
-    assert model.get_image_metrics_and_images(spoilt, batch)[0] == figures
+    assert model.get_image_metrics_and_images(spoilt, batch)[0] == metrics
     assert "mask" in data_of(trainer).cached_train[0]
 
 

@@ -202,16 +202,16 @@ def test_the_mesh_of_a_run_is_the_building_in_metres_in_the_shells_frame(run, fa
 
 
 def test_the_mesh_of_the_truth_is_near_truth_and_shell(run, facade):
-    figures = mesh_errors(run, facade)
-    assert figures["truth_chamfer_m"] < 0.15  # of pixels of 0.2
-    assert figures["truth_f_score_20cm"] > 0.8
-    assert figures["truth_rendered"] > 0.8
-    assert figures["chamfer_m"] < 0.2
-    assert figures["area_near_shell"] > 0.8
+    metrics = mesh_errors(run, facade)
+    assert metrics["truth_chamfer_m"] < 0.15  # of pixels of 0.2
+    assert metrics["truth_f_score_20cm"] > 0.8
+    assert metrics["truth_rendered"] > 0.8
+    assert metrics["chamfer_m"] < 0.2
+    assert metrics["area_near_shell"] > 0.8
     flap = np.add(facade.vertices, [0, 0, 30])
     faces = np.concatenate([facade.faces, facade.faces + len(flap)])
     both = trimesh.Trimesh(np.concatenate([facade.vertices, flap]), faces, process=False)
-    assert mesh_errors(run, both)["area_near_shell"] == pytest.approx(figures["area_near_shell"] / 2, abs=1e-3)
+    assert mesh_errors(run, both)["area_near_shell"] == pytest.approx(metrics["area_near_shell"] / 2, abs=1e-3)
 
 
 def test_what_is_far_from_the_shell_is_no_part_of_the_facade(run, facade):

@@ -241,9 +241,9 @@ def test_mono_gs_without_its_maps_ends_with_one_sentence(scene, tmp_path):
 
 def _normal_error(trainer, reference: str = "shell") -> float:
     trainer.pipeline.eval()
-    figures, _ = model_of(trainer).get_image_metrics_and_images(render(trainer), held_out(trainer)[1])
+    metrics, _ = model_of(trainer).get_image_metrics_and_images(render(trainer), held_out(trainer)[1])
     trainer.pipeline.train()
-    return figures["normal_deg" if reference == "shell" else f"{reference}_normal_deg"]
+    return metrics["normal_deg" if reference == "shell" else f"{reference}_normal_deg"]
 
 
 # Switches beyond the paper

@@ -26,8 +26,8 @@ from shellgs_method.sim.collider import Collider, make_collider
 from shellgs_method.sim.engine import beams, compiled, import_mujoco, lidar, load, warnings_kept
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.parts import Part
-from shellgs_method.sim.pictures import rendered
 from shellgs_method.sim.rays import Surface, outward
+from shellgs_method.sim.renders import rendered
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
 from shellgs_method.sim.texture import TexturedMesh
@@ -320,7 +320,7 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, cap
     assert "convex parts" in said
     assert "8 spheres and boxes thrown" in said
     names = "facade.xml facade.urdf facade.sdf facade.usda visual.glb visual.obj visual.mtl visual.png splats.ply"
-    for name in f"{names} frame.json figures.json README.md report.html deviations.ply deviations.json".split():
+    for name in f"{names} frame.json metrics.json README.md report.html deviations.ply deviations.json".split():
         assert (out / name).stat().st_size > 0, name
     assert load(out / "facade.xml").ngeom > 20
     assert compliance_errors(out / "facade.usda") == []
@@ -331,7 +331,7 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, cap
     building = transformed(transformed(corner, np.array(frame["to_national"])), np.linalg.inv(SHELL_FROM_BUILDING))
     assert building[:, 0].min() > -1.5
     assert building[:, 0].max() < 19.5
-    assert np.isfinite(json.loads((out / "figures.json").read_text())["buildings"]["facade"]["walk"]["metres"])
+    assert np.isfinite(json.loads((out / "metrics.json").read_text())["buildings"]["facade"]["walk"]["metres"])
     page = (out / "report.html").read_text()
     assert page.count("<img") >= 6
     assert "nan" not in page

@@ -1,4 +1,4 @@
-"""The methods inside nerfstudio: outputs, losses, schedules, checkpoints, figures."""
+"""The methods inside nerfstudio: outputs, losses, schedules, checkpoints, metrics."""
 
 from __future__ import annotations
 
@@ -263,7 +263,7 @@ def test_a_failed_save_leaves_the_last_checkpoint(trained, monkeypatch):
 def test_every_method_is_measured_against_shell_and_truth(pristine_scene, tmp_path, method):
     trainer = trainer_of(pristine_scene, tmp_path, method, iterations=10)
     trainer.train()
-    figures = trainer.pipeline.get_average_eval_image_metrics(get_std=True)
+    metrics = trainer.pipeline.get_average_eval_image_metrics(get_std=True)
     geometric = {
         "depth_mae_m",
         "normal_deg",
@@ -273,17 +273,17 @@ def test_every_method_is_measured_against_shell_and_truth(pristine_scene, tmp_pa
         "f_score_10cm",
         "supported",
     }
-    assert {"psnr", "ssim", *geometric, *(f"truth_{name}" for name in geometric)} <= figures.keys()
-    assert np.isfinite(list(figures.values())).all()
+    assert {"psnr", "ssim", *geometric, *(f"truth_{name}" for name in geometric)} <= metrics.keys()
+    assert np.isfinite(list(metrics.values())).all()
 
 
 def test_a_held_out_view_without_a_map_counts_for_the_pictures_only(scene, tmp_path):
     (scene / "cues" / "shell" / "images" / "frame_00001.png.npz").unlink()
     trainer = trainer_of(scene, tmp_path, iterations=5)
     trainer.train()
-    figures = trainer.pipeline.get_average_eval_image_metrics()
-    assert figures["normal_deg_views"] == 1
-    assert "psnr_views" not in figures
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    assert metrics["normal_deg_views"] == 1
+    assert "psnr_views" not in metrics
 
 
 def test_a_shell_method_on_a_scene_without_shell_maps_ends_with_one_sentence(scene, tmp_path):

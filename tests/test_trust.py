@@ -267,7 +267,7 @@ def test_a_run_without_its_config_is_named(tmp_path, monkeypatch):
     [
         (["evaluate", "--output-path", "folder"], "folder is a folder"),
         (["evaluate", "--output-path", "file/eval.json"], "is a file, not a folder"),
-        (["evaluate", "--output-path", "eval.json", "--pictures", "file"], "file is a file: name a folder"),
+        (["evaluate", "--output-path", "eval.json", "--renders", "file"], "file is a file: name a folder"),
         (["splats", "--output", "folder"], "folder is a folder"),
         (["mesh", "--output", "folder.ply"], "folder.ply is a folder"),
         (["mesh", "--output", "file/mesh.ply"], "is a file, not a folder"),

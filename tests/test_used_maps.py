@@ -39,9 +39,9 @@ def test_maps_that_a_method_does_not_train_on_do_not_stop_it(scene, tmp_path, ki
     trainer = trainer_of(scene, tmp_path, "photo_gs", iterations=2)
     trainer.train()
     assert not any(key.startswith(("shell", "mono", "truth")) for key in data_of(trainer).cached_train[0])
-    figures = trainer.pipeline.get_average_eval_image_metrics()
-    assert {"psnr", "psnr_seen"} <= figures.keys()
-    assert ("normal_deg" in figures, "truth_normal_deg" in figures) == (kind != "shell", kind != "truth")
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    assert {"psnr", "psnr_seen"} <= metrics.keys()
+    assert ("normal_deg" in metrics, "truth_normal_deg" in metrics) == (kind != "shell", kind != "truth")
     told = [record.message for record in caplog.records if "measures nothing against" in record.message]
     assert len(told) == (kind != "mono")
     assert all(f"the {kind} maps" in message for message in told)
@@ -56,8 +56,8 @@ def test_a_cast_at_another_size_leaves_every_method_its_truth(scene, tmp_path):
     cli.cast(scene, max_image_size=24)
     trainer = trainer_of(scene, tmp_path, "shellgs", iterations=2)
     trainer.train()
-    figures = trainer.pipeline.get_average_eval_image_metrics()
-    assert {"normal_deg", "truth_normal_deg", "truth_chamfer_m"} <= figures.keys()
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    assert {"normal_deg", "truth_normal_deg", "truth_chamfer_m"} <= metrics.keys()
 
 
 @pytest.mark.parametrize("size", [(24, 16), (36, 24), (96, 64)])

@@ -14,23 +14,23 @@ def evaluate(
     config: Annotated[Path, tyro.conf.Positional],
     output_path: Path = Path("eval.json"),
     holdout: Optional[Literal["A", "B"]] = None,
-    pictures: Optional[Path] = None,
+    renders: Optional[Path] = None,
 ) -> None:
-    """All figures of a trained run, as `ns-eval` writes them, for any nerfstudio method that renders depth.
+    """All metrics of a trained run, as `ns-eval` writes them, for any nerfstudio method that renders depth.
 
     Args:
         config: The run's config.yml. Other methods than ours are trained with `ns-train METHOD … facade-data`.
         output_path: The json.
         holdout: Measure these vertical bands of the facade alone, whatever the run was trained on.
-        pictures: Folder that gets what was rendered for each held-out view, as npz.
+        renders: Folder that gets what was rendered for each held-out view, as npz.
     """
     # First, and from here: nerfstudio's registry inspects the stack of calls 26 times, and deep in our imports that is
     # a second and a half longer.
     import nerfstudio.configs.method_configs  # noqa: F401
 
-    from shellgs_method.compare.measure import write_figures
+    from shellgs_method.compare.measure import write_metrics
     from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, rich_table
 
-    figures = {"run": write_figures(config, output_path, holdout, pictures)}
+    metrics = {"run": write_metrics(config, output_path, holdout, renders)}
     for columns in (MAIN_COLUMNS, SURFACE_COLUMNS):
-        console.print(rich_table(figures, columns))
+        console.print(rich_table(metrics, columns))

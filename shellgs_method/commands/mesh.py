@@ -42,12 +42,12 @@ def mesh(
         raise SceneError("a mesh has at least 4 --faces, a --voxel above 0 and a --margin from 0")
     run = TrainedRun.load(config, up)
     made = decimate(run.facade(fuse(run.views(), run.box(margin), voxel), margin), faces)
-    figures = mesh_errors(run, made)
-    write_mesh(output, made, run.frame, figures)
-    truth = {name.removeprefix("truth_"): value for name, value in figures.items() if name.startswith("truth_")}
-    rows = {name: row for name, row in (("shell", figures), ("truth", truth)) if "rendered" in row}
+    metrics = mesh_errors(run, made)
+    write_mesh(output, made, run.frame, metrics)
+    truth = {name.removeprefix("truth_"): value for name, value in metrics.items() if name.startswith("truth_")}
+    rows = {name: row for name, row in (("shell", metrics), ("truth", truth)) if "rendered" in row}
     console.print(f"{output}: {len(made.faces)} triangles, voxels of {made.metadata['voxel']:.3g}. {place(run.frame)}")
     if rows:
         console.print(rich_table(rows, SURFACE_COLUMNS, "Mesh in the held-out views, against"))
-    if "area_near_shell" in figures:
-        console.print(f"{figures['area_near_shell']:.0%} of its area is within 20 cm of the shell.")
+    if "area_near_shell" in metrics:
+        console.print(f"{metrics['area_near_shell']:.0%} of its area is within 20 cm of the shell.")

@@ -34,7 +34,7 @@ def sim(
     def tell(sentence: str) -> None:
         console.print(sentence, highlight=False)
 
-    figures, _ = simulate(configs, out, settings, tell, up)
-    for sentence in figures["summary"]:
+    metrics, _ = simulate(configs, out, settings, tell, up)
+    for sentence in metrics["summary"]:
         tell(sentence)
     console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how far off it is.")

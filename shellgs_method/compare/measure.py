@@ -22,7 +22,7 @@ from dataparsers.errors import SceneError, check_output
 from dataparsers.facade import FacadeDataParserConfig
 from dataparsers.files import atomic_write
 from dataparsers.layout import SceneLayout
-from shellgs_method.batches import picture_errors, pinhole_camera, reference_errors, reference_maps
+from shellgs_method.batches import masked_image_errors, pinhole_camera, reference_errors, reference_maps
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
 from shellgs_method.depth_normals import normals_from_depth
@@ -32,12 +32,12 @@ from shellgs_method.model import FacadeModel
 from shellgs_method.trained import load_run
 
 PICTURE_SIZE = 640
-"""Most pixels along the longer side of a picture in a report."""
+"""Most pixels along the longer side of an image in a report."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a run rendered for a held-out view, thinned to a picture's size; lengths in units of the rescaled world."""
+    """What a run rendered for a held-out view, thinned to an image's size; lengths in units of the rescaled world."""
 
     photograph: UInt8[np.ndarray, "H W 3"]
     rgb: UInt8[np.ndarray, "H W 3"]
@@ -58,7 +58,7 @@ class Snapshot:
 
     @property
     def camera(self) -> Camera:
-        """Of the picture, in the rescaled world."""
+        """Of the image, in the rescaled world."""
         height, width = self.mask.shape[:2]
         return Camera(torch.from_numpy(self.viewmat), torch.from_numpy(self.K), width, height)
 
@@ -81,18 +81,18 @@ class Snapshot:
             raise SceneError(f"{path} is damaged ({type(error).__name__})") from error
         pixels = [getattr(shot, name) for name in ("photograph", "rgb", "normal", "error", "depth", "mask")]
         if len({values.shape[:2] for values in pixels}) > 1 or any(values.ndim != 3 for values in pixels):
-            raise SceneError(f"{path} is damaged (its pictures are of different sizes)")
+            raise SceneError(f"{path} is damaged (its renders are of different sizes)")
         return shot
 
 
 @torch.no_grad()
-def measure(config_path: Path, half: Half | None = None, pictures: Path | None = None) -> dict:
-    """What ns-eval writes of a run, with the geometric figures of our methods for every method.
+def measure(config_path: Path, half: Half | None = None, renders: Path | None = None) -> dict:
+    """What ns-eval writes of a run, with the geometric metrics of our methods for every method.
 
     Args:
         config_path: config.yml of the run.
         half: bands of the facade that alone are measured; None: what the run itself held out, or all.
-        pictures: folder that gets a :class:`Snapshot` of each view that sees the shell.
+        renders: folder that gets a :class:`Snapshot` of each view that sees the shell.
 
     Raises:
         FileNotFoundError: there is no such config.
@@ -101,35 +101,35 @@ def measure(config_path: Path, half: Half | None = None, pictures: Path | None =
     config, pipeline, checkpoint = load_run(config_path, "test")
     model, datamanager = pipeline.model, _held_out_views(config.pipeline.datamanager, half, pipeline.device)
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
-    figures = []
-    if pictures:
-        pictures.mkdir(parents=True, exist_ok=True)
+    metrics = []
+    if renders:
+        renders.mkdir(parents=True, exist_ok=True)
     for index, (cameras, batch) in enumerate(track(datamanager.fixed_indices_eval_dataloader, transient=True)):
         camera = pinhole_camera(cameras)
         outputs = model.get_outputs_for_camera(cameras.to(model.device))
         rendering, photograph = _rendering(model, outputs, camera), _photograph(model, outputs, batch)
-        figures.append(
-            picture_errors(rendering.rgb, photograph, batch, metres_per_unit)
+        metrics.append(
+            masked_image_errors(rendering.rgb, photograph, batch, metres_per_unit)
             | reference_errors(rendering, camera, batch, metres_per_unit)
         )
-        if pictures and "shell_mask" in batch and batch["shell_mask"].any():
+        if renders and "shell_mask" in batch and batch["shell_mask"].any():
             name = f"{index:04d}-{Path(datamanager.eval_dataset.views[index].name).stem}.npz"
-            _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(pictures / name)
+            _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(renders / name)
     return {
         "experiment_name": config.experiment_name,
         "method_name": config.method_name,
         "checkpoint": str(checkpoint),
-        "results": mean_over_views(figures, deviation=True),
+        "results": mean_over_views(metrics, deviation=True),
     }
 
 
 def measure_shell(layout: SceneLayout) -> dict[str, float]:
-    """Figures of the shell itself against the truth, in held-out views and where both are; empty without a truth."""
+    """Metrics of the shell itself against the truth, in held-out views and where both are; empty without a truth."""
     if not {"shell", "truth"} <= {*find_cues(layout.data)}:
         return {}
     dataparser, cpu = FacadeDataParserConfig(**vars(layout)), torch.device("cpu")
     datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=layout.data), None, cpu)
-    dataset, figures = datamanager.eval_dataset, []
+    dataset, metrics = datamanager.eval_dataset, []
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
     for index in range(len(dataset)):
         batch = dataset.get_metadata({"image_idx": index})
@@ -137,8 +137,8 @@ def measure_shell(layout: SceneLayout) -> dict[str, float]:
             shell, truth = (reference_maps(batch, kind, cpu) for kind in ("shell", "truth"))
             both = truth._replace(mask=truth.mask & shell.mask)
             rendering = Rendering(shell.depth, shell.depth, shell.mask.float(), shell.normal)
-            figures.append(geometry_errors(rendering, dataset.camera(index), both, metres_per_unit))
-    return {f"truth_{name}": value for name, value in mean_over_views(figures).items()}
+            metrics.append(geometry_errors(rendering, dataset.camera(index), both, metres_per_unit))
+    return {f"truth_{name}": value for name, value in mean_over_views(metrics).items()}
 
 
 def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDataManager:
@@ -154,7 +154,7 @@ def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDa
 
 def _rendering(model: Model, outputs: dict[str, Tensor], camera: Camera) -> Rendering:
     if "depth" not in outputs or "accumulation" not in outputs:
-        raise SceneError(f"{type(model).__name__} renders no depth, which all geometric figures are made of")
+        raise SceneError(f"{type(model).__name__} renders no depth, which all geometric metrics are made of")
     depth = outputs["depth"]
     if not isinstance(model, SplatfactoModel):  # along the ray, in nerfstudio's radiance fields
         depth = depth / camera.rays().to(depth).norm(dim=-1, keepdim=True)
@@ -181,7 +181,7 @@ def _snapshot(
     step = camera.thinning(PICTURE_SIZE)
     K = camera.K.double().cpu().numpy().copy()
     K[:2] /= step
-    K[:2, 2] += 0.5 - 0.5 / step  # pixel i of the picture is pixel step * i: centres at 0.5 in both
+    K[:2, 2] += 0.5 - 0.5 / step  # pixel i of the image is pixel step * i: centres at 0.5 in both
 
     def thin(values: Tensor, dtype: type) -> np.ndarray:
         return values[::step, ::step].cpu().numpy().astype(dtype)
@@ -201,12 +201,12 @@ def _snapshot(
     )
 
 
-def write_figures(config: Path, output: Path, half: Half | None = None, pictures: Path | None = None) -> dict:
-    """:func:`measure`, as the json that ns-eval would write; returns the figures."""
+def write_metrics(config: Path, output: Path, half: Half | None = None, renders: Path | None = None) -> dict:
+    """:func:`measure`, as the json that ns-eval would write; returns the metrics."""
     check_output(output)
-    if pictures is not None and pictures.exists() and not pictures.is_dir():
-        raise SceneError(f"{pictures} is a file: name a folder for the pictures")
-    measured = measure(config, half, pictures)
+    if renders is not None and renders.exists() and not renders.is_dir():
+        raise SceneError(f"{renders} is a file: name a folder for the renders")
+    measured = measure(config, half, renders)
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(output) as file:
         file.write(json.dumps(measured, indent=2).encode())

@@ -1,4 +1,4 @@
-"""One HTML file with everything in it: tables, pictures, and a slider between methods on the held-out views."""
+"""One HTML file with everything in it: tables, images, and a slider between methods on the held-out views."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jaxtyping import UInt8
 
 from dataparsers.files import atomic_write
 from shellgs_method.compare.measure import Snapshot
-from shellgs_method.compare.pictures import REFERENCE, common_views
+from shellgs_method.compare.plots import REFERENCE, common_views
 from shellgs_method.compare.runs import Run
-from shellgs_method.compare.tables import FiguresTable
+from shellgs_method.compare.tables import MetricsTable
 from shellgs_method.evaluation.colours import error_colours, normal_colours
 from shellgs_method.html import data_uri, encoded
 
@@ -53,12 +53,12 @@ for (const box of document.querySelectorAll(".slider")) {{
 }}
 </script>
 """
-_KINDS = {"picture": "picture", "normals": "normals", "error": "angular error of the normals"}
+_KINDS = {"image": "image", "normals": "normals", "error": "angular error of the normals"}
 
 
 def write_report(
     path: Path,
-    tables: Sequence[FiguresTable],
+    tables: Sequence[MetricsTable],
     figures: Mapping[str, Path],
     views: Mapping[str, Sequence[Run]],
     failures: Mapping[str, str],
@@ -87,12 +87,12 @@ def write_report(
 def _slider(scene: str, runs: Sequence[Run], names: Sequence[str]) -> str:
     shots = {}
     for name in names:
-        loaded = {run.variant.name: Snapshot.load(run.pictures / name) for run in runs}
+        loaded = {run.variant.name: Snapshot.load(run.renders / name) for run in runs}
         first = next(iter(loaded.values()))
         exact = np.zeros_like(first.error)
-        reference = _pictures(first.photograph, first.shell_normal, exact, first.mask)
+        reference = _images(first.photograph, first.shell_normal, exact, first.mask)
         shots[Path(name).stem] = {REFERENCE: reference} | {
-            method: _pictures(shot.rgb, shot.normal, shot.error, shot.mask) for method, shot in loaded.items()
+            method: _images(shot.rgb, shot.normal, shot.error, shot.mask) for method, shot in loaded.items()
         }
     methods = [REFERENCE, *(run.variant.name for run in runs)]
     last_method = next((run for run in reversed(runs) if not run.variant.is_ablation), runs[-1]).variant.name
@@ -111,12 +111,10 @@ def _slider(scene: str, runs: Sequence[Run], names: Sequence[str]) -> str:
     )
 
 
-def _pictures(
-    rgb: UInt8[np.ndarray, "H W 3"], normal: np.ndarray, error: np.ndarray, mask: np.ndarray
-) -> dict[str, str]:
+def _images(rgb: UInt8[np.ndarray, "H W 3"], normal: np.ndarray, error: np.ndarray, mask: np.ndarray) -> dict[str, str]:
     mask = mask[..., 0]
-    pictures = {"picture": rgb, "normals": normal_colours(normal, mask), "error": error_colours(error[..., 0], mask)}
-    return {kind: data_uri(encoded(picture, "JPEG")) for kind, picture in pictures.items()}
+    images = {"image": rgb, "normals": normal_colours(normal, mask), "error": error_colours(error[..., 0], mask)}
+    return {kind: data_uri(encoded(image, "JPEG")) for kind, image in images.items()}
 
 
 def _select(label: str, options: Mapping[str, str], chosen: str = "") -> str:

@@ -12,10 +12,10 @@ from rich.console import Console
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write
 from shellgs_method.compare.measure import Snapshot, measure_shell
-from shellgs_method.compare.pictures import common_views, curves, strip, surfaces
+from shellgs_method.compare.plots import common_views, curves, strip, surfaces
 from shellgs_method.compare.report import write_report
 from shellgs_method.compare.runs import DamagedRunError, Run
-from shellgs_method.compare.tables import FiguresTable, read_figures, tables
+from shellgs_method.compare.tables import MetricsTable, read_metrics, tables
 from shellgs_method.evaluation.tables import rich_table
 from shellgs_method.folders import held
 
@@ -26,13 +26,13 @@ PANELS = (
     ("checked", "contradicted", "where photographs contradict the shell (red) and where they confirm it (green)."),
 )
 """Of a scene's maps: their kind, the file that the panel beside them is copied to, and its caption."""
-WRITING = "Writing tables, pictures and report ..."
+WRITING = "Writing tables, images and report ..."
 
 
 class Comparison(NamedTuple):
     """What came of a grid of runs."""
 
-    tables: Sequence[FiguresTable]
+    tables: Sequence[MetricsTable]
     figures: Mapping[str, Path]
     """Captions and PNG files."""
     failures: Mapping[Run, str]
@@ -85,20 +85,20 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
 def _remove_damaged(run: Run, console: Console) -> None:
     """Remove measurements that cannot be read; they are made again."""
     for half in (None, *run.halves):
-        if (path := run.figures(half)).exists() and read_figures(path) is None:
+        if (path := run.metrics(half)).exists() and read_metrics(path) is None:
             console.print(f"[yellow]{path} is damaged: it is measured again.", highlight=False)
             path.unlink()
-    for path in run.pictures.glob("*.npz"):
+    for path in run.renders.glob("*.npz"):
         try:
             Snapshot.load(path)
         except SceneError as error:
             console.print(f"[yellow]{error}: it is rendered again.", highlight=False)
             path.unlink()
-            run.figures().unlink(missing_ok=True)
+            run.metrics().unlink(missing_ok=True)
 
 
 def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]) -> Comparison:
-    """Write results.md, tables/, the pictures and report.html of what is measured so far."""
+    """Write results.md, tables/, the images and report.html of what is measured so far."""
     layouts = {run.scene: run.paths.of(run.scene) for run in runs}
     made = list(tables(runs, {scene: measure_shell(layout) for scene, layout in layouts.items()}))
     for table in made:
@@ -117,10 +117,10 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
 
 
 def _shown(runs: Sequence[Run]) -> list[Run]:
-    """The runs that pictures show: the first of each variant that is measured."""
+    """The runs that images show: the first of each variant that is measured."""
     first: dict[str, Run] = {}
     for run in runs:
-        if run.figures().exists() and any(run.pictures.glob("*.npz")):
+        if run.metrics().exists() and any(run.renders.glob("*.npz")):
             first.setdefault(run.variant.name, run)
     return list(first.values())
 

@@ -140,7 +140,7 @@ class Run:
         return self.folder / "config.yml"
 
     @property
-    def pictures(self) -> Path:
+    def renders(self) -> Path:
         """Folder of what it rendered for the held-out views."""
         return self.folder / "views"
 
@@ -154,23 +154,23 @@ class Run:
         """Whether its last checkpoint is there."""
         return (self.checkpoints / f"step-{self.iterations - 1:09d}.ckpt").exists()
 
-    def figures(self, half: Half | None = None) -> Path:
-        """The file of its figures, of the whole facade or of a half."""
+    def metrics(self, half: Half | None = None) -> Path:
+        """The file of its metrics, of the whole facade or of a half."""
         return self.folder / ("eval.json" if half is None else f"eval-{half}.json")
 
     @property
     def finished(self) -> bool:
         """Whether there is nothing left to do."""
-        return self.trained and all(self.figures(half).exists() for half in (None, *self.halves))
+        return self.trained and all(self.metrics(half).exists() for half in (None, *self.halves))
 
     def commands(self) -> Iterator[list[str]]:
         """What is left to do, word by word; ask for the next when the one before is done."""
         if not self.trained:
             yield self._train()
         for half in (None, *self.halves):
-            if not self.figures(half).exists():
-                extra = ["--pictures", self.pictures] if half is None else ["--holdout", half]
-                yield _words("shellgs", "evaluate", self.config, "--output-path", self.figures(half), *extra)
+            if not self.metrics(half).exists():
+                extra = ["--renders", self.renders] if half is None else ["--holdout", half]
+                yield _words("shellgs", "evaluate", self.config, "--output-path", self.metrics(half), *extra)
 
     def _train(self) -> list[str]:
         variant, every = self.variant, max(self.iterations // max(self.curve_points, 1), 1)

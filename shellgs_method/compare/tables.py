@@ -1,4 +1,4 @@
-"""The paper's tables of a grid of runs, with the paper's own figures beside them."""
+"""The paper's tables of a grid of runs, with the paper's own metrics beside them."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ TRUTH_COLUMNS = tuple(
 
 
 SHELL = "the shell itself"
-"""Row of a scene's shell, whose figures are those of the pixels where it is."""
+"""Row of a scene's shell, whose metrics are those of the pixels where it is."""
 
 
 @dataclass(frozen=True)
-class FiguresTable:
+class MetricsTable:
     """A table with what it says."""
 
     name: str
@@ -48,7 +48,7 @@ class FiguresTable:
     columns: Sequence[Column]
     rows: Rows
     paper: Rows = field(default_factory=dict)
-    """The paper's figures where the scene has the same role; they are of the paper's own scene."""
+    """The paper's metrics where the scene has the same role; they are of the paper's own scene."""
 
     @property
     def heading(self) -> str:
@@ -68,7 +68,7 @@ class FiguresTable:
     def save(self, folder: Path) -> None:
         """Write it as md, tex, csv and json."""
         folder.mkdir(parents=True, exist_ok=True)
-        everything = {"title": self.title, "figures": self.rows, "paper": self.paper}
+        everything = {"title": self.title, "metrics": self.rows, "paper": self.paper}
         texts = {
             "md": self.markdown,
             "tex": f"% {self.heading}\n{latex_table(self.rows, self.columns, self.paper)}",
@@ -80,8 +80,8 @@ class FiguresTable:
                 file.write(text.encode())
 
 
-def read_figures(path: Path) -> dict[str, float] | None:
-    """Figures of a run from the json that ns-eval, or we, wrote; without the deviations over the views.
+def read_metrics(path: Path) -> dict[str, float] | None:
+    """Metrics of a run from the json that ns-eval, or we, wrote; without the deviations over the views.
 
     None where the file is damaged.
     """
@@ -98,39 +98,39 @@ def read_figures(path: Path) -> dict[str, float] | None:
 
 def tables(
     runs: Sequence[Run], shells: Mapping[Path, Mapping[str, float]] = MappingProxyType({})
-) -> Iterator[FiguresTable]:
-    """All tables that the figures there are make; the first scene has the paper's primary role, others its second.
+) -> Iterator[MetricsTable]:
+    """All tables that the metrics there are make; the first scene has the paper's primary role, others its second.
 
     Args:
         runs: of all scenes.
-        shells: figures of each scene's shell itself, from :func:`.measure.measure_shell`.
+        shells: metrics of each scene's shell itself, from :func:`.measure.measure_shell`.
     """
     for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):
         of_scene = [run for run in runs if run.scene == scene]
         yield from _scene_tables(of_scene, shells.get(scene, {}), "" if index == 0 else f"{scene.name}-")
 
 
-def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) -> Iterator[FiguresTable]:
+def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) -> Iterator[MetricsTable]:
     whole = [run for run in runs if run.variant.held_out is None]
     methods = [run for run in whole if not run.variant.is_ablation]
     scene = runs[0].scene.name
     found = [
-        FiguresTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
-        FiguresTable(
+        MetricsTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
+        MetricsTable(
             "regions", f"{scene}: held-out views, where training views saw them", REGION_COLUMNS, _rows(whole)
         ),
-        FiguresTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
-        FiguresTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, {**_rows(whole), SHELL: shell}),
+        MetricsTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
+        MetricsTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, {**_rows(whole), SHELL: shell}),
     ]
     if any(run.variant.is_ablation for run in whole):
         ordered = [run for run in whole if run.variant.is_ablation or run.variant.name in ("photo-gs", "shellgs")]
-        found.append(FiguresTable("ablation", f"{scene}: ablations", ABLATION_COLUMNS, _rows(ordered)))
+        found.append(MetricsTable("ablation", f"{scene}: ablations", ABLATION_COLUMNS, _rows(ordered)))
     for half in HALVES:
         apart = [run for run in runs if run.variant.held_out == half]
         if apart:
             rows = _rows(methods, half) | _rows(apart)
             title = f"{scene}: in half {half} of the facade alone; -without-{half.lower()}: which no cue supervised"
-            found.append(FiguresTable(f"holdout-{half.lower()}", title, GEOMETRY_COLUMNS, rows))
+            found.append(MetricsTable(f"holdout-{half.lower()}", title, GEOMETRY_COLUMNS, rows))
     for table in found:
         role = table.name if not prefix else {"main": "second"}.get(table.name, "")
         rows = {name: row for name, row in table.rows.items() if any(c.key in row for c in table.columns)}
@@ -139,12 +139,12 @@ def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) 
 
 
 def _rows(runs: Sequence[Run], half: Half | None = None) -> dict[str, dict[str, list[float]]]:
-    """Figures of each variant, one for each seed that has them."""
+    """Metrics of each variant, one for each seed that has them."""
     rows: dict[str, dict[str, list[float]]] = {}
     for run in runs:
-        if run.figures(half).exists():
+        if run.metrics(half).exists():
             row = rows.setdefault(run.variant.name, {})
-            for key, value in (read_figures(run.figures(half)) or {}).items():
+            for key, value in (read_metrics(run.metrics(half)) or {}).items():
                 row.setdefault(key, []).append(value)
     return rows
 

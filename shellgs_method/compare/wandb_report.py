@@ -23,7 +23,7 @@ def log_in() -> None:
 
 
 def log_comparison(project: str, comparison: Comparison, runs: Sequence[Run]) -> None:
-    """Log each table as a ``wandb.Table`` (a row a method; mean and deviation of each figure), and the pictures.
+    """Log each table as a ``wandb.Table`` (a row a method; mean and deviation of each figure), and the images.
 
     Args:
         project: of wandb.

@@ -1,14 +1,14 @@
 """What is measured on held-out views: appearance, and geometry where a reference supports it.
 
-:func:`geometry_errors` says what each figure means. The parts it is made of take plain tensors and can be used alone.
+:func:`geometry_errors` says what each metric means. The parts it is made of take plain tensors and can be used alone.
 """
 
 from shellgs_method.evaluation.colours import colours_to_normals, normal_colours, normals_to_colours
 from shellgs_method.evaluation.geometry import NormalErrors, angular_error, depth_mae, normal_errors
 from shellgs_method.evaluation.image import image_errors, lpips_network
-from shellgs_method.evaluation.pictures import geometry_pictures
 from shellgs_method.evaluation.surface import SurfaceComparison, back_project, compare_surfaces
 from shellgs_method.evaluation.view import Rendering, evaluate_view, geometry_errors, mean_over_views
+from shellgs_method.evaluation.visualization import geometry_images
 
 __all__ = [
     "NormalErrors",
@@ -21,7 +21,7 @@ __all__ = [
     "depth_mae",
     "evaluate_view",
     "geometry_errors",
-    "geometry_pictures",
+    "geometry_images",
     "image_errors",
     "lpips_network",
     "mean_over_views",

@@ -1,4 +1,4 @@
-"""Colours for maps that are not pictures."""
+"""Colours for maps that are not images."""
 
 from __future__ import annotations
 

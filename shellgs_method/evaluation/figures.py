@@ -30,7 +30,7 @@ class Panel(NamedTuple):
 
 
 def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR, panel_inches: float = 2.5) -> None:
-    """Write a PNG of one column a panel: picture, normals, angular error with one colour bar for all, up to a limit."""
+    """Write a PNG of one column a panel: image, normals, angular error with one colour bar for all, up to a limit."""
     height, width = panels[0].rgb.shape[:2]
     size = (panel_inches * len(panels) + 0.8, panel_inches * 3 * height / width + 0.3)
     figure = Figure(figsize=size, layout="constrained")
@@ -39,9 +39,9 @@ def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR
     for column, panel in zip(axes.T, panels, strict=True):
         mask, normal = panel.mask[..., 0].cpu().numpy(), panel.normal.detach().cpu().numpy()
         error = error_colours(panel.error[..., 0].cpu().numpy(), mask, max_error)
-        pictures = (panel.rgb.detach().clamp(0, 1).cpu().numpy(), normal_colours(normal, mask), error)
-        for axis, picture in zip(column, pictures, strict=True):
-            axis.imshow(picture)
+        images = (panel.rgb.detach().clamp(0, 1).cpu().numpy(), normal_colours(normal, mask), error)
+        for axis, image in zip(column, images, strict=True):
+            axis.imshow(image)
             axis.set_axis_off()
         column[0].set_title(panel.title, fontsize=9)
     figure.colorbar(scale, ax=axes[2], extend="max", label="normal error (°)")

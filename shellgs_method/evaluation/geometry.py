@@ -49,7 +49,7 @@ def normal_errors(
 ) -> NormalErrors:
     """Summary of :func:`angular_error` over a mask that is not empty; a missing normal counts as 90°."""
     angle = angular_error(normal, target)[mask]
-    return NormalErrors(*(figure.item() for figure in (angle.mean(), share(angle < 10), share(angle < 20))))
+    return NormalErrors(*(metric.item() for metric in (angle.mean(), share(angle < 10), share(angle < 20))))
 
 
 def share(condition: Bool[Tensor, "*shape"]) -> Float[Tensor, ""]:

@@ -32,7 +32,7 @@ def image_errors(
     regions: Mapping[str, Bool[Tensor, "H W 1"]] | None = None,
     kept: Bool[Tensor, "H W 1"] | None = None,
 ) -> dict[str, float]:
-    """PSNR in dB (at most 100, so that an exact picture can be averaged), SSIM, and LPIPS where it can be had.
+    """PSNR in dB (at most 100, so that an exact image can be averaged), SSIM, and LPIPS where it can be had.
 
     Colours are in [0, 1]. SSIM is that of the loss, of a Gaussian window of 11 pixels and sigma 1.5; LPIPS has the
     AlexNet backbone. PSNR and SSIM of each region that is not empty are ``psnr_…`` and ``ssim_…`` with its name.
@@ -47,16 +47,16 @@ def image_errors(
     rgb, target, kept = rgb.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], kept[..., 0]
     similarity = ssim(rgb, target, window_size=11)[0]
     parts = {"": kept} | {f"_{name}": mask[..., 0] & kept for name, mask in (regions or {}).items()}
-    figures = {}
+    metrics = {}
     for suffix, region in parts.items():
         if region.any():
-            figures[f"psnr{suffix}"] = min(psnr(rgb[..., region], target[..., region], max_val=1.0).item(), 100.0)
-            figures[f"ssim{suffix}"] = similarity[:, region].mean().item()
+            metrics[f"psnr{suffix}"] = min(psnr(rgb[..., region], target[..., region], max_val=1.0).item(), 100.0)
+            metrics[f"ssim{suffix}"] = similarity[:, region].mean().item()
     network = lpips_network()
     if not isinstance(network, str) and min(rgb.shape[-2:]) >= SMALLEST_LPIPS_IMAGE:
         with torch.no_grad():
-            figures["lpips"] = network.to(rgb.device)(rgb, target).item() / kept.float().mean().item()
-    return figures
+            metrics["lpips"] = network.to(rgb.device)(rgb, target).item() / kept.float().mean().item()
+    return metrics
 
 
 @cache

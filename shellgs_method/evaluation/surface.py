@@ -60,7 +60,7 @@ def compare_surfaces(
 ) -> SurfaceComparison:
     """Compare two point clouds after both are thinned to one point a voxel.
 
-    The density of the samples alone moves the Chamfer distance threefold: figures can be compared only at the same
+    The density of the samples alone moves the Chamfer distance threefold: metrics can be compared only at the same
     voxel, and are stated with it.
     """
     points, reference = voxel_means(points, voxel), voxel_means(reference, voxel)

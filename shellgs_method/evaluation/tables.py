@@ -1,4 +1,4 @@
-"""Tables of figures, methods down and figures across: Markdown, LaTeX, HTML, CSV, and for the terminal."""
+"""Tables of metrics, methods down and metrics across: Markdown, LaTeX, HTML, CSV, and for the terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 Rows = Mapping[str, Mapping[str, float | Sequence[float]]]
-"""Figures by name, by method; a figure is one number, or one for each seed: then mean ± sample deviation is shown."""
+"""Metrics by name, by method; a metric is one number, or one for each seed: then mean ± sample deviation is shown."""
 
 _LATEX = str.maketrans(
     {character: rf"\{character}" for character in "&%$#_{}"}
@@ -24,10 +24,10 @@ _LATEX = str.maketrans(
 
 @dataclass(frozen=True)
 class Column:
-    """A figure as a table shows it."""
+    """A metric as a table shows it."""
 
     key: str
-    """Name of the figure, as in :func:`evaluate_view`."""
+    """Name of the metric, as in :func:`evaluate_view`."""
     title: str
     best: Callable[..., float]
     """``min`` or ``max``: which value is the best of a column."""
@@ -76,12 +76,12 @@ SURFACE_COLUMNS = (
 
 
 def markdown_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
-    """A Markdown table with the best of each column in bold; a figure that a method lacks is a dash.
+    """A Markdown table with the best of each column in bold; a metric that a method lacks is a dash.
 
     Args:
-        rows: figures of the methods.
-        columns: figures that are shown.
-        quoted: figures measured elsewhere, say a paper's; below the others, never bold.
+        rows: metrics of the methods.
+        columns: metrics that are shown.
+        quoted: metrics measured elsewhere, say a paper's; below the others, never bold.
     """
     lines = [["Method", *(column.heading for column in columns)], ["---", *("---:" for _ in columns)]]
     for method, cells in _cells(rows, columns, quoted):
@@ -117,11 +117,11 @@ def csv_table(rows: Rows, columns: Sequence[Column]) -> str:
 
 
 def plain_table(rows: Rows, columns: Sequence[Column]) -> tuple[list[str], list[list[str | float | None]]]:
-    """Head and lines: mean and sample deviation of each column's figure (None: there is none), number of seeds."""
+    """Head and lines: mean and sample deviation of each column's metric (None: there is none), number of seeds."""
     head = ["method", *(key for column in columns for key in (column.key, f"{column.key}_std")), "seeds"]
     lines: list[list[str | float | None]] = []
-    for method, figures in rows.items():
-        samples = [figures.get(column.key, ()) for column in columns]
+    for method, metrics in rows.items():
+        samples = [metrics.get(column.key, ()) for column in columns]
         spread = [statistic(values) for values in samples for statistic in (_mean, _deviation)]
         lines.append([method, *spread, max((np.size(values) for values in samples), default=0)])
     return head, lines
@@ -144,21 +144,21 @@ def _cells(
     """Each method with its cells' texts and whether they are the column's best; what reads the same is equally good."""
     best = {}
     for column in columns:
-        means = [_mean(figures[column.key]) for figures in rows.values() if column.key in figures]
+        means = [_mean(metrics[column.key]) for metrics in rows.values() if column.key in metrics]
         if means:
             best[column.key] = format(column.best(means), column.format)
-    for method, figures in rows.items():
-        cells = [(_text(figures, column), _mean(figures.get(column.key, ())), column) for column in columns]
+    for method, metrics in rows.items():
+        cells = [(_text(metrics, column), _mean(metrics.get(column.key, ())), column) for column in columns]
         yield (
             method,
             [(text, mean is not None and format(mean, c.format) == best[c.key]) for text, mean, c in cells],
         )
-    for source, figures in (quoted or {}).items():
-        yield source, [(_text(figures, column), False) for column in columns]
+    for source, metrics in (quoted or {}).items():
+        yield source, [(_text(metrics, column), False) for column in columns]
 
 
-def _text(figures: Mapping[str, float | Sequence[float]], column: Column) -> str:
-    values = figures.get(column.key, ())
+def _text(metrics: Mapping[str, float | Sequence[float]], column: Column) -> str:
+    values = metrics.get(column.key, ())
     mean, deviation = _mean(values), _deviation(values)
     if mean is None:
         return "–"

@@ -47,17 +47,17 @@ def evaluate_view(
     reference: Reference | None = None,
     metres_per_unit: float | None = None,
 ) -> dict[str, float]:
-    """All figures of a view by name: those of :func:`image_errors`, and with a reference those of the geometry."""
-    figures = image_errors(rendering.rgb, image)
+    """All metrics of a view by name: those of :func:`image_errors`, and with a reference those of the geometry."""
+    metrics = image_errors(rendering.rgb, image)
     if reference is not None:
-        figures |= geometry_errors(rendering, camera, reference, metres_per_unit)
-    return figures
+        metrics |= geometry_errors(rendering, camera, reference, metres_per_unit)
+    return metrics
 
 
 def geometry_errors(
     rendering: Rendering, camera: Camera, reference: Reference, metres_per_unit: float | None = None
 ) -> dict[str, float]:
-    """Geometric figures of a view: shares in [0, 1], angles in degrees, lengths in metres (``_m``).
+    """Geometric metrics of a view: shares in [0, 1], angles in degrees, lengths in metres (``_m``).
 
     Empty where the reference supports no pixel, else:
 
@@ -65,14 +65,14 @@ def geometry_errors(
     * ``depth_mae_m``: after the view's median scale, over rendered pixels.
     * ``normal_deg``, ``normal_below_10deg``, ``normal_below_20deg``: composited normals, over the whole mask;
       ``depth_normal_deg`` and so on: normals of the rendered depth, over the mask less the image's border. Where
-      nothing was rendered the angle counts as 90°: a hole is no way to a better figure.
+      nothing was rendered the angle counts as 90°: a hole is no way to a better metric.
     * ``accuracy_m``, ``completeness_m``, ``chamfer_m``, ``precision_5cm``, ``recall_5cm``, ``f_score_5cm`` (10cm,
       20cm): raw depth of rendered pixels against the mask's, both thinned to 2 cm voxels; ``surface_points`` and
       ``reference_points`` are what is left of the two.
 
     Where nothing of the mask was rendered, depth error and distances do not exist and are absent, and the F-scores
     are 0. Where ``metres_per_unit`` is unknown, lengths are in scene units and their names end in ``_units``, the
-    voxel is 1/500 of the reference's median depth, and there is no F-score. No figure is ever NaN.
+    voxel is 1/500 of the reference's median depth, and there is no F-score. No metric is ever NaN.
     """
     mask = reference.mask & (reference.depth > 0)
     if not mask.any():
@@ -80,34 +80,34 @@ def geometry_errors(
     depth = rendering.depth.detach()
     opaque = (depth > 0) & depth.isfinite() & (rendering.alpha >= OPAQUE)
     depth = depth.where(opaque, 0.0)
-    figures = {"supported": share(mask).item(), "rendered": share(opaque[mask]).item()}
+    metrics = {"supported": share(mask).item(), "rendered": share(opaque[mask]).item()}
 
     if rendering.normal is not None:
         composited = rendering.normal.detach().where(opaque, 0.0)
-        figures |= _normal_figures("normal", composited, reference.normal, mask)
+        metrics |= _normal_metrics("normal", composited, reference.normal, mask)
     inner = pad(mask[1:-1, 1:-1], (0, 0, 1, 1, 1, 1))
-    figures |= _normal_figures("depth_normal", normals_from_depth(depth, camera), reference.normal, inner)
-    return figures | _length_figures(depth, reference.depth, mask, camera, metres_per_unit)
+    metrics |= _normal_metrics("depth_normal", normals_from_depth(depth, camera), reference.normal, inner)
+    return metrics | _length_metrics(depth, reference.depth, mask, camera, metres_per_unit)
 
 
-def mean_over_views(figures: Sequence[Mapping[str, float]], deviation: bool = False) -> dict[str, float]:
-    """Mean of each figure over the views that have it.
+def mean_over_views(metrics: Sequence[Mapping[str, float]], deviation: bool = False) -> dict[str, float]:
+    """Mean of each metric over the views that have it.
 
-    A figure that some views lack gets its number of views beside it (``_views``), and with ``deviation`` every figure
+    A metric that some views lack gets its number of views beside it (``_views``), and with ``deviation`` every metric
     its standard deviation over the views (``_std``).
     """
     means: dict[str, float] = {}
-    for key in dict.fromkeys(key for view in figures for key in view):
-        values = [float(view[key]) for view in figures if key in view]
+    for key in dict.fromkeys(key for view in metrics for key in view):
+        values = [float(view[key]) for view in metrics if key in view]
         means[key] = float(np.mean(values))
         if deviation:
             means[f"{key}_std"] = float(np.std(values))
-        if len(values) < len(figures):
+        if len(values) < len(metrics):
             means[f"{key}_views"] = float(len(values))
     return means
 
 
-def _normal_figures(name: str, normal: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
+def _normal_metrics(name: str, normal: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
     if not mask.any():
         return {}
     errors = normal_errors(normal, target, mask)
@@ -118,7 +118,7 @@ def _normal_figures(name: str, normal: Tensor, target: Tensor, mask: Tensor) -> 
     }
 
 
-def _length_figures(
+def _length_metrics(
     depth: Tensor, target: Tensor, mask: Tensor, camera: Camera, metres_per_unit: float | None
 ) -> dict[str, float]:
     """Depth error and point clouds; a rendered depth of zero is none."""
@@ -129,18 +129,18 @@ def _length_figures(
 
     points = back_project(depth * scale, camera, mask & (depth > 0))
     surface = compare_surfaces(points, back_project(target * scale, camera, mask), voxel)
-    figures = {
+    metrics = {
         "surface_points": float(len(surface.to_reference)),
         "reference_points": float(len(surface.to_reconstruction)),
     }
     for name, threshold in thresholds.items():
-        figures[f"precision_{name}"] = surface.precision(threshold)
-        figures[f"recall_{name}"] = surface.recall(threshold)
-        figures[f"f_score_{name}"] = surface.f_score(threshold)
+        metrics[f"precision_{name}"] = surface.precision(threshold)
+        metrics[f"recall_{name}"] = surface.recall(threshold)
+        metrics[f"f_score_{name}"] = surface.f_score(threshold)
     error = depth_mae(depth, target, mask)
     if error is not None:
-        figures[f"depth_mae_{unit}"] = error * scale
-        figures[f"accuracy_{unit}"] = surface.accuracy
-        figures[f"completeness_{unit}"] = surface.completeness
-        figures[f"chamfer_{unit}"] = surface.chamfer
-    return figures
+        metrics[f"depth_mae_{unit}"] = error * scale
+        metrics[f"accuracy_{unit}"] = surface.accuracy
+        metrics[f"completeness_{unit}"] = surface.completeness
+        metrics[f"chamfer_{unit}"] = surface.chamfer
+    return metrics

@@ -154,14 +154,14 @@ class TrainedRun:
 
 
 def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
-    """Figures of :func:`geometry_errors` of the mesh as the held-out cameras see it, averaged over the views.
+    """Metrics of :func:`geometry_errors` of the mesh as the held-out cameras see it, averaged over the views.
 
     They can be compared with those of ns-eval: against the shell, and as ``truth_…`` against the true geometry where
     the scene has it. What no reference supports, such as flaps beside the building, only ``area_near_shell`` tells of:
     the share of the mesh's area within :data:`NEAR` of the shell.
     """
     caster = ShellCaster(ShellMesh(mesh.vertices, mesh.faces), run.frame.to_scene)
-    held_out, figures = run.datasets[1], []
+    held_out, metrics = run.datasets[1], []
     metres_per_unit = 1 / (run.frame.scale * run.model_scale) if run.frame.metric else None
     for index, view in enumerate(held_out.views):
         batch, cue = held_out.get_data(index), caster.cast(view.camera)
@@ -169,8 +169,8 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
         normal = torch.from_numpy(cue.normal).float()
         rendering = Rendering(torch.zeros_like(normal), depth, mask.float(), normal)
         camera = view.camera.to(dtype=torch.float32)
-        figures.append(reference_errors(rendering, camera, batch, metres_per_unit))
-    errors = mean_over_views(figures)
+        metrics.append(reference_errors(rendering, camera, batch, metres_per_unit))
+    errors = mean_over_views(metrics)
     if run.shell is not None:
         near = _distances(mesh, run.shell_in_frame) < NEAR
         errors["area_near_shell"] = float(np.average(near, weights=mesh.area_faces))

@@ -113,7 +113,7 @@ def _project(
 def disc_maps(
     alpha: Float[Tensor, "*batch 1"], maps: Float[Tensor, "*batch 3"]
 ) -> dict[str, Float[Tensor, "*batch 1"]]:
-    """What a disc picture tells of geometry, from what is composited of each disc: 1/z, 1/z², and the median's z.
+    """What a disc render tells of geometry, from what is composited of each disc: 1/z, 1/z², and the median's z.
 
     Distortion is the L2 form of 2DGS, sum over i and j < i of w_i w_j (m_i - m_j)², with depths mapped to
     m = far / (far - near) (1 - near / z). It is the variance A Σ w m² - (Σ w m)², A = Σ w, in which the constant of

@@ -26,8 +26,8 @@ from torch import Tensor
 
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer.discs import EDGE_ON
-from shellgs_method.rasterizer.picture import Picture
 from shellgs_method.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs
+from shellgs_method.rasterizer.renders import Renders
 
 logger = logging.getLogger(__name__)
 
@@ -64,10 +64,10 @@ def rasterize_3d(
     features: Float[Tensor, "N C"],
     cameras: Sequence[Camera],
     n_densifying: int | None = None,
-) -> Picture:
+) -> Renders:
     """Rasterize Gaussians on cameras of one size; float32 on a CUDA device, like all tensors here.
 
-    The picture is that of the torch backend, except that gsplat culls a splat beside the image that reaches into it
+    The render is that of the torch backend, except that gsplat culls a splat beside the image that reaches into it
     with no more than its alpha beyond three standard deviations, which is below 0.012.
     """
     viewmats, Ks, width, height = _stack(cameras)
@@ -75,19 +75,19 @@ def rasterize_3d(
         means, None, quats, scales, viewmats, Ks, width, height, eps2d=LOW_PASS, near_plane=NEAR_PLANE, packed=False
     )
     # gsplat's radii are of three standard deviations. A splat goes into the tiles where its alpha counts: farther out,
-    # or the picture would break off at their borders; or, of a faint splat, not so far, which saves time.
+    # or the render would break off at their borders; or, of a faint splat, not so far, which saves time.
     reach = (cutoffs(opacities).sqrt() / 3).view(-1, *[1] * (radii.dim() - 2))
     bins = _bin(means2d, radii * reach, depths, width, height)
     probe, groups = _probed(means2d, features, n_densifying)
-    pictures = [
+    renders = [
         rasterize_to_pixels(
             *(centres, conics, group.expand(len(cameras), -1, -1), opacities.expand(len(cameras), -1)),
             *(width, height, TILE, *bins),
         )
         for centres, group in groups
     ]
-    composited, alpha = torch.cat([picture for picture, _ in pictures], dim=-1), pictures[-1][1]
-    return Picture(composited, alpha, composited[..., :0], probe, radii)
+    composited, alpha = torch.cat([render for render, _ in renders], dim=-1), renders[-1][1]
+    return Renders(composited, alpha, composited[..., :0], probe, radii)
 
 
 def rasterize_2d(
@@ -98,27 +98,27 @@ def rasterize_2d(
     features: Float[Tensor, "N C"],
     cameras: Sequence[Camera],
     n_densifying: int | None = None,
-) -> Picture:
+) -> Renders:
     """Rasterize the discs of 2DGS (Huang et al. 2024).
 
     gsplat blends the depths of the centres, not of the intersections (its issues #477 and #863). Of an intersection,
     though, 1/z = q · ray with a constant q of the disc, see :class:`_Discs`: composited, the vectors q give the sum of
     weight over z exactly, and their products q qᵀ that of weight over z².
 
-    The picture is that of the torch backend, except that gsplat culls by the boxes of three standard deviations, and
+    The render is that of the torch backend, except that gsplat culls by the boxes of three standard deviations, and
     that its maps have the depth of the centre for all of a disc that is as good as edge-on.
     """
     discs = _project_discs(means, quats, scales, opacities, cameras)
     probe, groups = _probed(discs.means2d, features, n_densifying)
-    pictures = []
+    renders = []
     for means2d, group in groups:
         moved = replace(discs, means2d=means2d, ray_transforms=_centred(discs.ray_transforms, means2d))
         # One camera at a time: gsplat 1.4 writes the normals of a batch over those of its first (its issue #425).
         views = [_composite_discs(moved, i, opacities, group, camera) for i, camera in enumerate(cameras)]
-        pictures.append([torch.cat(view) for view in zip(*views, strict=True)])
-    composited = torch.cat([picture[0] for picture in pictures], dim=-1)
-    _, alpha, maps = pictures[-1]
-    return Picture(composited, alpha, maps, probe, discs.radii)
+        renders.append([torch.cat(view) for view in zip(*views, strict=True)])
+    composited = torch.cat([render[0] for render in renders], dim=-1)
+    _, alpha, maps = renders[-1]
+    return Renders(composited, alpha, maps, probe, discs.radii)
 
 
 RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
@@ -228,7 +228,7 @@ def _reach_of_discs(
 def _composite_discs(
     discs: _Discs, i: int, opacities: Float[Tensor, "N"], features: Float[Tensor, "N C"], camera: Camera
 ) -> tuple[Float[Tensor, "1 height width C"], Float[Tensor, "1 height width 1"], Float[Tensor, "1 height width 3"]]:
-    """Features, alpha, and the maps of a picture, as camera ``i`` sees them."""
+    """Features, alpha, and the maps of a render, as camera ``i`` sees them."""
     one = slice(i, i + 1)
     means2d, inverse_planes = discs.means2d[one], discs.inverse_planes[one]
     bins = _bin(means2d, discs.tile_radii[one], discs.ray_transforms[one, :, 2, 2], camera.width, camera.height)
@@ -241,11 +241,11 @@ def _composite_discs(
     numbers = torch.arange(len(features), dtype=features.dtype, device=features.device)
     filling = features.new_zeros(1, len(features), size - n_features - len(rows) - 1)
     channels = torch.cat([features[None], products, filling, numbers[None, :, None]], dim=-1)
-    pictures = rasterize_to_pixels_2dgs(
+    renders = rasterize_to_pixels_2dgs(
         *(means2d, discs.ray_transforms[one], channels, opacities[None], inverse_planes),
         *(torch.zeros_like(means2d), camera.width, camera.height, TILE, *bins),
     )
-    composited, alpha, inverse_plane, _, median = pictures  # pyright: ignore[reportAssignmentType]
+    composited, alpha, inverse_plane, _, median = renders  # pyright: ignore[reportAssignmentType]
     composited, products, _ = composited.split([n_features, len(rows), size - n_features - len(rows)], dim=-1)
     rays = camera.rays()
     pairs_of_rays = torch.where(rows == columns, 1, 2) * rays[..., rows] * rays[..., columns]

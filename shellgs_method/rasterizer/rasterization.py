@@ -20,8 +20,8 @@ from shellgs_method.rasterizer.disc_kernels import DISCS
 from shellgs_method.rasterizer.discs import disc_maps, project_discs
 from shellgs_method.rasterizer.gaussian_kernels import GAUSSIANS
 from shellgs_method.rasterizer.kernels import Kernels
-from shellgs_method.rasterizer.picture import Picture
 from shellgs_method.rasterizer.projection import Projection, View, project_gaussians
+from shellgs_method.rasterizer.renders import Renders
 
 
 def rasterize(
@@ -59,7 +59,7 @@ def rasterize(
     Returns:
         The sums of weight times feature (not divided by alpha, no background), the sums of the weights, and what
         gsplat's densification strategies need: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained,
-        ``radii``, …. The pictures of a sequence of cameras are stacked.
+        ``radii``, …. The renders of a sequence of cameras are stacked.
 
         Of discs there are also, differentiable, ``[*B, H, W, 1]``: ``inverse_depth``, the sum of weight over z of
         the ray's intersection, so that alpha / inverse_depth is the expected depth (the mean is taken of 1/z, which is
@@ -80,19 +80,19 @@ def rasterize(
     cameras = [each.to(means) for each in cameras]
     on_gsplat = gsplat_backend.runs_on_gsplat(backend, means)
     render = (gsplat_backend.RASTERIZE if on_gsplat else _RASTERIZE)[primitive]
-    picture = render(means, quats, scales, opacities, features, cameras, n_densifying)
+    renders = render(means, quats, scales, opacities, features, cameras, n_densifying)
     info = {
-        "means2d": picture.means2d,
-        "radii": picture.radii,
+        "means2d": renders.means2d,
+        "radii": renders.radii,
         "gaussian_ids": None,
         "width": width,
         "height": height,
         "n_cameras": len(cameras),
     }
     one = isinstance(camera, Camera)
-    composited, alpha, maps = (each[0] if one else each for each in (picture.composited, picture.alpha, picture.maps))
+    composited, alpha, maps = (each[0] if one else each for each in (renders.composited, renders.alpha, renders.maps))
     if primitive == "2d":
-        info |= {"gradient_2dgs": picture.means2d, **disc_maps(alpha, maps)}
+        info |= {"gradient_2dgs": renders.means2d, **disc_maps(alpha, maps)}
     return composited, alpha, info
 
 
@@ -106,14 +106,14 @@ def _rasterize(
     features: Float[Tensor, "N C"],
     cameras: Sequence[Camera],
     n_densifying: int | None,
-) -> Picture:
+) -> Renders:
     """Rasterize in torch the primitive of a projection and kernels."""
     projection = project(means, quats, scales, opacities, cameras, with_probe=n_densifying is not None)
     views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
     composited, alpha, maps = torch.stack(views).split([features.shape[1], 1, kernels.n_maps], dim=-1)
     radii = run_fused(_RADII, projection.outlines, projection.covars2d, projection.visible)
     centres = projection.means2d if projection.probe is None else projection.probe
-    return Picture(composited, alpha, maps, centres, radii)
+    return Renders(composited, alpha, maps, centres, radii)
 
 
 _RASTERIZE = {

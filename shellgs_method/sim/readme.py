@@ -24,7 +24,7 @@ scene's cameras (`to_scene`) and to national coordinates (`to_national`), whose 
 | `{folder}visual.glb` | the same for browsers; y-up, as glTF wants it |
 | `{folder}splats.ply` | the Gaussians |
 | `{folder}deviations.ply`, `.json` | the shell: red where the building stands before it, blue behind, grey not seen |
-| `report.html`, `figures.json` | how far off all of it is, and pictures |
+| `report.html`, `metrics.json` | how far off all of it is, and images |
 
 {summary}
 
@@ -62,7 +62,7 @@ pybullet.loadURDF("facade.urdf", useFixedBase=True)
 """
 
 
-def write_readme(out: Path, buildings: Sequence[Building], frame: SimFrame, figures: dict) -> None:
+def write_readme(out: Path, buildings: Sequence[Building], frame: SimFrame, metrics: dict) -> None:
     """Write what is in the folder, and how each simulator loads it."""
     where = (
         "Coordinates are metres along the shell's axes; the origin is on the ground before the facade."
@@ -75,7 +75,7 @@ def write_readme(out: Path, buildings: Sequence[Building], frame: SimFrame, figu
         frame=where,
         folder="BUILDING/" if several else "",
         parts=" and ".join(str(building.parts) for building in buildings),
-        summary="\n".join(f"* {sentence}" for sentence in figures["summary"]),
+        summary="\n".join(f"* {sentence}" for sentence in metrics["summary"]),
     )
     with atomic_write(out / "README.md") as file:
         file.write(text.encode())

@@ -1,4 +1,4 @@
-"""The report on a folder for simulators: pictures, distances, trials, deviations; one HTML file."""
+"""The report on a folder for simulators: images, distances, trials, deviations; one HTML file."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from shellgs_method.sim.distances import Distances
 from shellgs_method.sim.engine import beams, lidar, warnings_kept
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.parts import joined
-from shellgs_method.sim.pictures import overlaid, rendered, shown
 from shellgs_method.sim.rays import Surface
+from shellgs_method.sim.renders import overlaid, rendered, shown
 from shellgs_method.sim.texture import Photo
 from shellgs_method.sim.trials import throw, walk
 from shellgs_method.sim.world import Building
 
-PICTURES = 3
+IMAGES = 3
 """Photographs of each building that are shown."""
 REGIONS = 20
 """Deviations that are listed."""
@@ -70,7 +70,7 @@ class Chapter:
 def write_report(
     out: Path, buildings: Sequence[Building], chapters: Sequence[Chapter], tell: Callable[[str], None]
 ) -> dict:
-    """Try the world in MuJoCo, draw it, and write ``report.html``; returns the figures.
+    """Try the world in MuJoCo, draw it, and write ``report.html``; returns the metrics.
 
     Raises:
         SceneError: MuJoCo refuses the world.
@@ -81,25 +81,25 @@ def write_report(
     with warnings_kept() as warnings:
         thrown = throw(world, everything, eyes)
     summary = [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
-    figures = {"summary": summary, "throws": asdict(thrown), "warnings": warnings, "buildings": {}}
+    metrics = {"summary": summary, "throws": asdict(thrown), "warnings": warnings, "buildings": {}}
     page = [
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Simulation</title><style>{_STYLE}</style>',
         f"<h1>{escape(', '.join(chapter.made.scene for chapter in chapters))}</h1>",
     ]
     sections: list[str] = []
     for building, chapter in zip(buildings, chapters, strict=True):
-        made, sentences = _figures(world, building, chapter)
-        figures["buildings"][building.name] = made
+        made, sentences = _metrics(world, building, chapter)
+        metrics["buildings"][building.name] = made
         summary += sentences
         sections += _section(world, building, chapter, made, tell)
     page += [f"<p>{escape(sentence)}</p>" for sentence in summary]
     with atomic_write(out / "report.html") as file:
         file.write("".join([*page, *sections]).encode())
-    return figures
+    return metrics
 
 
-def _figures(world: Path, building: Building, chapter: Chapter) -> tuple[dict, list[str]]:
-    """A building's figures, and the sentences that say them."""
+def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, list[str]]:
+    """A building's metrics, and the sentences that say them."""
     collider, surface = chapter.collider, chapter.collider.surface
     front = Front.of(surface, chapter.made.eyes)
     with warnings_kept() as warnings:
@@ -113,7 +113,7 @@ def _figures(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
         "walk": asdict(walked),
         "visual": chapter.facts,
         "distances": {
-            name: {way: asdict(figures) for way, figures in ways.items()} for name, ways in chapter.distances.items()
+            name: {way: asdict(metrics) for way, metrics in ways.items()} for name, ways in chapter.distances.items()
         },
     }
     sentences = [
@@ -165,13 +165,13 @@ def text(errors: Mapping[str, float]) -> str:
 
 
 def _section(
-    world: Path, building: Building, chapter: Chapter, figures: dict, tell: Callable[[str], None]
+    world: Path, building: Building, chapter: Chapter, metrics: dict, tell: Callable[[str], None]
 ) -> Iterator[str]:
     yield f"<h2>{escape(building.name)}</h2>"
     width, height = chapter.facts["texture"]
     yield f"<p>{chapter.facts['triangles']} triangles with a texture of {width} x {height} pixels; "
     yield f"visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB.</p>"
-    yield from _pictures(world, chapter, tell)
+    yield from _images(world, chapter, tell)
     yield "<h3>Distances of the collider</h3>"
     rows = [
         (name, way, f"{100 * d.median:.1f}", f"{100 * d.p95:.1f}", f"{d.within:.1%}")
@@ -196,28 +196,28 @@ def _section(
         yield _table(("what", "area (m²)", "distance (cm)", "place (m)", "photograph"), rows)
 
 
-def _pictures(world: Path, chapter: Chapter, tell: Callable[[str], None]) -> Iterator[str]:
+def _images(world: Path, chapter: Chapter, tell: Callable[[str], None]) -> Iterator[str]:
     """Photographs, what MuJoCo draws from their cameras, and the collider's edges on them."""
     held_out = [k for k, view in enumerate(chapter.made.views) if view.name in chapter.made.held_out]
-    chosen = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, PICTURES).round().astype(int))]
+    chosen = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, IMAGES).round().astype(int))]
     photos = [shown(chapter.photos[k]) for k in chosen]
     try:
         drawn = rendered(world, [photo.camera for photo in photos])
     except SceneError as error:
-        tell(f"{error}; the report has no pictures of MuJoCo.")
+        tell(f"{error}; the report has no images of MuJoCo.")
         drawn = [None] * len(photos)
     surface = chapter.collider.surface
-    for k, photo, picture in zip(chosen, photos, drawn, strict=True):
+    for k, photo, image in zip(chosen, photos, drawn, strict=True):
         yield '<div class="row">'
         yield _figure(photo.image, chapter.made.views[k].name)
-        if picture is not None:
-            yield _figure(picture, "MuJoCo")
+        if image is not None:
+            yield _figure(image, "MuJoCo")
         yield _figure(overlaid(photo, surface), "the collider's edges")
         yield "</div>"
 
 
-def _figure(picture: np.ndarray, caption: str) -> str:
-    source = data_uri(encoded(np.ascontiguousarray(picture), "JPEG"))
+def _figure(image: np.ndarray, caption: str) -> str:
+    source = data_uri(encoded(np.ascontiguousarray(image), "JPEG"))
     return f'<figure><img src="{source}" alt=""><figcaption>{escape(caption)}</figcaption></figure>'
 
 

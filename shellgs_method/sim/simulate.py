@@ -54,7 +54,7 @@ def simulate(
         truths: for each run, its true geometry by the similarity from the scene to the world, where it is known.
 
     Returns:
-        The figures of ``figures.json``, and what they were taken from.
+        The metrics of ``metrics.json``, and what they were taken from.
 
     Raises:
         SceneError: a run cannot be used, or the runs have no common frame.
@@ -81,11 +81,11 @@ def simulate(
     unit = 1.0 if home.metric else None
     write_usd_world(out / "facade.usda", buildings, unit, all(chapter.with_splats for chapter in chapters))
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
-    figures = write_report(out, buildings, chapters, tell)
-    write_readme(out, buildings, home, figures)
-    with atomic_write(out / "figures.json") as file:
-        file.write((json.dumps(figures, indent=1) + "\n").encode())
-    return figures, chapters
+    metrics = write_report(out, buildings, chapters, tell)
+    write_readme(out, buildings, home, metrics)
+    with atomic_write(out / "metrics.json") as file:
+        file.write((json.dumps(metrics, indent=1) + "\n").encode())
+    return metrics, chapters
 
 
 def _building(

@@ -145,15 +145,15 @@ def refined(
 def judge(
     scene: Path, placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, target: Path
 ) -> Validation:
-    """Validate a placement, write the report, and unless it is refused write it to ``target``, with its figures.
+    """Validate a placement, write the report, and unless it is refused write it to ``target``, with its metrics.
 
-    Maps that were cast for the same place stay good: they are bound to the place, and told of the figures.
+    Maps that were cast for the same place stay good: they are bound to the place, and told of the metrics.
     """
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
     write_report(scene / REPORT, mesh, validation, placement.history)
     if validation.verdict == "refused":
         return validation
-    judged = replace(placement.alignment, verdict=validation.verdict, figures=validation.figures())
+    judged = replace(placement.alignment, verdict=validation.verdict, metrics=validation.metrics())
     judged.save(target)
     with suppress(FileNotFoundError, SceneError):  # none, or damaged, of which whoever reads them is told
         maps = CueMaps.open(scene, "shell")

@@ -33,7 +33,7 @@ class Alignment:
         metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
         source: how the alignment was found, for people.
         verdict: of the validation, "good" or "doubtful"; empty where there was none.
-        figures: the main numbers behind the verdict.
+        metrics: the main numbers behind the verdict.
         mesher: what makes a mesh of a shell that is a point cloud.
 
     Raises:
@@ -45,7 +45,7 @@ class Alignment:
     metres_per_shell_unit: float = 1.0
     source: str = "matrix"
     verdict: str = ""
-    figures: Mapping[str, float | None] = field(default_factory=dict)
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
     mesher: Mesher = "planes"
 
     def __post_init__(self) -> None:
@@ -85,7 +85,7 @@ class Alignment:
 
         It is the larger of the SfM points' median distance, with its sign, and how far a fit to them would move it.
         """
-        known = [abs(figure) for name in ("bias_m", "pull_m") if (figure := self.figures.get(name)) is not None]
+        known = [abs(metric) for name in ("bias_m", "pull_m") if (metric := self.metrics.get(name)) is not None]
         return max(known, default=None)
 
     def places_like(self, other: Alignment) -> bool:
@@ -101,7 +101,7 @@ class Alignment:
         """The same place of the surface that another mesher makes, which nobody has judged; None: the same mesher."""
         if mesher is None or mesher == self.mesher:
             return self
-        return replace(self, mesher=mesher, verdict="", figures={})
+        return replace(self, mesher=mesher, verdict="", metrics={})
 
     def load_shell(self, scene: Path, views: Sequence[View]) -> ShellMesh:
         """The shell's mesh, in its own frame; that of a point cloud is kept in ``scene/shell``.
@@ -146,9 +146,9 @@ class Alignment:
             matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
             unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
             verdict, mesher = str(fields.get("verdict", "")), fields.get("mesher", "planes")
-            known = dict(fields.get("figures", {}))
-            figures = {str(name): None if value is None else float(value) for name, value in known.items()}
-            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, figures, mesher)
+            known = dict(fields.get("metrics", fields.get("figures", {})))  # older files say figures
+            metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
+            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, metrics, mesher)
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
         except SceneError as error:

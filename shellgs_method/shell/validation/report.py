@@ -1,4 +1,4 @@
-"""The validation report: one HTML file that needs nothing else, its pictures also as PNG files, its figures as json."""
+"""The validation report: one HTML file that needs nothing else, its plots also as PNG files, its metrics as json."""
 
 from __future__ import annotations
 
@@ -90,19 +90,19 @@ def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history:
     folder.mkdir(parents=True, exist_ok=True)
     for stale in folder.glob("*.png"):
         stale.unlink()
-    pictures = {}
+    plots = {}
     for name, figure in (("distances", _histogram(validation)), ("shifts", _shifts(validation))):
         if figure is not None:
-            pictures[name] = _png(figure)
-            _write(folder / f"{name}.png", pictures[name])
+            plots[name] = _png(figure)
+            _write(folder / f"{name}.png", plots[name])
     overlays = list(_overlays(folder, mesh, validation))
     record = {
         "verdict": validation.verdict,
         "checks": [vars(check) for check in validation.checks],
-        "figures": validation.figures(),
+        "metrics": validation.metrics(),
     }
     _write(folder / "validation.json", (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
-    _write(folder / "index.html", "".join(_page(validation, history, pictures, overlays)).encode())
+    _write(folder / "index.html", "".join(_page(validation, history, plots, overlays)).encode())
     return folder / "index.html"
 
 
@@ -125,7 +125,7 @@ def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator
 
 
 def _page(
-    validation: Validation, history: Sequence[str], pictures: Mapping[str, bytes], overlays: Sequence[str]
+    validation: Validation, history: Sequence[str], plots: Mapping[str, bytes], overlays: Sequence[str]
 ) -> Iterator[str]:
     alignment, verdict = validation.alignment, validation.verdict
     title = f"Alignment of {escape(alignment.shell)}: {verdict}"
@@ -136,23 +136,23 @@ def _page(
     yield "1 m of the shell.</p>"
     yield "<h2>What the verdict rests on</h2>"
     checks = (
-        (f'<span class="{c.verdict}">{c.verdict}</span>', escape(c.name), escape(c.figure), escape(c.limits),
+        (f'<span class="{c.verdict}">{c.verdict}</span>', escape(c.name), escape(c.value), escape(c.limits),
          f'<span class="why">{escape(c.why)}</span>') for c in validation.checks
     )  # fmt: skip
-    yield _table(("", "figure", "value", "limits", "because"), checks)
+    yield _table(("", "metric", "value", "limits", "because"), checks)
     if overlays:
         yield "<h2>The shell's edges on the photographs</h2><p>They must lie on the photographed ones, at both ends of "
         yield "the building as well. The pointer on a picture hides them.</p>"
         yield f'<div class="views">{"".join(overlays)}</div>'
-    if "distances" in pictures:
+    if "distances" in plots:
         shares = ", ".join(f"{validation.share_within(d):.0%} within {100 * d:.0f} cm" for d in (0.05, 0.10, 0.20))
         yield f"<h2>Distance of the SfM points from the shell</h2><p>Of those within 1 m: {shares}; median "
         yield f"{100 * validation.bias:+.1f} cm along the normal, positive in front of the shell.</p>"
-        yield _img(pictures["distances"], "histogram of the distances")
-    if "shifts" in pictures:
+        yield _img(plots["distances"], "histogram of the distances")
+    if "shifts" in plots:
         yield "<h2>One bay further along?</h2><p>How well the shell fits the points where it is moved along the facade "
         yield f"and upwards. Another peak as high as {RIVALRY:.0%} of the one at 0 makes the alignment ambiguous.</p>"
-        yield _img(pictures["shifts"], "fit by shift")
+        yield _img(plots["shifts"], "fit by shift")
         rows = (
             (scan.name, f"{k:+d} × {scan.period:.2f} m", f"{fit:.2f}")
             for scan in validation.scans if scan.period for k, fit in scan.at_periods().items()

@@ -1,4 +1,4 @@
-"""Whether an alignment can be trusted, from the SfM points and the cameras alone: figures, limits, verdict.
+"""Whether an alignment can be trusted, from the SfM points and the cameras alone: metrics, limits, verdict.
 
 Everything is measured before any training and against what was there before the alignment, never tuned on results.
 """
@@ -35,7 +35,7 @@ _ORDER: tuple[Verdict, ...] = ("good", "doubtful", "refused")
 
 @dataclass(frozen=True)
 class Limit:
-    """What a figure must be: good as far as ``good``, refused beyond ``refused``, doubtful between the two."""
+    """What a metric must be: good as far as ``good``, refused beyond ``refused``, doubtful between the two."""
 
     good: float
     refused: float
@@ -76,10 +76,10 @@ _REACH = 0.25  # metres that the test refinement looks around
 
 @dataclass(frozen=True)
 class Check:
-    """One figure and what it says."""
+    """One metric and what it says."""
 
     name: str
-    figure: str
+    value: str
     limits: str
     verdict: Verdict
     why: str
@@ -87,11 +87,11 @@ class Check:
 
 @dataclass(frozen=True)
 class Validation:
-    """All figures of an alignment.
+    """All metrics of an alignment.
 
     Attributes:
         alignment: what is judged.
-        checks: figures with a verdict each.
+        checks: metrics with a verdict each.
         views: what each view sees.
         axes: right, up and out of the facade in the survey frame, as rows.
         signed: distances in metres of the SfM points within :data:`NEAR`, positive in front of the shell.
@@ -120,7 +120,7 @@ class Validation:
     def reasons(self) -> list[str]:
         """The checks that are not good, the worst first."""
         faults = sorted((c for c in self.checks if c.verdict != "good"), key=lambda c: -_ORDER.index(c.verdict))
-        return [f"{check.name}: {check.figure} ({check.limits}); {check.why}" for check in faults]
+        return [f"{check.name}: {check.value} ({check.limits}); {check.why}" for check in faults]
 
     def share_within(self, metres: float) -> float:
         """Share of the points near the shell that are this close to it."""
@@ -132,7 +132,7 @@ class Validation:
         close = self.signed[np.abs(self.signed) < OCCLUDING]
         return float(np.median(close)) if len(close) else float("nan")
 
-    def figures(self) -> dict[str, float | None]:
+    def metrics(self) -> dict[str, float | None]:
         """The main numbers, for json."""
         values = {f"within_{round(100 * d)}cm": self.share_within(d) for d in (0.05, 0.10, 0.20)}
         values |= {"bias_m": self.bias, "near": self.near, "metres_per_unit": self.alignment.metres_per_unit}

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Picture:
+class Renders:
     """Splats as B cameras of one size see them.
 
     Attributes:

@@ -35,16 +35,16 @@ REFERENCE = "photograph, shell"
 FAR = 10
 """Voxels from which a point's colour is the last of the scale: 20 cm."""
 PANEL = (550, 880)
-"""Rows and columns of the picture of one point cloud, about twice what the page shows of it."""
+"""Rows and columns of the image of one point cloud, about twice what the page shows of it."""
 DOT = 3
-"""Side of a point in that picture in pixels."""
+"""Side of a point in that image in pixels."""
 
 
 def strip(runs: Sequence[Run], view: str, path: Path) -> None:
     """One held-out view: the photograph with the shell's normals, then each run; below, the errors of the normals."""
     panels = []
     for run in runs:
-        shot = Snapshot.load(run.pictures / view)
+        shot = Snapshot.load(run.renders / view)
         mask = torch.from_numpy(shot.mask)
         if not panels:
             shell = torch.from_numpy(shot.shell_normal.astype(np.float32))
@@ -60,7 +60,7 @@ def curves(runs: Sequence[Run], path: Path) -> bool:
 
     They are in the tensorboard files of runs that were measured while they trained.
     """
-    recorded = {run: recorded_figures(run) for run in runs}
+    recorded = {run: recorded_metrics(run) for run in runs}
     columns = [column for column in CURVES if any(column.key in curve for curve in recorded.values())]
     if not columns:
         return False
@@ -83,7 +83,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
 
     A row an azimuth, a column a run. Points are thinned to the voxels that the figures are measured with.
     """
-    shots = {run.variant.name: [Snapshot.load(path) for path in sorted(run.pictures.glob("*.npz"))] for run in runs}
+    shots = {run.variant.name: [Snapshot.load(path) for path in sorted(run.renders.glob("*.npz"))] for run in runs}
     seen = next(iter(shots.values()))
     unit, voxel = _resolution(seen[0])
     reference = voxel_means(np.concatenate([_world(shot, shot.shell_depth) for shot in seen]), voxel)
@@ -108,18 +108,18 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
 def dotted(points: Float[np.ndarray, "N 3"], colours: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """A square dot a point on white, the nearest before the others; right, up and towards the eye, in pixels."""
     height, width = PANEL
-    picture = np.full((height, width, 3), 255, np.uint8)
+    image = np.full((height, width, 3), 255, np.uint8)
     points, colours = (values[np.argsort(points[:, 2])] for values in (points, colours))
     column, row = np.floor([width / 2 + points[:, 0], height / 2 - points[:, 1]]).astype(int)
     across, down = np.divmod(np.arange(DOT * DOT), DOT) - np.array(DOT // 2)
     column, row = column[:, None] + across, row[:, None] + down
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     # Of a pixel that is painted more than once, the last colour stays.
-    picture[row[inside], column[inside]] = np.broadcast_to(colours[:, None], (*inside.shape, 3))[inside]
-    return picture
+    image[row[inside], column[inside]] = np.broadcast_to(colours[:, None], (*inside.shape, 3))[inside]
+    return image
 
 
-def recorded_figures(run: Run) -> dict[str, dict[int, float]]:
+def recorded_metrics(run: Run) -> dict[str, dict[int, float]]:
     """Figures of all held-out views by name, by iteration; where a resumed run wrote one twice, the last."""
     events = EventAccumulator(str(run.folder), size_guidance={"scalars": 0})
     events.Reload()
@@ -156,5 +156,5 @@ def _seen_from(frame: Float[np.ndarray, "3 3"], azimuth: float) -> Float[np.ndar
 
 def common_views(runs: Sequence[Run]) -> list[str]:
     """Names of the snapshots that all runs have, in order."""
-    views = [{path.name for path in run.pictures.glob("*.npz")} for run in runs]
+    views = [{path.name for path in run.renders.glob("*.npz")} for run in runs]
     return sorted(set.intersection(*views)) if views else []

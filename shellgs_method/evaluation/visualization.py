@@ -13,8 +13,8 @@ from shellgs_method.evaluation.view import OPAQUE, Rendering
 from shellgs_method.reference import Reference
 
 
-def geometry_pictures(rendering: Rendering, reference: Reference | None = None) -> dict[str, Float[Tensor, "H _ 3"]]:
-    """What was rendered as pictures in [0, 1], by name.
+def geometry_images(rendering: Rendering, reference: Reference | None = None) -> dict[str, Float[Tensor, "H _ 3"]]:
+    """What was rendered as images in [0, 1], by name.
 
     * ``depth``, ``normal``: with a reference, that on the left, in the same colours; grey where there is none.
     * ``normal_error``: with a reference, the angle between the two as :func:`geometry_errors` counts it, from black
@@ -33,11 +33,11 @@ def geometry_pictures(rendering: Rendering, reference: Reference | None = None) 
     maps = [tuple(values.detach().cpu().numpy() for values in triple) for triple in shown]
     first, _, known = maps[0]
     near, far = np.percentile(first[known], [1, 99]) if known.any() else (0.0, 1.0)
-    pictures = {
+    images = {
         "depth": [depth_colours(depth[..., 0], mask[..., 0], near, far) for depth, _, mask in maps],
         "normal": [normal_colours(normal, mask[..., 0]) for _, normal, mask in maps],
     }
     if reference is not None:
         error = angular_error(normal, reference.normal)[..., 0].cpu().numpy()
-        pictures["normal_error"] = [error_colours(error, known[..., 0])]
-    return {name: torch.from_numpy(np.concatenate(row, axis=1)) / 255 for name, row in pictures.items()}
+        images["normal_error"] = [error_colours(error, known[..., 0])]
+    return {name: torch.from_numpy(np.concatenate(row, axis=1)) / 255 for name, row in images.items()}
