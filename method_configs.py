@@ -82,5 +82,5 @@ photo_gs = _method(
 two_dgs = _method(
     "2dgs",
     "The discs of 2D Gaussian Splatting from the photographs alone",
-    FacadeModelConfig(primitive="2d", cull_alpha_thresh=0.05, extra=ExtraLossConfig(agreement=0.05)),
+    FacadeModelConfig(primitive="2d", cull_alpha_thresh=0.05, extra=ExtraLossConfig(normal_consistency=0.05)),
 )

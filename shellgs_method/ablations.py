@@ -13,9 +13,9 @@ _METRIC = ("--pipeline.model.extra.point-to-plane", "1")
 
 ABLATIONS: dict[str, tuple[str, ...]] = {
     # The paper's: which terms (table of the ablation), and what the baseline has beside them.
-    "shellgs-depth": ("shellgs", *_off("normal", "consistency")),
-    "shellgs-normal": ("shellgs", *_off("depth", "consistency")),
-    "shellgs-depth-normal": ("shellgs", *_off("consistency")),
+    "shellgs-depth": ("shellgs", *_off("normal", "smoothness")),
+    "shellgs-normal": ("shellgs", *_off("depth", "smoothness")),
+    "shellgs-depth-normal": ("shellgs", *_off("smoothness")),
     "shellgs-vid2sim": ("shellgs", "--pipeline.model.geometry.ncc", "vid2sim"),
     "shellgs-flat": ("shellgs", *_FLATTENED),
     "mono-gs-flat": ("mono-gs", *_FLATTENED),

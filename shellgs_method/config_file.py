@@ -24,6 +24,14 @@ _COMPLETE = ("method_name", "experiment_name", "timestamp", "output_dir", "pipel
 """Settings that every config.yml has, the last of which is at its end."""
 
 
+RENAMED = {
+    "agreement": "normal_consistency",
+    "agreement_from": "normal_consistency_from",
+    "consistency": "smoothness",
+}
+"""Settings that older files have by another name."""
+
+
 def load_config(path: Path) -> TrainerConfig:
     """The config of a run, built from the classes of registered methods and of nothing else.
 
@@ -101,7 +109,7 @@ def _object(loader: Any, path: str, node: yaml.Node) -> Any:
     cls = _find(path)
     if not (isinstance(cls, type) and is_dataclass(cls)):
         raise SceneError(f"it takes {path} for settings")
-    values = loader.construct_mapping(node, deep=True)
+    values = {RENAMED.get(name, name): value for name, value in loader.construct_mapping(node, deep=True).items()}
     given = [field for field in fields(cls) if field.init and field.name in values]
     for field in given:
         if not _fits(values[field.name], field):

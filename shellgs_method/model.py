@@ -329,7 +329,7 @@ class FacadeModel(SplatfactoModel):
     @property
     def _supervises_geometry(self) -> bool:
         extra = self.config.extra
-        return self.config.cues != "none" or extra.agreement > 0 or extra.distortion > 0
+        return self.config.cues != "none" or extra.normal_consistency > 0 or extra.distortion > 0
 
     @property
     def colors(self) -> Float[Tensor, "N 3"]:

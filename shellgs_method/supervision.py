@@ -14,12 +14,12 @@ from torch import Tensor
 from shellgs_method.geometry import Geometry
 from shellgs_method.losses import (
     PAPER_ITERATIONS,
-    ConsistencyLoss,
     ExponentialDecay,
     NccLoss,
     NormalLoss,
     PointToPlaneLoss,
-    agreement_loss,
+    SmoothnessLoss,
+    normal_consistency_loss,
     normal_loss,
     vid2sim_ncc_loss,
 )
@@ -38,8 +38,8 @@ class GeometryLossConfig:
     """Weight α(t) of the inverse-depth NCC."""
     normal: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
     """Weight β(t) of the normal loss."""
-    consistency: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
-    """Weight γ(t) of the consistency of neighbouring normals."""
+    smoothness: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
+    """Weight γ(t) of normal smoothness."""
     ncc: Literal["local", "vid2sim"] = "local"
     """local: the paper's equation; vid2sim: the form of the released baseline."""
     ncc_window: int = 9
@@ -52,9 +52,9 @@ class GeometryLossConfig:
 class ExtraLossConfig:
     """Terms beyond the paper's objective, each off at 0. Lengths are scene units where metres are unknown."""
 
-    agreement: float = 0.0
+    normal_consistency: float = 0.0
     """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (there 0.05)."""
-    agreement_from: int = 7000
+    normal_consistency_from: int = 7000
     """First iteration of that term."""
     distortion: float = 0.0
     """Weight of the depth distortion of 2DGS; discs only."""
@@ -110,7 +110,7 @@ class CueLosses:
         terms = {
             "depth": (paper.depth(progress), lambda: self._ncc(1 / geometry.depth.clamp_min(1e-6))),
             "normal": (paper.normal(progress), lambda: self._normal(geometry.normal)),
-            "consistency": (paper.consistency(progress), lambda: self._consistency(geometry.normal)),
+            "smoothness": (paper.smoothness(progress), lambda: self._smoothness(geometry.normal)),
             "depth_normal": (
                 extra.depth_normal,
                 lambda: normal_loss(geometry.depth_normal, self.cue.normal, self.cue.mask & _known(geometry)),
@@ -146,8 +146,8 @@ class CueLosses:
         return NormalLoss(self.cue.normal, self.cue.mask)
 
     @cached_property
-    def _consistency(self) -> ConsistencyLoss:
-        return ConsistencyLoss(self.cue.depth, self.cue.mask)
+    def _smoothness(self) -> SmoothnessLoss:
+        return SmoothnessLoss(self.cue.depth, self.cue.mask)
 
     def _squares(self, geometry: Geometry) -> Tensor:
         assert geometry.moments is not None
@@ -185,8 +185,8 @@ def self_losses(
     """
     iteration = progress * PAPER_ITERATIONS
     losses = {}
-    if extra.agreement > 0 and iteration >= extra.agreement_from:
-        losses["agreement"] = extra.agreement * agreement_loss(
+    if extra.normal_consistency > 0 and iteration >= extra.normal_consistency_from:
+        losses["normal_consistency"] = extra.normal_consistency * normal_consistency_loss(
             geometry.normal, geometry.depth_normal, geometry.alpha, kept
         )
     if extra.distortion > 0 and iteration >= extra.distortion_from:

@@ -651,7 +651,7 @@ def test_a_half_is_measured_of_a_run_that_knows_no_halves(measured):
 
 
 def test_snapshots_are_pictures_of_the_views(measured):
-    shot = Snapshot.load(sorted(measured[0].pictures.glob("*.npz"))[0])
+    shot = Snapshot.load(sorted(measured[0].renders.glob("*.npz"))[0])
     assert shot.rgb.shape == shot.photograph.shape == (32, 48, 3)
     assert shot.mask.any()
     assert shot.error[shot.mask].max() <= 90
@@ -659,9 +659,9 @@ def test_snapshots_are_pictures_of_the_views(measured):
 
 def test_a_thinned_picture_has_the_rays_of_the_pixels_it_keeps(measured, tmp_path, monkeypatch):
     """Every third pixel: pixel (i, j) of the picture is pixel (3 i, 3 j) of the view."""
-    monkeypatch.setattr("shellgs_method.compare.measure.PICTURE_SIZE", 16)
+    monkeypatch.setattr("shellgs_method.compare.measure.IMAGE_SIZE", 16)
     measure(measured[0].config, renders=tmp_path)
-    thin, full = (Snapshot.load(sorted(folder.glob("*.npz"))[0]) for folder in (tmp_path, measured[0].pictures))
+    thin, full = (Snapshot.load(sorted(folder.glob("*.npz"))[0]) for folder in (tmp_path, measured[0].renders))
     cameras = [
         Camera(torch.from_numpy(shot.viewmat), torch.from_numpy(shot.K), *shot.mask.shape[1::-1])
         for shot in (thin, full)

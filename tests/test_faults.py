@@ -146,7 +146,7 @@ def test_a_run_whose_gaussians_are_all_no_numbers_ends(pristine_scene, tmp_path)
         ("pipeline.model.extra.flattening", "-1"),
         ("pipeline.model.extra.point-to-plane", "inf"),
         ("pipeline.model.extra.empty-space", "1e30"),
-        ("pipeline.model.extra.agreement-from", "-1"),
+        ("pipeline.model.extra.normal_consistency-from", "-1"),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_refused_by_ns_train_before_anything_is_written(

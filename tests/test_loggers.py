@@ -55,7 +55,7 @@ def last(events: EventAccumulator, prefix: str) -> dict[str, float]:
 def test_tensorboard_gets_every_term_of_the_loss(tensorboard):
     _, events = tensorboard
     terms = last(events, "Train Loss Dict/")
-    assert terms.keys() == {"photometric", "depth", "normal", "consistency"}
+    assert terms.keys() == {"photometric", "depth", "normal", "smoothness"}
     assert sum(terms.values()) == pytest.approx(last(events, "Train Loss")[""], rel=1e-5)
 
 

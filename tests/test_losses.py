@@ -15,19 +15,19 @@ from torch.autograd import gradcheck
 from dataparsers.camera import Camera
 from shellgs_method import fusion
 from shellgs_method.losses import (
-    ConsistencyLoss,
     ExponentialDecay,
     NccLoss,
     NormalLoss,
     PhotometricLoss,
     PointToPlaneLoss,
-    agreement_loss,
-    consistency_loss,
+    SmoothnessLoss,
     flattening_loss,
     ncc_loss,
+    normal_consistency_loss,
     normal_loss,
     photometric_loss,
     point_to_plane_loss,
+    smoothness_loss,
     vid2sim_ncc_loss,
 )
 from shellgs_method.losses.ssim import SsimTarget, ssim
@@ -190,7 +190,7 @@ def test_normal_loss_gradient(random):
 # C
 
 
-def test_consistency_equals_a_loop_over_pixels(random):
+def test_smoothness_equals_a_loop_over_pixels(random):
     normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
     mask[3, 5] = mask[9, 9:12] = False
     depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
@@ -203,50 +203,50 @@ def test_consistency_equals_a_loop_over_pixels(random):
     g = np.array([steepness[p] for p in pixels])
     w = 1 - (g - g.min()) / (g.max() - g.min())
     a = np.array([1 - 0.5 * (n[i, j] @ n[i, j - 1] + n[i, j] @ n[i - 1, j]) for i, j in pixels])
-    assert consistency_loss(normal, depth, mask).item() == pytest.approx((w * a).sum() / w.sum(), abs=1e-12)
+    assert smoothness_loss(normal, depth, mask).item() == pytest.approx((w * a).sum() / w.sum(), abs=1e-12)
 
 
-def test_consistency_ignores_pairs_that_straddle_the_mask():
+def test_smoothness_ignores_pairs_that_straddle_the_mask():
     # Two walls at a right angle; the column between them is not supported.
     normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
     normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
     mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
     depth = torch.full((HEIGHT, WIDTH, 1), 5.0)
-    assert consistency_loss(normal, depth, mask) > 0
+    assert smoothness_loss(normal, depth, mask) > 0
     mask[:, WIDTH // 2] = False
-    assert consistency_loss(normal, depth, mask) == 0
+    assert smoothness_loss(normal, depth, mask) == 0
 
 
-def test_consistency_does_not_take_missing_depth_for_an_edge(random):
+def test_smoothness_does_not_take_missing_depth_for_an_edge(random):
     normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
     mask[:, :5] = False
     depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
-    missing = consistency_loss(normal, depth.where(mask, 0.0), mask)
-    torch.testing.assert_close(missing, consistency_loss(normal, depth, mask))
+    missing = smoothness_loss(normal, depth.where(mask, 0.0), mask)
+    torch.testing.assert_close(missing, smoothness_loss(normal, depth, mask))
 
 
-def test_consistency_costs_nothing_at_the_strongest_edge():
+def test_smoothness_costs_nothing_at_the_strongest_edge():
     # The fold of the normals lies on the only step of the depth, where w = 0.
     normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
     normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
     depth = torch.full((HEIGHT, WIDTH, 1), 5.0)
     mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
-    flat = consistency_loss(normal, depth, mask)
+    flat = smoothness_loss(normal, depth, mask)
     depth[:, WIDTH // 2 :] = 5.01
-    assert consistency_loss(normal, depth, mask).item() < 0.01 * flat.item()
+    assert smoothness_loss(normal, depth, mask).item() < 0.01 * flat.item()
 
 
-def test_consistency_does_not_depend_on_the_unit_of_length(random):
+def test_smoothness_does_not_depend_on_the_unit_of_length(random):
     normal, mask = some_normals(random), some_mask(random)
     mask[4:10, 6:12] = True
     depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
-    torch.testing.assert_close(consistency_loss(normal, 100 * depth, mask), consistency_loss(normal, depth, mask))
+    torch.testing.assert_close(smoothness_loss(normal, 100 * depth, mask), smoothness_loss(normal, depth, mask))
 
 
-def test_consistency_gradient(random):
+def test_smoothness_gradient(random):
     normal, mask = torch.randn(5, 6, 3, generator=random, dtype=torch.float64), torch.ones(5, 6, 1, dtype=torch.bool)
     depth = 5 + torch.rand(5, 6, 1, generator=random, dtype=torch.float64)
-    assert gradcheck(lambda normal: consistency_loss(normal, depth, mask), normal.requires_grad_())
+    assert gradcheck(lambda normal: smoothness_loss(normal, depth, mask), normal.requires_grad_())
 
 
 # R
@@ -368,13 +368,13 @@ def test_agreement_equals_its_formula_pixel_by_pixel(random):
     expected = np.mean(
         [1 - alpha[v, u, 0] * (normal[v, u] @ depth_normal[v, u]) for v in range(HEIGHT) for u in range(WIDTH)]
     )
-    assert float(agreement_loss(normal, depth_normal, alpha)) == pytest.approx(expected)
+    assert float(normal_consistency_loss(normal, depth_normal, alpha)) == pytest.approx(expected)
 
 
 def test_agreement_does_not_make_splats_fade(random):
     alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64).requires_grad_()
     normal = some_normals(random).requires_grad_()
-    loss = agreement_loss(normal, some_normals(random), alpha)
+    loss = normal_consistency_loss(normal, some_normals(random), alpha)
     assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
 
 
@@ -397,7 +397,7 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
         "photometric, masked": (PhotometricLoss(b + 0.5, mask), a + 0.5),
         "ncc": (NccLoss(x, mask), y),
         "normal": (NormalLoss(target, mask), normal),
-        "consistency": (ConsistencyLoss(x, mask), normal),
+        "smoothness": (SmoothnessLoss(x, mask), normal),
         "point to plane": (PointToPlaneLoss(x, target, rays, mask), y),
         "empty space": (partial(PointToPlaneLoss(x, target, rays, mask).of_all, alpha=b[..., :1] + 0.5), y),
     }
@@ -430,10 +430,10 @@ def test_compiled_losses_are_the_plain_ones_at_every_size_of_image(compiler):
         (ncc_loss, 1),
         (vid2sim_ncc_loss, 1),
         (normal_loss, 3),
-        (lambda n, t, m: consistency_loss(n, t[..., :1], m), 3),
+        (lambda n, t, m: smoothness_loss(n, t[..., :1], m), 3),
         (photometric_loss, 3),
     ],
-    ids=["ncc", "vid2sim ncc", "normal", "consistency", "photometric"],
+    ids=["ncc", "vid2sim ncc", "normal", "smoothness", "photometric"],
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_empty_mask_gives_a_zero_that_can_be_back_propagated(random, loss, channels, dtype):

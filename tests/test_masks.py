@@ -123,13 +123,13 @@ def test_masked_pixels_are_in_no_term_of_the_rendered_geometry():
     camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), 8, 6)
     depth, alpha, kept = torch.full((6, 8, 1), 5.0), torch.ones(6, 8, 1), torch.zeros(6, 8, 1, dtype=torch.bool)
     kept[:, 4:] = True
-    extra = ExtraLossConfig(agreement=1.0, agreement_from=0, distortion=1.0, distortion_from=0)
+    extra = ExtraLossConfig(normal_consistency=1.0, normal_consistency_from=0, distortion=1.0, distortion_from=0)
 
     def terms(scale: float) -> dict[str, torch.Tensor]:
         changed = torch.where(kept, 1.0, scale)
         return self_losses(Geometry(depth, changed * normal, alpha, camera, changed), extra, 0.5, kept)
 
-    assert terms(1.0).keys() == {"agreement", "distortion"}
+    assert terms(1.0).keys() == {"normal_consistency", "distortion"}
     for name, value in terms(1.0).items():
         torch.testing.assert_close(terms(7.0)[name], value)
     assert terms(1.0)["distortion"] == 1

@@ -98,7 +98,7 @@ def parsed(words: tuple[str, ...]):
 )
 def test_an_ablation_leaves_out_the_terms_it_does_not_name(name, kept):
     geometry = parsed(ABLATIONS[name]).pipeline.model.geometry
-    assert {term for term in ("depth", "normal", "consistency") if getattr(geometry, term)(0.5) > 0} == kept
+    assert {term for term in ("depth", "normal", "smoothness") if getattr(geometry, term)(0.5) > 0} == kept
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
@@ -131,7 +131,9 @@ def discs(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory):
         model = config.pipeline.model
         model.warmup_length, model.refine_every, model.densify_grad_thresh = 2000, 5, 1e-6
         model.densify_size_thresh = 1e-3
-        model.extra = ExtraLossConfig(agreement=0.05, agreement_from=0, distortion=10.0, distortion_from=0)
+        model.extra = ExtraLossConfig(
+            normal_consistency=0.05, normal_consistency_from=0, distortion=10.0, distortion_from=0
+        )
 
     trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "two_dgs", iterations=30, change=densify)
     trainer.train()
@@ -178,18 +180,18 @@ def test_2dgs_renders_images_and_has_its_own_losses(discs):
     }
     assert all(image.isfinite().all() for image in outputs.values())
     losses = model_of(discs).get_loss_dict(outputs, batch)
-    assert losses.keys() == {"photometric", "agreement", "distortion"}
+    assert losses.keys() == {"photometric", "normal_consistency", "distortion"}
 
 
 def test_the_terms_of_2dgs_start_when_they_are_to(discs):
     model, (_, batch) = model_of(discs), held_out(discs)
     outputs, extra = render(discs), model.config.extra
-    model.config.extra = ExtraLossConfig(agreement=0.05, distortion=10.0)  # from 7000 and 3000 of 30 000
+    model.config.extra = ExtraLossConfig(normal_consistency=0.05, distortion=10.0)  # from 7000 and 3000 of 30 000
     terms = []
     for model.step in (2, 3, 6, 7):  # of 30
         terms.append(model.get_loss_dict(outputs, batch).keys() - {"photometric"})
     model.config.extra = extra
-    assert terms == [set(), {"distortion"}, {"distortion"}, {"distortion", "agreement"}]
+    assert terms == [set(), {"distortion"}, {"distortion"}, {"distortion", "normal_consistency"}]
 
 
 def test_exported_discs_are_finite(discs, tmp_path, monkeypatch):
@@ -221,7 +223,7 @@ def test_discs_take_the_shells_cues(pristine_scene, tmp_path):
     assert _normal_error(trainer) < before - 1
     trainer.pipeline.eval()
     losses = model_of(trainer).get_loss_dict(render(trainer), held_out(trainer)[1])
-    assert losses.keys() == {"photometric", "depth", "normal", "consistency"}
+    assert losses.keys() == {"photometric", "depth", "normal", "smoothness"}
 
 
 def test_mono_gs_learns_from_mono_maps_without_a_shell(mono_scene, tmp_path):
@@ -231,7 +233,7 @@ def test_mono_gs_learns_from_mono_maps_without_a_shell(mono_scene, tmp_path):
     trainer.train()
     assert _normal_error(trainer, "truth") < before - 1
     trainer.pipeline.eval()
-    assert model_of(trainer).get_loss_dict(render(trainer), batch).keys() >= {"depth", "normal", "consistency"}
+    assert model_of(trainer).get_loss_dict(render(trainer), batch).keys() >= {"depth", "normal", "smoothness"}
 
 
 def test_mono_gs_without_its_maps_ends_with_one_sentence(scene, tmp_path):
@@ -273,7 +275,7 @@ def terms(geometry, cue, progress: float = 0.5, paper: GeometryLossConfig = OFF,
 
 def test_all_switches_are_off_in_the_papers_setting(untrained):
     geometry, cue = rendered(untrained)
-    assert terms(geometry, cue, paper=GeometryLossConfig()).keys() == {"depth", "normal", "consistency"}
+    assert terms(geometry, cue, paper=GeometryLossConfig()).keys() == {"depth", "normal", "smoothness"}
 
 
 def test_the_normals_of_depth_move_gaussians_where_those_composited_hardly_do(untrained):
@@ -283,7 +285,7 @@ def test_the_normals_of_depth_move_gaussians_where_those_composited_hardly_do(un
     (gradient,) = torch.autograd.grad(loss, geometry.depth, retain_graph=True)
     assert gradient.abs().sum() > 0
     (only_n,) = terms(
-        geometry, cue, paper=GeometryLossConfig(OFF.depth, ExponentialDecay(1, 1), OFF.consistency)
+        geometry, cue, paper=GeometryLossConfig(OFF.depth, ExponentialDecay(1, 1), OFF.smoothness)
     ).values()
     assert torch.autograd.grad(only_n, geometry.depth, allow_unused=True) == (None,)
 

@@ -130,7 +130,7 @@ def test_geometry_weights_follow_the_run(trained):
     assert half["depth"] / start["depth"] == pytest.approx(0.2**0.5, rel=1e-4)
     assert end["depth"] / start["depth"] == pytest.approx(0.2, rel=1e-4)
     assert start["normal"] == end["normal"]
-    assert start["consistency"] == end["consistency"]
+    assert start["smoothness"] == end["smoothness"]
 
 
 def test_a_view_without_a_map_trains_with_its_photograph_alone(trained):
@@ -138,7 +138,7 @@ def test_a_view_without_a_map_trains_with_its_photograph_alone(trained):
     outputs, (_, batch) = render(trained), held_out(trained)
     bare = {key: value for key, value in batch.items() if not key.startswith("shell")}
     assert model.get_loss_dict(outputs, bare).keys() == {"photometric"}
-    assert model.get_loss_dict(outputs, batch).keys() == {"photometric", "depth", "normal", "consistency"}
+    assert model.get_loss_dict(outputs, batch).keys() == {"photometric", "depth", "normal", "smoothness"}
 
 
 def test_what_the_user_masked_out_supervises_nothing(trained):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import pickle
+import re
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -23,7 +24,7 @@ from runs import small_disk, trainer_of
 
 from dataparsers.errors import SceneError
 from shellgs_method import cli
-from shellgs_method.config_file import load_config
+from shellgs_method.config_file import RENAMED, load_config
 from shellgs_method.trained import load_run
 
 LAST = "nerfstudio_models/step-000000001.ckpt"
@@ -123,6 +124,17 @@ def test_a_config_of_before_a_setting_was_there_has_its_default_and_one_that_is_
     model = load_config(run / "config.yml").pipeline.model
     assert getattr(model, "seeds") == "none"  # noqa: B009
     assert not hasattr(model, "of_an_earlier_build")
+
+
+def test_settings_keep_their_values_under_the_names_of_an_older_config(tmp_path):
+    config = copy.deepcopy(all_methods["2dgs"])
+    config.set_timestamp()
+    written = yaml.dump(config)
+    for old, new in RENAMED.items():
+        assert f"{new}:" in written
+        written = re.sub(rf"\b{new}:", f"{old}:", written)
+    (tmp_path / "config.yml").write_text(written)
+    assert load_config(tmp_path / "config.yml") == config
 
 
 DAMAGE: dict[str, tuple[Callable[[str], str], str]] = {

@@ -31,7 +31,7 @@ from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.model import FacadeModel
 from shellgs_method.trained import load_run
 
-PICTURE_SIZE = 640
+IMAGE_SIZE = 640
 """Most pixels along the longer side of an image in a report."""
 
 
@@ -178,7 +178,7 @@ def _snapshot(
     reference = reference_maps(batch, "shell", rendering.depth.device)
     depth = rendering.depth.where(rendering.alpha >= OPAQUE, 0.0)
     normal = normals_from_depth(depth, camera) if rendering.normal is None else rendering.normal
-    step = camera.thinning(PICTURE_SIZE)
+    step = camera.thinning(IMAGE_SIZE)
     K = camera.K.double().cpu().numpy().copy()
     K[:2] /= step
     K[:2, 2] += 0.5 - 0.5 / step  # pixel i of the image is pixel step * i: centres at 0.5 in both

@@ -1,34 +1,34 @@
 """The terms of the objective: plain differentiable functions of [H, W, C] maps in the camera frame.
 
-L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C consistency; the others are off in the paper's
-setting. Masks are true where a pixel counts; an empty one gives a zero that can be back-propagated.
+L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C normal smoothness; the others are off in the
+paper's setting. Masks are true where a pixel counts; an empty one gives a zero that can be back-propagated.
 
 A class ``…Loss`` is its function ``…_loss`` for many renderings of one view: what depends on the view alone is computed
 once. On a CPU both run as fused loops, see :mod:`shellgs_method.fusion`.
 """
 
-from shellgs_method.losses.agreement import agreement_loss, flattening_loss
-from shellgs_method.losses.consistency import ConsistencyLoss, consistency_loss
 from shellgs_method.losses.depth import NccLoss, ncc_loss, vid2sim_ncc_loss
 from shellgs_method.losses.normal import NormalLoss, normal_loss
 from shellgs_method.losses.photometric import PhotometricLoss, photometric_loss
 from shellgs_method.losses.schedules import PAPER_ITERATIONS, ExponentialDecay
+from shellgs_method.losses.self_consistency import flattening_loss, normal_consistency_loss
+from shellgs_method.losses.smoothness import SmoothnessLoss, smoothness_loss
 from shellgs_method.losses.surface import PointToPlaneLoss, point_to_plane_loss
 
 __all__ = [
     "PAPER_ITERATIONS",
-    "ConsistencyLoss",
     "ExponentialDecay",
     "NccLoss",
     "NormalLoss",
     "PhotometricLoss",
     "PointToPlaneLoss",
-    "agreement_loss",
-    "consistency_loss",
+    "SmoothnessLoss",
     "flattening_loss",
     "ncc_loss",
+    "normal_consistency_loss",
     "normal_loss",
     "photometric_loss",
     "point_to_plane_loss",
+    "smoothness_loss",
     "vid2sim_ncc_loss",
 ]

@@ -12,8 +12,8 @@ from shellgs_method.fusion import run_fused
 from shellgs_method.losses.normal import unit
 
 
-class ConsistencyLoss:
-    """:func:`consistency_loss` for many renderings of one view."""
+class SmoothnessLoss:
+    """:func:`smoothness_loss` for many renderings of one view."""
 
     def __init__(self, target_depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]):
         smoothness = _smoothness(target_depth, mask)
@@ -25,7 +25,7 @@ class ConsistencyLoss:
         return run_fused(_roughness, normal, self._weights, varying=2)
 
 
-def consistency_loss(
+def smoothness_loss(
     normal: Float[Tensor, "H W 3"], target_depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]
 ) -> Float[Tensor, ""]:
     """Edge-aware smoothness of the rendered normals, Σ w a / Σ w (Vid2Sim's geometry consistency).
@@ -38,7 +38,7 @@ def consistency_loss(
         target_depth: the cue's z-depth.
         mask: true where the target is valid.
     """
-    return ConsistencyLoss(target_depth, mask)(normal)
+    return SmoothnessLoss(target_depth, mask)(normal)
 
 
 def _roughness(normal: Float[Tensor, "H W 3"], weights: Float[Tensor, "H-1 W-1 1"]) -> Float[Tensor, ""]:

@@ -8,7 +8,7 @@ from torch import Tensor
 from shellgs_method.losses.reduction import weighted_mean
 
 
-def agreement_loss(
+def normal_consistency_loss(
     normal: Float[Tensor, "H W 3"],
     depth_normal: Float[Tensor, "H W 3"],
     alpha: Float[Tensor, "H W 1"],
