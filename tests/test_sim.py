@@ -322,6 +322,12 @@ def test_distances_are_measured_where_cameras_look(wall):
     assert both_ways(wall, half, None, [behind], 0.05) == {}
 
 
+def test_distances_leave_out_what_cameras_look_along():
+    house, front = box([-1, 0, 0], [0, 6, 2], subdivided=0.5), box([-1, 0, 0], [0, 0.2, 2])
+    along = [frontal(0.2)]  # sees the side wall at a slant of 3° at most
+    assert both_ways(house, front, None, along, 0.05)["from the collider"].p95 < 1e-6
+
+
 def places(count: int = 400, width: float = 1.2) -> np.ndarray:
     rng = np.random.default_rng(0)
     return np.stack([rng.uniform(-width, width, count), np.zeros(count), rng.uniform(0.1, 1.9, count)], axis=1)

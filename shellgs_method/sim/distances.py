@@ -12,6 +12,8 @@ from dataparsers.camera import Camera, positions, project
 from shellgs_method.sim.rays import Surface
 
 COUNT = 40_000
+SLANT = 0.17
+"""Sine of the angle (10°) below which a camera looks along a surface, and shows nothing of it: side walls, say."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,7 @@ def both_ways(
         collider: the collider.
         other: shell, reconstruction or truth.
         shell: wound outwards; None where there is none, and nothing is told apart.
-        cameras: what is in none of their images does not count: the far end of a side wall, say, which a camera's
-            place would let one see, but which was never photographed.
+        cameras: what is in none of their images, or at a slant of less than 10°, does not count: side walls, say.
         before: metres from the shell from which a point stands before it.
     """
     found = {}
@@ -68,12 +69,15 @@ def both_ways(
 
 def visible(surface: Surface, cameras: Sequence[Camera]) -> Float64[np.ndarray, "N 3"]:
     """Points spread over what is in some camera's image of a surface, above the ground."""
-    points, _ = surface.samples(COUNT)
-    points = points[points[:, 2] > 0.02]
+    points, faces = surface.samples(COUNT)
+    above = points[:, 2] > 0.02
+    points, normals = points[above], surface.normals[faces[above]]
     seen = np.zeros(len(points), bool)
     for camera, eye in zip(cameras, positions(cameras), strict=True):
         pixels, depth = project(camera, points)
         inside = (depth > 0) & (pixels > 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
-        asked = np.flatnonzero(inside & ~seen)
+        towards = eye - points
+        steep = np.abs((normals * towards).sum(1)) > SLANT * np.linalg.norm(towards, axis=1)
+        asked = np.flatnonzero(inside & steep & ~seen)
         seen[asked] = surface.sees(np.broadcast_to(eye, (len(asked), 3)), points[asked], 5e-3)
     return points[seen]
