@@ -476,6 +476,7 @@ def test_the_panel_shows_photograph_depth_normals_and_mask(tmp_path: Path, metre
     shown = np.ma.masked_array(figure.axes[1].images[0].get_array())
     assert shown.compressed() == pytest.approx(7 * (metres_per_unit or 1))
     assert label in [child.get_xlabel() for child in figure.axes[1].child_axes]
+    assert figure.axes[3].axison  # else a mask that is white everywhere cannot be seen
 
 
 def test_a_view_that_sees_nothing_has_a_panel(tmp_path: Path):

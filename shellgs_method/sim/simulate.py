@@ -124,7 +124,7 @@ def _building(
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
     surfaces = {"shell": shell, "fused surface": fused, "truth": truth}
     distances = {
-        name: both_ways(collider.surface, other, shell, eyes, stands)
+        name: both_ways(collider.surface, other, shell, [photo.camera for photo in photos], stands)
         for name, other in surfaces.items()
         if other is not None
     }

@@ -40,6 +40,8 @@ def supervision_panel(
     bar.set_label("metres" if metres_per_unit else "scene units")
     axes[2].imshow(normal_colours(cue.normal, cue.mask), interpolation="nearest")
     axes[3].imshow(cue.mask, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axes[3].set_axis_on()  # a frame, without which a mask that is white everywhere is not there on white paper
+    axes[3].set(xticks=[], yticks=[])
     return figure
 
 
