@@ -1,4 +1,4 @@
-"""Open3D, whose wheel takes libraries of the system for granted."""
+"""Importing Open3D, whose wheel needs system libraries."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from types import ModuleType
 
 
 def import_open3d() -> ModuleType:
-    """Open3D, or an ImportError that says which system libraries its wheel takes for granted."""
+    """Return Open3D, or raise an ImportError that names the system libraries its wheel needs."""
     try:
         import open3d
     except (ImportError, OSError) as error:
         raise ImportError(
-            f"Open3D cannot be loaded ({error}); it needs libraries of the system: "
+            f"Open3D cannot be loaded ({error}); it needs system libraries: "
             "apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
         ) from error
     return open3d
 
 
 def reason(error: Exception) -> str:
-    """What an error says, on one line, without the colours that Open3D gives it."""
+    """Return an error's message on one line, without Open3D's colour codes."""
     return " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(error)).split())

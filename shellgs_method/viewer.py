@@ -1,4 +1,4 @@
-"""What nerfstudio's viewer shows beside renderings."""
+"""Layers for nerfstudio's viewer."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from shellgs_method.shell import CONTRADICTED_PLACES
 from shellgs_method.shell.geometry.similarity import transformed
 
 POINT = 0.004
-"""Size of a point as a share of the cloud's longest side."""
+"""Point size relative to the cloud's longest side."""
 
 logger = logging.getLogger(__name__)
 
 
 class ContradictedShell(ViewerControl):
-    """Places of the shell, the redder the more photographs contradict them: a layer of the scene tree, hidden at first.
+    """Points on the shell, redder where more photographs contradict them: a layer of the scene tree, hidden at first.
 
     Args:
-        scene: the scene's folder, whose shell was cast.
-        from_scene: the similarity from the scene to the viewer's world.
+        scene: the scene's folder; its shell must have been cast.
+        from_scene: similarity from the scene to the viewer's world.
     """
 
     LAYER = "/shell_contradicted"

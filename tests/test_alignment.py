@@ -1,4 +1,4 @@
-"""Finding the shell's place, and judging it: closed forms, known truths, and the mistakes that are to be caught."""
+"""Alignments and their validation: closed forms, known truths, and mistakes that must be caught."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ def surface(mesh: ShellMesh) -> ShellSurface:
 
 @pytest.fixture(scope="module")
 def survey_from_scene(surface: ShellSurface) -> np.ndarray:
-    """The truth that every start is to come back to."""
+    """The true similarity, which every start must converge to."""
     return surface.survey_from_shell @ np.linalg.inv(TRUTH)
 
 
 @pytest.fixture(scope="module")
 def points(mesh: ShellMesh, surface: ShellSurface, survey_from_scene: np.ndarray) -> SparsePoints:
-    """1500 points of the front with 1.5 cm of noise, and 150 of the street before it, in the scene's frame."""
+    """1500 points of the front with 1.5 cm of noise, and 150 of the street in front of it, in the scene's frame."""
     random = np.random.default_rng(1)
     samples, _ = surface.samples(20_000)
     in_scene = transformed(samples, np.linalg.inv(survey_from_scene))
@@ -80,7 +80,7 @@ def views() -> list[View]:
 
 
 def displaced(metres: float, degrees: float, growth: float, seed: int) -> np.ndarray:
-    """A similarity by so much, in a random direction."""
+    """A similarity that shifts, turns and grows by these amounts, in random directions."""
     random = np.random.default_rng(seed)
     shift, turn = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
     matrix = np.eye(4)
@@ -126,12 +126,12 @@ def test_refinement_returns_from_30_cm_1_degree_and_1_percent(surface, points, s
     assert not found.evidence.weak.any()
 
 
-def test_a_bare_wall_tells_of_three_directions_and_leaves_the_other_four_alone():
+def test_a_bare_wall_determines_three_directions_and_leaves_the_other_four_unchanged():
     corners = np.array([[-8.0, 0, -4], [8, 0, -4], [8, 0, 4], [-8, 0, 4]])
     surface = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])))
     random = np.random.default_rng(0)
     points = random.uniform([-6, 0, -3], [6, 0, 3], (500, 3)) + random.normal(0, 0.01, (500, 1)) * [0, 1, 0]
-    # 20 cm along the wall, which nothing tells, and 10 cm out of it, which the points mend.
+    # 20 cm along the wall, which the points do not determine, and 10 cm out of it, which they do.
     start = np.eye(4)
     start[:3, 3] = [0.2, 0.1, 0.0]
     found = refine(surface, points, start, reach=0.5)
@@ -148,17 +148,17 @@ def test_points_of_something_else_are_refused(surface, survey_from_scene):
         refine(surface, np.full((50, 3), 1000.0), survey_from_scene, reach=1.0)
 
 
-# The program's own proposal
+# Coarse registration
 
 
-def test_a_proposal_is_right_where_the_ends_of_the_facade_are_seen(mesh, surface, views, points, survey_from_scene):
+def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface, views, points, survey_from_scene):
     placement = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0)
     found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
     assert placement.proposed
     assert error(surface, found, survey_from_scene) < 0.02
 
 
-def test_a_proposal_is_right_for_a_shell_that_lies_askew_in_its_file(mesh, surface, views, points, survey_from_scene):
+def test_a_proposal_is_right_for_a_shell_tilted_in_its_file(mesh, surface, views, points, survey_from_scene):
     turned = displaced(0.0, 50.0, 0.0, seed=7)
     askew = ShellMesh(transformed(mesh.vertices, turned), mesh.faces)
     alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
@@ -166,11 +166,11 @@ def test_a_proposal_is_right_for_a_shell_that_lies_askew_in_its_file(mesh, surfa
     assert error(surface, found, survey_from_scene) < 0.02
 
 
-def test_a_proposal_names_the_other_bays_where_the_points_are_of_a_part_without_ends(mesh, views):
+def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
     layout = Layout(5, 3)
     openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]
     random = np.random.default_rng(0)
-    # Window edges of the two bays 1 and 3 alone, around the door, and wall between them.
+    # Window edges of bays 1 and 3 only, on both sides of the door, and the wall between them.
     corners = [(x, -0.0, z) for x0, x1, z0, z1 in openings for x in (x0, x1) for z in (z0, z1) if 3 < x0 < 12]
     wall = random.uniform([3.0, 0, 0.3], [12.0, 0, 9.5], (1500, 3))
     inside = np.zeros(len(wall), bool)
@@ -180,14 +180,14 @@ def test_a_proposal_names_the_other_bays_where_the_points_are_of_a_part_without_
     building += random.normal(0, 0.01, building.shape)
     points = SparsePoints(transformed(building, SCENE_FROM_BUILDING))
     history = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0).history
-    assert any(sentence.startswith("Ambiguous: a place") for sentence in history)
+    assert any(sentence.startswith("Ambiguous: an alignment") for sentence in history)
 
 
 # Picks
 
 
 def rig(count: int = 3) -> tuple[list[View], np.ndarray]:
-    """Views that look along +z from a baseline, 1000 pixels wide, and their 3x4 projections."""
+    """Views along a baseline that look along +z, 1000 pixels wide, and their 3x4 projections."""
     views = []
     K = torch.tensor([[800.0, 0, 500], [0, 800, 400], [0, 0, 1]], dtype=torch.float64)
     for k in range(count):
@@ -212,7 +212,7 @@ def test_exact_pixels_triangulate_to_their_point():
     np.testing.assert_allclose(errors, 0, atol=1e-8)
 
 
-def test_two_cameras_with_a_parallax_triangulate_as_in_the_textbook():
+def test_two_parallel_cameras_triangulate_the_depth_of_the_textbook_formula():
     # Baseline 2, focal length 800, disparity 160 pixels: depth = 800 * 2 / 160 = 10.
     views, _ = rig(2)
     viewmats, Ks = np.stack([np.eye(4)] * 2), np.stack([v.camera.K.numpy() for v in views])
@@ -221,7 +221,7 @@ def test_two_cameras_with_a_parallax_triangulate_as_in_the_textbook():
     np.testing.assert_allclose(found, [1.0, 0.0, 10.0], atol=1e-10)
 
 
-def test_noisy_pixels_are_triangulated_to_the_least_sum_of_squares():
+def test_noisy_pixels_are_triangulated_to_the_least_squares_point():
     from scipy.optimize import least_squares
 
     views, projections = rig()
@@ -233,14 +233,14 @@ def test_noisy_pixels_are_triangulated_to_the_least_sum_of_squares():
 
 @pytest.fixture
 def rigged(tmp_path: Path) -> tuple[list[View], np.ndarray]:
-    """The rig with photographs on disk, whose size picks are counted in."""
+    """The rig with photographs on disk, in whose pixels picks are given."""
     views, projections = rig()
     Image.new("RGB", (1000, 800)).save(tmp_path / "0.png")
     return [replace(view, image=tmp_path / "0.png") for view in views], projections
 
 
 def picked(projections: np.ndarray, count: int = 8, noise: float = 0.2) -> tuple[list[Pick], np.ndarray]:
-    """Picks of a shell in national coordinates, and its true place."""
+    """Picks on a shell in national coordinates, and its true alignment."""
     random = np.random.default_rng(2)
     scene = random.uniform([-3, -2, 8], [3, 2, 11], (count, 3))
     truth = displaced(1.0, 50.0, -0.6, seed=1)
@@ -254,19 +254,19 @@ def picked(projections: np.ndarray, count: int = 8, noise: float = 0.2) -> tuple
 
 
 def far_off(matrix: np.ndarray, truth: np.ndarray, picks: list[Pick]) -> float:
-    """Largest distance of the picks' images in the scene under two alignments, in shell units."""
+    """Largest distance between the picks under two alignments, in shell units."""
     points = np.stack([pick.shell for pick in picks])
     scale = np.cbrt(np.linalg.det(truth[:3, :3]))
     return float(np.linalg.norm(transformed(points, matrix) - transformed(points, truth), axis=1).max() / scale)
 
 
-def test_picks_with_noise_give_the_place(rigged):
+def test_noisy_picks_give_the_alignment(rigged):
     views, projections = rigged
     picks, truth = picked(projections)
     matrix, points = align_picks(picks, views)
     assert far_off(matrix, truth, picks) < 0.05
     assert all(point.is_used for point in points)
-    assert all(point.left_out_residual > point.residual for point in points)  # a fit without it is freer to miss it
+    assert all(point.left_out_residual > point.residual for point in points)  # a fit without it misses it by more
 
 
 def test_a_pick_that_is_2_m_off_is_left_out_and_comes_first(rigged):
@@ -280,7 +280,7 @@ def test_a_pick_that_is_2_m_off_is_left_out_and_comes_first(rigged):
     assert [point.name for point in points if not point.is_used] == ["p4"]
 
 
-def test_a_pixel_that_disagrees_is_named_and_its_point_left_out(rigged):
+def test_a_pick_with_a_wrong_pixel_is_flagged_and_left_out(rigged):
     views, projections = rigged
     picks, truth = picked(projections)
     x, y = picks[3].pixels["images/2.png"]
@@ -304,7 +304,7 @@ def test_check_points_are_measured_and_not_fitted(rigged):
 
 
 @pytest.mark.parametrize("count", [2, 5])
-def test_too_few_picks_or_picks_on_a_line_are_refused(rigged, count):
+def test_too_few_picks_and_picks_on_a_line_are_refused(rigged, count):
     views, projections = rigged
     line = np.linspace([-2.0, 0, 9], [2, 0, 9], count)
     picks = [
@@ -315,7 +315,7 @@ def test_too_few_picks_or_picks_on_a_line_are_refused(rigged, count):
         align_picks(picks, views)
 
 
-def test_a_picks_file_is_read_as_opendronemap_defines_it(rigged, tmp_path):
+def test_a_picks_file_is_read_in_opendronemaps_format(rigged, tmp_path):
     views, _ = rigged
     views = [replace(view, image=Path(view.name).with_name(f"photo {k}.png")) for k, view in enumerate(views)]
     file = tmp_path / "gcp_list.txt"
@@ -335,21 +335,21 @@ def test_a_picks_file_is_read_as_opendronemap_defines_it(rigged, tmp_path):
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("1 2 3 4 5", "line 2: a pick is X Y Z"),
-        ("1 2 3 4 x images/0.png", "line 2: a pick is X Y Z"),
-        ("1 2 3 4 5 nowhere.png", "nowhere.png is no photograph of the scene"),
-        ("1 2 9 4 5 images/1.png a", "line 2: the point a had other coordinates"),
+        ("1 2 3 4 5", "line 2: expected X Y Z"),
+        ("1 2 3 4 x images/0.png", "line 2: expected X Y Z"),
+        ("1 2 3 4 5 nowhere.png", "nowhere.png is not a photograph of the scene"),
+        ("1 2 9 4 5 images/1.png a", "line 2: the point a has other coordinates"),
         ("1 2 3 4 5 images/0.png a", "line 2: the point a is picked twice"),
         ("1 2 3 4 5 images/1.png 'a", "line 2"),
     ],
 )
-def test_a_line_that_is_no_pick_is_refused_by_its_number(rigged, tmp_path, line, sentence):
+def test_an_invalid_line_of_a_picks_file_is_refused_with_its_number(rigged, tmp_path, line, sentence):
     (tmp_path / "picks.txt").write_text(f"1 2 3 4 5 images/0.png a\n{line}\n")
     with pytest.raises(SceneError, match=re.escape(sentence)):
         read_picks(tmp_path / "picks.txt", rigged[0])
 
 
-def test_picks_are_pixels_of_the_photograph_as_it_lies_on_disk(tmp_path):
+def test_picks_are_pixels_of_the_photograph_on_disk(tmp_path):
     from nerfstudio.cameras.cameras import Cameras, CameraType
 
     from dataparsers.photograph import undistort
@@ -361,7 +361,7 @@ def test_picks_are_pixels_of_the_photograph_as_it_lies_on_disk(tmp_path):
     )[0]  # fmt: skip
     K, image = undistort(lens, np.zeros((480, 640, 3), np.uint8))
     camera = Camera(torch.eye(4, dtype=torch.float64), torch.from_numpy(K).double(), image.shape[1], image.shape[0])
-    Image.new("RGB", (1280, 960)).save(tmp_path / "a.png")  # twice the size that was calibrated
+    Image.new("RGB", (1280, 960)).save(tmp_path / "a.png")  # twice the calibrated size
     view = View("a.png", tmp_path / "a.png", camera, lens)
     x, y = 0.3, -0.2
     factor = 1 - 0.1 * (x * x + y * y)
@@ -377,7 +377,7 @@ ORIGIN = np.array([410_000.0, 5_413_000.0, 250.0])
 
 
 def surveyed(count: int = 20, noise: float = 0.02, bow: float = 2.0) -> tuple[SurveyedPositions, np.ndarray]:
-    """Cameras on a walk of 24 m that leaves the straight line by ``bow`` metres, in national coordinates; the truth."""
+    """Cameras on a walk of 24 m that deviates from a line by ``bow`` metres, in national coordinates, and the truth."""
     random = np.random.default_rng(4)
     along = np.linspace(-1, 1, count)
     walk = np.stack([12 * along, bow * along**2, 0.1 * bow * np.sin(7 * along)], axis=1)
@@ -399,7 +399,7 @@ def at_the_wall(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(transformed(wall, found) - transformed(wall, truth), axis=1).max() / scale)
 
 
-def test_exact_camera_positions_give_the_place_to_a_tenth_of_a_millimetre():
+def test_exact_camera_positions_give_the_alignment_to_a_tenth_of_a_millimetre():
     positions, truth = surveyed(noise=0.0)
     found, cameras, play = align_positions(positions)
     assert at_the_wall(found, truth) < 1e-4  # doubles in national coordinates are good to a nanometre
@@ -407,7 +407,7 @@ def test_exact_camera_positions_give_the_place_to_a_tenth_of_a_millimetre():
     assert play < 1e-5
 
 
-def test_camera_positions_by_rtk_give_the_place_within_their_play():
+def test_rtk_camera_positions_give_the_alignment_within_their_play():
     positions, truth = surveyed(noise=0.02)
     found, cameras, play = align_positions(positions)
     assert all(camera.is_used for camera in cameras)
@@ -416,7 +416,7 @@ def test_camera_positions_by_rtk_give_the_place_within_their_play():
     assert at_the_wall(found, truth) < 2.5 * np.radians(play) * np.hypot(12, 10)
 
 
-def test_the_play_is_the_scatter_of_the_turn_about_the_path():
+def test_the_play_is_the_standard_deviation_of_the_rotation_about_the_path():
     turns, plays = [], []
     for seed in range(40):
         positions, truth = surveyed(count=10, noise=0.0)
@@ -442,19 +442,19 @@ def test_a_camera_that_lost_its_fix_is_left_out_and_comes_first():
     ("settings", "sentence"),
     [
         ({"bow": 0.0}, "camera positions lie on one line, about which the shell can turn: add photographs"),
-        ({"bow": 0.0, "noise": 0.3}, "lie on one line"),  # the photographs know how straight they were taken
+        ({"bow": 0.0, "noise": 0.3}, "lie on one line"),  # by the cameras in the scene, which are exact
         ({"count": 2}, "2 photographs of the scene have a position: at least 3 are needed"),
-        ({"noise": 2.0}, "of 20 camera positions agree with the photographs within 0.15 m: they need RTK"),
+        ({"noise": 2.0}, "of 20 camera positions agree with the photographs within 0.15 m: they must be accurate"),
     ],
     ids=["a straight walk", "a straight walk and a poor survey", "two", "a telephone"],
 )
-def test_camera_positions_that_leave_the_shell_free_are_refused(settings, sentence):
+def test_camera_positions_that_do_not_determine_the_alignment_are_refused(settings, sentence):
     with pytest.raises(SceneError, match=sentence):
         align_positions(surveyed(**settings)[0])
 
 
 @pytest.mark.parametrize("first", ["EPSG:25832\n", "WGS84 UTM 32N\n", "+proj=utm +zone=32 +units=m +no_defs\n", ""])
-def test_a_file_of_positions_is_read_as_opendronemap_defines_it(tmp_path, first):
+def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     views = [replace(view, image=Path(view.name).with_name(f"photo {k}.jpg")) for k, view in enumerate(rig()[0])]
     (tmp_path / "geo.txt").write_text(
         first + '"photo 0.jpg" 410000.125 5413000.25 251 0 0 0 0.02 0.03\n\n'
@@ -470,13 +470,13 @@ def test_a_file_of_positions_is_read_as_opendronemap_defines_it(tmp_path, first)
     ("line", "sentence"),
     [
         ("EPSG:4326", "is in degrees (EPSG:4326): convert it"),
-        ("EPSG:25832\nimages/0.png 1 2", "line 2: a camera's position is the image, then X Y Z"),
-        ("EPSG:25832\nimages/0.png 1 2 nan", "line 2: a camera's position is"),
+        ("EPSG:25832\nimages/0.png 1 2", "line 2: expected the image, then X Y Z"),
+        ("EPSG:25832\nimages/0.png 1 2 nan", "line 2: expected the image"),
         ("images/0.png 1 2 3\nimages/0.png 1 2 3", "line 2: images/0.png has a position already"),
         ("images/0.png 1 2 3\n'images/1.png 1 2 3", "line 2"),
     ],
 )
-def test_a_line_that_is_no_position_is_refused_by_its_number(rigged, tmp_path, line, sentence):
+def test_an_invalid_line_of_a_positions_file_is_refused_with_its_number(rigged, tmp_path, line, sentence):
     (tmp_path / "geo.txt").write_text(line)
     with pytest.raises(SceneError, match=re.escape(sentence)):
         read_positions(tmp_path / "geo.txt", rigged[0])
@@ -485,13 +485,13 @@ def test_a_line_that_is_no_position_is_refused_by_its_number(rigged, tmp_path, l
 # The bay test
 
 
-def test_bays_and_storeys_are_measured_off_the_shell(surface, points, survey_from_scene):
+def test_the_sizes_of_bays_and_storeys_are_measured_on_the_shell(surface, points, survey_from_scene):
     along, upwards = scan_shifts(surface, transformed(points.positions, survey_from_scene), AXES.T)
     assert along.period in (pytest.approx(BAY, abs=0.1), pytest.approx(2 * BAY, abs=0.1))  # columns: every second bay
     assert upwards.period == pytest.approx(STOREY, abs=0.1)
 
 
-def test_a_shift_by_a_bay_has_a_better_place_a_bay_back(surface, points, survey_from_scene):
+def test_a_shell_shifted_by_a_bay_fits_better_a_bay_back(surface, points, survey_from_scene):
     placed = transformed(points.positions, survey_from_scene)
     along, _ = scan_shifts(surface, placed, AXES.T)
     assert along.elsewhere[1] < 0.9
@@ -501,7 +501,7 @@ def test_a_shift_by_a_bay_has_a_better_place_a_bay_back(surface, points, survey_
     assert fit > 1.1
 
 
-def test_the_axes_of_a_facade_are_upright_though_the_cameras_look_up():
+def test_the_axes_of_a_facade_are_upright_even_if_the_cameras_look_up():
     normals = np.array([[0.0, -1, 0]] * 8 + [[1.0, 0, 0]] * 3 + [[0, 0, 1.0]] * 20)
     axes = facade_axes(normals, np.array([0.0, 0.3, 0.95]))
     np.testing.assert_allclose(axes, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
@@ -535,15 +535,15 @@ def test_the_verdict_names_what_is_wrong(mesh, views, points, alignment, verdict
     assert reason is None or any(reason in sentence for sentence in validation.reasons)
 
 
-def test_limits_judge_from_both_sides_and_refuse_nan():
+def test_limits_work_from_both_sides_and_refuse_nan():
     below, above = Limit(0.1, 0.5, ""), Limit(0.6, 0.3, "")
-    assert [below.judge(v) for v in (0.1, 0.2, 0.6, np.nan)] == ["good", "doubtful", "refused", "refused"]
-    assert [above.judge(v) for v in (0.6, 0.5, 0.2, np.nan)] == ["good", "doubtful", "refused", "refused"]
+    assert [below.verdict(v) for v in (0.1, 0.2, 0.6, np.nan)] == ["good", "doubtful", "refused", "refused"]
+    assert [above.verdict(v) for v in (0.6, 0.5, 0.2, np.nan)] == ["good", "doubtful", "refused", "refused"]
     assert all(limit.why for limit in LIMITS.values())
 
 
-def test_the_bias_is_that_of_the_wall(mesh, views, points):
-    # The shell 5 cm deeper: points of the wall stand 5 cm before it, those of reveals and slabs' undersides on it.
+def test_the_bias_is_the_distance_of_the_wall(mesh, views, points):
+    # The shell is 5 cm deeper: wall points are 5 cm in front of it, points of reveals and undersides of slabs on it.
     assert 0.03 < validate(mesh, shifted(out=-0.05), views, points).bias < 0.05
     assert validate(mesh, shifted(), views, points).bias == pytest.approx(0.0, abs=0.003)
 
@@ -551,7 +551,7 @@ def test_the_bias_is_that_of_the_wall(mesh, views, points):
 # Report and command
 
 
-def test_edges_are_where_the_shell_ends_steps_or_bends_and_nowhere_on_a_slanted_plane():
+def test_edges_are_at_outlines_steps_and_bends_but_not_on_a_slanted_plane():
     K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], dtype=torch.float64)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 40, degrees=True).as_matrix())
@@ -559,15 +559,15 @@ def test_edges_are_where_the_shell_ends_steps_or_bends_and_nowhere_on_a_slanted_
         np.array([[-99.0, -99, 9], [99, -99, 9], [99, 99, 9], [-99, 99, 9]]), np.array([[0, 1, 2], [0, 2, 3]])
     )
     assert not shell_edges(ShellCaster(plane, np.eye(4)).cast(Camera(viewmat, K, 64, 48)), 1.0).any()
-    # A plate 10 cm before the plane, from -1 to 1: at 60 pixels of focal length and a depth of 9 it ends at 32 ± 6.7.
+    # A plate 10 cm in front of the plane, from -1 to 1: with a focal length of 60 and a depth of 9 it ends at 32 ± 6.7.
     corners = np.array([[-1.0, -1, 8.9], [1, -1, 8.9], [1, 1, 8.9], [-1, 1, 8.9]])
     both = ShellMesh(np.concatenate([plane.vertices, corners]), np.concatenate([plane.faces, plane.faces + 4]))
     edges = shell_edges(ShellCaster(both, np.eye(4)).cast(Camera(torch.eye(4, dtype=torch.float64), K, 64, 48)), 1.0)
     assert set(np.flatnonzero(edges[24])) == {24, 25, 38, 39}
 
 
-def test_a_crease_is_drawn_and_the_noise_of_the_triangles_beside_it_is_not():
-    # Two walls of 2 x 2 m that meet at a right angle in the middle of the picture, in triangles of 4 cm, 3 pixels.
+def test_a_crease_is_an_edge_and_the_noise_of_triangles_beside_it_is_not():
+    # Two walls of 2 x 2 m that meet at a right angle in the middle of the image, in triangles of 4 cm, 3 pixels.
     u, v = np.meshgrid(np.linspace(-2, 2, 101), np.linspace(-2, 2, 101))
     noise = np.random.default_rng(0).normal(0, 0.01, u.shape)
     vertices = np.stack([u / np.sqrt(2), v, 8 - np.abs(u) / np.sqrt(2) + noise], axis=-1).reshape(-1, 3)
@@ -580,16 +580,16 @@ def test_a_crease_is_drawn_and_the_noise_of_the_triangles_beside_it_is_not():
     edges = shell_edges(cue, 1.0)
     neighbours = np.einsum("hwc,hwc->hw", cue.normal[:, 1:].astype(float), cue.normal[:, :-1].astype(float))
     beside = np.abs(np.arange(160) - 79.5) > 8
-    assert (neighbours < np.cos(np.radians(25)))[:, beside[1:]].mean() > 0.1  # what a threshold alone would draw
+    assert (neighbours < np.cos(np.radians(25)))[:, beside[1:]].mean() > 0.1  # edges of a threshold alone
     assert edges[:, beside].mean() < 0.02
     assert edges[1:-1, 76:84].any(axis=1).mean() > 0.7
 
 
-def test_a_matrix_is_judged_reported_and_written(scene, shellgs):
+def test_a_matrix_is_validated_reported_and_written(scene, shellgs):
     true = Alignment.load(scene / ALIGNMENT)
     shift = np.array([412_000.0, 5_123_000.0, 0.0])
     unshifted = true.shell_to_scene.copy()
-    unshifted[:3, 3] += unshifted[:3, :3] @ shift  # of coordinates less the shift, as CloudCompare sees them
+    unshifted[:3, 3] += unshifted[:3, :3] @ shift  # for coordinates minus the shift, as CloudCompare has them
     (scene / "matrix.txt").write_text("\n".join(" ".join(f"{value:.12f}" for value in row) for row in unshifted))
     (scene / ALIGNMENT).unlink()
     shell = scene / true.shell
@@ -609,7 +609,7 @@ def test_a_matrix_is_judged_reported_and_written(scene, shellgs):
     assert json.loads((scene / REPORT / "validation.json").read_text())["verdict"] == written.verdict
 
 
-def test_picks_and_refinement_give_the_place_and_their_residuals(scene, shellgs):
+def test_picks_and_refinement_give_the_alignment_and_residuals(scene, shellgs):
     true = Alignment.load(scene / ALIGNMENT)
     corners = [(o.x0, 0.0, o.z0) for o in Layout(6, 3).openings] + [(o.x1, 0.0, o.z1) for o in Layout(6, 3).openings]
     building = np.array(corners)
@@ -626,16 +626,16 @@ def test_picks_and_refinement_give_the_place_and_their_residuals(scene, shellgs)
     picks.write_text("\n".join(line for k, line in lines if seen.count(k) >= 4))
     (scene / ALIGNMENT).unlink()
     output = shellgs("align", scene, scene / true.shell, "--picks", picks, "--refine", 0.3)
-    assert "picks decide" in output
+    assert "picks are used" in output
     assert "Refined against" in output
     written = Alignment.load(scene / ALIGNMENT)
     vertices = load_shell(scene / true.shell).vertices
     moved = np.linalg.norm(written.apply(vertices) - true.apply(vertices), axis=1).mean() * true.metres_per_unit
-    assert moved < 0.05  # 300 SfM points, some of them on what the shell leaves out: flowers, railings, frames
+    assert moved < 0.05  # 300 SfM points, some of them on parts missing in the shell: flowers, railings, frames
     assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
 
 
-def test_camera_positions_give_the_place_and_name_who_was_not_there(scene, shellgs):
+def test_camera_positions_give_the_alignment_and_name_missing_photographs(scene, shellgs):
     true = Alignment.load(scene / ALIGNMENT)
     lines = ["EPSG:25832", "IMG_0001.jpg 0 0 0"]
     for k, view in enumerate(read_views(FacadeDataParserConfig(data=scene))):
@@ -645,7 +645,7 @@ def test_camera_positions_give_the_place_and_name_who_was_not_there(scene, shell
     (scene / "geo.txt").write_text("\n".join(lines))
     (scene / ALIGNMENT).unlink()
     output = shellgs("align", scene, scene / true.shell, "--positions", scene / "geo.txt")
-    assert "9 of 10 camera positions decide" in output
+    assert "9 of 10 camera positions are used" in output
     assert "In geo.txt but not in the scene: IMG_0001.jpg" in output
     assert "left out" in output
     written = Alignment.load(scene / ALIGNMENT)
@@ -654,7 +654,7 @@ def test_camera_positions_give_the_place_and_name_who_was_not_there(scene, shell
     assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
 
 
-def test_a_refused_place_leaves_the_alignment_alone(scene, shellgs):
+def test_a_refused_alignment_does_not_replace_the_saved_one(scene, shellgs):
     before = (scene / ALIGNMENT).read_bytes()
     true = Alignment.load(scene / ALIGNMENT)
     (scene / "off.json").write_text(json.dumps((true.shell_to_scene @ np.diag([1e3, 1e3, 1e3, 1])).tolist()))
@@ -664,7 +664,7 @@ def test_a_refused_place_leaves_the_alignment_alone(scene, shellgs):
     assert "Verdict: <b>refused</b>" in (scene / REPORT / "index.html").read_text()
 
 
-def test_a_proposal_becomes_the_alignment_only_when_it_is_accepted(scene, shellgs):
+def test_a_proposal_becomes_the_alignment_only_with_accept(scene, shellgs):
     true = Alignment.load(scene / ALIGNMENT)
     (scene / ALIGNMENT).unlink()
     assert "--accept" in shellgs("align", scene, scene / true.shell)
@@ -673,21 +673,21 @@ def test_a_proposal_becomes_the_alignment_only_when_it_is_accepted(scene, shellg
     assert Alignment.load(scene / ALIGNMENT).places_like(Alignment.load(scene / PROPOSAL))
 
 
-def test_judging_what_was_cast_writes_the_figures_and_tells_the_maps(scene, shellgs):
+def test_validating_a_cast_alignment_writes_its_metrics_and_the_maps_error(scene, shellgs):
     before = Alignment.load(scene / ALIGNMENT)
     assert before.error is None
     assert "Written" in shellgs("align", scene)
-    judged = Alignment.load(scene / ALIGNMENT)
-    assert judged.verdict in ("good", "doubtful")
-    assert judged.places_like(before)
+    validated = Alignment.load(scene / ALIGNMENT)
+    assert validated.verdict in ("good", "doubtful")
+    assert validated.places_like(before)
     maps = CueMaps.open(scene, "shell")
-    assert maps.manifest.error == judged.error is not None
+    assert maps.manifest.error == validated.error is not None
     for view in read_views(FacadeDataParserConfig(data=scene)):
         assert maps.read(view.name, view.camera) is not None
     assert "0 views cast, 10 there already" in shellgs("cast", scene)
 
 
-def test_another_place_makes_the_maps_stale(scene, shellgs):
+def test_another_alignment_makes_the_maps_stale(scene, shellgs):
     moved = Alignment.load(scene / ALIGNMENT).shell_to_scene.copy()
     moved[0, 3] += 0.01
     np.save(scene / "matrix.npy", moved)
@@ -699,7 +699,7 @@ def test_another_place_makes_the_maps_stale(scene, shellgs):
 
 @pytest.fixture
 def scanned(scene: Path) -> Path:
-    """The scene whose shell is a point cloud, sparse enough for every mesher to be quick."""
+    """The scene with a point cloud as its shell, sparse enough for fast meshing."""
     alignment = Alignment.load(scene / ALIGNMENT)
     samples, _ = ShellSurface(load_shell(scene / alignment.shell)).samples(4000)
     survey = ShellSurface(load_shell(scene / alignment.shell)).survey_from_shell
@@ -709,7 +709,7 @@ def scanned(scene: Path) -> Path:
 
 
 def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
-    """What is judged is cast, cut and judged again; another mesher takes the verdict away."""
+    """The validated mesh is cast and loaded; another mesher removes the verdict."""
     used: list[str] = []
     load = alignment_module.load_shell
     monkeypatch.setattr(
@@ -717,17 +717,17 @@ def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
     )
     shell = scanned / "shell" / "scan.xyz"
     shellgs("align", scanned, shell, "--matrix", scanned / "matrix.npy", "--mesher", "bpa")
-    judged = Alignment.load(scanned / ALIGNMENT)
-    assert (judged.mesher, bool(judged.verdict)) == ("bpa", True)
+    validated = Alignment.load(scanned / ALIGNMENT)
+    assert (validated.mesher, bool(validated.verdict)) == ("bpa", True)
     assert "10 views cast" in shellgs("cast", scanned)
-    judged.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
+    validated.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
     assert set(used) == {"bpa"}
     assert "judged with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
-    assert Alignment.load(scanned / ALIGNMENT) == replace(judged, mesher="planes", verdict="", metrics={})
+    assert Alignment.load(scanned / ALIGNMENT) == replace(validated, mesher="planes", verdict="", metrics={})
 
 
 def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
-    """A proposal knows of no cameras; what it keeps is not what is cast."""
+    """A proposal's mesh, made without viewpoints, is not the one that is cast."""
     shell, cache = scanned / "shell" / "scan.xyz", scanned / "shell"
     views = read_views(FacadeDataParserConfig(data=scanned))
     alignment = Alignment(np.load(scanned / "matrix.npy"), "shell/scan.xyz")
@@ -745,7 +745,7 @@ def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
 
 
 def test_chosen_folders_reach_every_command(scene, shellgs):
-    """Photographs and cameras in folders of other names; what the maps say of themselves names them too."""
+    """Photographs and cameras in folders of other names, which the maps' manifest names too."""
     write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
     cloud = trimesh.load(scene / "sparse_pc.ply")
     lines = [
@@ -773,16 +773,16 @@ def test_starts_that_contradict_each_other_are_refused(scene, shellgs, words):
     assert "give the shell with" in shellgs("align", scene, *words)
 
 
-def test_an_alignment_without_a_verdict_is_still_read(tmp_path):
+def test_an_alignment_without_a_verdict_is_read(tmp_path):
     fields = {"shell_to_scene": np.eye(4).tolist(), "shell": "a.ply", "metres_per_shell_unit": 1.0, "source": "matrix"}
     (tmp_path / "alignment.json").write_text(json.dumps(fields))
     assert Alignment.load(tmp_path / "alignment.json") == Alignment(np.eye(4), "a.ply")
-    judged = Alignment(np.eye(4), "a.ply", verdict="good", metrics={"bias_m": 0.01, "pull_m": None})
-    judged.save(tmp_path / "alignment.json")
-    assert Alignment.load(tmp_path / "alignment.json") == judged
+    validated = Alignment(np.eye(4), "a.ply", verdict="good", metrics={"bias_m": 0.01, "pull_m": None})
+    validated.save(tmp_path / "alignment.json")
+    assert Alignment.load(tmp_path / "alignment.json") == validated
 
 
-def test_a_report_of_what_no_camera_sees_is_written_all_the_same(mesh, views, points, tmp_path):
+def test_a_report_is_written_even_if_no_camera_sees_the_shell(mesh, views, points, tmp_path):
     validation = validate(mesh, Alignment(displaced(1e4, 0, 0, 1) @ TRUTH, "<shell>.ply"), views, points)
     page = write_report(tmp_path / "report", mesh, validation).read_text()
     assert "&lt;shell&gt;.ply: refused" in page

@@ -420,11 +420,11 @@ def test_sfm_points_that_cannot_be_meant_are_left_out_and_counted(scene, caplog)
         (("mono", "{scene}", "--max-image-size", 0, "from", "{scene}/predictions"), "at least 1 pixel, not 0"),
         (
             ("align", "{scene}", "{scene}/shell/facade.ply", "--picks", "{scene}/sparse_pc.ply"),
-            "is no text file of picks",
+            "is not a text file of picks",
         ),
         (
             ("align", "{scene}", "{scene}/shell/facade.ply", "--positions", "{scene}/shell/facade.ply"),
-            "is no text file of camera positions",
+            "is not a text file of camera positions",
         ),
         (("align", "{scene}", "{scene}/shell/facade.ply", "--matrix", "{scene}/sparse_pc.ply"), "not a 4x4 matrix"),
         (("align", "{scene}", "{scene}/images"), "does not exist"),

@@ -1,4 +1,4 @@
-"""Photographs against the shell: what stands before it is found, and what is right is left alone."""
+"""Check of the shell against photographs: occluders are found, and a correct shell is confirmed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def camera_at(x: float) -> Camera:
 
 
 def painted(points: np.ndarray, seed: int) -> np.ndarray:
-    """Colours of a plane's points: a sum of waves, the same from everywhere."""
+    """Colours of a plane's points: a sum of waves, the same from all directions."""
     rng = np.random.default_rng(seed)
     waves = rng.normal(0, 6, (24, 2)), rng.uniform(0, 2 * np.pi, 24), rng.normal(0, 0.09, (24, 3))
     return 0.5 + np.sin(points[..., :2] @ waves[0].T + waves[1]) @ waves[2]
@@ -59,7 +59,7 @@ def painted(points: np.ndarray, seed: int) -> np.ndarray:
 def street(
     cameras: list[Camera], post: float | None = None, mirror: bool = False
 ) -> list[tuple[ShellView, np.ndarray]]:
-    """Views of a painted wall, perhaps with a post at some depth before it or a mirror in it, and where the post is."""
+    """Views of a painted wall, optionally with a post in front of it or a mirror in it, and masks of the post."""
     views = []
     for camera in cameras:
         rays, position = camera.rays().numpy(), camera.position.numpy()
@@ -81,7 +81,7 @@ CAMERAS = [camera_at(x) for x in np.linspace(-2.5, 2.5, 9)]
 
 
 def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Of the middle view: its sweep's score, the agreed one, and the depth found."""
+    """Sweep score, agreed score and depth of the middle view."""
     sweeps = [sweep(view, [other for other in views if other is not view]) for view in views]
     middle = len(views) // 2
     beside = [index for index in range(len(views)) if index != middle]
@@ -90,7 +90,7 @@ def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Te
 
 
 @pytest.mark.parametrize("depth", [7.0, 5.0, 3.5])
-def test_a_post_before_the_wall_is_found_where_it_stands(depth: float):
+def test_a_post_in_front_of_the_wall_is_found_at_its_depth(depth: float):
     views = street(CAMERAS, post=depth)
     _, score, found = scores([view for view, _ in views])
     before, contradicted = views[len(views) // 2][1], score.numpy() > CONTRADICTED
@@ -98,22 +98,22 @@ def test_a_post_before_the_wall_is_found_where_it_stands(depth: float):
     assert both / before.sum() > 0.9
     assert both / contradicted.sum() > 0.8
     inverse = WALL / np.median(found.numpy()[before & contradicted]) - 1
-    assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # a rung of the ladder
+    assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # one step of the offsets
 
 
-def test_a_wall_that_is_as_the_shell_says_is_confirmed():
+def test_a_wall_that_agrees_with_the_shell_is_confirmed():
     swept, score, _ = scores([view for view, _ in street(CAMERAS)])
     assert (score > CONTRADICTED).float().mean() < 0.002
     assert (swept < CONFIRMED).float().mean() > 0.8
 
 
-def test_what_a_mirror_shows_is_farther_and_contradicts_nothing():
+def test_a_mirror_shows_farther_things_and_does_not_contradict_the_shell():
     _, score, _ = scores([view for view, _ in street(CAMERAS, mirror=True)])
     assert (score > CONTRADICTED).float().mean() < 0.01
 
 
 @pytest.mark.parametrize("offset", [OFFSETS[3], OFFSETS[8]])
-def test_neighbours_on_both_sides_see_an_offset_move_by_some_pixels(offset: float):
+def test_chosen_neighbours_are_on_both_sides_and_have_the_wanted_parallax(offset: float):
     view, others = camera_at(0.0), [camera_at(x) for x in np.linspace(-12, 12, 200)]
     chosen = neighbours(view, sides(view, others), WALL, offset)
     assert {side for _, side in chosen} == {0, 1}
@@ -124,7 +124,7 @@ def test_neighbours_on_both_sides_see_an_offset_move_by_some_pixels(offset: floa
         assert pixels == pytest.approx(MOVES, rel=0.25)
 
 
-def test_the_better_half_is_a_mean_of_the_least_costs_by_weight():
+def test_the_better_half_is_the_weighted_mean_of_the_lowest_costs():
     costs = torch.tensor([0.9, 0.1, torch.nan, 0.3, 0.5]).view(5, 1, 1)
     weights = torch.tensor([1.0, 1.0, 1.0, 0.5, 1.5]).view(5, 1, 1)
     # Half of the weight that counts is 2: all of 0.1's, all of 0.3's, and half a unit of 0.5's.
@@ -138,7 +138,7 @@ def check(scene: Path):
 
 
 def contents(scene: Path) -> dict[str, bytes]:
-    """Depth and mask of every map."""
+    """Depth and mask of every map, as bytes."""
     maps = {}
     for path in sorted((scene / "cues/checked").rglob("*.npz")):
         with np.load(path) as file:
@@ -146,7 +146,7 @@ def contents(scene: Path) -> dict[str, bytes]:
     return maps
 
 
-def test_maps_are_made_once_and_again_only_where_they_are_missing(scene: Path):
+def test_maps_are_made_once_and_again_only_if_missing(scene: Path):
     first = check(scene)
     assert (first.checked, first.skipped) == (10, 0)
     before = contents(scene)
@@ -159,14 +159,14 @@ def test_maps_are_made_once_and_again_only_where_they_are_missing(scene: Path):
     assert contents(scene) == before
 
 
-def test_a_full_disk_is_an_error_that_tells_so(scene: Path):
+def test_a_full_disk_raises_an_error_that_says_so(scene: Path):
     with small_disk(3_000), pytest.raises(OSError, match="File too large") as refusal:
         check(scene)
     assert refusal.value.errno == errno.EFBIG
     assert check(scene).checked == 10
 
 
-def test_the_maps_of_training_views_know_nothing_of_held_out_photographs(scene: Path):
+def test_the_maps_of_training_views_do_not_depend_on_held_out_photographs(scene: Path):
     check(scene)
     before = contents(scene)
     held_out = sorted(held_out_names(FacadeDataParserConfig(data=scene)))
@@ -174,13 +174,13 @@ def test_the_maps_of_training_views_know_nothing_of_held_out_photographs(scene: 
         with Image.open(scene / name) as image:
             noise = np.random.default_rng(0).integers(0, 255, (*image.size[::-1], 3), dtype=np.uint8)
         Image.fromarray(noise).save(scene / name)
-    assert check(scene).checked == 10  # the photographs are others
+    assert check(scene).checked == 10  # the photographs have changed
     stems = {f"{Path(name).name}" for name in held_out}
     after = contents(scene)
     assert {name for name in before if after[name] != before[name]} <= stems
 
 
-def test_a_contradicted_shell_is_no_reference_and_supervises_only_where_asked():
+def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request():
     mask = torch.tensor([True] * 7 + [False]).view(1, 8, 1)
     nearer = torch.tensor([0.0, 1.5] + [0.0] * 6).view(1, 8, 1)
     batch = {"shell_depth": torch.full((1, 8, 1), 2.0), "shell_normal": torch.zeros(1, 8, 3), "shell_mask": mask}
@@ -194,8 +194,8 @@ def test_a_contradicted_shell_is_no_reference_and_supervises_only_where_asked():
     assert parts["off_shell"] == [False] * 7 + [True]
 
 
-def test_verdicts_are_those_of_the_views_that_see_a_place(tmp_path: Path):
-    """A wall at z = 8, of which 8 of 10 cameras show a box, 1 m before it, in the middle of the wall."""
+def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
+    """A wall at z = 8; 8 of 10 cameras show a box 1 m in front of its middle."""
     views = [View(f"{k}.png", tmp_path / f"{k}.png", camera_at(0.1 * k)) for k in range(10)]
     shell, checked = (CueMaps.create(tmp_path, kind, command="cast") for kind in ("shell", "checked"))
     normal = np.zeros((HEIGHT, WIDTH, 3), np.float16)
@@ -207,7 +207,7 @@ def test_verdicts_are_those_of_the_views_that_see_a_place(tmp_path: Path):
         checked.write(view.name, CueMap(np.where(box, 7, 0).astype(np.float32), normal, box), view.camera)
     places = np.array([[0.0, 0, WALL], [1.0, 0, WALL], [0.0, 0, 7.0], [0.0, 100.0, WALL]])
     verdicts = shell_verdicts(tmp_path, views, places)
-    assert verdicts.seen.tolist() == [10, 10, 0, 0]  # one is not on the shell, one is in no picture
+    assert verdicts.seen.tolist() == [10, 10, 0, 0]  # one is not on the shell, one is in no image
     assert verdicts.contradicted.tolist() == [8, 0, 0, 0]
     slant = np.hypot(1, 0.35 / WALL)  # of the median camera's ray
     assert verdicts.distance[0] == pytest.approx(slant, rel=1e-3)
@@ -225,8 +225,8 @@ def test_verdicts_are_those_of_the_views_that_see_a_place(tmp_path: Path):
     assert np.asarray(cloud.colors)[contradicted, 1].max() < 100
 
 
-def test_the_viewer_has_the_contradicted_places_where_the_cameras_are(pristine_scene, tmp_path, monkeypatch):
-    """Places at the cameras themselves, which nerfstudio has moved to its own world."""
+def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scene, tmp_path, monkeypatch):
+    """Places at the cameras' positions, which nerfstudio transforms to its own world."""
     scene = tmp_path / "scene"
     shutil.copytree(pristine_scene, scene)
     views = read_views(FacadeDataParserConfig(data=scene))
@@ -256,8 +256,8 @@ def test_the_viewer_has_the_contradicted_places_where_the_cameras_are(pristine_s
     assert not settings["visible"]
 
 
-def test_surfaces_are_measured_on_the_shell_and_before_it():
-    """A wall of which the right half has something 1 m before it, that the rendering leaves out."""
+def test_surfaces_are_measured_on_the_shell_and_in_front_of_it():
+    """A wall with something 1 m in front of its right half, which the rendering lacks."""
     camera, size = camera_at(0.0), (HEIGHT, WIDTH, 1)
     wall, everywhere = torch.full(size, WALL), torch.ones(size, dtype=torch.bool)
     truth = torch.where(torch.arange(WIDTH)[None, :, None] < WIDTH // 2, wall, wall - 1)

@@ -1,4 +1,4 @@
-"""A scene in national coordinates is the same scene: cameras, points, maps and outputs agree to a millimetre."""
+"""Scenes in national coordinates: cameras, points, maps and outputs agree to a millimetre with the local scene's."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MILLIMETRE = 1e-3
 
 
 def moved_to_national_coordinates(scene: Path) -> None:
-    """The same scene with all its coordinates, and its shell's place, shifted."""
+    """Shift all coordinates of the scene, and the alignment of its shell."""
     path = scene / "transforms.json"
     transforms = json.loads(path.read_text())
     for frame in transforms["frames"]:
@@ -58,7 +58,7 @@ def national(request, scene: Path) -> Path:
     return scene
 
 
-def test_cameras_of_a_national_scene_are_those_of_the_local_one(national, pristine_scene):
+def test_cameras_of_a_national_scene_agree_with_the_local_ones(national, pristine_scene):
     local = read_views(FacadeDataParserConfig(data=pristine_scene))
     for here, there in zip(local, read_views(FacadeDataParserConfig(data=national)), strict=True):
         assert there.name == here.name
@@ -67,8 +67,8 @@ def test_cameras_of_a_national_scene_are_those_of_the_local_one(national, pristi
         torch.testing.assert_close(there.camera.viewmat[:3, :3], here.camera.viewmat[:3, :3], atol=1e-7, rtol=0)
 
 
-def test_nerfstudios_world_leads_back_to_national_coordinates(national):
-    """Through the dataparser's float32 poses and points, as every output goes."""
+def test_nerfstudios_world_transforms_back_to_national_coordinates(national):
+    """Through the dataparser's float32 poses and points, like every output."""
     outputs = parse(national)
     to_scene = np.linalg.inv(np.vstack([outputs.dataparser_transform.numpy(), [0, 0, 0, 1]]))
     cameras = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy() / outputs.dataparser_scale
@@ -83,7 +83,7 @@ def test_nerfstudios_world_leads_back_to_national_coordinates(national):
     )
 
 
-def test_the_transform_that_nerfstudio_saves_keeps_national_coordinates(national, tmp_path):
+def test_the_transform_saved_by_nerfstudio_keeps_national_coordinates(national, tmp_path):
     parse(national).save_dataparser_transform(tmp_path / "dataparser_transforms.json")
     saved = json.loads((tmp_path / "dataparser_transforms.json").read_text())
     view = parse(national).metadata["views"][0]
@@ -93,7 +93,7 @@ def test_the_transform_that_nerfstudio_saves_keeps_national_coordinates(national
     np.testing.assert_allclose(placed, there, atol=MILLIMETRE / 10 * saved["scale"])
 
 
-def test_maps_of_a_national_scene_are_those_of_the_local_one(national, pristine_scene):
+def test_maps_of_a_national_scene_agree_with_the_local_ones(national, pristine_scene):
     views = read_views(FacadeDataParserConfig(data=national))
     cast_views(national, views, Alignment.load(national / ALIGNMENT))
     here, there = (CueMaps.open(scene, "shell") for scene in (pristine_scene, national))
@@ -104,16 +104,14 @@ def test_maps_of_a_national_scene_are_those_of_the_local_one(national, pristine_
         both = one.mask & other.mask
         assert (one.mask == other.mask).mean() > 0.999
         close = np.abs(one.depth - other.depth)[both] < MILLIMETRE
-        assert close.mean() > 0.999  # but for pixels on the edge of a sill
+        assert close.mean() > 0.999  # except for pixels on the edge of a sill
 
 
 @pytest.mark.usefixtures("eager")
-def test_what_is_exported_from_a_national_scene_stands_where_it_stands_in_the_local_one(
-    national, pristine_scene, tmp_path
-):
-    """The shell is the same in both, and so is its frame."""
+def test_exports_of_a_national_scene_agree_with_those_of_the_local_one(national, pristine_scene, tmp_path):
+    """Both have the same shell, and so the same frame."""
     if (national / "sparse").exists():
-        pytest.skip("its points are others")
+        pytest.skip("its points are different")
     views = read_views(FacadeDataParserConfig(data=national))
     cast_views(national, views, Alignment.load(national / ALIGNMENT))
     placed = []
@@ -125,7 +123,7 @@ def test_what_is_exported_from_a_national_scene_stands_where_it_stands_in_the_lo
     np.testing.assert_allclose(placed[1], placed[0], atol=MILLIMETRE)
 
 
-def test_results_without_a_shell_are_shifted_by_whole_hundreds():
+def test_exports_without_a_shell_are_offset_by_whole_hundreds():
     frame = scene_frame(middle=NATIONAL)
     np.testing.assert_array_equal(frame.offset, [410_100, 5_414_000, 300])
     np.testing.assert_allclose(frame.to_scene @ [*(NATIONAL - frame.offset), 1], [*NATIONAL, 1])

@@ -1,4 +1,4 @@
-"""Maps of distorted cameras: cast for the pinhole camera that nerfstudio's undistortion leaves."""
+"""Maps of distorted cameras, cast for the pinhole camera of nerfstudio's undistorted image."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 480, 320
 
 
 def with_lens(scene: Path, model: str, coefficients: dict[str, float]) -> list[View]:
-    """The views of the scene, as if larger photographs had been taken through another lens."""
+    """Views of the scene, as if larger photographs had been taken with another lens."""
     transforms = json.loads((scene / "transforms.json").read_text())
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 400.0, "fl_y": 396.0, "cx": 235.0, "cy": 163.0, "camera_model": model}
     transforms |= lens | coefficients
@@ -35,7 +35,7 @@ def with_lens(scene: Path, model: str, coefficients: dict[str, float]) -> list[V
 
 
 def rays_through(model: str, coefficients: dict[str, float]) -> np.ndarray:
-    """The direction that each pixel of the distorted photograph looks in, with z = 1, by OpenCV."""
+    """Ray direction of each pixel of the distorted photograph, with z = 1, by OpenCV."""
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)  # OpenCV's pixel centres are whole numbers
     K = np.array([[400.0, 0, 234.5], [0, 396, 162.5], [0, 0, 1]])
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
@@ -53,8 +53,8 @@ def rays_through(model: str, coefficients: dict[str, float]) -> np.ndarray:
     ("model", "coefficients"),
     [("OPENCV", BROWN), ("OPENCV", {}), ("OPENCV_FISHEYE", FISHEYE), ("OPENCV_FISHEYE", {})],
 )
-def test_the_shell_photographed_through_a_lens_lies_on_its_map(scene: Path, model: str, coefficients: dict):
-    """The silhouette traced through the lens itself, undistorted as a photograph, is the mask that is cast."""
+def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, model: str, coefficients: dict):
+    """The depth image cast through the lens itself, undistorted as a photograph, equals the cast depth."""
     view = with_lens(scene, model, coefficients)[4]
     alignment = Alignment.load(scene / ALIGNMENT)
     caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
@@ -72,7 +72,7 @@ def test_the_shell_photographed_through_a_lens_lies_on_its_map(scene: Path, mode
     difference = np.abs(photograph - expected)[3:-3, 3:-3]
     assert 0.2 < cue.mask.mean() <= 1
     assert np.median(difference) < 1.5
-    # Only pixels on depth edges, which the undistortion blurs, may differ; a shift of one pixel makes three times more.
+    # Only depth edges, which undistortion blurs, may differ; a shift of one pixel makes three times as many differ.
     assert (difference > 8).mean() < 0.02
     shifted = np.abs(np.roll(photograph, 2, axis=1) - expected)[3:-3, 3:-3]
     assert (difference > 8).mean() < 0.6 * (shifted > 8).mean()
@@ -88,7 +88,7 @@ def test_a_colmap_fisheye_keeps_its_fourth_coefficient(scene: Path):
 
 
 @pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "ORTHOPHOTO", "FISHEYE624"])
-def test_a_camera_that_cannot_become_a_pinhole_is_refused(scene: Path, model: str):
+def test_a_camera_that_cannot_be_undistorted_is_refused(scene: Path, model: str):
     with pytest.raises(SceneError, match=rf"frame_\d+\.png is {model}.*undistort"):
         with_lens(scene, model, {})
 
@@ -102,7 +102,7 @@ def test_browns_fourth_radial_coefficient_is_refused(scene: Path):
     ("model", "extra"),
     [("FULL_OPENCV", "0.1 0 0 0 0 0 0.1 0"), ("FOV", "0.9"), ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 0 0")],
 )
-def test_a_colmap_model_that_nerfstudio_does_not_know_is_refused(scene: Path, model: str, extra: str):
+def test_a_colmap_model_unknown_to_nerfstudio_is_refused(scene: Path, model: str, extra: str):
     views = read_views(FacadeDataParserConfig(data=scene))
     write_colmap(scene, views, list(range(1, 11)), model=model, extra=extra)
     with pytest.raises(SceneError, match=rf"{re.escape(str(scene))}: {model} camera model is not supported.*undistort"):

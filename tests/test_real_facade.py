@@ -1,4 +1,4 @@
-"""The shell pipeline on photographs of a real facade; the data are not part of the project."""
+"""The shell pipeline on photographs of real facades; the data are not part of the project."""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ from shellgs_method.shell import Alignment, cast_views
 DATA = Path(os.environ.get("SHELLGS_DATA", Path(__file__).parents[2] / "shared" / "data"))
 SCENES = {"herz-jesu-p25": "herz_jesu_survey.ply", "south-building-26": "south_building_survey.ply"}
 
-pytestmark = pytest.mark.skipif(
-    not DATA.is_dir(), reason=f"no real scenes in {DATA}; SHELLGS_DATA tells where they are"
-)
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real scenes in {DATA}; set SHELLGS_DATA to their folder")
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_cast_shell_lies_where_sfm_saw_the_building(tmp_path: Path, name: str):
+def test_the_cast_shell_agrees_with_the_sfm_points(tmp_path: Path, name: str):
     scene = tmp_path / name
     shutil.copytree(DATA / name, scene, copy_function=os.symlink)
     shell = f"shell/{SCENES[name]}"
@@ -44,5 +42,5 @@ def test_the_cast_shell_lies_where_sfm_saw_the_building(tmp_path: Path, name: st
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         depth = cue.depth[row[inside], column[inside]]
         errors.append(np.abs(seen[inside, 2] / depth - 1)[depth > 0])
-    # Points on the far side of a relief are in it too: the median stands for those that the camera sees.
+    # Includes points hidden behind a relief: the median stands for those that are visible.
     assert np.median(np.concatenate(errors)) < 0.005

@@ -1,4 +1,4 @@
-"""The shell's way into the views: files, alignments, rays against closed forms, and casts that survive interruption."""
+"""The shell from its file to its maps: files, alignments, rays against closed forms, and interrupted casts."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def save(path: Path, mesh: ShellMesh) -> Path:
 
 
 def write_ply(path: Path, vertices: list[str], faces: list[str]) -> Path:
-    """An ASCII PLY, which may hold what no exporter would write."""
+    """Write an ASCII PLY, which may hold data that no exporter would write."""
     header = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
     header += [f"property double {axis}" for axis in "xyz"]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
@@ -81,7 +81,7 @@ def write_ply(path: Path, vertices: list[str], faces: list[str]) -> Path:
 # Rays
 
 
-def test_a_wall_seen_from_the_front_has_one_depth_and_faces_the_camera():
+def test_a_wall_seen_from_the_front_has_constant_depth_and_faces_the_camera():
     cue = ShellCaster(wall(), np.eye(4)).cast(camera_at([0, 0, 0]))
     assert cue.mask.all()
     np.testing.assert_allclose(cue.depth, 10, rtol=1e-6)  # along the ray it would be 12.2 in the corner
@@ -92,7 +92,7 @@ def test_a_slanted_wall_has_the_depth_of_its_plane_equation():
     camera = camera_at([0.5, -1, 2], yaw=30)
     cue = ShellCaster(wall(), np.eye(4)).cast(camera)
     normal = camera.viewmat[:3, :3].numpy() @ [0, 0, -1]
-    expected = -8 / (camera.rays().numpy() @ normal)  # n · (z ray) = -distance, the camera is 8 in front of the wall
+    expected = -8 / (camera.rays().numpy() @ normal)  # n · (z ray) = -distance; the camera is 8 in front of the wall
     np.testing.assert_allclose(cue.depth, expected, rtol=1e-5)
     np.testing.assert_allclose(cue.normal, np.broadcast_to(normal, cue.normal.shape), atol=1e-3)
 
@@ -119,7 +119,7 @@ def test_normals_face_the_camera_whichever_way_triangles_wind(yaw: float):
     np.testing.assert_array_equal(cue.normal, ShellCaster(mesh, np.eye(4)).cast(camera).normal)
 
 
-def test_types_and_shapes_are_those_of_a_cue_map():
+def test_the_map_has_the_types_and_shapes_of_a_cue_map():
     cue = ShellCaster(wall(), np.eye(4)).cast(camera_at([0, 0, 0]).to(torch.float32))
     assert (cue.depth.dtype, cue.normal.dtype, cue.mask.dtype) == (np.float32, np.float16, np.bool_)
     assert (cue.depth.shape, cue.normal.shape) == ((48, 64), (48, 64, 3))
@@ -132,7 +132,7 @@ def assert_same_maps(actual: CueMap, expected: CueMap, scale: float = 1.0) -> No
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.25, 1.0, 1e4])
-def test_moving_shell_and_camera_together_scales_depth_and_keeps_normals(scale: float):
+def test_one_similarity_of_shell_and_camera_scales_depth_and_keeps_normals(scale: float):
     camera = camera_at([-2, 0.4, 0], yaw=-15)
     translation = scale * np.array([7.0, -3.0, 11.0])
     viewmat = camera.viewmat.numpy().copy()
@@ -144,7 +144,7 @@ def test_moving_shell_and_camera_together_scales_depth_and_keeps_normals(scale: 
     assert_same_maps(moved, ShellCaster(box(), np.eye(4)).cast(camera), scale)
 
 
-def test_a_georeferenced_shell_gives_the_maps_of_a_local_one():
+def test_a_georeferenced_shell_gives_the_same_maps_as_a_local_one():
     camera = camera_at([-2, 0.4, 0], yaw=-15)
     to_survey = similarity(4.0, TURN, GEOREFERENCE)
     survey = ShellMesh(4 * box().vertices @ TURN.T + GEOREFERENCE, box().faces)
@@ -152,7 +152,7 @@ def test_a_georeferenced_shell_gives_the_maps_of_a_local_one():
     assert_same_maps(maps, ShellCaster(box(), np.eye(4)).cast(camera))
 
 
-def test_a_georeferenced_scene_gives_the_maps_of_a_local_one():
+def test_a_georeferenced_scene_gives_the_same_maps_as_a_local_one():
     camera = camera_at([-2, 0.4, 0], yaw=-15)
     viewmat = camera.viewmat.clone()
     viewmat[:3, 3] -= viewmat[:3, :3] @ torch.from_numpy(GEOREFERENCE)
@@ -182,7 +182,7 @@ def test_every_format_gives_the_same_triangles(tmp_path: Path, suffix: str):
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], box().vertices[box().faces])
 
 
-def test_doubles_keep_their_last_bit(tmp_path: Path):
+def test_doubles_are_read_without_rounding(tmp_path: Path):
     vertices = wall().vertices / 7 + GEOREFERENCE
     path = write_ply(
         tmp_path / "survey.ply", [" ".join(map(repr, map(float, v))) for v in vertices], ["3 0 1 2", "3 0 2 3"]
@@ -190,7 +190,7 @@ def test_doubles_keep_their_last_bit(tmp_path: Path):
     np.testing.assert_array_equal(load_shell(path).vertices, vertices)
 
 
-def test_the_nodes_of_a_glb_are_placed(tmp_path: Path):
+def test_the_transforms_of_a_glbs_nodes_are_applied(tmp_path: Path):
     scene = trimesh.Scene()
     for x in (0.0, 5.0):
         scene.add_geometry(trimesh.creation.box(), transform=similarity(1, np.eye(3), np.array([x, 0, 0])))
@@ -213,14 +213,14 @@ HALF_A_PLY = (
         (lambda path: path.write_text("not a mesh"), "cannot be read"),
         (lambda path: path.write_text(HALF_A_PLY), "cannot be read"),
         (lambda path: write_ply(path, [], []), "no triangles"),
-        (lambda path: write_ply(path, CORNERS, ["3 0 1 3"]), "beyond the 3 there are"),
-        (lambda path: write_ply(path, CORNERS, ["3 0 1 -1"]), "beyond the 3 there are"),
+        (lambda path: write_ply(path, CORNERS, ["3 0 1 3"]), "outside its 3 vertices"),
+        (lambda path: write_ply(path, CORNERS, ["3 0 1 -1"]), "outside its 3 vertices"),
         (lambda path: write_ply(path, ["nan 0 0", *CORNERS[1:]], ["3 0 1 2"]), "every triangle"),
         (lambda path: write_ply(path, CORNERS, ["3 0 1 1"]), "degenerate"),
         (lambda path: write_ply(path, ["4e5 5e6 0", "400001 5e6 0", "400003 5e6 0"], ["3 0 1 2"]), "degenerate"),
     ],
 )
-def test_a_shell_that_cannot_be_used_is_refused_by_name(tmp_path: Path, write: Callable, words: str):
+def test_an_unusable_shell_is_refused_with_its_file_name(tmp_path: Path, write: Callable, words: str):
     path = tmp_path / "shell.ply"
     write(path)
     with pytest.raises(SceneError) as caught:
@@ -229,12 +229,12 @@ def test_a_shell_that_cannot_be_used_is_refused_by_name(tmp_path: Path, write: C
     assert words in str(caught.value)
 
 
-def test_a_missing_shell_is_refused_by_name(tmp_path: Path):
+def test_a_missing_shell_is_refused_with_its_file_name(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"nowhere\.ply does not exist"):
         load_shell(tmp_path / "nowhere.ply")
 
 
-def test_a_file_that_is_no_mesh_is_refused(tmp_path: Path):
+def test_a_file_of_an_unknown_format_is_refused(tmp_path: Path):
     (tmp_path / "shell.dxf").write_bytes(b"0")
     with pytest.raises(SceneError, match=r"shell\.dxf .* export it as one of \.ply, \.obj"):
         load_shell(tmp_path / "shell.dxf")
@@ -247,7 +247,7 @@ def test_triangles_with_nan_are_dropped_and_counted(tmp_path: Path, caplog: pyte
     assert "dropped 1 of 2 triangles" in caplog.text
 
 
-def test_large_coordinates_in_single_precision_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+def test_large_coordinates_in_single_precision_cause_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     load_shell(save(tmp_path / "survey.stl", ShellMesh(box().vertices + GEOREFERENCE, box().faces)))
     assert "single precision, in steps of 0.5" in caplog.text
 
@@ -255,7 +255,7 @@ def test_large_coordinates_in_single_precision_are_warned_of(tmp_path: Path, cap
 # Alignment
 
 
-def test_an_alignment_is_read_as_it_was_saved(tmp_path: Path):
+def test_a_saved_alignment_is_loaded_unchanged(tmp_path: Path):
     alignment = Alignment(similarity(0.3, TURN, GEOREFERENCE), "shell/façade.ply", 0.001, "picks")
     alignment.save(tmp_path / "alignment.json")
     assert Alignment.load(tmp_path / "alignment.json") == alignment
@@ -270,7 +270,7 @@ def test_scale_rotation_and_metres_follow_from_the_matrix():
 
 
 @pytest.mark.parametrize("suffix", ["txt", "json", "npy"])
-def test_a_matrix_is_read_from_any_form(tmp_path: Path, suffix: str):
+def test_a_matrix_is_read_from_each_format(tmp_path: Path, suffix: str):
     matrix, path = similarity(0.3, TURN, GEOREFERENCE), tmp_path / f"matrix.{suffix}"
     {
         "txt": lambda: path.write_text("\n".join(" ".join(map(repr, row)) for row in matrix.tolist()) + "\n"),
@@ -280,7 +280,7 @@ def test_a_matrix_is_read_from_any_form(tmp_path: Path, suffix: str):
     np.testing.assert_array_equal(Alignment.from_matrix_file(path, "shell.ply").shell_to_scene, matrix)
 
 
-def test_a_global_shift_comes_before_the_matrix(tmp_path: Path):
+def test_a_global_shift_is_applied_before_the_matrix(tmp_path: Path):
     np.savetxt(tmp_path / "matrix.txt", similarity(0.3, TURN, np.array([1.0, 2, 3])))
     alignment = Alignment.from_matrix_file(tmp_path / "matrix.txt", "shell.ply", global_shift=(-GEOREFERENCE).tolist())
     np.testing.assert_allclose(alignment.apply(GEOREFERENCE[None]), [[1, 2, 3]], atol=1e-6)
@@ -300,7 +300,9 @@ def mirrored() -> np.ndarray:
         (np.full((4, 4), np.nan), "NaN"),
     ],
 )
-def test_a_matrix_that_is_no_similarity_is_refused_by_name(tmp_path: Path, matrix: np.ndarray, words: str):
+def test_a_matrix_that_is_not_a_similarity_is_refused_with_its_file_name(
+    tmp_path: Path, matrix: np.ndarray, words: str
+):
     np.savetxt(tmp_path / "matrix.txt", matrix)
     with pytest.raises(SceneError) as caught:
         Alignment.from_matrix_file(tmp_path / "matrix.txt", "shell.ply")
@@ -309,25 +311,25 @@ def test_a_matrix_that_is_no_similarity_is_refused_by_name(tmp_path: Path, matri
 
 
 @pytest.mark.parametrize("text", ["", "1 0 0 0\n0 1 0 0\n0 0 1 0\n", "a b c d\n" * 4, "1 0 0\n0 1 0 0\n"])
-def test_text_that_is_no_4x4_matrix_is_refused_by_name(tmp_path: Path, text: str):
+def test_text_that_is_not_a_4x4_matrix_is_refused_with_its_file_name(tmp_path: Path, text: str):
     (tmp_path / "matrix.txt").write_text(text)
     with pytest.raises(SceneError, match=r"matrix\.txt: this is not a 4x4 matrix"):
         Alignment.from_matrix_file(tmp_path / "matrix.txt", "shell.ply")
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"shell_to_scene": [[1]], "shell": "a"}', '{"shell_to_scene": 1}'])
-def test_an_alignment_file_that_cannot_be_read_is_refused_by_name(tmp_path: Path, text: str):
+def test_a_damaged_alignment_file_is_refused_with_its_name(tmp_path: Path, text: str):
     (tmp_path / "alignment.json").write_text(text)
     with pytest.raises(SceneError, match=r"alignment\.json"):
         Alignment.load(tmp_path / "alignment.json")
 
 
-def test_a_missing_alignment_is_refused_by_name(tmp_path: Path):
+def test_a_missing_alignment_is_refused_with_its_file_name(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"alignment\.json does not exist"):
         Alignment.load(tmp_path / "alignment.json")
 
 
-def test_a_unit_without_length_is_refused():
+def test_a_unit_of_length_0_is_refused():
     with pytest.raises(SceneError, match="0 metres long"):
         Alignment(np.eye(4), "shell.ply", 0)
 
@@ -348,7 +350,7 @@ def view(name: str, camera: Camera) -> View:
 VIEWS = [view(f"images/{k}.jpg", camera_at([k - 2.0, 0, 0])) for k in range(5)]
 
 
-def test_every_view_gets_the_map_that_its_camera_sees(tmp_path: Path, alignment: Alignment):
+def test_every_view_gets_the_map_of_its_camera(tmp_path: Path, alignment: Alignment):
     summary = cast_views(tmp_path, VIEWS, alignment)
     maps, caster = CueMaps.open(tmp_path, "shell"), ShellCaster(box(), np.eye(4))
     expected = [caster.cast(view.camera) for view in VIEWS]
@@ -360,7 +362,7 @@ def test_every_view_gets_the_map_that_its_camera_sees(tmp_path: Path, alignment:
     assert summary.supported == pytest.approx(np.mean([cue.mask for cue in expected]))
 
 
-def test_maps_are_cast_at_the_size_asked_for(tmp_path: Path, alignment: Alignment):
+def test_maps_are_cast_at_the_requested_size(tmp_path: Path, alignment: Alignment):
     cast_views(tmp_path, VIEWS, alignment, max_image_size=32)
     maps = CueMaps.open(tmp_path, "shell")
     assert maps.manifest.max_image_size == 32
@@ -369,14 +371,14 @@ def test_maps_are_cast_at_the_size_asked_for(tmp_path: Path, alignment: Alignmen
         maps.read(VIEWS[0].name, VIEWS[0].camera)
 
 
-def test_the_scale_in_metres_is_kept_with_the_maps(tmp_path: Path):
+def test_the_maps_manifest_stores_the_scale_in_metres(tmp_path: Path):
     save(tmp_path / "shell" / "box.ply", ShellMesh(1000 * box().vertices, box().faces))
     millimetres = Alignment(similarity(0.0005, np.eye(3), np.zeros(3)), "shell/box.ply", metres_per_shell_unit=0.001)
     cast_views(tmp_path, [view("images/x.jpg", camera_at([0, 0, -5]))], millimetres)
     assert CueMaps.open(tmp_path, "shell").manifest.metres_per_unit == pytest.approx(2)
 
 
-def test_an_interrupted_cast_goes_on_where_it_stopped(
+def test_an_interrupted_cast_resumes_where_it_stopped(
     tmp_path: Path, alignment: Alignment, monkeypatch: pytest.MonkeyPatch
 ):
     write, written = CueMaps.write, []
@@ -406,14 +408,14 @@ def test_a_damaged_map_is_made_again(tmp_path: Path, alignment: Alignment):
     assert CueMaps.open(tmp_path, "shell").read(VIEWS[1].name, VIEWS[1].camera) is not None
 
 
-def test_another_alignment_makes_all_maps_again(tmp_path: Path, alignment: Alignment):
+def test_all_maps_are_made_again_for_another_alignment(tmp_path: Path, alignment: Alignment):
     cast_views(tmp_path, VIEWS, alignment)
     moved = Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shell)
     assert cast_views(tmp_path, VIEWS, moved).cast == 5
     assert Alignment.load(tmp_path / ALIGNMENT) == moved
 
 
-def test_the_same_alignment_keeps_its_file(tmp_path: Path, alignment: Alignment):
+def test_casting_with_the_same_alignment_keeps_its_file(tmp_path: Path, alignment: Alignment):
     kept = tmp_path / ALIGNMENT
     kept.write_text(json.dumps({"shell_to_scene": np.eye(4).tolist(), "shell": alignment.shell, "residuals": [1, 2]}))
     cast_views(tmp_path, VIEWS, alignment)
@@ -437,7 +439,7 @@ def test_one_camera_that_sees_the_shell_is_enough(tmp_path: Path, alignment: Ali
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_units_a_thousand_times_off_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: float):
+def test_units_off_by_a_factor_of_1000_cause_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: float):
     save(tmp_path / "shell" / "wall.ply", wall())
     views = [view(f"images/{k}.jpg", camera_at([k * 5.0, 0, 0])) for k in range(3)]
     cast_views(tmp_path, views, Alignment(np.diag([1.0, 1, 1, 1]), "shell/wall.ply"))
@@ -451,7 +453,7 @@ def test_no_views_are_refused(tmp_path: Path, alignment: Alignment):
         cast_views(tmp_path, [], alignment)
 
 
-# Pictures
+# Images and masks
 
 
 def test_a_wall_seen_from_the_front_is_bluish():
@@ -462,7 +464,7 @@ def test_a_wall_seen_from_the_front_is_bluish():
 
 
 @pytest.mark.parametrize(("metres_per_unit", "label"), [(2.0, "metres"), (None, "scene units")])
-def test_the_panel_shows_photograph_depth_normals_and_mask(tmp_path: Path, metres_per_unit: float | None, label: str):
+def test_the_panel_shows_photograph_depth_normal_and_mask(tmp_path: Path, metres_per_unit: float | None, label: str):
     cue = ShellCaster(box(), np.eye(4)).cast(camera_at([0, 0, 0]))
     figure = supervision_panel(np.zeros((48, 64, 3), np.uint8), cue, metres_per_unit)
     figure.savefig(tmp_path / "panel.png")
@@ -485,7 +487,7 @@ def test_a_view_that_sees_nothing_has_a_panel(tmp_path: Path):
     assert (tmp_path / "panel.png").stat().st_size > 0
 
 
-def test_what_a_mask_paints_black_is_no_shell(tmp_path: Path, alignment: Alignment):
+def test_black_pixels_of_a_mask_are_left_out_of_the_map(tmp_path: Path, alignment: Alignment):
     cast_views(tmp_path, VIEWS, alignment)
     before = CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)
     height, width = VIEWS[2].camera.height, VIEWS[2].camera.width

@@ -1,4 +1,4 @@
-"""Shells that come as point clouds: their files, the mesh that is made of them, and the mesh that is kept."""
+"""Shells that are point clouds: their files, their meshes, and the cached mesh."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from dataparsers.photograph import View
 from shellgs_method.shell import Alignment, Mesher, ShellCaster, ShellMesh, cast_views, load_shell, mesh_cloud
 
 GEOREFERENCE = np.array([410_000.0, 5_413_000.0, 250.0])
-NOWHERE = np.empty((0, 3))
+NO_POINTS = np.empty((0, 3))
 K = torch.tensor([[80.0, 0, 40], [0, 80, 30], [0, 0, 1]], dtype=torch.float64)
 STREET = np.array([[0.0, 0, -10]])
 
 
 def camera() -> Camera:
-    """Looks along +z at the wall from the street, 10 away."""
+    """A camera on the street that looks along +z at the wall, 10 away."""
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[2, 3] = 10
     return Camera(viewmat, K, 80, 60)
@@ -64,7 +64,7 @@ def view_of(mesh: ShellMesh, shell_to_scene: np.ndarray | None = None) -> CueMap
 
 
 def wall_and_window(margin: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels well inside the front's wall, and those well inside its window; 8 pixels are 1 at its depth of 10."""
+    """Pixels well inside the front's wall, and pixels well inside its window; 8 pixels are 1 at its depth of 10."""
     u, v = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
     x, y = (u - 40) / 8, (v - 30) / 8
     m = margin / 8
@@ -77,36 +77,36 @@ def wall_and_window(margin: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("mesher", ["planes", "bpa", "poisson"])
-def test_walls_are_where_they_were_scanned_and_windows_stay_open(mesher: Mesher):
+def test_walls_are_at_the_scanned_depth_and_windows_stay_open(mesher: Mesher):
     cue = view_of(meshed(scan(), mesher))
     wall, window = wall_and_window()
-    assert cue.mask[wall].mean() > 0.9  # ball pivoting leaves out points that noise puts in the wrong place
+    assert cue.mask[wall].mean() > 0.9  # ball pivoting leaves out points that noise moved
     assert cue.mask[window].mean() < 0.05
     assert np.median(np.abs(cue.depth[wall & cue.mask] - 10)) < 0.03  # a third of the spacing
 
 
-def test_the_walls_of_planes_have_no_noise_in_their_normals():
+def test_the_planes_mesher_removes_noise_from_the_normals_of_walls():
     cue = view_of(meshed(scan(noise=0.01)))
     wall, _ = wall_and_window()
     tilt = np.degrees(np.arccos(np.clip(-cue.normal[wall & cue.mask][:, 2].astype(float), -1, 1)))
     assert np.median(tilt) < 0.3  # 1 cm of noise on points 9 cm apart tilts triangles by degrees
 
 
-def test_a_cloud_in_survey_coordinates_gives_the_mesh_of_a_local_one():
+def test_a_cloud_in_survey_coordinates_gives_the_same_mesh_as_a_local_one():
     points = scan()
     local, survey = meshed(points), meshed(points + GEOREFERENCE, viewpoints=STREET + GEOREFERENCE)
     np.testing.assert_array_equal(survey.faces, local.faces)
     np.testing.assert_allclose(survey.vertices - GEOREFERENCE, local.vertices, rtol=0, atol=1e-4)
 
 
-def test_normals_need_no_viewpoint():
+def test_normals_are_oriented_without_viewpoints():
     wall, window = wall_and_window()
-    cue = view_of(meshed(scan(), viewpoints=NOWHERE))
+    cue = view_of(meshed(scan(), viewpoints=NO_POINTS))
     assert cue.mask[wall].mean() > 0.95
     assert cue.mask[window].mean() < 0.05
 
 
-def test_points_all_in_a_plane_are_a_wall():
+def test_points_in_one_plane_make_a_wall():
     x, y = np.meshgrid(np.arange(20.0), np.arange(10.0))
     grid = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) @ Rotation.from_euler("xyz", [20, 50, 9], True).as_matrix()
     mesh = meshed(grid)
@@ -115,7 +115,7 @@ def test_points_all_in_a_plane_are_a_wall():
     assert area.sum() == pytest.approx(19 * 9)
 
 
-def test_three_points_are_a_triangle():
+def test_three_points_make_a_triangle():
     assert len(meshed(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])).faces) == 1
 
 
@@ -141,7 +141,7 @@ def test_nan_points_are_dropped_and_counted(caplog: pytest.LogCaptureFixture):
 @pytest.mark.parametrize(
     ("points", "words"),
     [
-        (NOWHERE, "no points"),
+        (NO_POINTS, "no points"),
         (np.full((4, 3), np.nan), "all points are NaN"),
         (np.ones((1, 3)), "a single point"),
         (np.ones((9, 3)), "a single point"),
@@ -158,7 +158,7 @@ def test_the_report_measures_the_points_against_the_mesh():
     points = scan(noise=0.01)
     mesh = meshed(points)
     assert mesh.meshing is not None
-    # The front, two sides and two caps; the points are as far from these as noise throws them: 0.67 σ in the median.
+    # The front, two sides and two caps; noise moves the points 0.67 σ away from these in the median.
     assert mesh.meshing.planes == 5
     assert mesh.meshing.triangles == len(mesh.faces)
     assert mesh.meshing.spacing == pytest.approx(np.sqrt(house().area / len(points)), rel=0.15)
@@ -182,7 +182,7 @@ def write_las(path: Path, points: np.ndarray) -> None:
 def write_e57(path: Path, points: np.ndarray) -> None:
     pye57 = pytest.importorskip("pye57")
     file = pye57.E57(str(path), mode="w")
-    local = points - GEOREFERENCE  # the scan lies where its pose puts it
+    local = points - GEOREFERENCE  # the scan's pose adds it again
     data = {f"cartesian{axis}": np.ascontiguousarray(local[:, k]) for k, axis in enumerate("XYZ")}
     file.write_scan_raw(data, translation=GEOREFERENCE)
     file.close()
@@ -230,7 +230,7 @@ def test_text_clouds_may_have_comments_colours_and_commas(tmp_path: Path, line: 
 @pytest.mark.parametrize(
     ("suffix", "module", "extra"), [("las", "laspy", "las"), ("laz", "lazrs", "las"), ("e57", "pye57", "e57")]
 )
-def test_a_reader_that_is_not_installed_is_named_with_its_extra(
+def test_a_missing_reader_is_named_with_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, module: str, extra: str
 ):
     path, load = tmp_path / f"scan.{suffix}", builtins.__import__
@@ -249,7 +249,7 @@ def test_a_reader_that_is_not_installed_is_named_with_its_extra(
 
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz", "las", "laz", "e57"])
-def test_a_damaged_cloud_is_refused_by_name(tmp_path: Path, suffix: str):
+def test_a_damaged_cloud_is_refused_with_its_file_name(tmp_path: Path, suffix: str):
     pytest.importorskip({"las": "laspy", "laz": "lazrs", "e57": "pye57"}.get(suffix, "numpy"))
     path = tmp_path / f"scan.{suffix}"
     path.write_bytes(b"not a cloud")
@@ -257,7 +257,7 @@ def test_a_damaged_cloud_is_refused_by_name(tmp_path: Path, suffix: str):
         load_shell(path)
 
 
-# The mesh that is kept
+# The cached mesh
 
 
 @pytest.fixture
@@ -277,13 +277,13 @@ def test_a_cloud_is_meshed_once(cloud: Path, monkeypatch: pytest.MonkeyPatch):
     assert again.meshing == first.meshing
 
 
-def test_the_kept_mesh_can_be_opened_elsewhere(cloud: Path):
+def test_the_cached_mesh_can_be_opened_by_other_programs(cloud: Path):
     mesh = load_shell(cloud, cache=cloud.parent)
     seen = trimesh.load(cloud.parent / "scan.ply.planes.ply", process=False)
     np.testing.assert_array_equal(seen.vertices, mesh.vertices)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_another_cloud_of_the_same_name_is_meshed_anew(cloud: Path):
+def test_another_cloud_of_the_same_name_is_meshed_again(cloud: Path):
     load_shell(cloud, cache=cloud.parent)
     write_open3d(cloud, scan(2000))
     mesh = load_shell(cloud, cache=cloud.parent)
@@ -292,10 +292,10 @@ def test_another_cloud_of_the_same_name_is_meshed_anew(cloud: Path):
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-40], lambda data: b"", lambda data: b"ply\nx\ny\nz\n"])
-def test_a_damaged_kept_mesh_is_made_again(cloud: Path, damage: Callable[[bytes], bytes]):
+def test_a_damaged_cached_mesh_is_made_again(cloud: Path, damage: Callable[[bytes], bytes]):
     first = load_shell(cloud, cache=cloud.parent)
-    kept = cloud.parent / "scan.ply.planes.ply"
-    kept.write_bytes(damage(kept.read_bytes()))
+    cached = cloud.parent / "scan.ply.planes.ply"
+    cached.write_bytes(damage(cached.read_bytes()))
     np.testing.assert_array_equal(load_shell(cloud, cache=cloud.parent).vertices, first.vertices)
 
 

@@ -57,11 +57,11 @@ def align(
     from shellgs_method.shell.registration.align import (
         PROPOSAL,
         Placement,
-        judge,
         place_by_guess,
         place_by_picks,
         place_by_positions,
         refined,
+        validate_placement,
     )
 
     starts = [start for start in (matrix, picks, positions) if start]
@@ -88,7 +88,7 @@ def align(
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
-    _show_alignment(scene, target, placement, judge(scene, placement, mesh, views, points, target))
+    _show_alignment(scene, target, placement, validate_placement(scene, placement, mesh, views, points, target))
 
 
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:

@@ -1,8 +1,8 @@
-"""The facade shell: its file, where it stands in the scene, and what each camera sees of it.
+"""The facade shell: load it, align it to the scene, validate the alignment, and cast the shell into each camera.
 
-:func:`align_picks`, :func:`refine` and :func:`propose` find its place, :func:`validate` judges it,
-:func:`cast_views` makes the maps, and :func:`check_views` compares the photographs on it and before it; the parts these
-are made of can be used alone.
+:func:`align_picks`, :func:`refine` and :func:`propose` find the alignment, :func:`validate` validates it,
+:func:`cast_views` makes the shell maps, and :func:`check_views` finds where photographs confirm or contradict the
+shell. Their parts can be used on their own.
 """
 
 from shellgs_method.shell.casting.cast import MASKS, CastSummary, cast_views

@@ -1,1 +1,1 @@
-"""What each camera sees of the shell."""
+"""Cast the shell into each camera."""

@@ -1,4 +1,4 @@
-"""Shell maps for all views of a scene."""
+"""Cast the shell maps of all views of a scene."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from shellgs_method.shell.registration.alignment import ALIGNMENT, Alignment
 log = logging.getLogger(__name__)
 
 MASKS = Path("shell/masks")
-"""In the scene's folder."""
+"""Folder of the shell's masks, in the scene's folder."""
 
 
 @dataclass(frozen=True)
 class CastSummary:
-    """What :func:`cast_views` did.
+    """Summary of :func:`cast_views`.
 
     Attributes:
-        cast: views whose map was made.
-        skipped: views that had a map for this camera, shell and alignment already.
-        seeing: views with at least one pixel on the shell.
+        cast: number of views whose map was made.
+        skipped: number of views that already had a map for this camera, shell and alignment.
+        seeing: number of views with at least one pixel on the shell.
         supported: share of the pixels of all views that lie on the shell.
         seconds: wall time.
-        meshing: how the shell, a point cloud, became a mesh; None if it is one.
+        meshing: how a point cloud was meshed; None if the shell is a mesh.
     """
 
     cast: int
@@ -58,20 +58,20 @@ def cast_views(
 ) -> CastSummary:
     """Cast the scene's shell into views and store the maps in ``scene/cues/shell``.
 
-    Views whose map is sound and made for the same camera, shell and alignment are skipped, so an interrupted run goes
-    on where it stopped. ``scene/shell/alignment.json``, which the maps are bound to, is written if it holds another
-    alignment. Nothing is written before some camera is known to see the shell.
+    Views with an intact map for the same camera, shell and alignment are skipped, so that an interrupted run resumes
+    where it stopped. ``scene/shell/alignment.json``, which the maps are bound to, is written if it holds another
+    alignment. Nothing is written unless the shell is visible in some view.
 
-    The shell knows nothing of what stands before it, a tree or a car: :func:`check_views` finds it, and what is black
-    in ``scene/shell/masks/<image's name>.png``, if there is such a picture, is taken out of the view's mask. So is what
-    the photograph's own mask leaves out.
+    The shell lacks trees, cars and whatever else stands in front of it: :func:`check_views` finds such occluders, and
+    black pixels of ``scene/shell/masks/<image's name>.png``, if that file exists, are removed from the view's mask, as
+    are those of the photograph's own mask.
 
     Args:
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
-        alignment: names the shell, says how it is meshed if it is a point cloud, and places it.
-        max_image_size: cast for photographs resized to this longer side.
-        flags: what the command line must say to find the same photographs, with a blank before it.
+        alignment: the shell's file, its similarity to the scene, and the mesher of a point cloud.
+        max_image_size: longer side of the photographs to cast for; None for their own size.
+        flags: command-line flags that select the same photographs, with a leading blank.
 
     Raises:
         FileNotFoundError: the shell is missing.
@@ -85,24 +85,24 @@ def cast_views(
     mesh = alignment.load_shell(scene, views)
     caster = ShellCaster(mesh, alignment.shell_to_scene)
     _check_placement(caster, cameras, shell)
-    if not any(kept is None or kept.any() for kept in (_kept(view, scene) for view in views)):
-        raise SceneError(f"the masks of {scene} are black everywhere in every view: white is what is kept")
-    kept = scene / ALIGNMENT
-    if not kept.is_file() or not Alignment.load(kept).places_like(alignment):  # else it keeps its verdict
-        alignment.save(kept)
-    (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a mask that is painted later is missed if it is not there
+    if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):
+        raise SceneError(f"the masks of {scene} are black everywhere in every view: white is kept")
+    saved = scene / ALIGNMENT
+    if not saved.is_file() or not Alignment.load(saved).places_like(alignment):  # else it keeps its verdict
+        alignment.save(saved)
+    (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a source of the maps: a mask painted later makes them stale
     maps = CueMaps.create(
         scene,
         "shell",
         command=_command(max_image_size, mesh.meshing) + flags,
-        sources=[shell, kept, scene / MASKS, *_mask_sources(scene, views)],
+        sources=[shell, saved, scene / MASKS, *_mask_sources(scene, views)],
         revisions={"mesher": f"{mesh.meshing.mesher} {VERSION}"} if mesh.meshing else {},
         metres_per_unit=alignment.metres_per_unit,
         max_image_size=max_image_size,
-        error=Alignment.load(kept).error,
+        error=Alignment.load(saved).error,
     )
     cast = 0
-    with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast; there are never more in memory
+    with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast: at most two are in memory
         written: Future[None] | None = None
         for full_size in track(views, description="casting the shell"):
             view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
@@ -136,12 +136,12 @@ def _command(max_image_size: int | None, meshing: Meshing | None) -> str:
 
 
 def _mask_sources(scene: Path, views: Sequence[View]) -> list[Path]:
-    """The files or folders, at the top of the scene, that hold the photographs' masks."""
+    """Top-level files or folders of the scene that hold the photographs' masks."""
     return sorted({scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask})
 
 
-def _kept(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
-    """What the photograph's mask and the shell's leave of a view; None where it has neither."""
+def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
+    """Intersection of the photograph's mask and the shell's mask of a view; None if it has neither."""
     painted = scene / MASKS / f"{view.name}.png"
     masks = [load_mask(replace(view, mask=path)) for path in (view.mask, painted if painted.is_file() else None)]
     masks = [mask for mask in masks if mask is not None]
@@ -149,12 +149,12 @@ def _kept(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
 
 
 def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
-    kept = _kept(view, scene)
-    return cue if kept is None else replace(cue, mask=cue.mask & kept)
+    mask = _load_masks(view, scene)
+    return cue if mask is None else replace(cue, mask=cue.mask & mask)
 
 
 def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path) -> None:
-    """Refuse a shell that no camera sees, and warn of one whose size is out of all proportion to the camera path."""
+    """Refuse a shell that no camera sees; warn if its size is out of proportion to the camera path."""
     if not cameras:
         raise SceneError("there are no views to cast the shell into")
     path = positions(cameras)
@@ -179,7 +179,7 @@ def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path
 
 
 def _median_depth(caster: ShellCaster, cameras: Sequence[Camera]) -> float | None:
-    """Median depth of the shell in a handful of thumbnails, spread over the views; None if no view at all sees it."""
+    """Median depth of the shell in a few thumbnails spread over the views; None if no view sees it."""
     step = -(-len(cameras) // 16)
     seen: list[np.ndarray] = []
     for k in sorted(range(len(cameras)), key=lambda k: k % step):

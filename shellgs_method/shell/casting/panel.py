@@ -1,4 +1,4 @@
-"""What supervises a view, as a picture: photograph, depth, normals, mask."""
+"""Plots of a view's supervision: photograph, depth, normals, mask."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from shellgs_method.evaluation.colours import GREY, normal_colours
 def supervision_panel(
     image: UInt8[np.ndarray, "H W 3"], cue: CueMap, metres_per_unit: float | None = None, kind: str = "shell"
 ) -> Figure:
-    """The paper's supervision figure for one view; save it with ``.savefig(path)``.
+    """Plot the paper's supervision figure for one view; save it with ``.savefig(path)``.
 
     Args:
         image: the photograph.
         cue: its maps.
-        metres_per_unit: gives the depth in metres; without it the colour bar counts scene units.
-        kind: what the maps come from, for the titles.
+        metres_per_unit: scale of the scene, for depth in metres; None for scene units.
+        kind: source of the maps, for the titles.
     """
     height, width = cue.mask.shape
     figure = Figure(figsize=(16, 4.2 * height / width + 0.9), dpi=120, layout="constrained")
@@ -46,11 +46,11 @@ def supervision_panel(
 
 
 def check_panel(images: Sequence[UInt8[np.ndarray, "H W 3"]], checked: Sequence[CueMap]) -> Figure:
-    """Where photographs contradict the shell (red) and confirm it (green), in some views; save it with ``.savefig``.
+    """Plot where photographs contradict the shell (red) and confirm it (green); save it with ``.savefig(path)``.
 
     Args:
         images: the photographs.
-        checked: their maps of the kind that :func:`~shellgs_method.shell.check_views` makes.
+        checked: their maps by :func:`~shellgs_method.shell.check_views`.
     """
     height, width = checked[0].mask.shape
     columns = 2

@@ -1,1 +1,1 @@
-"""What the photographs say of the shell."""
+"""Check the shell against the photographs."""

@@ -1,4 +1,4 @@
-"""Maps of where a scene's photographs confirm or contradict its shell."""
+"""Make maps of where a scene's photographs confirm or contradict its shell."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from shellgs_method.shell.checking.contradiction import (
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared."""
 WITNESSES = 6
-"""Neighbours on either side of a view that must agree on what stands where."""
+"""Neighbours on either side of a view that are compared with it."""
 VERSION = 2
-"""Of the maps: those of another one are made again."""
+"""Version of the maps: maps of another version are made again."""
 
 
 @dataclass(frozen=True)
 class CheckSummary:
-    """What :func:`check_views` found.
+    """Summary of :func:`check_views`.
 
     Attributes:
-        checked: views whose map was made.
-        skipped: views that had one already.
-        contradicted: share of the shell's pixels, of all views, before which something stands.
+        checked: number of views whose map was made.
+        skipped: number of views that already had a map.
+        contradicted: share of the shell's pixels in all views that have something in front of them.
         seconds: wall time.
     """
 
@@ -55,18 +55,19 @@ class CheckSummary:
 
 
 def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -> CheckSummary:
-    """Compare the photographs on the shell and before it, and store what they say in ``scene/cues/checked``.
+    """Compare the photographs on the shell and in front of it, and store the maps in ``scene/cues/checked``.
 
-    The mask of such a map is where something stands before the shell. Its depth is that of what stands there, or the
-    shell's where photographs confirm it, and 0 where they do not tell: on plain or reflecting walls, and where few see.
+    The mask of a map marks pixels with an occluder, something in front of the shell. The depth is that of the
+    occluder, or the shell's where photographs confirm it, and 0 where they are inconclusive: on plain or reflecting
+    walls, and where few views overlap.
 
-    Held-out photographs are compared with the others, and no other is compared with them: what is learnt from the maps
-    of training views knows nothing of the held-out ones.
+    Held-out photographs are compared with the training photographs, but not the other way round, so that the maps of
+    training views contain nothing of the held-out ones.
 
     Args:
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
-        held_out: names of the views that are held out.
+        held_out: names of the held-out views.
 
     Raises:
         FileNotFoundError: the scene has no shell maps.
@@ -74,13 +75,13 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     """
     start = time.monotonic()
     shell = CueMaps.open(scene, "shell")
-    made_of = _digest(views, held_out)
+    inputs = _digest(views, held_out)
     maps = CueMaps.create(
         scene,
         "checked",
         command=shell.manifest.command,
         sources=[path for source in shell.manifest.sources if (path := scene / source).exists()],
-        revisions={"photographs": made_of, "check": str(VERSION)},
+        revisions={"photographs": inputs, "check": str(VERSION)},
         metres_per_unit=shell.manifest.metres_per_unit,
         max_image_size=shell.manifest.max_image_size,
     )
@@ -91,16 +92,14 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     ]
     missing = [view for view in views if not maps.current(view.name, view.camera)]
     if missing:
-        known = _Known.of(
-            [view for view in views if view.name not in held_out], shell, maps.folder / f".{made_of[:16]}"
-        )
+        known = _Known.of([view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}")
         for view in track(missing, description="comparing the photographs"):
             maps.write(view.name, known.compare(view, _read(shell, view)), view.camera)
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
     records = [(shell.record(view.name), maps.record(view.name)) for view in views]
     supported = sum(on_shell.supported for on_shell, _ in records if on_shell)
-    contradicted = sum(before.supported for _, before in records if before)
+    contradicted = sum(occluded.supported for _, occluded in records if occluded)
     return CheckSummary(
         len(missing), len(views) - len(missing), contradicted / max(supported, 1e-9), time.monotonic() - start
     )
@@ -108,22 +107,22 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
 
 @dataclass(frozen=True)
 class _Known:
-    """The training views, and what each finds before the shell."""
+    """The training views and their sweeps."""
 
     views: dict[str, ShellView]
     sweeps: dict[str, Sweep]
 
     @classmethod
-    def of(cls, views: Sequence[View], shell: CueMaps, kept: Path) -> _Known:
-        """Sweep all views; what an interrupted check had found is in the folder ``kept``."""
+    def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _Known:
+        """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
         shell_views = {view.name: _shell_view(view, _read(shell, view)) for view in views}
         sweeps = {}
         for index, (name, view) in enumerate(track(shell_views.items(), "looking before the shell", len(views))):
-            file = kept / f"{index}.npy"
+            file = unfinished / f"{index}.npy"
             if not file.is_file():
                 found = sweep(view, [other for other in shell_views.values() if other is not view])
                 file.parent.mkdir(exist_ok=True)
-                content = io.BytesIO()  # numpy's own writing to a full disk raises no error that tells of a disk
+                content = io.BytesIO()  # on a full disk, numpy's own writing raises an error that does not say so
                 np.save(content, torch.stack(found).numpy(), allow_pickle=False)
                 with atomic_write(file) as stream:
                     stream.write(content.getvalue())
@@ -131,7 +130,7 @@ class _Known:
         return cls(shell_views, sweeps)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
-        """What the photographs say of a view's shell."""
+        """Make the map of a view."""
         if view.name in self.views:
             seen, found = self.views[view.name], self.sweeps[view.name]
         else:
@@ -141,14 +140,14 @@ class _Known:
         others, found_there = [self.views[name] for name in witnesses], [self.sweeps[name] for name in witnesses]
         score = agreed_score(seen, found, others, found_there)
         size, hit = cue.depth.shape, cue.depth > 0
-        before = _resized(score, size).numpy() > CONTRADICTED
-        confirmed = ~before & (_resized(found.score.float(), size).numpy() < CONFIRMED)
+        occluded = _resized(score, size).numpy() > CONTRADICTED
+        confirmed = ~occluded & (_resized(found.score.float(), size).numpy() < CONFIRMED)
         nearer = cue.depth / (1 + _nearest(found.offset.float(), size).numpy())
-        depth = np.where(before, nearer, np.where(confirmed, cue.depth, 0)) * hit
-        return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), before & hit)
+        depth = np.where(occluded, nearer, np.where(confirmed, cue.depth, 0)) * hit
+        return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), occluded & hit)
 
     def _witnesses(self, seen: ShellView) -> list[str]:
-        """The nearest training views on either side that look the same way."""
+        """Names of the nearest training views on either side that look in about the same direction."""
         if not (seen.depth > 0).any():
             return []
         reach = 0.9 * float(seen.depth[seen.depth > 0].median())
@@ -180,7 +179,7 @@ def _resized(values: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tenso
 
 
 def _digest(views: Sequence[View], held_out: Collection[str]) -> str:
-    """Of all that the maps depend on beside the shell: the photographs, their cameras, and which are held out."""
+    """Fingerprint of the maps' inputs besides the shell: photographs, cameras, and which are held out."""
     return fingerprint(
         [
             [

@@ -1,9 +1,9 @@
-"""Whether photographs agree on the shell, or on something that stands before it.
+"""Decide whether photographs agree on the shell, or on something in front of it.
 
-A plane sweep between the shell and the cameras, over the views' own pixels. Its costs are smoothed along the edges of
-the photograph (cost-volume filtering, Hosni et al. 2013, with the guided filter of He et al. 2010), and a second pass
-lets the views agree on what stands where. Glass reflects what looks farther away than the shell, never nearer: only
-nearer depths are tried.
+A plane sweep between the shell and the cameras, per pixel of each view. Its costs are smoothed with the edges of the
+photograph preserved (cost-volume filtering, Hosni et al. 2013, with the guided filter of He et al. 2010); a second pass
+makes the views consistent. Reflections in glass appear farther away than the shell, never nearer, so only nearer
+depths are tried.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from dataparsers.camera import Camera
 
 _NEAREST, _STEP = 0.0125, 1.4
 OFFSETS = tuple(_NEAREST * _STEP**k for k in range(15))
-"""Depths that are tried, as the share by which their inverse exceeds that of the shell: 10 cm before a wall that is 8 m
-away, and from there to a third of its depth."""
+"""Tried depths, as the relative excess of their inverse over the shell's: from 10 cm in front of a wall that is 8 m
+away to a third of its depth."""
 MOVES = 5.5
-"""Pixels that an offset should move in a neighbour, which is chosen for it: much less tells nothing, and much more
-needs the depth more exactly than the offsets have it."""
+"""Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and much more needs
+finer steps of depth than the offsets have."""
 A_SIDE = 4
-"""Neighbours on either side of a view: of what is hidden on one side, more is seen from the other."""
+"""Neighbours on either side of a view: what is occluded on one side is visible from the other."""
 CONTRADICTED = 0.14
-"""Least score of a pixel that is contradicted. With 0.08 more are found, and pictures of what stands before the shell
-are better, but mirrors contradict it too, and what is left to the photographs alone is farther from the truth."""
+"""Score above which a pixel is contradicted. With 0.08 more are found, and renders of what is in front of the shell
+improve, but mirrors contradict the shell too, and surfaces left to the photographs alone are less accurate."""
 CONFIRMED = -0.03
-"""Largest score of the best nearer depth where the shell is confirmed."""
+"""Score of the best nearer depth below which the shell is confirmed."""
 
 Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
 """Distances and indices of cameras on the left and on the right of a view."""
 
-_WINDOW, _EDGES = 13, 1e-3  # of the guided filter: side in pixels, variance of what it takes for an edge
+_WINDOW, _EDGES = 13, 1e-3  # guided filter: window side in pixels, regularisation (variance of an edge)
 _SEPARABLE: Any = {"separable": True} if "separable" in signature(guided_blur).parameters else {}  # kornia 0.9
-_COLOUR, _GRADIENT = 0.12, 0.06  # differences of colours and gradients in [0, 1] from which all are the same
-_SUPPORT = 0.2  # weight of other views' verdicts beside the photographs
+_COLOUR, _GRADIENT = 0.12, 0.06  # truncation of colour and gradient differences, for values in [0, 1]
+_SUPPORT = 0.2  # weight of the other views' scores relative to the photographs
 
 
 @dataclass(frozen=True)
 class ShellView:
-    """A photograph and the shell in it.
+    """A photograph and the shell's depth in it.
 
     Attributes:
-        camera: of the size that the views are compared at.
-        image: the photograph at that size.
-        depth: z-depth of the shell in the camera's world, 0 where there is none.
+        camera: camera at the size at which views are compared.
+        image: photograph at that size.
+        depth: z-depth of the shell in scene units, 0 where there is none.
     """
 
     camera: Camera
@@ -61,26 +61,26 @@ class ShellView:
 
 
 class Sweep(NamedTuple):
-    """What one view finds before the shell."""
+    """The best depth in front of the shell, by one view and its neighbours."""
 
     score: Float16[Tensor, "h w"]
-    """How much better photographs agree there than on the shell, as a share of the worst disagreement; -1 where there
-    is no shell."""
+    """How much better photographs agree at this depth than on the shell, relative to the worst disagreement; -1 where
+    there is no shell."""
     offset: Float16[Tensor, "h w"]
-    """Where they do: the share by which the inverse depth there exceeds the shell's, between those that are tried."""
+    """Relative excess of the inverse depth over the shell's, interpolated between the tried :data:`OFFSETS`."""
 
 
 def neighbours(view: Camera, beside: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
-    """The cameras in which what is ``offset`` nearer than the shell moves by some pixels, on either side of a view.
+    """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES`.
 
     Args:
-        view: the camera whose neighbours are wanted.
-        beside: the cameras to choose from, as :func:`sides` has them.
-        depth: of the shell in the view.
+        view: the view's camera.
+        beside: cameras to choose from, by :func:`sides`.
+        depth: typical depth of the shell in the view.
         offset: one of :data:`OFFSETS`.
 
     Returns:
-        The index of each, and its side: 0 on the left, 1 on the right.
+        Index and side of each camera: 0 on the left, 1 on the right.
     """
     wanted = MOVES * depth / (offset * float(view.K[0, 0]))
     found = [
@@ -93,7 +93,7 @@ def neighbours(view: Camera, beside: Sides, depth: float, offset: float) -> list
 
 
 def sides(view: Camera, others: Sequence[Camera]) -> Sides:
-    """Distances and indices of the cameras on the left and on the right of a view that look about the same way."""
+    """Distances and indices of the cameras left and right of a view that look in about the same direction."""
     found: Sides = ([], [])
     for index, other in enumerate(others):
         step = other.position - view.position
@@ -103,9 +103,9 @@ def sides(view: Camera, others: Sequence[Camera]) -> Sides:
 
 
 def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
-    """The best depth before the shell, by the photographs of a view and of its neighbours.
+    """Find the best depth in front of the shell, by the photographs of a view and its neighbours.
 
-    A side's neighbours speak with their mean, and for the shell or what is nearer speaks the side that knows it better.
+    Costs are averaged over the neighbours of a side; the side with the lower cost counts.
     """
     pixels, near = _Pixels(view), sides(view.camera, [other.camera for other in others])
     depth = float(pixels.surface.median())
@@ -130,16 +130,16 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
 def agreed_score(
     view: ShellView, found: Sweep, others: Sequence[ShellView], found_there: Sequence[Sweep]
 ) -> Float[Tensor, "h w"]:
-    """The score of a view's sweep once the others' are known: -1 where there is no shell.
+    """Score a view's sweep in the light of its neighbours' sweeps: -1 where there is no shell.
 
-    What others find before the shell hides the shell from them, so that they say nothing of it; and what stands before
-    the shell in one view does so in others.
+    Where a neighbour's sweep finds an occluder, the shell is hidden from it, so its photograph does not count for the
+    shell; and an occluder in one view should be an occluder in the others.
 
     Args:
         view: the view.
-        found: what it found.
+        found: its sweep.
         others: its neighbours, at most :data:`A_SIDE` and a few more on either side.
-        found_there: what they found.
+        found_there: their sweeps.
     """
     pixels = _Pixels(view)
     shell, nearer, trust, support = [], [], [], []
@@ -163,13 +163,13 @@ def agreed_score(
     agreed = support.nanmean(dim=0).nan_to_num(0.0)
     trusted = (trust * shell.isfinite()).sum(dim=0) > 1
     better = _better_half(shell, trust) - _better_half(nearer, torch.ones_like(trust))
-    better = torch.where(trusted, better, 0.3 * (agreed - 0.3))  # nobody sees the shell there: the views' verdicts
+    better = torch.where(trusted, better, 0.3 * (agreed - 0.3))  # hidden from the neighbours: only their sweeps count
     score = _smooth(pixels, (better + _SUPPORT * agreed)[None])[0]
     return score.where(view.depth > 0, -1.0)
 
 
 class _Look(NamedTuple):
-    """Where a view's pixels are in another view, for some depth."""
+    """Position of a view's pixels in another view, at some depth."""
 
     grid: Float[Tensor, "1 h w 2"]  # from -1 to 1
     z: Float[Tensor, "h w"]
@@ -177,7 +177,7 @@ class _Look(NamedTuple):
 
 
 class _Pixels:
-    """What a view's pixels are compared by, and where they are if they lie on the shell."""
+    """A view's features and rays, and the shell's depth, filled in where there is none."""
 
     def __init__(self, view: ShellView) -> None:
         hit = view.depth > 0
@@ -187,7 +187,7 @@ class _Pixels:
 
 
 class _Beside:
-    """A view beside another one, for which the lines that its pixels' rays make there are computed once."""
+    """A neighbour of a view; the epipolar lines of the view's pixels in it are computed once."""
 
     def __init__(self, pixels: _Pixels, other: ShellView) -> None:
         motion = other.camera.viewmat.double() @ torch.linalg.inv(pixels.camera.viewmat.double())
@@ -197,26 +197,26 @@ class _Beside:
         self._size = other.camera.width, other.camera.height
         self._features, self._there = pixels.features, _features(other)
         self.shell = self.look(pixels.surface)
-        """Where the pixels are if they lie on the shell."""
+        """Position of the pixels if they lie on the shell."""
         surface = _sampled(other.depth, self.shell.grid, "nearest")
         hidden = ~self.shell.inside | ((surface > 0) & (self.shell.z > 1.01 * surface))
         self.visible = (~hidden).float()
-        """1 where the other view shows the shell: in its picture, and not behind another part of the shell."""
+        """1 where the shell is visible in the other view: inside its image, not behind another part of the shell."""
         self.on_shell = self.disagreement(self.shell)
-        """Disagreement of the two photographs there."""
+        """Disagreement of the two photographs on the shell."""
 
     def look(self, depth: Float[Tensor, "h w"]) -> _Look:
-        """Where pixels of these depths are."""
+        """Project the pixels, at these depths, into the other view."""
         x, y, z = (direction * depth + start for direction, start in zip(self._direction, self._start, strict=True))
         near = z.clamp_min(1e-9)
         u, v = (2 / size * along / near - 1 for size, along in zip(self._size, (x, y), strict=True))
         return _Look(torch.stack([u, v], dim=-1)[None], z, (z > 0) & (u.abs() < 1) & (v.abs() < 1))
 
     def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
-        """From 0 to 1: truncated differences of colours and of gradients, if the pixels are there."""
+        """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
         there = grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
-        apart = (self._features - there).abs_()
-        colours, gradients = apart[:3].mean(dim=0) / _COLOUR, apart[3:].mean(dim=0) / _GRADIENT
+        difference = (self._features - there).abs_()
+        colours, gradients = difference[:3].mean(dim=0) / _COLOUR, difference[3:].mean(dim=0) / _GRADIENT
         return (colours.clamp_max_(1) + gradients.clamp_max_(1)) / 2
 
 
@@ -227,14 +227,14 @@ def _sampled(
 
 
 def _features(view: ShellView) -> Float[Tensor, "5 h w"]:
-    """What is compared: colours in [0, 1], and both gradients of their mean."""
+    """Features for comparison: colours in [0, 1], and both gradients of their mean."""
     colours = view.image.permute(2, 0, 1).float() / 255
     down, across = torch.gradient(colours.mean(dim=0))
     return torch.cat([colours, across[None], down[None]])
 
 
 def _vertex(scores: Float[Tensor, "K h w"], best: Int64[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Where the parabola through the best score and those beside it has its top, from -1/2 to 1/2 steps from it."""
+    """Vertex of the parabola through the best score and its two neighbours, from -1/2 to 1/2 steps from the best."""
     inside = best.clamp(1, len(scores) - 2)
     below, at, above = (scores.gather(0, (inside + k)[None])[0] for k in (-1, 0, 1))
     top = 0.5 * (below - above) / (below - 2 * at + above).clamp_max(-1e-6)
@@ -242,7 +242,7 @@ def _vertex(scores: Float[Tensor, "K h w"], best: Int64[Tensor, "h w"]) -> Float
 
 
 def _better_half(costs: Float[Tensor, "V h w"], weights: Float[Tensor, "V h w"]) -> Float[Tensor, "h w"]:
-    """Weighted mean of the least costs that have half of the weight; NaN counts for nothing, and 0 where all are."""
+    """Weighted mean of the lowest costs that make up half of the weight; NaN is ignored, 0 where all are NaN."""
     weights = weights.where(costs.isfinite(), 0.0)
     costs, order = costs.nan_to_num(2.0).sort(dim=0)
     weights = weights.gather(0, order)

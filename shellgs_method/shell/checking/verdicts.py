@@ -1,4 +1,4 @@
-"""What the photographs of all views together say of places on the shell."""
+"""Combine the checks of all views at points on the shell."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from dataparsers.photograph import View
 from shellgs_method.voxels import cell_means, voxel_cells
 
 CONTRADICTED_PLACES = "cues/checked/contradicted.ply"
-"""Where in a scene :meth:`Verdicts.write` puts the places for viewers."""
+"""File in the scene's folder for :meth:`Verdicts.write`, shown by viewers."""
 MANY = 6
-"""Photographs, and at least half of those that see it, that contradict a place where the building differs from its
-shell. What stands farther before it hides another place in each."""
-_STEP = 4  # from pixel to pixel of what is lifted
-_ACROSS = 300  # places along the longest side of the shell
-_SAME = 0.01  # share of its depth by which a place may miss the map of a view that sees it
+"""Photographs that must contradict a point, and be half of those that see it, for the building to differ from its shell
+there. An occluder farther in front of the shell hides different points in each photograph."""
+_STEP = 4  # stride in pixels of the lifted points
+_ACROSS = 300  # points along the longest side of the shell
+_SAME = 0.01  # relative difference of depth within which a point is visible in a view's shell map
 
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What the photographs say of places on the shell, in the scene's frame and units.
+    """Verdicts of the photographs on points of the shell, in the scene's frame and units.
 
     Attributes:
-        places: the places.
-        seen: number of views that see each.
-        contradicted: number of these that show something before it.
-        distance: median distance before it at which they do; NaN where none does.
+        places: the points.
+        seen: number of views in which each is visible.
+        contradicted: number of these views that show something in front of it.
+        distance: median distance of that from the point; NaN where no view contradicts it.
         views: names of all views.
-        differs: places that many of them contradict.
-        by_view: number of these places that each view contradicts.
+        differs: mask of the points where the building differs from the shell, by :data:`MANY`.
+        by_view: number of these points that each view contradicts.
     """
 
     places: Float64[np.ndarray, "N 3"]
@@ -51,16 +51,16 @@ class Verdicts:
 
     @property
     def share(self) -> float:
-        """Of the places that are seen, those where the building differs."""
+        """Share of the visible points where the building differs."""
         return float(self.differs.sum() / max((self.seen > 0).sum(), 1))
 
     @property
     def witness(self) -> str:
-        """The view that contradicts most of them."""
+        """Name of the view that contradicts most of these points."""
         return self.views[int(self.by_view.argmax())]
 
     def write(self, path: Path) -> None:
-        """The places as a ply, the redder the more of the views that see them contradict them."""
+        """Write the points as a ply, redder where a larger share of the views contradicts them."""
         red = self.contradicted / np.maximum(self.seen, 1)
         colours = 255 - 255 * red[:, None] * [0.1, 1, 1]
         content = trimesh.PointCloud(self.places, colours.round().astype(np.uint8)).export(file_type="ply")
@@ -74,7 +74,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     Args:
         scene: the scene's folder.
         views: its photographs, of any size.
-        places: on the shell, in the scene's frame; if None, some that the views see, evenly spread.
+        places: points on the shell, in the scene's frame; None for evenly spread points that the views see.
 
     Raises:
         FileNotFoundError: the scene has no such maps.
@@ -87,18 +87,18 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     seen, distances = np.zeros(len(places), np.int64), np.full((len(sized), len(places)), np.nan, np.float32)
     for distance, view in zip(distances, sized, strict=True):
         camera = view.camera.shrunk(shell.manifest.max_image_size)
-        cue, said = shell.read(view.name, camera), checked.read(view.name, camera)
+        cue, check = shell.read(view.name, camera), checked.read(view.name, camera)
         assert cue is not None
-        assert said is not None
+        assert check is not None
         pixels, z = project(camera, places)
         inside = (z > 0) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
         k = np.flatnonzero(inside)
         columns, rows = pixels[k].astype(int).T
         visible = np.abs(cue.depth[rows, columns] / z[k] - 1) < _SAME
         seen[k] += visible
-        before = visible & said.mask[rows, columns]
-        along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z[k]  # for a depth of 1
-        distance[k[before]] = ((cue.depth - said.depth)[rows, columns] * along)[before]
+        occluded = visible & check.mask[rows, columns]
+        along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z[k]  # per unit of depth
+        distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
     contradicted = np.isfinite(distances).sum(axis=0)
     median = np.full(len(places), np.nan)
     some = contradicted > 0
@@ -109,7 +109,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
 
 
 def _seen_places(views: Sequence[View], shell: CueMaps) -> Float64[np.ndarray, "N 3"]:
-    """Places of the shell that views see, evenly spread over it."""
+    """Evenly spread points of the shell that are visible in the views."""
     lifted = []
     for view in views:
         camera = view.camera.shrunk(shell.manifest.max_image_size).to(torch.float64)

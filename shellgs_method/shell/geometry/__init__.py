@@ -1,1 +1,1 @@
-"""The shell itself: files, point clouds, triangles, rays."""
+"""Shell geometry: files, point clouds, meshes and ray casting."""

@@ -1,4 +1,4 @@
-"""Point clouds into triangle meshes that keep openings open and walls flat."""
+"""Mesh point clouds with open windows and flat walls."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ log = logging.getLogger(__name__)
 Mesher = Literal["planes", "bpa", "poisson"]
 
 VERSION = 1
-"""Of the meshers: another one meshes clouds again."""
+"""Version of the meshers: clouds are meshed again if it changes."""
 
-CELLS = 1500  # points are merged in cells of this part of the cloud's extent: 2 cm of 30 m
-LONGEST_EDGE = 3.0  # all lengths below are in units of the cloud's spacing
+CELLS = 1500  # cells along the cloud's extent in which points are merged: 2 cm of 30 m
+LONGEST_EDGE = 3.0  # this and the next two lengths are in units of the cloud's spacing
 NEIGHBOURHOOD = 2.5
 BALLS = 0.8, 1.6
 NORMAL_AGREEMENT = 0.85  # cosine
 NO_PLANE = -1
-HYPOTHESES, JUDGES, FAILURES = 300, 4000, 6
-LEAST_POINTS = 150  # of a plane
+HYPOTHESES, TESTED, FAILURES = 300, 4000, 6  # of RANSAC
+LEAST_POINTS = 150  # in a plane
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,14 @@ class Meshing:
     """How a point cloud became a mesh; lengths are in the shell's units.
 
     Attributes:
-        mesher: the method.
-        points: read from the file.
-        dropped: of these, how many were NaN, infinite or absurdly far away.
+        mesher: method.
+        points: number of points in the file.
+        dropped: number of them that were NaN, infinite or absurdly far away.
         spacing: mean distance between neighbouring points after merging them in cells.
-        planes: found by RANSAC.
-        triangles: of the mesh.
-        meshed: share of the points within a spacing of the mesh.
-        median: distance from a point to the mesh.
+        planes: number of planes found by RANSAC.
+        triangles: number of triangles of the mesh.
+        meshed: share of the points within one spacing of the mesh.
+        median: median distance from a point to the mesh.
         p95: 95th percentile of that distance.
     """
 
@@ -59,13 +59,13 @@ class Meshing:
     p95: float
 
     def __str__(self) -> str:
-        """One sentence for people."""
+        """Return one sentence for people."""
         planes = f" and {self.planes} planes" if self.planes else ""
         nan = f" ({self.dropped} NaN or infinite ones dropped)" if self.dropped else ""
         return (
             f"{self.points} points{nan}, {self.spacing:.3g} apart, became {self.triangles} triangles{planes} "
-            f"({self.mesher}); {self.meshed:.1%} of the points are within {self.spacing:.3g} of these, the median is "
-            f"{self.median:.2g} and the 95th percentile {self.p95:.2g} away."
+            f"({self.mesher}); {self.meshed:.1%} of the points are within {self.spacing:.3g} of the mesh, at a median "
+            f"distance of {self.median:.2g} and a 95th percentile of {self.p95:.2g}."
         )
 
 
@@ -74,36 +74,39 @@ def mesh_cloud(
     viewpoints: Float64[np.ndarray, "V 3"],
     mesher: Mesher = "planes",
 ) -> tuple[Float64[np.ndarray, "M 3"], Int64[np.ndarray, "F 3"], Meshing]:
-    """A triangle mesh of a point cloud's surface, its vertices and faces, and a report.
+    """Mesh the surface of a point cloud.
 
     ``planes``: RANSAC planes, each with a Delaunay triangulation of the points on it, and ball pivoting for the rest;
-    the least noise on buildings. ``bpa``: ball pivoting alone. ``poisson``: Poisson reconstruction, trimmed to what is
-    near points; for ornament and other round things. None of them closes openings wider than three times the spacing
-    of the points.
+    the least noise on buildings. ``bpa``: ball pivoting alone. ``poisson``: Poisson reconstruction, trimmed to the
+    neighbourhood of the points; for ornament and other round shapes. None of them closes openings wider than three
+    times the spacing of the points.
 
     Args:
-        points: in any frame, georeferenced as they came; NaN and duplicates are dropped.
-        viewpoints: where scanners or cameras stood; a point's normal faces the nearest. Without them, normals are
-            made to agree with their neighbours.
-        mesher: the method.
+        points: positions in any frame, possibly georeferenced; NaN and duplicates are dropped.
+        viewpoints: positions of scanners or cameras; a point's normal faces the nearest. Without viewpoints, normals
+            are made consistent with their neighbours.
+        mesher: method.
+
+    Returns:
+        Vertices and faces of the mesh, and a report.
 
     Raises:
         SceneError: the points make no surface.
     """
-    meant = sound(points)
-    if not meant.any():
+    usable = sound(points)
+    if not usable.any():
         raise SceneError("the point cloud has no points" if len(points) == 0 else "all points are NaN or infinite")
-    if not meant.all():
+    if not usable.all():
         log.warning(
-            "dropped %d of %d points that are NaN or infinite, or absurdly far away", (~meant).sum(), len(points)
+            "dropped %d of %d points that are NaN or infinite, or absurdly far away", (~usable).sum(), len(points)
         )
-    kept = points[meant]
-    origin = np.median(kept, axis=0)  # what follows is relative to it: georeferenced digits would swamp squares
+    kept = points[usable]
+    origin = np.median(kept, axis=0)  # squares of georeferenced coordinates would lose precision
     kept = kept - origin
     try:
         cloud = _Cloud.of(kept, viewpoints - origin)
         parts = list(_MESHERS[mesher](cloud))
-    except RuntimeError as error:  # Open3D's, of too few points or of the like
+    except RuntimeError as error:  # raised by Open3D, for too few points for example
         raise SceneError(f"the points make no surface with the mesher {mesher!r} ({reason(error)})") from error
     vertices, faces = _merge(parts)
     if len(faces) == 0:
@@ -113,7 +116,7 @@ def mesh_cloud(
     report = Meshing(
         mesher=mesher,
         points=len(points),
-        dropped=int((~meant).sum()),
+        dropped=int((~usable).sum()),
         spacing=cloud.spacing,
         planes=sum(part.is_plane for part in parts),
         triangles=len(faces),
@@ -133,7 +136,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Cloud:
-    """Evenly thinned points near the origin, with their oriented normals and their typical distance."""
+    """Evenly thinned points near the origin, with oriented normals and their spacing."""
 
     points: Float64[np.ndarray, "N 3"]
     normals: Float64[np.ndarray, "N 3"]
@@ -142,7 +145,7 @@ class _Cloud:
 
     @classmethod
     def of(cls, points: np.ndarray, viewpoints: np.ndarray) -> _Cloud:
-        low, high = np.percentile(points, [1, 99], axis=0)  # a stray point far away is not the building's size
+        low, high = np.percentile(points, [1, 99], axis=0)  # stray points far away must not change the extent
         extent = np.max(high - low) or np.ptp(points, axis=0).max()
         legacy = _legacy(points)
         points = np.asarray((legacy.voxel_down_sample(extent / CELLS) if extent > 0 else legacy).points)
@@ -150,7 +153,7 @@ class _Cloud:
         if not spread[1] > 1e-6 * spread[0]:
             what = "is a single point" if spread[0] == 0 else "lies on one straight line"
             raise SceneError(f"the point cloud makes no surface: it {what}")
-        # The k-th neighbour of points of density ρ on a surface is √(k / π ρ) away.
+        # On a surface with ρ points per unit of area, the k-th neighbour is √(k / π ρ) away.
         k = min(6, len(points) - 1)
         nearest = KDTree(points).query(points, k + 1)[0][:, k]
         spacing = float(np.median(nearest) * np.sqrt(np.pi / k))
@@ -172,7 +175,7 @@ def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray) -
 
 
 def _planes(cloud: _Cloud) -> Iterator[_Part]:
-    """Planes one after the other, the largest first, then balls over their seams and over what lies on none."""
+    """Mesh planes one by one, the largest first, then their seams and the remaining points by ball pivoting."""
     rng, points = np.random.default_rng(0), cloud.points.copy()
     plane = np.full(len(points), NO_PLANE)
     least = max(3, min(LEAST_POINTS, len(cloud.points) // 20))
@@ -186,14 +189,14 @@ def _planes(cloud: _Cloud) -> Iterator[_Part]:
         yield part
         points[members], plane[members] = part.vertices, members[0]
         left = np.setdiff1d(left, members, assume_unique=True)
-    yield _balls_between(replace(cloud, points=points), plane)
+    yield _mesh_seams(replace(cloud, points=points), plane)
 
 
 def _largest_plane(cloud: _Cloud, left: Int64[np.ndarray, " L"], rng: np.random.Generator) -> Bool[np.ndarray, " L"]:
-    """The points that RANSAC finds on one plane, as to place and normal, after fitting it to them until it settles.
+    """Find the points on the largest plane, by position and normal, with RANSAC and repeated least-squares fits.
 
-    One point and its normal make a hypothesis, which a sample of the others judges. Open3D's ``segment_plane`` knows
-    no normals, and gives another plane in each run.
+    A hypothesis is one point with its normal, tested on a sample of the others. Open3D's ``segment_plane`` ignores
+    normals and returns a different plane in each run.
     """
     points, normals = cloud.points[left], cloud.normals[left]
     tolerance = float(np.clip(4 * cloud.roughness, 0.1 * cloud.spacing, cloud.spacing))
@@ -203,8 +206,8 @@ def _largest_plane(cloud: _Cloud, left: Int64[np.ndarray, " L"], rng: np.random.
         return near & (np.abs(normals[among] @ axes.T) > NORMAL_AGREEMENT)
 
     hypotheses = rng.integers(len(points), size=HYPOTHESES)
-    judges = rng.permutation(len(points))[:JUDGES]
-    best = hypotheses[on(points[hypotheses], normals[hypotheses], judges).sum(axis=0).argmax()]
+    tested = rng.permutation(len(points))[:TESTED]
+    best = hypotheses[on(points[hypotheses], normals[hypotheses], tested).sum(axis=0).argmax()]
     members = on(points[[best]], normals[[best]], slice(None))[:, 0]
     for _ in range(10):
         centre = points[members].mean(0)
@@ -217,13 +220,13 @@ def _largest_plane(cloud: _Cloud, left: Int64[np.ndarray, " L"], rng: np.random.
 
 
 def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
-    """The Delaunay triangulation of points in their best plane, without triangles that have a longer edge."""
+    """Delaunay triangulation of points in their best-fit plane, without edges longer than ``longest``."""
     centre = points.mean(0)
     axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
     flat = (points - centre) @ axes.T
     try:
         faces = Delaunay(flat).simplices
-    except QhullError:  # all on a line
+    except QhullError:  # all points on a line
         return None
     corners = flat[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
@@ -231,8 +234,8 @@ def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
     return _Part(centre + flat @ axes, faces.astype(np.int64), is_plane=True) if len(faces) else None
 
 
-def _balls_between(cloud: _Cloud, plane: Int64[np.ndarray, " N"]) -> _Part:
-    """The triangles that balls find between points of different planes, or at points of none."""
+def _mesh_seams(cloud: _Cloud, plane: Int64[np.ndarray, " N"]) -> _Part:
+    """Mesh the points between planes, and those on no plane, by ball pivoting."""
     neighbours = KDTree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
     seam = (plane == NO_PLANE) | (plane[neighbours] != plane[:, None]).any(axis=1)
     near = seam[neighbours].any(axis=1)
@@ -255,7 +258,7 @@ def _ball_pivoting(cloud: _Cloud) -> Iterator[_Part]:
 
 
 def _poisson(cloud: _Cloud) -> Iterator[_Part]:
-    """Screened Poisson reconstruction (Kazhdan and Hoppe 2013), trimmed by distance: density fills windows."""
+    """Screened Poisson reconstruction (Kazhdan and Hoppe 2013), trimmed by distance: density would fill windows."""
     cells = np.ptp(cloud.points, axis=0).max() / (2 * cloud.spacing)
     depth = int(np.clip(np.round(np.log2(cells)), 5, 10))
     mesh, _ = import_open3d().geometry.TriangleMesh.create_from_point_cloud_poisson(
@@ -274,7 +277,7 @@ _MESHERS: dict[Mesher, Callable[[_Cloud], Iterator[_Part]]] = {
 
 
 def _merge(parts: list[_Part]) -> tuple[np.ndarray, np.ndarray]:
-    """One mesh of all parts, without the vertices that no triangle uses."""
+    """Join the parts in one mesh, without unused vertices."""
     vertices, faces, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
     for part in parts:
         used, renumbered = np.unique(part.faces, return_inverse=True)
@@ -292,7 +295,7 @@ def _distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> n
 
 
 def _legacy(points: np.ndarray, normals: np.ndarray | None = None):
-    """Open3D's point cloud of doubles."""
+    """Return Open3D's legacy point cloud, which stores doubles."""
     o3d = import_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     if normals is not None:

@@ -1,4 +1,4 @@
-"""Reading meshes and point clouds from files, in double precision."""
+"""Read meshes and point clouds from files, in double precision."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from shellgs_method.open3d import reason
 log = logging.getLogger(__name__)
 
 NO_FACES = np.empty((0, 3), np.int64)
-NOWHERE = np.empty((0, 3))
+NO_POINTS = np.empty((0, 3))
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """What a file holds, in its own frame and units, unchecked.
+    """Unchecked contents of a file, in its own frame and units.
 
     Attributes:
-        vertices: of the mesh, or the points of the cloud.
-        faces: three vertex indices for each triangle; none in a point cloud.
-        scanners: where the scanner stood, as far as the file tells.
+        vertices: vertices of the mesh, or points of the cloud.
+        faces: three vertex indices per triangle; empty for a point cloud.
+        scanners: scanner positions, if the file has them.
     """
 
     vertices: Float64[np.ndarray, "V 3"]
@@ -36,11 +36,11 @@ class Geometry:
 
 
 def read_geometry(path: Path) -> Geometry:
-    """All triangles or points of a file, in the precision that it stores.
+    """Read all triangles or points of a file, in the precision it stores.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        SceneError: the file is empty, damaged or of an unknown kind, or its reader is not installed.
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is empty, damaged or of an unknown format, or its reader is not installed.
     """
     if not path.is_file():
         raise FileNotFoundError(f"the shell {path} does not exist")
@@ -57,22 +57,22 @@ def read_geometry(path: Path) -> Geometry:
     except ModuleNotFoundError as error:
         extra = "e57" if path.suffix.lower() == ".e57" else "las"
         raise SceneError(f"the shell {path} needs {error.name}: run `pip install 'shellgs[{extra}]'`") from error
-    except Exception as error:  # each format's reader has its own kinds of error for a damaged file
+    except Exception as error:  # each format's reader raises errors of its own for a damaged file
         raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason(error)})") from error
     _warn_of_float32(geometry.vertices, path)
     return geometry
 
 
 def _read_mesh(path: Path) -> Geometry:
-    """All triangles or points of a file, the nodes of a scene graph placed and joined."""
+    """Read a file with trimesh, and join the nodes of its scene graph, each in its place."""
     import trimesh
 
     if path.suffix.lower() == ".ply":
         check_ply(path)
-    # process=False: merging vertices would round them. trimesh, unlike Open3D's tensor reader, keeps doubles.
+    # process=False: merging vertices would round them. Unlike Open3D's tensor reader, trimesh keeps doubles.
     loaded = trimesh.load(path, process=False, skip_materials=True)
     scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
-    vertices, faces, count = [NOWHERE], [NO_FACES], 0
+    vertices, faces, count = [NO_POINTS], [NO_FACES], 0
     for node in scene.graph.nodes_geometry:
         pose, name = scene.graph[node]
         geometry = scene.geometry[name]
@@ -80,7 +80,7 @@ def _read_mesh(path: Path) -> Geometry:
         vertices.append(trimesh.transform_points(points, pose))
         faces.append(np.asarray(getattr(geometry, "faces", NO_FACES), np.int64) + count)  # a point cloud has none
         count += len(points)
-    return Geometry(np.concatenate(vertices), np.concatenate(faces), NOWHERE)
+    return Geometry(np.concatenate(vertices), np.concatenate(faces), NO_POINTS)
 
 
 def _read_pcd(path: Path) -> Geometry:
@@ -89,37 +89,37 @@ def _read_pcd(path: Path) -> Geometry:
     cloud = import_open3d().t.io.read_point_cloud(str(path))
     if "positions" not in cloud.point:
         raise ValueError("it has no points")
-    return Geometry(cloud.point.positions.numpy().astype(np.float64), NO_FACES, NOWHERE)
+    return Geometry(cloud.point.positions.numpy().astype(np.float64), NO_FACES, NO_POINTS)
 
 
 def _read_xyz(path: Path) -> Geometry:
     separator = "," if "," in path.open(errors="replace").readline() else None
     points = np.loadtxt(path, usecols=(0, 1, 2), comments=("#", "//"), delimiter=separator, ndmin=2)
-    return Geometry(points, NO_FACES, NOWHERE)
+    return Geometry(points, NO_FACES, NO_POINTS)
 
 
 def _read_las(path: Path) -> Geometry:
     import laspy
 
     if path.suffix.lower() == ".laz":
-        import lazrs  # noqa: F401  # laspy itself would not say which of its backends to install
+        import lazrs  # noqa: F401  # laspy would not say which of its backends to install
     check_las(path)
-    with laspy.open(path) as file:  # in pieces: what a damaged file only claims to hold takes no memory
+    with laspy.open(path) as file:  # in chunks: points that a damaged file only claims to hold take no memory
         pieces = [np.stack([np.array(piece[x]) for x in "xyz"], axis=1) for piece in file.chunk_iterator(1_000_000)]
         claimed = file.header.point_count
-    points = np.concatenate([NOWHERE, *pieces])
+    points = np.concatenate([NO_POINTS, *pieces])
     if len(points) != claimed:
         raise ValueError(f"it holds {len(points)} of {claimed} points")
-    return Geometry(points, NO_FACES, NOWHERE)
+    return Geometry(points, NO_FACES, NO_POINTS)
 
 
 def _read_e57(path: Path) -> Geometry:
     import pye57
 
     file = pye57.E57(str(path))
-    points, scanners = [NOWHERE], [NOWHERE]
+    points, scanners = [NO_POINTS], [NO_POINTS]
     for k in range(file.scan_count):
-        scan = file.read_scan(k, ignore_missing_fields=True)  # placed by the scan's pose, invalid points left out
+        scan = file.read_scan(k, ignore_missing_fields=True)  # moved by the scan's pose, without invalid points
         points.append(np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], axis=1))
         header = file.get_header(k)
         if header.has_pose():
@@ -137,7 +137,7 @@ READERS: dict[str, Callable[[Path], Geometry]] = {
 
 
 def _warn_of_float32(vertices: np.ndarray, path: Path) -> None:
-    """Georeferenced coordinates that a file stores as float32 were rounded before we could read them."""
+    """Warn of georeferenced coordinates stored as float32: they were rounded when the file was written."""
     vertices = vertices[np.isfinite(vertices).all(axis=1)]
     if not len(vertices):
         return

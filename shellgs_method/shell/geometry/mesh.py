@@ -1,4 +1,4 @@
-"""The shell as a triangle mesh, read from the file it came in; a point cloud is meshed once, and the mesh is kept."""
+"""Load the shell as a triangle mesh; a point cloud is meshed once, and its mesh is cached."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 COMMENT = "comment shellgs "
 SCANNER = "scanner"
-"""Where the points were seen from, by the file's own word."""
+"""Source of the viewpoints: scanner positions in the file."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class ShellMesh:
     """A triangle mesh with at least one triangle, finite vertices and indices in range.
 
     Attributes:
-        vertices: in the shell's own frame and units, georeferenced as they came.
-        faces: three vertex indices for each triangle.
-        meshing: how a point cloud became this mesh; None if it always was one.
+        vertices: positions in the shell's own frame and units, possibly georeferenced.
+        faces: three vertex indices per triangle.
+        meshing: how a point cloud was meshed; None if the file holds a mesh.
 
     Raises:
-        SceneError: the arrays make no such mesh.
+        SceneError: the arrays are not such a mesh.
     """
 
     vertices: Float64[np.ndarray, "V 3"]
@@ -41,23 +41,23 @@ class ShellMesh:
     meshing: Meshing | None = None
 
     def __post_init__(self) -> None:
-        """Check what Open3D does not: it reads out of range indices without a word."""
+        """Check what Open3D does not: it accepts indices out of range."""
         if len(self.faces) == 0:
             raise SceneError("the shell has no triangles")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
-            raise SceneError(f"the shell's triangles refer to vertices beyond the {len(self.vertices)} there are")
+            raise SceneError(f"the shell's triangles have vertex indices outside its {len(self.vertices)} vertices")
         if not np.isfinite(self.vertices).all():
             raise SceneError("the shell has NaN or infinite vertices")
         if not self._areas().any():
-            raise SceneError("all triangles of the shell are degenerate: none has an area")
+            raise SceneError("all triangles of the shell are degenerate: their areas are 0")
 
     @property
     def bounds(self) -> Float64[np.ndarray, "2 3"]:
-        """Lowest and highest corner of the box around the vertices."""
+        """Lowest and highest corner of the bounding box."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
     def _areas(self) -> np.ndarray:
-        """Area of each triangle relative to the shell's size squared; 0 where it is no more than rounding."""
+        """Area of each triangle relative to the shell's size squared; 0 where it is only rounding error."""
         extent = np.ptp(self.bounds, axis=0).max()
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 / max(extent, np.finfo(float).tiny) ** 2
@@ -71,26 +71,26 @@ def load_shell(
     viewpoints: Float64[np.ndarray, "V 3"] | None = None,
     mesher: Mesher = "planes",
 ) -> ShellMesh:
-    """Read a shell, a triangle mesh or a point cloud, in full double precision where the file has it.
+    """Load a shell, a triangle mesh or a point cloud, in double precision if the file has it.
 
-    Triangles with a vertex, and points, that are NaN, infinite or absurdly far away are dropped, and counted. A
-    point cloud is meshed by :func:`~shellgs_method.shell.geometry.clouds.mesh_cloud`, and its mesh kept, as
-    ``<cache>/<file name>.<mesher>.ply``, until the cloud changes.
+    Points and vertices that are NaN, infinite or absurdly far away are dropped, with their triangles, and counted. A
+    point cloud is meshed by :func:`~shellgs_method.shell.geometry.clouds.mesh_cloud`; its mesh is cached as
+    ``<cache>/<file name>.<mesher>.ply`` until the cloud changes.
 
     Args:
         path: ply, obj, glb, gltf, stl, off, pcd, xyz, las, laz or e57; the last three need the extras ``las``, ``e57``.
-        cache: folder for the mesh of a point cloud; None does not keep it.
-        viewpoints: places that see the surface, in the shell's frame: they orient the normals of a cloud whose file
-            does not tell where its scanner stood. A mesh that was kept for others is made again.
-        mesher: turns a point cloud into a mesh.
+        cache: folder for the mesh of a point cloud; None for no cache.
+        viewpoints: positions that see the surface, in the shell's frame. They orient the normals of a cloud whose file
+            has no scanner positions. A mesh cached for other viewpoints is made again.
+        mesher: method that meshes a point cloud.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         SceneError: the file is empty or damaged, its reader is not installed, or it holds no surface.
     """
     path = Path(path)
-    kept = None if cache is None else cache / f"{path.name}.{mesher}.ply"
-    if kept is not None and path.is_file() and (mesh := _read_kept(kept, path, viewpoints)):
+    cached = None if cache is None else cache / f"{path.name}.{mesher}.ply"
+    if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, viewpoints)):
         return mesh
     geometry = read_geometry(path)
     try:
@@ -100,8 +100,8 @@ def load_shell(
         mesh = ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
-    if kept is not None:
-        _keep(mesh, kept, path, SCANNER if len(geometry.scanners) else _seen_from(viewpoints))
+    if cached is not None:
+        _write_cached(mesh, cached, path, SCANNER if len(geometry.scanners) else _seen_from(viewpoints))
     return mesh
 
 
@@ -110,14 +110,14 @@ def _seen_from(viewpoints: np.ndarray | None) -> list[float] | None:
 
 
 def _seen_alike(before: list[float] | str | None, now: list[float] | None, mesh: ShellMesh) -> bool:
-    """Whether the points' normals were oriented as they would be now: an alignment's last centimetres turn none."""
+    """Whether the viewpoints orient the normals as before: an alignment's last centimetres flip none."""
     if before is None or now is None or before == SCANNER:
         return now is None or before == SCANNER
     return bool(np.linalg.norm(np.subtract(before, now)) <= 0.1 * np.ptp(mesh.bounds, axis=0).max())
 
 
-def _keep(mesh: ShellMesh, kept: Path, source: Path, seen_from: list[float] | str | None) -> None:
-    """Write the mesh as a PLY of doubles, with a comment that says what it was made from."""
+def _write_cached(mesh: ShellMesh, cached: Path, source: Path, seen_from: list[float] | str | None) -> None:
+    """Write the mesh as a PLY of doubles, with a comment that identifies its source."""
     assert mesh.meshing is not None
     made = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
     record = json.dumps(made | {"seen_from": seen_from})
@@ -126,28 +126,28 @@ def _keep(mesh: ShellMesh, kept: Path, source: Path, seen_from: list[float] | st
     header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]
     header += [*(f"property double {axis}" for axis in "xyz"), f"element face {len(faces)}"]
     header += ["property list uchar int vertex_indices", "end_header\n"]
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(kept) as file:
+    cached.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(cached) as file:
         file.write("\n".join(header).encode() + mesh.vertices.astype("<f8").tobytes() + faces.tobytes())
 
 
-def _read_kept(kept: Path, source: Path, viewpoints: np.ndarray | None) -> ShellMesh | None:
-    """The mesh made of a point cloud before, if it was made of this one, seen from about there, and is whole."""
+def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> ShellMesh | None:
+    """Read a cached mesh; None if it is damaged or was made from another cloud or for other viewpoints."""
     try:
-        with kept.open("rb") as file:
+        with cached.open("rb") as file:
             comment = file.read(4096).decode(errors="replace").splitlines()[2]
         record = json.loads(comment.removeprefix(COMMENT))
         if (record["version"], record["sha256"]) != (VERSION, content_hash(source)):
             return None
-        geometry = read_geometry(kept)
+        geometry = read_geometry(cached)
         mesh = ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]))
         return mesh if _seen_alike(record["seen_from"], _seen_from(viewpoints), mesh) else None
-    except (OSError, IndexError, KeyError, TypeError, ValueError):  # none, or damaged: it is made again
+    except (OSError, IndexError, KeyError, TypeError, ValueError):  # missing or damaged: it is made again
         return None
 
 
 def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh without the triangles that touch a vertex that cannot be meant."""
+    """Drop vertices that are not finite or absurdly far away, and their triangles."""
     kept = sound(vertices)
     if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
         return vertices, faces

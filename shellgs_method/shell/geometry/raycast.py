@@ -1,4 +1,4 @@
-"""Casting a camera's rays against the shell."""
+"""Cast a camera's rays against the shell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shellgs_method.shell.geometry.similarity import transformed
 
 
 class ShellCaster:
-    """A shell, placed in the scene, ready to be seen from any camera.
+    """A shell aligned to the scene, to be cast into any camera.
 
     Args:
         mesh: the shell in its own frame.
@@ -21,8 +21,8 @@ class ShellCaster:
 
     Attributes:
         scene: Open3D's ray casting scene, whose origin is :attr:`origin`.
-        origin: middle of the shell's bounds, in the scene's frame.
-        extent: longest side of the shell's bounds, in scene units.
+        origin: centre of the shell's bounding box, in the scene's frame.
+        extent: longest side of the bounding box, in scene units.
 
     Raises:
         ImportError: Open3D cannot be loaded.
@@ -31,7 +31,7 @@ class ShellCaster:
     def __init__(self, mesh: ShellMesh, shell_to_scene: Float64[np.ndarray, "4 4"]) -> None:
         self._o3d = import_open3d()
         placed = transformed(mesh.vertices, shell_to_scene)
-        # Embree computes in float32, whose steps are 3 cm at 4e5: everything it sees is relative to the shell's centre.
+        # Embree computes in float32, whose steps are 3 cm at 4e5: its coordinates are relative to the shell's centre.
         self.origin = (placed.min(0) + placed.max(0)) / 2
         self.extent = float(np.ptp(placed, axis=0).max())
         placed -= self.origin
@@ -45,35 +45,35 @@ class ShellCaster:
         self._rays = np.empty((0, 0, 6), np.float32)
 
     def rays(self, camera: Camera) -> Float32[np.ndarray, "H W 6"]:
-        """Position and direction of each pixel's ray in the frame of :attr:`scene`, valid until the next call.
+        """Origin and direction of each pixel's ray in the frame of :attr:`scene`, valid until the next call.
 
-        Directions have z = 1 in the camera's frame, which makes the parameter of a hit its z-depth.
+        Directions have z = 1 in the camera's frame, so that the ray parameter of a hit is its z-depth.
         """
         position, rotation = self._pose(camera)
         step_u, step_v, first = (rotation.T @ np.linalg.inv(camera.K.detach().cpu().double().numpy())).T
         u, v = (np.arange(count)[:, None] + 0.5 for count in (camera.width, camera.height))
-        if self._rays.shape[:2] != (camera.height, camera.width):  # fresh memory costs more than what is written to it
+        if self._rays.shape[:2] != (camera.height, camera.width):  # allocating costs more than writing
             self._rays = np.empty((camera.height, camera.width, 6), np.float32)
         rays = self._rays
         across, down = (u * step_u).astype(np.float32), (v * step_v + first).astype(np.float32)
-        for axis in range(3):  # numpy's innermost loop is then over pixels
+        for axis in range(3):  # so that numpy's inner loop is over pixels
             rays[..., axis] = position[axis]
             np.add.outer(down[:, axis], across[:, axis], out=rays[..., 3 + axis])
         return rays
 
     def cast(self, camera: Camera) -> CueMap:
-        """What the camera sees of the shell: z-depth in scene units, normals that face it, and where it hits."""
+        """Cast the shell into a camera: z-depth in scene units, normals facing the camera, and the mask of hits."""
         hits = self.scene.cast_rays(self._o3d.core.Tensor.from_numpy(self.rays(camera)))
         depth = hits["t_hit"].numpy()
         mask = np.isfinite(depth)
         depth[~mask] = 0
-        triangles = hits["primitive_ids"].numpy()  # of a miss: 2³² - 1, which clips to the last row
+        triangles = hits["primitive_ids"].numpy()  # 2³² - 1 for a miss, which clips to the last row
         return CueMap(depth, self._facing(camera).take(triangles, axis=0, mode="clip"), mask)
 
     def _facing(self, camera: Camera) -> Float16[np.ndarray, "F+1 3"]:
-        """The normal of each triangle in the camera's frame, and zero for none.
+        """Normal of each triangle in the camera's frame, facing the camera; the last row is zero, for misses.
 
-        Shells do not keep to one winding; but a triangle turns the same side to a camera in all of its pixels.
+        The winding of shells is not consistent; but a triangle shows a camera the same side in all pixels.
         """
         position, rotation = self._pose(camera)
         normals, offsets = self._planes[:, :3], self._planes[:, 3]
@@ -81,7 +81,7 @@ class ShellCaster:
         return np.concatenate([facing, np.zeros((1, 3))]).astype(np.float16)
 
     def _pose(self, camera: Camera) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"]]:
-        """The camera's centre in the frame of :attr:`scene`, and its rotation from the world."""
+        """Camera centre in the frame of :attr:`scene`, and rotation from world to camera."""
         viewmat = camera.viewmat.detach().cpu().double().numpy()
         rotation = viewmat[:3, :3]
         return -rotation.T @ viewmat[:3, 3] - self.origin, rotation

@@ -9,12 +9,12 @@ from jaxtyping import Float64
 def transformed(
     points: Float64[np.ndarray, "*N 3"], similarity: Float64[np.ndarray, "4 4"]
 ) -> Float64[np.ndarray, "*N 3"]:
-    """The points after the similarity."""
+    """Apply a similarity to points."""
     return points @ similarity[:3, :3].T + similarity[:3, 3]
 
 
 def fit_similarity(source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"]) -> np.ndarray:
-    """Least-squares similarity that carries points onto others (Umeyama 1991), as a 4x4 matrix."""
+    """Least-squares similarity from source to target points (Umeyama 1991), as a 4x4 matrix."""
     centre, goal = source.mean(0), target.mean(0)
     source, target = source - centre, target - goal
     u, s, vt = np.linalg.svd(target.T @ source)
@@ -26,7 +26,7 @@ def fit_similarity(source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarra
 
 
 def centred(centre: Float64[np.ndarray, " 3"], scale: float) -> Float64[np.ndarray, "4 4"]:
-    """The similarity that makes a point the origin and scales, without a turn."""
+    """Similarity that moves a point to the origin and scales, without rotation."""
     matrix = np.diag([scale] * 3 + [1.0])
     matrix[:3, 3] = -scale * centre
     return matrix

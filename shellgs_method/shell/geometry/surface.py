@@ -1,4 +1,4 @@
-"""The shell as a surface to measure against, in metres and near the origin."""
+"""The shell as a surface to measure distances to, in metres and near the origin."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.similarity import centred, transformed
 
 _FEW = 2000
-"""Points below which waking other threads costs more than it saves, manyfold where other programs hold the cores."""
+"""Number of points below which more threads cost more than they save, many times more on busy cores."""
 
 
 @dataclass(frozen=True)
 class Closest:
-    """For each of some points the nearest one of the surface.
+    """Closest points of the surface.
 
     Attributes:
-        foot: that point.
-        normal: unit normal of its triangle, as the triangle winds.
+        foot: closest point of the surface to each query point.
+        normal: unit normal of its triangle, by the triangle's winding.
     """
 
     foot: Float64[np.ndarray, "N 3"]
@@ -29,7 +29,7 @@ class Closest:
 
 
 class ShellSurface:
-    """A shell in its *survey frame*: the shell's axes, in metres, with the origin at the middle of its box.
+    """A shell in its *survey frame*: the shell's axes, in metres, with the origin at the centre of its bounding box.
 
     Open3D computes in float32, which is accurate to a micrometre there, and to decimetres in national coordinates.
 
@@ -39,7 +39,7 @@ class ShellSurface:
 
     Attributes:
         survey_from_shell: similarity from the shell's own frame.
-        bounds: lowest and highest corner of the shell's box.
+        bounds: lowest and highest corner of the bounding box.
     """
 
     def __init__(self, mesh: ShellMesh, metres_per_shell_unit: float = 1.0) -> None:
@@ -53,24 +53,24 @@ class ShellSurface:
         self._scene.add_triangles(tensor(self.vertices.astype(np.float32)), tensor(self.faces.astype(np.uint32)))
 
     def closest(self, points: Float64[np.ndarray, "N 3"]) -> Closest:
-        """The surface's nearest point to each of the points, all in the survey frame."""
-        threads = 1 if len(points) < _FEW else 0  # 0: all there are
+        """Return the closest point of the surface to each point, in the survey frame."""
+        threads = 1 if len(points) < _FEW else 0  # 0: all threads
         answer = self._scene.compute_closest_points(self._o3d.core.Tensor(points.astype(np.float32)), threads)
         foot, normal = answer["points"].numpy(), answer["primitive_normals"].numpy()
         return Closest(foot.astype(np.float64), normal.astype(np.float64))
 
     def distance(self, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
-        """Unsigned distances of points from the surface, in metres."""
+        """Return the unsigned distance of each point from the surface, in metres."""
         return self._scene.compute_distance(self._o3d.core.Tensor(points.astype(np.float32))).numpy()
 
     def first_hit(self, origins: np.ndarray, direction: np.ndarray) -> Float32[np.ndarray, " *N"]:
-        """How far parallel rays travel to the surface, in metres; inf where they miss it."""
+        """Return the distance along parallel rays to the surface, in metres; inf where they miss it."""
         rays = np.empty((*origins.shape[:-1], 6), np.float32)
         rays[..., :3], rays[..., 3:] = origins, direction
         return self._scene.cast_rays(self._o3d.core.Tensor(rays))["t_hit"].numpy()
 
     def samples(self, count: int) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
-        """Points spread evenly over the surface, and their normals; the same ones each time."""
+        """Sample points uniformly on the surface, with their normals; the same points in each call."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         area = np.linalg.norm(normal, axis=1)

@@ -1,1 +1,1 @@
-"""Where the shell stands in the scene."""
+"""Align the shell to the scene."""

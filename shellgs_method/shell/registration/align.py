@@ -1,4 +1,4 @@
-"""From a shell and what is known of its place to an alignment that has been judged."""
+"""Find an alignment from picks, camera positions or coarse registration, refine it, and validate it."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 PROPOSAL = Path("shell/proposal.json")
 REPORT = Path("shell/report")
 
-_PLAY = 0.1  # degrees: 2 cm on a wall 10 m away
+_MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
 
 
 @dataclass(frozen=True)
 class Placement:
-    """An alignment and what led to it.
+    """An alignment and how it was found.
 
     Attributes:
-        alignment: the shell's place.
-        history: a sentence for each step, for the report.
-        correspondences: picks or camera positions with their residuals, where there are any.
-        proposed: whether nobody but the program has said so.
+        alignment: the alignment.
+        history: one sentence per step, for the report.
+        correspondences: picks or camera positions with their residuals, if any.
+        proposed: whether it comes from coarse registration and the user has not accepted it yet.
     """
 
     alignment: Alignment
@@ -54,48 +54,48 @@ class Placement:
 
 
 def place_by_picks(path: Path, views: Sequence[View], shell: str, metres_per_shell_unit: float) -> Placement:
-    """The place that a file of picked correspondences tells.
+    """Align the shell by a file of picks.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         SceneError: the picks cannot be read, triangulated or trusted.
     """
     matrix, picked = align_picks(read_picks(path, views), views, metres_per_shell_unit)
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
-    return Placement(alignment, [_what_decided(picked, "picks")], picked)
+    return Placement(alignment, [_residuals_in_words(picked, "picks")], picked)
 
 
 def place_by_positions(path: Path, views: Sequence[View], shell: str, metres_per_shell_unit: float) -> Placement:
-    """The place that a file of the cameras' surveyed positions tells.
+    """Align the shell by a file of surveyed camera positions.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         SceneError: the positions cannot be read or trusted.
     """
     surveyed = read_positions(path, views)
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
-    history = [_what_decided(cameras, "camera positions")]
+    history = [_residuals_in_words(cameras, "camera positions")]
     if surveyed.strangers:
         history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.strangers)}.")
-    if play > _PLAY:
-        history.append(f"The shell can still turn about the cameras' path, by some {play:.1f}°: --refine settles that.")
+    if play > _MAX_PLAY:
+        history.append(f"The rotation about the cameras' path is uncertain by about {play:.1f}°: use --refine.")
     return Placement(alignment, history, cameras)
 
 
-def _what_decided(points: Sequence[Correspondence], called: str) -> str:
+def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
     used = [point.residual for point in points if point.is_used]
     mean = np.sqrt(np.mean(np.square(used)))
-    return f"{len(used)} of {len(points)} {called} decide; they are {mean:.3f} m off (root mean square)."
+    return f"{len(used)} of {len(points)} {called} are used; their residual is {mean:.3f} m (root mean square)."
 
 
 def place_by_guess(
     mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shell: str, metres_per_shell_unit: float
 ) -> Placement:
-    """A proposal for the place, from the outline of the main wall.
+    """Propose an alignment by coarse registration, from the outline of the main wall.
 
-    Up in the shell is taken to be y in glTF, as that format has it, and z in all others, unless its walls are askew to
-    that.
+    The shell's up axis is y in glTF, by that format's convention, and z in all other formats, unless its walls
+    are not aligned with it.
 
     Raises:
         SceneError: the points show no wall, or it fits nowhere.
@@ -104,9 +104,9 @@ def place_by_guess(
     up = np.array([0.0, 1.0, 0.0] if shell.lower().endswith((".glb", ".gltf")) else [0.0, 0.0, 1.0])
     cameras = [view.camera for view in views]
     best, *rivals = propose(surface, points.positions, positions(cameras), upwards(cameras), up)
-    history = ["Proposed by the program from the outline of the main wall; nobody has confirmed it."]
+    history = ["Proposed from the outline of the main wall; not yet confirmed."]
     history += [
-        f"Ambiguous: a place {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
+        f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
         for rival in rivals
     ]
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
@@ -116,22 +116,22 @@ def place_by_guess(
 def refined(
     placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, reach: float
 ) -> Placement:
-    """The placement brought closer to the SfM points.
+    """Refine a placement against the SfM points.
 
     Raises:
-        SceneError: too few points are within ``reach`` metres of the shell, or these are none.
+        SceneError: ``reach`` is not a positive number, or too few points are within ``reach`` metres of the shell.
     """
     if not 0 < reach < np.inf:
-        raise SceneError(f"--refine takes the metres by which the start may be off, more than 0, not {reach:g}")
+        raise SceneError(f"--refine must be the largest error of the start in metres, more than 0, not {reach:g}")
     alignment = placement.alignment
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
     result = refine(surface, points.positions, start, reach)
     up = start[:3, :3] @ upwards(view.camera for view in views)
     axes = facade_axes(surface.samples(5000)[1], up / np.linalg.norm(up))
-    sentence = f"Refined against {result.evidence.points} SfM points, which moved them by {result.moved:.3f} m."
+    sentence = f"Refined against {result.evidence.points} SfM points, which moved by {result.moved:.3f} m."
     if words := result.evidence.in_words(axes):
-        sentence += f" Left as it was, for the points cannot tell: {'; '.join(words)}."
+        sentence += f" Left unchanged, as the points do not determine it: {'; '.join(words)}."
     matrix = np.linalg.inv(result.survey_from_scene) @ surface.survey_from_shell
     moved = replace(alignment, shell_to_scene=matrix, source=f"{alignment.source}, refined")
     return replace(
@@ -142,21 +142,21 @@ def refined(
     )
 
 
-def judge(
+def validate_placement(
     scene: Path, placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, target: Path
 ) -> Validation:
-    """Validate a placement, write the report, and unless it is refused write it to ``target``, with its metrics.
+    """Validate a placement, write the report, and write the alignment with its metrics to ``target`` unless refused.
 
-    Maps that were cast for the same place stay good: they are bound to the place, and told of the metrics.
+    Maps cast with the same alignment stay valid: they are bound to its matrix, and get the new error.
     """
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
     write_report(scene / REPORT, mesh, validation, placement.history)
     if validation.verdict == "refused":
         return validation
-    judged = replace(placement.alignment, verdict=validation.verdict, metrics=validation.metrics())
-    judged.save(target)
-    with suppress(FileNotFoundError, SceneError):  # none, or damaged, of which whoever reads them is told
+    validated = replace(placement.alignment, verdict=validation.verdict, metrics=validation.metrics())
+    validated.save(target)
+    with suppress(FileNotFoundError, SceneError):  # no maps, or damaged ones, which is reported when they are read
         maps = CueMaps.open(scene, "shell")
         if maps.manifest.sources.get(target.relative_to(scene).as_posix()) == source_hash(target):
-            maps.with_error(judged.error)
+            maps.with_error(validated.error)
     return validation

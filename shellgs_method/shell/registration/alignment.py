@@ -1,4 +1,4 @@
-"""The fixed similarity that carries a shell into the frame of the photographs."""
+"""The similarity from the shell's frame to the scene's, and its file."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from shellgs_method.shell.geometry.mesh import ShellMesh, load_shell
 from shellgs_method.shell.geometry.similarity import transformed
 
 ALIGNMENT = Path("shell/alignment.json")
-"""In the scene's folder."""
+"""Alignment file, in the scene's folder."""
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A similarity from the shell's frame to the scene's, and where it came from.
+    """A similarity from the shell's frame to the scene's, and how it was found.
 
     Attributes:
         shell_to_scene: uniform scale, rotation and translation.
         shell: the shell's file, relative to the scene's folder (or absolute).
         metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
         source: how the alignment was found, for people.
-        verdict: of the validation, "good" or "doubtful"; empty where there was none.
-        metrics: the main numbers behind the verdict.
-        mesher: what makes a mesh of a shell that is a point cloud.
+        verdict: verdict of the validation, "good" or "doubtful"; empty if not validated.
+        metrics: main metrics behind the verdict.
+        mesher: method that meshes a point cloud.
 
     Raises:
-        SceneError: the matrix is no similarity, or mirrors, or there is no such mesher.
+        SceneError: the matrix is not a similarity, or mirrors, or the mesher is unknown.
     """
 
     shell_to_scene: Float64[np.ndarray, "4 4"]
@@ -49,7 +49,7 @@ class Alignment:
     mesher: Mesher = "planes"
 
     def __post_init__(self) -> None:
-        """Check the matrix."""
+        """Check the matrix, the unit and the mesher."""
         matrix = np.array(self.shell_to_scene, dtype=np.float64)
         matrix.setflags(write=False)
         object.__setattr__(self, "shell_to_scene", matrix)
@@ -57,10 +57,10 @@ class Alignment:
         if not 0 < self.metres_per_shell_unit < np.inf:
             raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
         if self.mesher not in get_args(Mesher):
-            raise SceneError(f"there is no mesher {self.mesher!r}: it is one of {', '.join(get_args(Mesher))}")
+            raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
 
     def __eq__(self, other: object) -> bool:
-        """Equal in every number and word."""
+        """Compare all fields."""
         return isinstance(other, Alignment) and self._fields() == other._fields()
 
     @property
@@ -81,15 +81,15 @@ class Alignment:
 
     @property
     def error(self) -> float | None:
-        """Metres that the shell may be off as a whole; None where the alignment was not validated.
+        """Error of the alignment as a whole, in metres; None if it was not validated.
 
-        It is the larger of the SfM points' median distance, with its sign, and how far a fit to them would move it.
+        It is the larger of the magnitude of the SfM points' median signed distance and the motion of a fit to them.
         """
         known = [abs(metric) for name in ("bias_m", "pull_m") if (metric := self.metrics.get(name)) is not None]
         return max(known, default=None)
 
     def places_like(self, other: Alignment) -> bool:
-        """Whether both put the same surface in the same place, however they were found."""
+        """Whether both place the same surface identically, however they were found."""
         return (
             np.array_equal(self.shell_to_scene, other.shell_to_scene)
             and self.shell == other.shell
@@ -98,17 +98,17 @@ class Alignment:
         )
 
     def meshed_by(self, mesher: Mesher | None) -> Alignment:
-        """The same place of the surface that another mesher makes, which nobody has judged; None: the same mesher."""
+        """Return the same alignment with another mesher, without a verdict; None keeps the mesher."""
         if mesher is None or mesher == self.mesher:
             return self
         return replace(self, mesher=mesher, verdict="", metrics={})
 
     def load_shell(self, scene: Path, views: Sequence[View]) -> ShellMesh:
-        """The shell's mesh, in its own frame; that of a point cloud is kept in ``scene/shell``.
+        """Load the shell's mesh, in its own frame; the mesh of a point cloud is cached in ``scene/shell``.
 
         Args:
             scene: the scene's folder.
-            views: photographs of the shell, whose cameras tell which side of a cloud's surface is out.
+            views: photographs of the shell, whose cameras orient the normals of a point cloud.
 
         Raises:
             FileNotFoundError: the shell is missing.
@@ -119,7 +119,7 @@ class Alignment:
         return load_shell(scene / self.shell, cache=scene / "shell", viewpoints=viewpoints, mesher=self.mesher)
 
     def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-        """Points of the shell in the scene's frame, in double precision."""
+        """Transform points of the shell to the scene's frame, in double precision."""
         return transformed(np.asarray(points, dtype=np.float64), self.shell_to_scene)
 
     def save(self, path: Path) -> None:
@@ -134,8 +134,8 @@ class Alignment:
         """Read what :meth:`save` wrote.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            SceneError: the file is damaged or its matrix no similarity.
+            FileNotFoundError: the file does not exist.
+            SceneError: the file is damaged or its matrix is not a similarity.
         """
         if not path.is_file():
             raise FileNotFoundError(
@@ -164,18 +164,18 @@ class Alignment:
         metres_per_shell_unit: float = 1.0,
         global_shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Alignment:
-        """The alignment in a file that holds a row-major 4x4 matrix: text as CloudCompare saves it, json or npy.
+        """Read a row-major 4x4 matrix from a file: text as CloudCompare saves it, json or npy.
 
         Args:
             path: the file.
             shell: the shell's file, relative to the scene's folder (or absolute).
             metres_per_shell_unit: 1 for a shell in metres.
-            global_shift: CloudCompare's "global shift", which it adds to a cloud's coordinates on loading and which
-                its matrices therefore take for granted.
+            global_shift: CloudCompare's "global shift", which it adds to a cloud's coordinates on loading, so that its
+                matrices apply to the shifted coordinates.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            SceneError: the file holds no 4x4 matrix, or one that is no similarity.
+            FileNotFoundError: the file does not exist.
+            SceneError: the file does not hold a 4x4 matrix, or one that is not a similarity.
         """
         if not path.is_file():
             raise FileNotFoundError(f"the matrix file {path} does not exist")
@@ -193,13 +193,13 @@ class Alignment:
 def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
     try:
         if path.suffix == ".npy":
-            matrix = np.load(path, allow_pickle=False, mmap_mode="r")  # nothing that it only claims is allocated
+            matrix = np.load(path, allow_pickle=False, mmap_mode="r")  # a false size in the header allocates nothing
         elif path.suffix == ".json":
             matrix = json.loads(path.read_bytes())
         else:
             matrix = [line.replace(",", " ").split() for line in path.read_text().splitlines() if line.strip()]
         matrix = np.array(matrix, dtype=np.float64)
-    except Exception as error:  # each form has its own kinds of error for a damaged file
+    except Exception as error:  # each format's reader raises errors of its own for a damaged file
         raise SceneError(f"this is not a 4x4 matrix ({' '.join(str(error).split())})") from error
     if matrix.shape != (4, 4):
         raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")

@@ -1,7 +1,7 @@
-"""The trap of repeated windows: does the shell fit as well a bay further along, or a storey higher?
+"""The bay test: with repeated windows, a shell may fit as well one bay further along, or one storey higher.
 
-No distance between points and surface sees a facade that is displaced by exactly one bay; only its ends, and what
-interrupts the rhythm, do. So the shell is moved past the points, and the fit at each shift compared.
+Distances between points and surface do not reveal a displacement by exactly one bay; only the ends of the facade and
+interruptions of its rhythm do. So the test shifts the shell along the points and compares the fit at each shift.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from scipy.signal import argrelmax, fftconvolve
 from shellgs_method.shell.geometry.surface import ShellSurface
 
 FIT = 0.10
-"""Metres from the shell at which a point stops counting as a fit: three to five times the scatter of SfM points, and
-less than the depth of a window's recess."""
+"""Metres from the shell beyond which a point does not count as a fit: three to five times the scatter of SfM points,
+and less than the depth of a window's recess."""
 RIVALRY = 0.90
-"""Share of the fit in place from which another place is a rival: within 10 %."""
+"""Fit relative to that in place from which a shift is a rival: within 10 %."""
 BETTER = 1.02
-"""Share of the fit in place from which another place is better, beyond what noise does."""
-_NEAR = 1.0  # metres: farther points are of something else at any shift
+"""Fit relative to that in place from which a shift is better, beyond noise."""
+_NEAR = 1.0  # metres: points farther away at every shift are not of the shell
 _STEP = 0.1
-_SHORTEST = 1.0  # nothing that repeats within a metre is a bay
+_SHORTEST = 1.0  # metres: shortest bay
 _MAX_POINTS = 3000
 _MAX_STEPS = 250  # 25 m each way
 
 
 @dataclass(frozen=True)
 class ShiftScan:
-    """How well the shell fits when it is moved along one direction.
+    """Fit of the shell when shifted along one direction.
 
     Attributes:
         name: the direction, in words.
-        shifts: in metres, 0 among them.
-        fits: at each, the mean over the points of (1 − (distance / 10 cm)²)², 0 for farther ones.
-        period: length of a bay or height of a storey, None where the shell does not repeat itself.
+        shifts: shifts in metres, including 0.
+        fits: mean over the points of (1 − (distance / 10 cm)²)² at each shift, 0 for points farther away.
+        period: length of a bay or height of a storey in metres; None if the shell does not repeat itself.
     """
 
     name: str
@@ -47,20 +47,20 @@ class ShiftScan:
 
     @property
     def in_place(self) -> float:
-        """The fit without a shift, or by less than half the shortest bay."""
+        """Best fit at shifts of less than half the shortest bay."""
         return float(self.fits[np.abs(self.shifts) < _SHORTEST / 2].max())
 
     @property
     def elsewhere(self) -> tuple[float, float]:
-        """The best place a metre or more away: its shift in metres, and its fit relative to the one in place."""
+        """Best shift of a metre or more, in metres, and its fit relative to the one in place."""
         away = np.abs(self.shifts) >= _SHORTEST
-        if not away.any():  # the shell is no longer than that
+        if not away.any():  # the shell is too small
             return 0.0, 0.0
         best = np.argmax(np.where(away, self.fits, -1.0))
         return float(self.shifts[best]), float(self.fits[best] / max(self.in_place, 1e-9))
 
     def at_periods(self) -> dict[int, float]:
-        """Fits at ±1 and ±2 periods relative to the one in place, as far as the scan goes."""
+        """Fits at ±1 and ±2 periods relative to the one in place, within the scanned range."""
         if self.period is None:
             return {}
         near = {k: np.abs(self.shifts - k * self.period) <= 1.5 * _STEP for k in (-2, -1, 1, 2)}
@@ -68,7 +68,7 @@ class ShiftScan:
 
 
 def facade_axes(normals: Float64[np.ndarray, "N 3"], up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Right, up and out of the wall that most of some outward normals belong to, as rows; ``up`` need only be rough."""
+    """Right, up and out of the wall that most outward normals belong to, as rows; ``up`` may be approximate."""
     upright = normals[np.abs(normals @ up) < 0.5]
     if len(upright) == 0:
         upright = normals
@@ -79,8 +79,8 @@ def facade_axes(normals: Float64[np.ndarray, "N 3"], up: Float64[np.ndarray, " 3
 
 
 def wall_axes(out: Float64[np.ndarray, " 3"], up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Right, up and out of a wall, as rows; ``up`` need only be rough."""
-    up = up - (up @ out) * out  # cameras look up at a building: what that tilts, the wall sets right
+    """Right, up and out of a wall, as rows; ``up`` may be approximate."""
+    up = up - (up @ out) * out  # removes the tilt of cameras that look up at a building
     up /= np.linalg.norm(up)
     return np.stack([np.cross(up, out), up, out])
 
@@ -88,7 +88,7 @@ def wall_axes(out: Float64[np.ndarray, " 3"], up: Float64[np.ndarray, " 3"]) -> 
 def scan_shifts(
     surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes: Float64[np.ndarray, "3 3"]
 ) -> list[ShiftScan]:
-    """Move the shell past the points (survey frame) along the facade and upwards."""
+    """Fit the shell to the points (survey frame) at shifts along the facade and upwards."""
     points = np.random.default_rng(0).permutation(points)[:_MAX_POINTS]
     relief = _relief(surface, axes)
     scans = []
@@ -98,7 +98,7 @@ def scan_shifts(
         longest = min(2.2 * period, 0.75 * size) if period else size / 2
         steps = min(int(longest / _STEP), _MAX_STEPS)
         shifts = np.linspace(-steps * _STEP, steps * _STEP, 2 * steps + 1)
-        # The shell moves by the shift, so the points move against it.
+        # Shifting the shell is shifting the points the other way.
         distances = np.stack([surface.distance(points - shift * direction) for shift in shifts])
         eligible = distances.min(axis=0) < _NEAR
         fits = np.maximum(1 - (distances[:, eligible] / FIT) ** 2, 0.0) ** 2
@@ -107,7 +107,7 @@ def scan_shifts(
 
 
 def _relief(surface: ShellSurface, axes: np.ndarray) -> tuple[Float64[np.ndarray, "V U"], float]:
-    """How far the shell stands out in each cell of the facade (NaN: nothing there), and the cell's size in metres."""
+    """Height of the shell's relief in each cell of the facade (NaN where there is none), and cell size, in metres."""
     placed = surface.vertices @ axes.T
     low, high = placed.min(0), placed.max(0)
     cell = max(0.05, float((high - low)[:2].max()) / 1000)
@@ -118,21 +118,21 @@ def _relief(surface: ShellSurface, axes: np.ndarray) -> tuple[Float64[np.ndarray
 
 
 def _edges(relief: np.ndarray, cell: float) -> list[np.ndarray]:
-    """Steps of the relief of more than 3 cm, along the facade and upwards, the direction in question last."""
+    """Steps of more than 3 cm in the relief, along the facade and upwards; the last axis is that of the steps."""
     steps = (np.nan_to_num(np.diff(r, axis=1)) for r in (relief, relief.T))
     return [gaussian_filter1d((np.abs(step) > 0.03).astype(np.float64), 0.05 / cell, axis=1) for step in steps]
 
 
 def _period(edges: Float64[np.ndarray, "rows n"], cell: float) -> float | None:
-    """The shortest length after which a pattern repeats itself, from the autocorrelation of its rows; None if none."""
+    """Shortest period of a pattern in metres, from the autocorrelation of its rows; None if it does not repeat."""
     n = edges.shape[1]
     product = fftconvolve(edges, edges[:, ::-1], axes=1).sum(axis=0)[n - 1 :]
     energy = np.cumsum((edges**2).sum(axis=0))
-    overlap = np.sqrt(energy[::-1] * (energy[-1] - np.append(0.0, energy[:-1])))  # of what both have in common
-    likeness = product / np.maximum(overlap, 1e-9)
+    overlap = np.sqrt(energy[::-1] * (energy[-1] - np.append(0.0, energy[:-1])))  # norms where both overlap
+    correlation = product / np.maximum(overlap, 1e-9)
     first, last = round(_SHORTEST / cell), int(0.75 * n)
-    peaks = argrelmax(likeness[:last], order=max(1, round(0.2 / cell)))[0]
+    peaks = argrelmax(correlation[:last], order=max(1, round(0.2 / cell)))[0]
     peaks = peaks[peaks >= first]
-    if len(peaks) == 0 or likeness[peaks].max() < 0.3:
+    if len(peaks) == 0 or correlation[peaks].max() < 0.3:
         return None
-    return float(cell * peaks[likeness[peaks] >= 0.7 * likeness[peaks].max()][0])
+    return float(cell * peaks[correlation[peaks] >= 0.7 * correlation[peaks].max()][0])

@@ -1,4 +1,4 @@
-"""Points that are known in the shell's frame and in the scene's, some of them wrongly, and the similarity they tell."""
+"""Robust fit of a similarity to points known in the shell's frame and in the scene's, some of them wrong."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from shellgs_method.shell.geometry.similarity import centred, fit_similarity, tr
 from shellgs_method.shell.registration.alignment import Alignment
 
 MAX_ERROR = 0.15
-"""Metres between a point on the shell and the same one in the scene from which it counts as a mistake: five times the
-scatter of careful picks (1 cm on a scan, 3 cm from photographs) and of RTK positions (2 to 3 cm)."""
+"""Residual in metres from which a point is an outlier: five times the scatter of careful picks (1 cm on a scan, 3 cm
+from photographs) and of RTK positions (2 to 3 cm)."""
 LARGEST = 1e12
-"""Of any coordinate, in any unit."""
+"""Largest coordinate, in any unit."""
 _THIN = 0.02  # breadth over length below which points are on one line
 _MAX_TRIPLES = 2000
 
 
 @dataclass(frozen=True)
 class Correspondence:
-    """A point in both frames and what became of it.
+    """A point in both frames and its residuals.
 
     Attributes:
-        name: what the user calls it.
+        name: name in the user's file.
         shell: coordinates in the shell's own frame.
         scene: coordinates in the scene's frame.
         held_out: whether it only checks the fit.
-        is_used: whether the fit follows it; mistakes and check points are left out.
-        residual: distance between the two, in metres.
-        left_out_residual: the same for a fit without this point; NaN where the others determine none.
+        is_used: whether it is fitted; outliers and check points are not.
+        residual: distance between the two after alignment, in metres.
+        left_out_residual: residual under a fit without this point; NaN if the others do not determine a fit.
     """
 
     name: str
@@ -52,13 +52,13 @@ class Correspondence:
 
 @dataclass(frozen=True)
 class RobustFit:
-    """A similarity from points of which some are wrong.
+    """A similarity fitted to points with outliers.
 
     Attributes:
         shell_to_scene: the similarity.
-        used: which points it follows.
-        residuals: distances of all points, in metres.
-        left_out: the same for a fit without the point in question; NaN where the others determine none.
+        used: mask of the points that are fitted.
+        residuals: residuals of all points, in metres.
+        left_out: residual of each point under a fit without it; NaN if the others do not determine a fit.
     """
 
     shell_to_scene: Float64[np.ndarray, "4 4"]
@@ -78,24 +78,24 @@ def fit_robustly(
     called: str,
     remedy: str,
 ) -> RobustFit:
-    """The similarity that most candidates agree on within :data:`MAX_ERROR`, by least squares of these.
+    """Fit a similarity by least squares to the largest set of candidates that agree within :data:`MAX_ERROR`.
 
     Args:
-        shell: points in the shell's frame, georeferenced as they came.
-        scene: the same points in the scene's.
-        candidates: which may be followed.
+        shell: points in the shell's frame, possibly georeferenced.
+        scene: the same points in the scene's frame.
+        candidates: mask of the points that may be fitted.
         metres_per_shell_unit: 1 for a shell in metres.
-        called: what the points are, for messages.
-        remedy: what to do where they lie on one line, for messages.
+        called: plural name of the points, for messages.
+        remedy: advice if they lie on one line, for messages.
 
     Raises:
         SceneError: fewer than 3 points, or only points on one line, can be trusted.
     """
     survey_from_shell = centred(shell.mean(axis=0), metres_per_shell_unit)
     shell = transformed(shell, survey_from_shell)
-    _refuse_a_line(scene[candidates], shell[candidates], called, remedy)
+    _check_spread(scene[candidates], shell[candidates], called, remedy)
     used = _consensus(scene, shell, candidates)
-    _refuse_a_line(scene[used], shell[used], called, remedy)
+    _check_spread(scene[used], shell[used], called, remedy)
     survey_from_scene = fit_similarity(scene[used], shell[used])
     residuals = np.linalg.norm(transformed(scene, survey_from_scene) - shell, axis=1)
     left_out = np.array([_left_out(k, scene, shell, used) for k in range(len(shell))])
@@ -104,7 +104,7 @@ def fit_robustly(
 
 
 def measured_again(points: Sequence[Point], alignment: Alignment) -> list[Point]:
-    """The points with their residuals under another alignment, worst first."""
+    """Recompute the residuals of points under another alignment; worst first."""
     again = []
     for point in points:
         offset = alignment.apply(point.shell[None])[0] - point.scene
@@ -113,29 +113,29 @@ def measured_again(points: Sequence[Point], alignment: Alignment) -> list[Point]
 
 
 def worst_first(points: Sequence[Point]) -> list[Point]:
-    """The points by their residuals."""
+    """Sort points by residual, largest first."""
     return sorted(points, key=lambda point: -point.residual)
 
 
 def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
-    """The words of each line of a text file, and where it is, for messages.
+    """Yield the position, for messages, and the words of each line of a text file.
 
-    What follows a # is skipped. Words with spaces stand in quotes.
+    Comments after # are skipped. Words with spaces are quoted.
 
     Args:
         path: the file.
-        contents: what is in it, for messages.
+        contents: name of its contents, for messages.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        SceneError: the file is no text, or a quote is not closed.
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is not text, or a quote is not closed.
     """
     if not path.is_file():
         raise FileNotFoundError(f"the file of {contents} {path} does not exist")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise SceneError(f"{path} is no text file of {contents} ({error.reason}): save it as UTF-8") from error
+        raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
     for number, line in enumerate(text.splitlines(), start=1):
         where = f"{path}, line {number}"
         try:
@@ -147,10 +147,10 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def view_named(name: str, views: Sequence[View], where: str) -> View | None:
-    """The view of an image given by its path in the scene or by its file name alone; None if it is not there.
+    """Find a view by its image's path in the scene or its file name; None if there is none.
 
     Raises:
-        SceneError: the file name is that of several.
+        SceneError: several images have this file name.
     """
     matches = [view for view in views if name in (view.name, view.image.name)]
     if len(matches) > 1:
@@ -159,7 +159,7 @@ def view_named(name: str, views: Sequence[View], where: str) -> View | None:
 
 
 def are_numbers(words: Sequence[str]) -> bool:
-    """Whether all words of a line are numbers, as large as coordinates are."""
+    """Whether all words are finite numbers below :data:`LARGEST`."""
     try:
         return all(abs(float(word)) < LARGEST for word in words)
     except ValueError:
@@ -167,9 +167,9 @@ def are_numbers(words: Sequence[str]) -> bool:
 
 
 def _consensus(scene: np.ndarray, shell: np.ndarray, candidates: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
-    """The points that the best triple agrees with (MSAC, Torr and Zisserman 2000), over all triples if they are few."""
+    """Inliers of the best triple of points (MSAC, Torr and Zisserman 2000), over all triples if they are few."""
     indices = np.flatnonzero(candidates)
-    thin = min(0.1, _thinness(scene[candidates]) / 2)  # of a walk past a facade all triples are thin
+    thin = min(0.1, _thinness(scene[candidates]) / 2)  # all triples of a walk along a facade are thin
     best, cost = candidates, np.inf
     for triple in _triples(indices):
         if _thinness(shell[triple]) < thin:
@@ -198,12 +198,12 @@ def _left_out(k: int, scene: np.ndarray, shell: np.ndarray, used: np.ndarray) ->
 
 
 def _thinness(points: np.ndarray) -> float:
-    """Breadth over length of some points: 0 on a line."""
+    """Breadth over length of points: 0 on a line."""
     extents = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return float(extents[1] / max(extents[0], 1e-30))
 
 
-def _refuse_a_line(scene: np.ndarray, shell: np.ndarray, called: str, remedy: str) -> None:
+def _check_spread(scene: np.ndarray, shell: np.ndarray, called: str, remedy: str) -> None:
     if len(shell) < 3:
         raise SceneError(f"{len(shell)} {called} can be trusted, at least 3 are needed (6 or more are better)")
     if min(_thinness(scene), _thinness(shell)) < _THIN:

@@ -1,10 +1,10 @@
-"""Correspondences picked by people: pixels of photographs and coordinates of the shell, in a text file.
+"""Align the shell by picks: a text file of points picked on the shell and in photographs.
 
-The file is a `gcp_list.txt` as OpenDroneMap defines it, which several tools for picking write: a line for each sight of
-a point, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in the shell's file, x y the pixel (from the
-top left corner of the picture). Lines with the same name, or without one the same X Y Z, are one point, which needs two
-photographs. A first line that does not start with a number (the projection) and what follows a # are skipped; names of
-images with spaces stand in quotes. Points whose name begins with "check" are not fitted, only measured.
+The file is a `gcp_list.txt` in OpenDroneMap's format, which several picking tools write: one line per point and
+photograph, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in the shell's file, x y the pixel (from
+the top left corner of the image). Lines with the same name, or without a name with the same X Y Z, are one point,
+which needs two photographs. A first line that does not start with a number (the projection) and comments after # are
+skipped; quote image names with spaces. Points whose name begins with "check" are not fitted, only measured.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from shellgs_method.shell.registration.correspondences import (
 )
 
 MAX_REPROJECTION = 4.0
-"""Pixels, of a photograph 1000 wide, between a picked pixel and the point triangulated from all: more is a mistake."""
+"""Largest distance of a picked pixel from the triangulated point, in pixels of a photograph 1000 pixels wide."""
 _MIN_ANGLE = 1.0  # degrees between two rays, for a point to have a depth
 
 
 @dataclass(frozen=True)
 class Pick:
-    """A point on the shell and where photographs show it.
+    """A point on the shell and its pixels in photographs.
 
     Attributes:
-        name: what the user calls it.
+        name: name in the file.
         shell: coordinates in the shell's own frame.
-        pixels: by the name of the view, in the photograph as it lies on disk.
+        pixels: pixel in the photograph as stored on disk, by the view's name.
     """
 
     name: str
@@ -54,11 +54,11 @@ class Pick:
 
 @dataclass(frozen=True)
 class PickedPoint(Correspondence):
-    """What became of a pick; its place in the scene is triangulated from the photographs.
+    """A pick and its residuals; its point in the scene is triangulated from the photographs.
 
     Attributes:
-        reprojection: largest distance of a picked pixel from that point's image, in pixels.
-        worst_view: the view of that pixel.
+        reprojection: largest reprojection error of the triangulated point, in pixels.
+        worst_view: name of the view with that error.
         is_sharp: whether the picked pixels agree on one point.
     """
 
@@ -71,8 +71,8 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
     """Read a file of picks.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        SceneError: a line cannot be read, names no photograph of the scene, or contradicts another.
+        FileNotFoundError: the file does not exist.
+        SceneError: a line cannot be read, names an image that is not in the scene, or contradicts another line.
     """
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
@@ -80,14 +80,14 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
         if number == 0 and not are_numbers(words[:1]):
             continue
         if len(words) < 6 or not are_numbers(words[:5]):
-            raise SceneError(f"{where}: a pick is X Y Z of the shell, x y in the photograph, the image, and a name")
+            raise SceneError(f"{where}: expected X Y Z of the shell, x y in the photograph, the image, and a name")
         point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
         view = view_named(words[5], views, where)
         if view is None:
-            raise SceneError(f"{where}: {words[5]} is no photograph of the scene")
+            raise SceneError(f"{where}: {words[5]} is not a photograph of the scene")
         name = words[6] if len(words) > 6 else " ".join(words[:3])
         if not np.array_equal(shell.setdefault(name, point), point):
-            raise SceneError(f"{where}: the point {name} had other coordinates before: give it another name")
+            raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")
         if view.name in pixels.setdefault(name, {}):
             raise SceneError(f"{where}: the point {name} is picked twice in {words[5]}")
         pixels[name][view.name] = pixel
@@ -99,12 +99,12 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
 def triangulate(
     viewmats: Float64[np.ndarray, "M 4 4"], Ks: Float64[np.ndarray, "M 3 3"], pixels: Float64[np.ndarray, "M 2"]
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " M"]]:
-    """The point that pixels of several views show, and how far its image is from each of them.
+    """Triangulate a point from its pixels in several views; return it and its reprojection errors, in pixels.
 
-    Starts from the point nearest to all rays and minimises the squared distances in the images by Gauss-Newton.
+    Starts at the point closest to all rays and minimises the squared reprojection errors by Gauss-Newton.
 
     Raises:
-        ValueError: the rays are parallel, or the point they meet in is behind a camera.
+        ValueError: the rays are parallel, or they meet behind a camera.
     """
     rays = np.linalg.solve(Ks, np.append(pixels, np.ones((len(pixels), 1)), axis=1)[..., None])[..., 0]
     directions = np.einsum("mji,mj->mi", viewmats[:, :3, :3], rays)
@@ -135,9 +135,9 @@ def triangulate(
 def align_picks(
     picks: Sequence[Pick], views: Sequence[View], metres_per_shell_unit: float = 1.0
 ) -> tuple[Float64[np.ndarray, "4 4"], list[PickedPoint]]:
-    """The similarity from the shell to the scene that picks tell, and each pick's residuals, worst first.
+    """Fit the similarity from the shell to the scene to picks; return it and each pick's residuals, worst first.
 
-    Points whose pixels disagree are left out, and of the others those that most triples of points contradict.
+    Points whose pixels disagree are left out, and so are outliers among the others.
 
     Raises:
         SceneError: a point cannot be triangulated, or fewer than 3 points off one line can be trusted.

@@ -1,9 +1,8 @@
-"""Where the cameras stood, by RTK or another survey: a text file, and the place of the shell that it tells.
+"""Align the shell by surveyed camera positions (RTK or similar) in a text file.
 
-The file is a `geo.txt` as OpenDroneMap defines it: the coordinate system in the first line, then a line for each
-photograph, ``image X Y Z``; what follows these (angles, accuracies) and what follows a # is skipped. X Y Z are the
-camera's coordinates in the shell's frame and units, so that degrees will not do. Names of images with spaces stand in
-quotes.
+The file is a `geo.txt` in OpenDroneMap's format: the coordinate system in the first line, then one line per
+photograph, ``image X Y Z``; further columns (angles, accuracies) and comments after # are skipped. X Y Z are the
+camera's coordinates in the shell's frame and units, not degrees. Quote image names with spaces.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ _REMEDY = "add photographs from higher or lower, nearer or farther, or pick poin
 
 @dataclass(frozen=True)
 class SurveyedPositions:
-    """What a file of positions says.
+    """Contents of a file of camera positions.
 
     Attributes:
-        views: photographs of the scene that it names.
-        shell: where each was taken, in the shell's own frame.
-        strangers: names in the file that are no photographs of the scene.
+        views: photographs of the scene that have a position.
+        shell: camera position of each, in the shell's own frame.
+        strangers: names in the file that are not photographs of the scene.
     """
 
     views: Sequence[View]
@@ -51,7 +50,7 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
     """Read a file of camera positions.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         SceneError: the file is in degrees, or a line cannot be read or contradicts another.
     """
     found: dict[str, tuple[View, list[float]]] = {}
@@ -63,7 +62,7 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
                 raise SceneError(f"{path} is in degrees ({' '.join(words)}): convert it to the shell's coordinates")
             continue
         if not is_position:
-            raise SceneError(f"{where}: a camera's position is the image, then X Y Z in the shell's coordinates")
+            raise SceneError(f"{where}: expected the image, then X Y Z in the shell's coordinates")
         view = view_named(words[0], views, where)
         if view is None:
             strangers.append(words[0])
@@ -78,16 +77,16 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
 def align_positions(
     surveyed: SurveyedPositions, metres_per_shell_unit: float = 1.0
 ) -> tuple[Float64[np.ndarray, "4 4"], list[Correspondence], float]:
-    """The similarity from the shell to the scene, each camera's residual, worst first, and the play.
+    """Fit the similarity from the shell to the scene; return it, each camera's residual, worst first, and the play.
 
-    The play is the standard error, in degrees, of the turn about the line that the cameras follow most.
+    The play is the standard error, in degrees, of the rotation about the cameras' principal line.
 
     Raises:
         SceneError: fewer than 3 positions off one line can be trusted, or less than half agree.
     """
     views = surveyed.views
     if len(views) < 3:
-        known = f" ({', '.join(surveyed.strangers[:3])} … are none of its photographs)" if surveyed.strangers else ""
+        known = f" ({', '.join(surveyed.strangers[:3])} … are not in the scene)" if surveyed.strangers else ""
         raise SceneError(f"{len(views)} photographs of the scene have a position{known}: at least 3 are needed")
     everyone = np.ones(len(views), bool)
     scene = positions(view.camera for view in views)
@@ -95,7 +94,7 @@ def align_positions(
     if 2 * fit.used.sum() < len(views):
         raise SceneError(
             f"only {fit.used.sum()} of {len(views)} camera positions agree with the photographs within {MAX_ERROR} m: "
-            "they need RTK's precision, and the shell's coordinates and units"
+            "they must be accurate, as by RTK, and in the shell's coordinates and units"
         )
     cameras = [
         Correspondence(view.name, *known)
@@ -108,6 +107,6 @@ def align_positions(
 
 
 def _play(points: np.ndarray, residuals: np.ndarray) -> float:
-    deviation = np.sqrt((residuals**2).sum() / (3 * len(points) - 7))  # along each axis; a similarity has 7 unknowns
+    deviation = np.sqrt((residuals**2).sum() / (3 * len(points) - 7))  # per axis; a similarity has 7 unknowns
     breadth = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1:]
     return float(np.degrees(deviation / np.linalg.norm(breadth)))

@@ -1,9 +1,9 @@
-"""A start for the alignment where there is none: a guess from up, the main wall and its outline.
+"""Coarse registration: propose an alignment from the up direction, the main wall and its outline.
 
-Facades repeat themselves, so that features and their descriptors register them a whole number of bays off, with perfect
-scores. What is searched here exhaustively instead is all the places that put the main wall of the SfM points upright on
-a wall of the shell: which wall, at which scale, where on it. The best ones are refined and ranked, and those that come
-close to the best are named. The outcome is a proposal for people to look at.
+Facades repeat themselves, so feature descriptors can register them a whole number of bays off, with perfect scores.
+Instead, the search is exhaustive over all alignments that put the main wall of the SfM points upright on a wall of the
+shell: which wall, at which scale, where on it. The best ones are refined and ranked, and close rivals of the best are
+reported. The result is a proposal for the user to check.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from shellgs_method.shell.registration.bays import wall_axes
 from shellgs_method.shell.registration.refinement import FINAL_GATE, refine
 
 AMBIGUOUS = 0.90
-"""Share of the best score from which another place is named beside it."""
-_DIFFERENT = 0.5  # metres of mean displacement from which two places are two
-_PEAKS = 6  # shifts that are kept for a wall and a scale, a metre or more apart
-_KEPT = 10  # places that are kept on each wall
-_REFINED = 20  # places on all walls that are refined
-_FEW = 1000  # SfM points tell a good place from a bad one; what is returned is fitted to all
+"""Share of the best score from which another candidate is reported as a rival."""
+_DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ
+_PEAKS = 6  # shifts kept per wall and scale, a metre or more apart
+_KEPT = 10  # candidates kept per wall
+_REFINED = 20  # candidates refined, of all walls
+_FEW = 1000  # SfM points that suffice to rank candidates; the result is fitted to all
 _SCALE_STEP = 1.04
-_FLAT = 0.05  # breadth of the SfM wall over its length within which points are on it
-_ROUGH, _FIT = 0.50, 0.10  # metres from the shell within which a point fits, before refinement and after
+_FLAT = 0.05  # distance from the SfM wall, relative to the points' extent, within which points are on it
+_COARSE, _FIT = 0.50, 0.10  # metres from the shell within which a point fits, before refinement and after
 _BESIDE = 0.50  # metres
 _REACH = 1.0  # metres
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A place for the shell.
+    """A candidate alignment.
 
     Attributes:
         survey_from_scene: similarity.
         score: harmonic mean of the share of the wall's SfM points within 10 cm of the shell and the share of the
-            shell's surface that has SfM points beside it.
-        displacement: mean distance from the best candidate's place, in metres.
+            shell's surface with SfM points near it.
+        displacement: mean displacement of the shell from the best candidate, in metres.
     """
 
     survey_from_scene: Float64[np.ndarray, "4 4"]
@@ -56,7 +56,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class _Cloud:
-    """The SfM points, those on their main wall or near it, and right, up and out of that wall, as rows."""
+    """SfM points, those on or near their main wall, and right, up and out of that wall, as rows."""
 
     points: Float64[np.ndarray, "N 3"]
     wall: Float64[np.ndarray, "W 3"]
@@ -73,14 +73,14 @@ def propose(
     scene_up: Float64[np.ndarray, " 3"],
     shell_up: Float64[np.ndarray, " 3"],
 ) -> list[Candidate]:
-    """Places for the shell, the best first, then those whose score is within 10 % of it.
+    """Propose alignments, the best first, followed by those whose score is within 10 % of it.
 
     Args:
         surface: the shell.
         points: SfM points in the scene's frame.
-        cameras: positions of the cameras, all on the outside.
-        scene_up: up as the cameras hold it, roughly.
-        shell_up: up in the shell's axes; where its walls are askew to that, their own directions are tried as well.
+        cameras: positions of the cameras, all outside the building.
+        scene_up: approximate up direction of the cameras.
+        shell_up: up in the shell's frame; if its walls are not aligned with it, their own directions are tried instead.
 
     Raises:
         SceneError: the SfM points have no main wall, or it fits nowhere.
@@ -92,12 +92,12 @@ def propose(
     starts: list[Candidate] = []
     for up in _upwards(normals, shell_up):
         for axes, wall in _shell_walls(samples, normals, up):
-            # Of each wall the best, for by their cells walls of different sizes do not compare.
-            starts += _distinct(_places(cloud, axes, wall), spread, _KEPT)
-    starts = [replace(s, score=_score(surface, spread, few, s.survey_from_scene, _ROUGH)) for s in starts]
+            # The best of each wall: scores by cells are not comparable between walls of different sizes.
+            starts += _distinct(_wall_candidates(cloud, axes, wall), spread, _KEPT)
+    starts = [replace(s, score=_score(surface, spread, few, s.survey_from_scene, _COARSE)) for s in starts]
     found = _refined(surface, spread, few, _best_first(starts)[:_REFINED], _REACH)
     if not found:
-        raise SceneError("no place was found for the shell: pick points in the photographs and use --picks")
+        raise SceneError("no alignment of the shell was found: pick points in the photographs and use --picks")
     found = _refined(surface, spread, cloud, _close_to_best(_distinct(found, spread, _KEPT)), 2 * FINAL_GATE)
     best, *rivals = _close_to_best(_best_first(found))
     return [best, *(replace(rival, displacement=_displacement(best, rival, spread)) for rival in rivals)]
@@ -124,7 +124,7 @@ def _main_wall(points: np.ndarray, cameras: np.ndarray, up: np.ndarray) -> _Clou
 
 
 def _upwards(normals: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
-    """Up in the shell: as its file has it, or where its walls are askew to that, each of their axes, either way."""
+    """Up directions of the shell to try: ``up``, or if its walls are not aligned with it, their axes in both signs."""
     first = _commonest(normals)
     across = normals[np.abs(normals @ first) < 0.2]
     if len(across) < 100:
@@ -134,7 +134,7 @@ def _upwards(normals: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
 
 
 def _commonest(normals: np.ndarray) -> np.ndarray:
-    """The direction, up to its sign, that most normals have within 20°."""
+    """Direction, up to its sign, of the most normals within 20°."""
     some = normals[:: max(1, len(normals) // 1000)]
     alike = np.abs(some @ some.T) > 0.94
     group = some[alike[alike.sum(axis=1).argmax()]]
@@ -142,7 +142,7 @@ def _commonest(normals: np.ndarray) -> np.ndarray:
 
 
 def _shell_walls(samples: np.ndarray, normals: np.ndarray, up: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Right, up and out of up to four walls of the shell, seen from either side, and samples of the surface there."""
+    """Yield right, up and out of up to four walls of the shell, from either side, and surface samples on each."""
     upright = np.abs(normals @ up) < 0.2
     samples, normals = samples[upright], normals[upright]
     for _ in range(4):
@@ -161,17 +161,17 @@ def _shell_walls(samples: np.ndarray, normals: np.ndarray, up: np.ndarray) -> It
         samples, normals = samples[~(wall & alike)], normals[~(wall & alike)]
 
 
-def _places(cloud: _Cloud, axes: np.ndarray, samples: np.ndarray) -> list[Candidate]:
-    """The best places on one wall, over all scales and shifts by cells.
+def _wall_candidates(cloud: _Cloud, axes: np.ndarray, samples: np.ndarray) -> list[Candidate]:
+    """Best candidates on one wall, over all scales and all shifts by whole cells.
 
-    Both walls are boxes of cells; their correlation counts, for every shift at once, the points in the shell's cells
+    Both walls are grids of cells; their correlation counts, for all shifts at once, the points in the shell's cells
     and the shell's cells that have points.
     """
     flat, wall = cloud.wall @ cloud.axes.T, samples @ axes.T
     middle, target = np.median(flat, axis=0), (wall.min(0) + wall.max(0)) / 2
     boxes = [np.percentile(p[:, :2], [2, 98], axis=0) for p in (wall, flat)]
     sizes = [np.ptp(box, axis=0) for box in boxes]
-    margin = 0.2 * sizes[1]  # a few points far out would make for boxes of empty cells
+    margin = 0.2 * sizes[1]  # a few points far out would make large grids of empty cells
     flat = flat[((flat[:, :2] > boxes[1][0] - margin) & (flat[:, :2] < boxes[1][1] + margin)).all(axis=1)]
     ratios = sizes[0] / np.maximum(sizes[1], 1e-9)
     cell = max(0.25, float(sizes[0].max()) / 300)
@@ -186,7 +186,7 @@ def _places(cloud: _Cloud, axes: np.ndarray, samples: np.ndarray) -> list[Candid
         hits, covered = (fftconvolve(shell_cells[0], c[::-1, ::-1, ::-1]) for c in (counts[0], occupied[0]))
         precision, recall = hits / counts[0].sum(), covered / shell_cells[0].sum()
         score = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
-        best = score.max(axis=2)  # over the shifts out of the wall
+        best = score.max(axis=2)  # over the shifts normal to the wall
         peaks = np.argwhere(best == maximum_filter(best, 2 * round(1.0 / cell) + 1))
         for u, v in peaks[np.argsort(-best[tuple(peaks.T)])][:_PEAKS]:
             index = np.array([u, v, score[u, v].argmax()])
@@ -199,7 +199,7 @@ def _places(cloud: _Cloud, axes: np.ndarray, samples: np.ndarray) -> list[Candid
 
 
 def _cells(points: np.ndarray, cell: float, counted: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """A dense box of cells with the points in each (or 1 where there are any), and its lowest cell's index."""
+    """Dense grid with the number of points in each cell (or 1 if there are any), and the index of its lowest cell."""
     index = np.floor(points / cell).astype(int)
     inside = np.abs(points[:, 2]) < 2.0
     index = index[inside]
@@ -212,7 +212,7 @@ def _cells(points: np.ndarray, cell: float, counted: bool = False) -> tuple[np.n
 def _refined(
     surface: ShellSurface, spread: np.ndarray, cloud: _Cloud, starts: Sequence[Candidate], reach: float
 ) -> list[Candidate]:
-    """The places brought closer to the points, without those that are too far off for it."""
+    """Refine candidates, leaving out those with too few points in reach."""
     found = []
     for start in starts:
         try:
@@ -235,12 +235,12 @@ def _best_first(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _close_to_best(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Those within 10 % of the first, which is the best."""
+    """Candidates whose score is within 10 % of the first, which is the best."""
     return [candidate for candidate in candidates if candidate.score >= AMBIGUOUS * candidates[0].score]
 
 
 def _distinct(candidates: Sequence[Candidate], spread: np.ndarray, count: int) -> list[Candidate]:
-    """So many places, best first, each the best of a group that differ by little."""
+    """Up to ``count`` candidates, best first, each the best of a group of similar ones."""
     kept: list[Candidate] = []
     for candidate in _best_first(candidates):
         if all(_displacement(other, candidate, spread) > _DIFFERENT for other in kept):
@@ -251,12 +251,12 @@ def _distinct(candidates: Sequence[Candidate], spread: np.ndarray, count: int) -
 
 
 def _displacement(one: Candidate, other: Candidate, spread: np.ndarray) -> float:
-    """Mean distance between the shell in one place and in another, in the metres of the first."""
+    """Mean displacement of the shell between two candidates, in metres."""
     some = spread[:200]
     moved = transformed(some, one.survey_from_scene @ np.linalg.inv(other.survey_from_scene))
     return float(np.linalg.norm(moved - some, axis=1).mean())
 
 
 def _some(points: np.ndarray, count: int) -> np.ndarray:
-    """Not more than so many of the points, by chance, the same ones each time."""
+    """Random subset of up to ``count`` points, the same in each call."""
     return np.random.default_rng(0).permutation(points)[:count]

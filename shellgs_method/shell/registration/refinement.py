@@ -1,4 +1,4 @@
-"""Refining a rough alignment against the SfM points: robust point-to-plane Gauss-Newton over a similarity."""
+"""Refine an alignment against the SfM points: robust point-to-plane Gauss-Newton over a similarity."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.shell.geometry.surface import ShellSurface
 
 FINAL_GATE = 0.05
-"""Metres from the shell beyond which a point has no say in the end: SfM points of a wall scatter by 1 to 3 cm, and
-what a shell leaves out (frames, sills, railings) stands 5 to 20 cm off it and pulls the result its way."""
+"""Metres from the shell beyond which a point has no weight in the last steps: SfM points on a wall scatter by 1 to 3
+cm, while parts missing in the shell (frames, sills, railings) are 5 to 20 cm off it and would bias the result."""
 WEAK = 1e-3
 """Eigenvalue of the normal equations, relative to the largest, below which a direction is weak. A facade with recessed
 windows has 2e-3 and more in every direction, a bare wall less than 1e-6 in four of the seven."""
 MOTIONS = ("along the facade", "upwards", "out of the facade", "tilt", "turn", "roll", "scale")
-"""The seven ways to move, in the facade's axes: shifts along right, up, out; turns about these; growing."""
+"""The seven degrees of freedom in the facade's axes: shifts along right, up, out; rotations about these; scale."""
 _STEPS = 40
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the points near the shell say about each way to move it.
+    """How well the points near the shell determine each direction of motion.
 
     Attributes:
-        directions: orthonormal rows of (shift, turn, growth), of which a unit moves the points by about a metre.
-        strengths: mean squared distance from the shell's planes, in m², that a unit along each makes; descending.
-        centre: what turns and growth leave in place, in the survey frame.
+        directions: orthonormal rows of (shift, rotation, scale); a unit moves the points by about a metre.
+        strengths: mean squared distance from the shell's planes, in m², per unit along each; descending.
+        centre: fixed point of rotation and scale, in the survey frame.
         radius: root-mean-square distance of the points from it, in metres.
-        points: how many had a say.
+        points: number of points within the gate.
     """
 
     directions: Float64[np.ndarray, "7 7"]
@@ -43,7 +43,7 @@ class Evidence:
 
     @property
     def weak(self) -> np.ndarray:
-        """Which directions the points say too little about."""
+        """Mask of the directions that the points do not determine."""
         return self.strengths < WEAK * max(self.strengths[0], 1e-30)
 
     @property
@@ -52,10 +52,10 @@ class Evidence:
         return float(self.strengths[0] / max(self.strengths[-1], 1e-30))
 
     def in_words(self, axes: Float64[np.ndarray, "3 3"]) -> list[str]:
-        """The weak directions, by the motions that make up most of each.
+        """Describe each weak direction by its main motions.
 
         Args:
-            axes: the facade's right, up and out, as rows.
+            axes: right, up and out of the facade, as rows.
         """
         turn = np.kron(np.eye(2), axes)
         words = []
@@ -71,9 +71,9 @@ class Refinement:
     """A refined alignment.
 
     Attributes:
-        survey_from_scene: the similarity found.
-        evidence: of the last step.
-        moved: root-mean-square motion of the points that decided, from start to end, in metres.
+        survey_from_scene: refined similarity.
+        evidence: evidence of the last step.
+        moved: root-mean-square motion, from start to end, of the points within the last gate, in metres.
     """
 
     survey_from_scene: Float64[np.ndarray, "4 4"]
@@ -87,17 +87,17 @@ def refine(
     survey_from_scene: Float64[np.ndarray, "4 4"],
     reach: float,
 ) -> Refinement:
-    """Bring SfM points onto the shell.
+    """Refine an alignment by fitting the SfM points to the shell.
 
-    Each step moves the points by the similarity that best takes them onto the planes of the triangles next to them
-    (Chen and Medioni 1991, with a scale), weighted by Tukey's biweight, whose limit shrinks from ``reach`` to
-    :data:`FINAL_GATE`. Directions that the points say too little about are left as they are.
+    Each step applies the similarity that best moves the points onto the planes of their closest triangles (Chen and
+    Medioni 1991, with a scale), weighted by Tukey's biweight, whose limit shrinks from ``reach`` to
+    :data:`FINAL_GATE`. Directions that the points do not determine stay unchanged.
 
     Args:
         surface: the shell.
-        points: SfM points in the scene's frame; those off the shell do no harm.
-        survey_from_scene: the start.
-        reach: metres by which the start may be off.
+        points: SfM points in the scene's frame; points off the shell do no harm.
+        survey_from_scene: initial similarity.
+        reach: largest error of the initial similarity, in metres.
 
     Raises:
         SceneError: fewer than 7 points are within reach of the shell.
@@ -117,14 +117,14 @@ def refine(
 
 
 def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evidence, np.ndarray, np.ndarray]:
-    """One step: the evidence at hand, the similarity to apply, and which points were within the gate."""
+    """One step: its evidence, the similarity to apply, and the mask of points within the gate."""
     closest = surface.closest(points)
     offset = points - closest.foot
     used = np.linalg.norm(offset, axis=1) < gate
     if used.sum() < 7:
         raise SceneError(
             f"only {used.sum()} SfM points are within {gate:.2g} m of the shell: the start is too far off, or the "
-            "points are of something else"
+            "points show something else"
         )
     points, normal = points[used], closest.normal[used]
     distance = np.einsum("nd,nd->n", normal, offset[used])
@@ -132,9 +132,9 @@ def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evid
     centre = np.average(points, axis=0, weights=weight)
     arm = points - centre
     radius = float(np.sqrt(np.average((arm**2).sum(axis=1), weights=weight)))
-    # Shift, turn and growth all in metres at that radius, so that their strengths can be compared.
-    growth = np.einsum("nd,nd->n", normal, arm)[:, None]
-    J = np.concatenate([normal, np.cross(arm, normal) / radius, growth / radius], axis=1)
+    # Shift, rotation and scale are all in metres at that radius, so that their strengths can be compared.
+    scale = np.einsum("nd,nd->n", normal, arm)[:, None]
+    J = np.concatenate([normal, np.cross(arm, normal) / radius, scale / radius], axis=1)
     strengths, directions = np.linalg.eigh(J.T @ (weight[:, None] * J) / weight.sum())
     evidence = Evidence(directions.T[::-1], np.maximum(strengths[::-1], 0.0), centre, radius, int(used.sum()))
     gradient = evidence.directions @ (J.T @ (weight * distance) / weight.sum())
@@ -144,7 +144,7 @@ def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evid
 
 
 def _similarity(update: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """The 4x4 matrix of (shift, turn, growth) about a centre."""
+    """4x4 matrix of (shift, rotation, scale) about a centre."""
     matrix = np.eye(4)
     matrix[:3, :3] = np.exp(update[6] / radius) * Rotation.from_rotvec(update[3:6] / radius).as_matrix()
     matrix[:3, 3] = centre + update[:3] - matrix[:3, :3] @ centre

@@ -1,1 +1,1 @@
-"""Whether an alignment can be trusted."""
+"""Validate an alignment and report the verdict."""

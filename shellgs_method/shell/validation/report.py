@@ -1,4 +1,4 @@
-"""The validation report: one HTML file that needs nothing else, its plots also as PNG files, its metrics as json."""
+"""The validation report: a self-contained HTML file, its plots also as PNG files, its metrics as json."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ figure img + img { position: absolute; inset: 0 } figure div:hover img + img { o
 
 
 def shell_edges(cue: CueMap, metres_per_unit: float) -> Bool[np.ndarray, "H W"]:
-    """Where the cast shell ends, steps by more than 3 cm, or bends by more than 25°, two pixels wide.
+    """Edges of the cast shell, two pixels wide: outlines, steps of more than 3 cm, and bends of more than 25°.
 
-    A bend counts if it is there in the normals blurred over a few pixels as well: the triangles of a photogrammetric
-    shell turn by as much from one to the next, but this way and that.
+    A bend must also show in normals blurred over a few pixels: neighbouring triangles of a photogrammetric shell can
+    differ by as much, but in random directions.
     """
     with np.errstate(divide="ignore"):
         inverse = np.where(cue.mask, 1 / cue.depth, 0.0)
@@ -74,18 +74,18 @@ def shell_edges(cue: CueMap, metres_per_unit: float) -> Bool[np.ndarray, "H W"]:
 
 
 def _turns(normal: np.ndarray, one: np.ndarray, other: np.ndarray, axis: int) -> Bool[np.ndarray, "H W"]:
-    """Where normals at two places along an axis differ by more than 25°."""
+    """Mask of pixels where the normals at two indices along an axis differ by more than 25°."""
     return np.einsum("hwc,hwc->hw", normal.take(one, axis), normal.take(other, axis)) < np.cos(np.radians(25))
 
 
 def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history: Sequence[str] = ()) -> Path:
-    """Write ``index.html``, ``validation.json`` and the PNG files; returns the HTML file.
+    """Write ``index.html``, ``validation.json`` and the PNG files; return the path of the HTML file.
 
     Args:
-        folder: where they go; an older report there is replaced.
+        folder: output folder; an older report there is replaced.
         mesh: the shell in its own frame.
-        validation: what is reported.
-        history: what led to the alignment, a sentence each.
+        validation: the validation to report.
+        history: how the alignment was found, one sentence per step.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for stale in folder.glob("*.png"):
@@ -107,7 +107,7 @@ def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history:
 
 
 def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator[str]:
-    """The HTML of each representative view; its picture is written as PNG on the way."""
+    """Yield the HTML of each representative view, and write its overlay as PNG."""
     caster = ShellCaster(mesh, validation.alignment.shell_to_scene)
     for number, support in enumerate(representative(validation.views, validation.axes[0]), start=1):
         view = replace(support.view, camera=support.view.camera.shrunk(_OVERLAY))
@@ -134,15 +134,15 @@ def _page(
     yield "".join(f"<p>{escape(sentence)}</p>" for sentence in (f"From: {alignment.source}.", *history))
     yield f"<p>One scene unit is {alignment.metres_per_unit:.6g} m; {validation.near:.0%} of the SfM points are within "
     yield "1 m of the shell.</p>"
-    yield "<h2>What the verdict rests on</h2>"
+    yield "<h2>Checks behind the verdict</h2>"
     checks = (
         (f'<span class="{c.verdict}">{c.verdict}</span>', escape(c.name), escape(c.value), escape(c.limits),
          f'<span class="why">{escape(c.why)}</span>') for c in validation.checks
     )  # fmt: skip
     yield _table(("", "metric", "value", "limits", "because"), checks)
     if overlays:
-        yield "<h2>The shell's edges on the photographs</h2><p>They must lie on the photographed ones, at both ends of "
-        yield "the building as well. The pointer on a picture hides them.</p>"
+        yield "<h2>The shell's edges on the photographs</h2><p>They must lie on the photographed edges, also at both "
+        yield "ends of the building. Hover over an image to hide them.</p>"
         yield f'<div class="views">{"".join(overlays)}</div>'
     if "distances" in plots:
         shares = ", ".join(f"{validation.share_within(d):.0%} within {100 * d:.0f} cm" for d in (0.05, 0.10, 0.20))
@@ -150,8 +150,8 @@ def _page(
         yield f"{100 * validation.bias:+.1f} cm along the normal, positive in front of the shell.</p>"
         yield _img(plots["distances"], "histogram of the distances")
     if "shifts" in plots:
-        yield "<h2>One bay further along?</h2><p>How well the shell fits the points where it is moved along the facade "
-        yield f"and upwards. Another peak as high as {RIVALRY:.0%} of the one at 0 makes the alignment ambiguous.</p>"
+        yield "<h2>Bay test</h2><p>Fit of the shell to the points when it is shifted along the facade and upwards. "
+        yield f"Another peak of {RIVALRY:.0%} or more of the one at 0 makes the alignment ambiguous.</p>"
         yield _img(plots["shifts"], "fit by shift")
         rows = (
             (scan.name, f"{k:+d} × {scan.period:.2f} m", f"{fit:.2f}")
@@ -160,7 +160,7 @@ def _page(
         yield _table(("direction", "shift", "fit, relative"), rows)
     if validation.test is not None:
         evidence = validation.test.evidence
-        yield f"<h2>What the points can tell</h2><p>Condition number of the fit {evidence.condition:.3g} over "
+        yield f"<h2>What the points determine</h2><p>Condition number of the fit {evidence.condition:.3g} over "
         yield f"{evidence.points} points; strengths of its seven directions: "
         yield ", ".join(f"{strength:.2g}" for strength in evidence.strengths) + ".</p>"
     if validation.correspondences:
@@ -171,13 +171,13 @@ def _page(
         (escape(s.view.name), f"{s.supported:.0%}", len(s.errors), f"{100 * s.error:.1f} cm", f"{s.occluded:.0%}")
         for s in validation.views
     )
-    yield _table(("view", "on the shell", "SfM points there", "median depth error", "hidden by things before it"), rows)
+    yield _table(("view", "on the shell", "SfM points there", "median depth error", "occluded"), rows)
 
 
 def residual_table(points: Sequence[Correspondence]) -> list[tuple[str, ...]]:
-    """The head of a table and a row for each point: what is left of it, and of a pick how the photographs agree."""
+    """Header and one row per point: its residuals, and for a pick its reprojection error."""
     picked = [point for point in points if isinstance(point, PickedPoint)]
-    table = [("point", "residual", "without it", *(("in the picture", "worst photograph") if picked else ()), "")]
+    table = [("point", "residual", "leave-one-out", *(("reprojection", "worst photograph") if picked else ()), "")]
     for point in points:
         remark = "check point" if point.held_out else "" if point.is_used else "left out"
         without = "–" if np.isnan(point.left_out_residual) else f"{point.left_out_residual:.3f} m"

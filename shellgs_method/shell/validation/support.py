@@ -1,4 +1,4 @@
-"""What each view sees of the shell, and how its SfM points agree with that."""
+"""The part of the shell visible in each view, and how well the view's SfM points agree with it."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints
 
 NEAR = 1.0
-"""Metres from the shell within which an SfM point is taken to be of the building or of something just before it."""
+"""Metres from the shell within which an SfM point counts as part of the building or of something just in front."""
 OCCLUDING = 0.3
-"""Metres in front of the shell from which a point is of something that hides it."""
+"""Metres in front of the shell from which a point belongs to an occluder."""
 _THUMBNAIL = 320  # pixels
 _MAX_HITS = 500
 
 
 @dataclass(frozen=True)
 class ViewSupport:
-    """What one view sees of the shell; positions are in the survey frame.
+    """The part of the shell visible in one view; positions are in the survey frame.
 
     Attributes:
         view: the view.
         supported: share of its pixels on the shell.
-        hits: some of the places on the shell that it sees.
-        normals: of the shell there, facing the view.
-        distance: median depth of the shell in metres; NaN where the view does not see it.
-        errors: depth of the view's SfM points less the shell's in the same pixel, in metres.
+        hits: sample of the visible points of the shell.
+        normals: normals of the shell there, facing the view.
+        distance: median depth of the shell in metres; NaN if it is not visible.
+        errors: depth of the view's SfM points minus the shell's in the same pixel, in metres.
     """
 
     view: View
@@ -46,18 +46,18 @@ class ViewSupport:
 
     @property
     def error(self) -> float:
-        """Median depth error of the points within a metre of the shell, in metres; NaN without any."""
+        """Median depth error of the points within a metre of the shell, in metres; NaN if there are none."""
         near = np.abs(self.errors[np.abs(self.errors) < NEAR])
         return float(np.median(near)) if len(near) else float("nan")
 
     @property
     def occluded(self) -> float:
-        """Share of the points not behind the shell that stand before it, where it is hidden therefore."""
+        """Share of points in front of the shell, where it is occluded, among all points not behind it."""
         before = self.errors[self.errors < NEAR] < -OCCLUDING
         return float(before.mean()) if len(before) else 0.0
 
     def span(self, axis: Float64[np.ndarray, " 3"]) -> tuple[float, float]:
-        """Where along an axis the part of the shell that it sees begins and ends, in metres."""
+        """Start and end of the visible part of the shell along an axis, in metres."""
         along = self.hits @ axis
         return float(along.min()), float(along.max())
 
@@ -68,7 +68,7 @@ def look(
     points: SparsePoints,
     survey_from_scene: Float64[np.ndarray, "4 4"],
 ) -> ViewSupport:
-    """Cast the shell into a thumbnail of the view and compare its SfM points, both where its mask keeps them."""
+    """Cast the shell into a thumbnail of the view, and compare it with the view's SfM points inside its mask."""
     thumbnail = view.camera.shrunk(_THUMBNAIL)
     metres = float(np.cbrt(np.linalg.det(survey_from_scene[:3, :3])))
     cue = caster.cast(thumbnail)
@@ -96,7 +96,7 @@ def look(
 def representative(
     supports: Sequence[ViewSupport], axis: Float64[np.ndarray, " 3"], count: int = 8
 ) -> list[ViewSupport]:
-    """Views spread over the facade, from the one that shows its left end best to that of its right end."""
+    """Select views spread over the facade, from the best one of its left end to the best one of its right end."""
     seeing = [support for support in supports if len(support.hits)]
     if len(seeing) <= count:
         return sorted(seeing, key=lambda s: sum(s.span(axis)))

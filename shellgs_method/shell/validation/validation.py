@@ -1,6 +1,6 @@
-"""Whether an alignment can be trusted, from the SfM points and the cameras alone: metrics, limits, verdict.
+"""Validate an alignment from the SfM points and the cameras alone: metrics, limits, verdict.
 
-Everything is measured before any training and against what was there before the alignment, never tuned on results.
+All metrics are measured before training, on data that do not depend on the alignment; no limit is tuned on results.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _ORDER: tuple[Verdict, ...] = ("good", "doubtful", "refused")
 
 @dataclass(frozen=True)
 class Limit:
-    """What a metric must be: good as far as ``good``, refused beyond ``refused``, doubtful between the two."""
+    """Limits of a metric: good up to ``good``, refused beyond ``refused``, doubtful in between."""
 
     good: float
     refused: float
     why: str
 
-    def judge(self, value: float) -> Verdict:
-        """The verdict on a value; NaN is refused."""
+    def verdict(self, value: float) -> Verdict:
+        """Return the verdict on a value; NaN is refused."""
         sign = 1 if self.good <= self.refused else -1
         if sign * value <= sign * self.good:
             return "good"
@@ -50,33 +50,31 @@ class Limit:
 
 
 LIMITS = {
-    "distance": Limit(300.0, 2000.0, "a facade is photographed from metres, not millimetres or kilometres"),
-    "closeness": Limit(0.5, 0.1, "a facade is photographed from metres, not millimetres or kilometres"),
-    "views": Limit(0.25, 0.01, "the shell supervises only the views it is in"),
-    "points": Limit(200, 30, "fewer SfM points than this beside the shell prove little"),
-    "share": Limit(
-        0.55, 0.30, "SfM points of a wall scatter by 1 to 3 cm; a wall in the wrong place has 10 to 25 % near it"
-    ),
+    "distance": Limit(300.0, 2000.0, "facades are photographed from metres away, not millimetres or kilometres"),
+    "closeness": Limit(0.5, 0.1, "facades are photographed from metres away, not millimetres or kilometres"),
+    "views": Limit(0.25, 0.01, "the shell supervises only the views that it is visible in"),
+    "points": Limit(200, 30, "fewer SfM points near the shell prove little"),
+    "share": Limit(0.55, 0.30, "SfM points of a wall scatter by 1 to 3 cm; a misplaced wall has 10 to 25 % near it"),
     "bias": Limit(
-        0.025, 0.15, "5 cm out of the wall is 3 times the scatter; sills and frames shift the median by 1 cm"
+        0.025, 0.15, "5 cm along the normal is 3 times the scatter; sills and frames shift the median by 1 cm"
     ),
     "pull": Limit(
         0.03,
         0.25,
-        "5 cm sideways turn the supervision at the shell's edges by 5.6° on average; --refine makes that motion",
+        "a shift of 5 cm sideways turns the normals at the shell's edges by 5.6° on average; --refine removes it",
     ),
-    "weak": Limit(0, 7, "a bare wall cannot tell along it from truth: only pictures or picked points can"),
-    "rival": Limit(RIVALRY, BETTER, "on repeated windows a bay further along fits almost as well"),
-    "check": Limit(0.10, 0.50, "a careful pick is good to 3 to 5 cm"),
+    "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
+    "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
+    "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
 }
 """All thresholds of the verdict, with their reasons."""
 
-_REACH = 0.25  # metres that the test refinement looks around
+_REACH = 0.25  # metres: reach of the test refinement
 
 
 @dataclass(frozen=True)
 class Check:
-    """One metric and what it says."""
+    """One metric with its verdict."""
 
     name: str
     value: str
@@ -90,15 +88,15 @@ class Validation:
     """All metrics of an alignment.
 
     Attributes:
-        alignment: what is judged.
+        alignment: the alignment.
         checks: metrics with a verdict each.
-        views: what each view sees.
+        views: the visible part of the shell in each view.
         axes: right, up and out of the facade in the survey frame, as rows.
-        signed: distances in metres of the SfM points within :data:`NEAR`, positive in front of the shell.
-        near: share of all SfM points that these are.
-        scans: the shell moved along the facade and upwards.
-        test: where refinement would take the alignment; None where too few points are near.
-        correspondences: picks or camera positions and their residuals, where there are any.
+        signed: signed distances in metres of the SfM points within :data:`NEAR`, positive in front of the shell.
+        near: share of these among all SfM points.
+        scans: fit at shifts along the facade and upwards.
+        test: test refinement of the alignment; None if too few points are near the shell.
+        correspondences: picks or camera positions and their residuals, if any.
     """
 
     alignment: Alignment
@@ -113,27 +111,27 @@ class Validation:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the checks'."""
+        """Worst verdict of the checks."""
         return _ORDER[max(_ORDER.index(check.verdict) for check in self.checks)]
 
     @property
     def reasons(self) -> list[str]:
-        """The checks that are not good, the worst first."""
+        """Checks that are not good, the worst first, in words."""
         faults = sorted((c for c in self.checks if c.verdict != "good"), key=lambda c: -_ORDER.index(c.verdict))
         return [f"{check.name}: {check.value} ({check.limits}); {check.why}" for check in faults]
 
     def share_within(self, metres: float) -> float:
-        """Share of the points near the shell that are this close to it."""
+        """Share of the points near the shell that are less than ``metres`` from it."""
         return float((np.abs(self.signed) < metres).mean()) if len(self.signed) else 0.0
 
     @property
     def bias(self) -> float:
-        """Median signed distance of the points within 30 cm, in metres; NaN without any."""
+        """Median signed distance of the points within 30 cm, in metres; NaN if there are none."""
         close = self.signed[np.abs(self.signed) < OCCLUDING]
         return float(np.median(close)) if len(close) else float("nan")
 
     def metrics(self) -> dict[str, float | None]:
-        """The main numbers, for json."""
+        """Main metrics, for json."""
         values = {f"within_{round(100 * d)}cm": self.share_within(d) for d in (0.05, 0.10, 0.20)}
         values |= {"bias_m": self.bias, "near": self.near, "metres_per_unit": self.alignment.metres_per_unit}
         if self.test is not None:
@@ -151,14 +149,14 @@ def validate(
     points: SparsePoints,
     correspondences: Sequence[Correspondence] = (),
 ) -> Validation:
-    """Measure an alignment.
+    """Validate an alignment.
 
     Args:
         mesh: the shell in its own frame.
-        alignment: where it stands.
+        alignment: the alignment.
         views: all photographs.
         points: the SfM points.
-        correspondences: residuals of picks or camera positions, if there are any.
+        correspondences: picks or camera positions with their residuals, if any.
     """
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     survey_from_scene = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
@@ -193,10 +191,10 @@ def validate(
         test=test,
         correspondences=correspondences,
     )
-    return replace(measured, checks=[sight, size, *_judge(measured)])
+    return replace(measured, checks=[sight, size, *_checks(measured)])
 
 
-def _judge(measured: Validation) -> Iterator[Check]:
+def _checks(measured: Validation) -> Iterator[Check]:
     yield _check("points", len(measured.signed), "SfM points within 1 m of the shell", "{:.0f}")
     yield _check("share", measured.share_within(0.10), "SfM points within 1 m, share within 10 cm", "{:.0%}")
     yield _check("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
@@ -204,10 +202,11 @@ def _judge(measured: Validation) -> Iterator[Check]:
         evidence = measured.test.evidence
         yield _check("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
         words = "; ".join(evidence.in_words(measured.axes))
-        yield _check("weak", int(evidence.weak.sum()), "Directions the points cannot tell", f"{{:.0f}} {words}".strip())
+        name = "Directions the points do not determine"
+        yield _check("weak", int(evidence.weak.sum()), name, f"{{:.0f}} {words}".strip())
     for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
-        yield _check("rival", fit, f"Fit {shift:+.1f} m {scan.name}, relative", "{:.2f}")
+        yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.2f}")
     if held_out := [p.residual for p in measured.correspondences if p.held_out]:
         yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
 
@@ -218,18 +217,18 @@ def _check(key: str, value: float, name: str, form: str) -> Check:
     percent = "%" in form
     good, refused = (f"{value:.0%}" if percent else f"{value:g}" for value in (limit.good, limit.refused))
     limits = f"good {sign} {good}, refused beyond {refused}"
-    return Check(name, form.format(value), limits, limit.judge(value), limit.why)
+    return Check(name, form.format(value), limits, limit.verdict(value), limit.why)
 
 
 def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.ndarray:
-    """Right, up and out of the facade that the views see most of."""
+    """Right, up and out of the facade that is most visible in the views."""
     up = survey_from_scene[:3, :3] @ upwards(support.view.camera for support in seeing)
     normals = np.concatenate([support.normals for support in seeing])
     return facade_axes(normals, up / np.linalg.norm(up))
 
 
 def _signed_distances(surface: ShellSurface, points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
-    """Distances of points from the shell, positive on the side of the nearest camera."""
+    """Distance of each point from the shell, positive on the side of the nearest camera."""
     closest = surface.closest(points)
     towards = cameras[KDTree(cameras).query(closest.foot)[1]] - closest.foot
     normal = closest.normal * np.sign(np.einsum("nd,nd->n", closest.normal, towards))[:, None]
