@@ -1,7 +1,7 @@
-"""Time the casting of shell maps against the ray caster alone: the same mesh, cameras and rays, without any output.
+"""Time the casting of shell maps against the ray caster alone, which casts the same rays at the same mesh.
 
-Both take turns, round after round, so that what else the machine does meets them alike. A second table gives the peak
-of resident memory of fresh processes that cast few and many views (Linux).
+Both take turns in every round, so that other load on the machine affects them alike. Then the peak resident memory of
+fresh processes that cast few and many views is printed (Linux).
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Benchmark:
     """What to time.
 
     Attributes:
-        size: of the maps.
-        subdivisions: of the shell's triangles, each into four.
-        views: cast in each round.
-        rounds: that both contenders are timed, after one that is not.
-        memory: numbers of views whose peak of memory is measured.
+        size: size of the maps.
+        subdivisions: times that the shell's triangles are subdivided, each into four.
+        views: number of views in each round.
+        rounds: timed rounds, after one that is not timed.
+        memory: numbers of views to measure the peak memory for.
     """
 
     size: str = "1898x1066"
@@ -58,7 +58,7 @@ def make_shell(subdivisions: int) -> ShellMesh:
 
 
 def make_views(n: int, size: str) -> list[View]:
-    """A walk past it, of a camera held by hand."""
+    """Views of a hand-held camera moving past the facade."""
     width, height = map(int, size.split("x"))
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]], dtype=torch.float64)
     rng, views = np.random.default_rng(0), []
@@ -72,7 +72,7 @@ def make_views(n: int, size: str) -> list[View]:
 
 
 def cast_maps(mesh: ShellMesh, views: list[View]) -> float:
-    """Seconds in which the shell is read and the maps of all views are written."""
+    """Seconds to read the shell and write the maps of all views."""
     with tempfile.TemporaryDirectory() as folder:
         vertices, faces = o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces)
         o3d.io.write_triangle_mesh(f"{folder}/shell.ply", o3d.geometry.TriangleMesh(vertices, faces))
@@ -88,15 +88,15 @@ def cast_bare(caster: ShellCaster, rays: list[o3d.core.Tensor]) -> float:
 
 
 def peak_memory(benchmark: Benchmark, n: int) -> float:
-    """MB resident at the peak of a process that casts n views."""
+    """Peak resident memory in MB of a process that casts n views."""
     cast_maps(make_shell(benchmark.subdivisions), make_views(n, benchmark.size))
-    # Not ru_maxrss, which a process inherits from the one that started it.
+    # Not ru_maxrss, which a process inherits from its parent.
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return int(status["VmHWM"].split()[0]) / 1024
 
 
 def main(benchmark: Benchmark) -> None:
-    """Time, measure, print."""
+    """Print the times and the peak memory."""
     console = Console()
     mesh, views = make_shell(benchmark.subdivisions), make_views(benchmark.views, benchmark.size)
     caster = ShellCaster(mesh, np.eye(4))
@@ -118,7 +118,7 @@ def main(benchmark: Benchmark) -> None:
     for n in benchmark.memory:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
             peak = process.submit(peak_memory, benchmark, n).result()
-        console.print(f"peak of resident memory with {n} views: {peak:.0f} MB", highlight=False)
+        console.print(f"peak resident memory with {n} views: {peak:.0f} MB", highlight=False)
 
 
 if __name__ == "__main__":

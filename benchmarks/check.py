@@ -1,4 +1,4 @@
-"""How much of what stands before the shell the photographs find, on the synthetic facade, whose truth is known.
+"""How much geometry in front of the shell the photographs reveal, on the synthetic facade with its true geometry.
 
 python -m benchmarks.check --width 640
 """
@@ -22,7 +22,7 @@ from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.scene import Facade
 
 NEARER = 0.1
-"""Metres by which the truth is nearer than the shell where it should be found."""
+"""Metres by which the true geometry must be nearer than the shell to count."""
 
 
 def main(width: int = 320, views: int = 40, seed: int = 0) -> None:

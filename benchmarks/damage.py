@@ -1,4 +1,4 @@
-"""Random damage to the files of a scene, by the thousand: what is refused, used, and what breaks.
+"""Damage the files of a scene at random, thousands of times: count what is refused, what is used, and what breaks.
 
 python -m benchmarks.damage --cases 2000
 """
@@ -30,14 +30,14 @@ from broken import KINDS, Workbench, outcome
 
 def main(
     cases: int = 2000,
-    kinds: Annotated[tuple[str, ...], tyro.conf.arg(help="What is damaged. If not set: everything.")] = tuple(KINDS),
+    kinds: Annotated[tuple[str, ...], tyro.conf.arg(help="Kinds of files to damage. If not set: all.")] = tuple(KINDS),
     start: int = 0,
 ) -> None:
-    """Count what comes of damaged scenes.
+    """Count the outcomes for damaged scenes.
 
     Args:
-        cases: In all, evenly over the kinds.
-        kinds: What is damaged.
+        cases: Number of cases, divided evenly among the kinds.
+        kinds: Kinds of files to damage.
         start: Seed.
     """
     table = Table("damaged", "cases", "refused", "used", "broken", "slowest (s)", "memory (MB)", title="Damaged scenes")
@@ -57,7 +57,7 @@ def main(
 
 
 def _damage(bench: Workbench, kind: str, cases: int, start: int, broken: Counter[str]) -> tuple[Counter[str], float]:
-    """What the cases of one kind come to, and how long the slowest took; errors are added to ``broken``."""
+    """Outcomes of the cases of one kind, and seconds of the slowest; errors are added to ``broken``."""
     counts: Counter[str] = Counter()
     slowest = 0.0
 

@@ -1,10 +1,10 @@
-"""Let the disk be full in the middle of commands: each must end in a sentence, and nothing that was there be lost.
+"""Fill the disk in the middle of commands: each must end with one sentence, and no existing file may be lost.
 
     mkdir /tmp/small && mount -t tmpfs -o size=60m tmpfs /tmp/small
     python -m benchmarks.full_disk /tmp/small
 
-The disk is filled up but for a part of what a command is going to write. Then there is room again, and the same command
-must finish.
+The disk is filled except for a share of what a command is going to write. Then there is room again, and the same
+command must finish.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rich.table import Table
 from benchmarks.kills import COMMANDS, is_record, preload, prepare, start
 
 SHARES = (0.0, 0.05, 0.3, 0.6, 0.9)
-"""Of what a command writes, for which there is room."""
+"""Shares of what a command writes that there is room for."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class FullDisk:
     """Which disk to fill.
 
     Attributes:
-        disk: folder of a small one, which is empty.
-        commands: to try; those before them are run where there is room.
+        disk: empty folder on a small disk.
+        commands: commands to test; those before them are run where there is room.
     """
 
     disk: Annotated[Path, tyro.conf.Positional]
@@ -45,13 +45,13 @@ class FullDisk:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Hashes of all files, but for records of what was done."""
+    """Hashes of all files except logs."""
     files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
     return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items() if not is_record(name)}
 
 
 def given(command: str, folder: Path, log: Path) -> tuple[int, list[str]]:
-    """Exit status and last words of a command."""
+    """Exit status and output lines of a command."""
     log.unlink(missing_ok=True)
     process = start(command, folder, log)
     process.join()
@@ -59,7 +59,7 @@ def given(command: str, folder: Path, log: Path) -> tuple[int, list[str]]:
 
 
 def faults(command: str, before: Path, disk: Path, room: int, log: Path) -> list[str]:
-    """What is wrong with a command whose disk has so many bytes for it."""
+    """What is wrong after a command with ``room`` bytes on its disk."""
     work = Path(shutil.copytree(before, disk / "work", symlinks=True))
     there, free = contents(work), shutil.disk_usage(disk).free
     with (disk / "ballast").open("wb") as ballast:
@@ -80,7 +80,7 @@ def faults(command: str, before: Path, disk: Path, room: int, log: Path) -> list
 
 
 def main(config: FullDisk, folder: Path, console: Console) -> bool:
-    """Try each command with some shares of the room that it needs; whether all is well."""
+    """Test each command with shares of the room that it needs; return whether all pass."""
     before, well = folder / "0", True
     before.mkdir()
     with redirect_stdout(io.StringIO()):
@@ -106,12 +106,12 @@ def main(config: FullDisk, folder: Path, console: Console) -> bool:
 
 
 def size(folder: Path) -> int:
-    """Bytes on disk, in whole pages."""
+    """Size of a folder on disk in bytes, in whole pages."""
     return sum(-(-path.stat().st_size // 4096) * 4096 for path in folder.rglob("*") if path.is_file())
 
 
 def run(words: Sequence[str]) -> bool:
-    """From the command line."""
+    """Parse the command line and run."""
     config = tyro.cli(FullDisk, description=__doc__, args=list(words))
     with tempfile.TemporaryDirectory() as made:
         return main(config, Path(made), Console(width=150))

@@ -1,7 +1,7 @@
-"""What an iteration costs on a CUDA device: ShellGS's two backends against gsplat called as splatfacto calls it.
+"""Time an iteration on a CUDA device: ShellGS's two backends against gsplat called as splatfacto calls it.
 
-Forward and backward from the parameters to a picture: SH of degree 3, and for ShellGS normals and depths besides. The
-contestants take turns; the figures are medians, and ratios to splatfacto's.
+Forward and backward from the parameters to an image: SH of degree 3, and for ShellGS also normals and depth. The
+contenders take turns; the results are medians, and ratios to splatfacto's.
 
     python -m benchmarks.gpu --n 200000 --width 960 --height 540
 """
@@ -24,7 +24,7 @@ from shellgs_method.rasterizer.gsplat_backend import Backend
 
 
 def parameters(scene: Scene) -> dict[str, Tensor]:
-    """The splats of a scene as splatfacto holds them, on the device."""
+    """The splats of a scene as splatfacto's parameters, on the device."""
     held = {
         "means": scene.means,
         "quats": scene.quats,
@@ -37,7 +37,7 @@ def parameters(scene: Scene) -> dict[str, Tensor]:
 
 def splatfacto(splats: dict[str, Tensor], camera: Camera) -> Tensor:
     """Colours and expected depth."""
-    picture, alpha, _ = rasterization(
+    image, alpha, _ = rasterization(
         *(splats["means"], splats["quats"], splats["scales"].exp(), splats["opacities"].sigmoid()),
         *(splats["harmonics"], camera.viewmat[None], camera.K[None], camera.width, camera.height),
         packed=False,
@@ -45,7 +45,7 @@ def splatfacto(splats: dict[str, Tensor], camera: Camera) -> Tensor:
         sh_degree=3,
         absgrad=True,
     )
-    return torch.cat([picture[0], alpha[0]], dim=-1)
+    return torch.cat([image[0], alpha[0]], dim=-1)
 
 
 def shellgs(backend: Backend, splats: dict[str, Tensor], camera: Camera) -> Tensor:
@@ -69,38 +69,38 @@ def shellgs(backend: Backend, splats: dict[str, Tensor], camera: Camera) -> Tens
 def milliseconds(
     render: Callable[[dict[str, Tensor], Camera], Tensor], splats: dict[str, Tensor], camera: Camera
 ) -> float:
-    """Of one iteration, between two events of the device."""
+    """Duration of one iteration, between two CUDA events."""
     start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     for parameter in splats.values():
         parameter.grad = None
     start.record()
-    picture = render(splats, camera)
-    picture.backward(torch.ones_like(picture))
+    image = render(splats, camera)
+    image.backward(torch.ones_like(image))
     end.record()
     end.synchronize()
     return start.elapsed_time(end)
 
 
 def main(n: int = 200_000, width: int = 960, height: int = 540, rounds: int = 20) -> None:
-    """Time the contestants in turns.
+    """Time the contenders in turns.
 
     Args:
-        n: splats.
-        width: of the picture in pixels.
-        height: of the picture in pixels.
-        rounds: in each of which every contestant has one iteration, after two that do not count.
+        n: number of splats.
+        width: image width in pixels.
+        height: image height in pixels.
+        rounds: timed iterations of each contender, after two that are not timed.
     """
     if not torch.cuda.is_available():
         raise SystemExit("This benchmark needs a CUDA device.")
     camera, splats = make_camera(width, height).to("cuda"), parameters(make_scene(n))
-    contestants = {
+    contenders = {
         "splatfacto": splatfacto,
         "shellgs, gsplat": partial(shellgs, "gsplat"),
         "shellgs, torch": partial(shellgs, "torch"),
     }
-    times: dict[str, list[float]] = {name: [] for name in contestants}
+    times: dict[str, list[float]] = {name: [] for name in contenders}
     for i in range(rounds + 2):
-        for name, render in contestants.items():
+        for name, render in contenders.items():
             time = milliseconds(render, splats, camera)
             if i >= 2:
                 times[name].append(time)

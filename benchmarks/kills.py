@@ -1,11 +1,11 @@
-"""Kill commands at random moments, give them again, and hold the results against those of commands left in peace.
+"""Kill commands at random moments, run them again, and compare the results with those of undisturbed runs.
 
-Every command works on a small synthetic scene, on one thread. SIGKILL leaves no time to tidy up. A training or a
-comparison goes on from its last checkpoint; the others simply begin again.
+Every command works on a small synthetic scene, on one thread. SIGKILL leaves no time to clean up. A training or a
+comparison resumes from its last checkpoint; the other commands start over.
 
-Each command is left in peace twice. Files that come out the same then, byte for byte (checkpoints number for number),
-must do so after a kill. The others are named; of them meshes are compared in any order of their triangles, JSON but for
-the last digits, and what differs even so between two commands left in peace is not compared.
+Each command first runs undisturbed twice. Files that are then identical, byte for byte (checkpoints number for number),
+must be so after a kill. The others are listed; among them meshes are compared in any order of their triangles and JSON
+up to the last digits, and what still differs between two undisturbed runs is not compared.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ COMMANDS = {
     "compare": "shellgs compare scene --methods photo-gs --iterations 60 --curve-points 0",
     "capture": "shellgs capture photographs captured",
 }
-"""In the order in which each finds what it needs."""
+"""Commands, ordered so that each finds what it needs."""
 RESULTS = {
     "align": ["scene/shell/alignment.json"],
     "cast": ["scene/cues/shell", "scene/cues/checked"],
@@ -68,10 +68,10 @@ class Kills:
     """What to kill.
 
     Attributes:
-        kills: of each command.
-        commands: that are killed; those before them are run in peace.
-        seed: of the moments.
-        keep: folder for what is made, else a temporary one that is removed.
+        kills: kills of each command.
+        commands: commands to kill; those before them only run undisturbed.
+        seed: seed of the moments.
+        keep: folder to keep the output in; a temporary folder if not set.
     """
 
     kills: int = 10
@@ -82,7 +82,7 @@ class Kills:
 
 @dataclass
 class Tally:
-    """What came of killing one command."""
+    """Counts for one command that is killed."""
 
     kills: int = 0
     finished: int = 0
@@ -91,7 +91,7 @@ class Tally:
 
 
 def words_of(command: str) -> list[str]:
-    """As a user types it, who goes on with a training where there is a checkpoint."""
+    """The command's arguments, with --load-dir to resume a training that has a checkpoint."""
     words = COMMANDS[command].split()
     if command == "train" and any(CHECKPOINTS.glob("step-*.ckpt")):
         words += ["--load-dir", str(CHECKPOINTS)]
@@ -99,7 +99,7 @@ def words_of(command: str) -> list[str]:
 
 
 def act(command: str, folder: Path, log: Path) -> None:
-    """Give a command in this process, in a folder; its words go to a log."""
+    """Run a command in this process, in a folder; its output goes to a log."""
     from nerfstudio.scripts import train
 
     from shellgs_method import cli
@@ -118,14 +118,14 @@ def act(command: str, folder: Path, log: Path) -> None:
 
 
 def start(command: str, folder: Path, log: Path) -> Any:
-    """The same in a process of its own, which has all imports already."""
+    """Run a command in a process of its own, which has all imports already."""
     process = multiprocessing.get_context("forkserver").Process(target=act, args=(command, folder, log))
     process.start()
     return process
 
 
 def prepare(folder: Path, captured: bool) -> None:
-    """A scene without maps, the matrix of its shell, and photographs that cameras can be found of, if they must."""
+    """Write a scene without maps, the matrix of its shell, and if ``captured`` photographs for SfM."""
     from shellgs_method.shell import ALIGNMENT, Alignment
     from shellgs_method.synthetic import FacadeConfig, write_scene
 
@@ -145,7 +145,7 @@ def files(folder: Path) -> set[str]:
 
 
 def differences(command: str, here: Path, there: Path, loosely: Collection[str] = ()) -> Iterator[str]:
-    """Results of a command that are not the same in two folders; some need not be so byte for byte."""
+    """Results of a command that differ in two folders; those in ``loosely`` need not be equal byte for byte."""
     for result in RESULTS[command]:
         names = files(there / result) if (there / result).is_dir() else {""}
         for name in sorted(names):
@@ -156,14 +156,14 @@ def differences(command: str, here: Path, there: Path, loosely: Collection[str] 
 
 
 def same_file(one: Path, other: Path) -> bool:
-    """Byte for byte; checkpoints, which are zip files of another name, number for number."""
+    """Compare byte for byte; checkpoints, zip files that contain their name, number for number."""
     if one.suffix == ".ckpt":
         return same(torch.load(one, weights_only=True), torch.load(other, weights_only=True))
     return filecmp.cmp(one, other, shallow=False)
 
 
 def alike(one: Path, other: Path) -> bool:
-    """Meshes in any order of their triangles, JSON but for the last digits."""
+    """Compare meshes in any order of their triangles, JSON up to the last digits."""
     if one.suffix == ".ply":
         corners = (trimesh.load(path, process=False).triangles.reshape(-1, 9) for path in (one, other))  # pyright: ignore
         return np.array_equal(*(np.unique(np.round(each, 5), axis=0) for each in corners))
@@ -171,7 +171,7 @@ def alike(one: Path, other: Path) -> bool:
 
 
 def same(one: object, other: object) -> bool:
-    """Whether nested numbers and tensors are the same; those of JSON but for the last digits."""
+    """Whether nested numbers and tensors are the same; floats up to the last digits."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
@@ -182,13 +182,13 @@ def same(one: object, other: object) -> bool:
 
 
 @dataclass(frozen=True)
-class Peace:
-    """What comes of a command that is left in peace.
+class Undisturbed:
+    """Results of a command that runs undisturbed.
 
     Attributes:
         before, after: folders without and with its results.
-        seconds: it took.
-        unsteady: results that are not the same each time.
+        seconds: duration.
+        unsteady: results that differ from run to run.
         loose: those of them that are alike.
     """
 
@@ -204,8 +204,8 @@ class Peace:
         return set(self.unsteady) - set(self.loose)
 
 
-def leave(command: str, before: Path, after: Path) -> Peace:
-    """Give a command twice, and let it end."""
+def undisturbed(command: str, before: Path, after: Path) -> Undisturbed:
+    """Run a command to its end, twice."""
     seconds, again = [], after.with_name(f"{after.name}-again")
     for folder in (after, again):
         shutil.copytree(before, folder, symlinks=True)
@@ -214,19 +214,19 @@ def leave(command: str, before: Path, after: Path) -> Peace:
         process.join()
         seconds.append(time.perf_counter() - since)
         if process.exitcode != 0:
-            raise SystemExit(f"{command} fails when left in peace: see {log}")
+            raise SystemExit(f"{command} fails undisturbed: see {log}")
     unsteady = set(differences(command, again, after))
     loose = unsteady - set(differences(command, again, after, unsteady))
     shutil.rmtree(again)
-    return Peace(before, after, min(seconds), unsteady, loose)
+    return Undisturbed(before, after, min(seconds), unsteady, loose)
 
 
-def kill(command: str, peace: Peace, tally: Tally, moment: float, trial: Path, say: Callable) -> None:
-    """Start a command on a copy, kill it, give it again, and count."""
-    shutil.copytree(peace.before, trial, symlinks=True)
+def kill(command: str, reference: Undisturbed, tally: Tally, moment: float, trial: Path, say: Callable) -> None:
+    """Start a command on a copy, kill it, run it again, and count."""
+    shutil.copytree(reference.before, trial, symlinks=True)
     log = trial.with_suffix(".log")
     process = start(command, trial, log)
-    process.join(moment * peace.seconds)
+    process.join(moment * reference.seconds)
     if process.is_alive():
         process.kill()
     process.join()
@@ -237,10 +237,10 @@ def kill(command: str, peace: Peace, tally: Tally, moment: float, trial: Path, s
     again = start(command, trial, log)
     again.join()
     tally.finished += again.exitcode == 0
-    compared = set(differences(command, trial, peace.after, peace.loose))
-    wrong = sorted(compared - peace.not_compared)
+    compared = set(differences(command, trial, reference.after, reference.loose))
+    wrong = sorted(compared - reference.not_compared)
     tally.same += not wrong
-    litter = {name for name in files(trial) - files(peace.after) if not is_record(name)}
+    litter = {name for name in files(trial) - files(reference.after) if not is_record(name)}
     tally.litter += bool(litter)
     for what, names in (("differs", wrong), ("is left over", sorted(litter))):
         if names:
@@ -250,12 +250,12 @@ def kill(command: str, peace: Peace, tally: Tally, moment: float, trial: Path, s
 
 
 def is_record(name: str) -> bool:
-    """Whether a file is of what was done rather than of what came out: each start of a training writes its events."""
+    """Whether a file is a log rather than a result: each start of a training writes its events."""
     return "events.out.tfevents" in name or name.endswith((".log", "log.txt"))
 
 
 def main(config: Kills, folder: Path, console: Console) -> Sequence[Tally]:
-    """Everything in a folder; the table."""
+    """Run everything in a folder, and print the table."""
     dice = random.Random(config.seed)
     before, tallies = folder / "0", []
     before.mkdir()
@@ -267,27 +267,27 @@ def main(config: Kills, folder: Path, console: Console) -> Sequence[Tally]:
     table = Table("command", "seconds", "kills", "finished again", "same result", "with litter", "unsteady")
     last = max(list(COMMANDS).index(command) for command in config.commands)
     for number, command in enumerate(list(COMMANDS)[: last + 1], start=1):
-        peace = leave(command, before, folder / str(number))
-        if peace.unsteady:
-            console.print(f"{command}, left in peace twice, differs in {', '.join(sorted(peace.unsteady))}")
-        if peace.not_compared:
-            console.print(f"{command}: not compared are {', '.join(sorted(peace.not_compared))}")
+        reference = undisturbed(command, before, folder / str(number))
+        if reference.unsteady:
+            console.print(f"{command}, undisturbed, differs from run to run in {', '.join(sorted(reference.unsteady))}")
+        if reference.not_compared:
+            console.print(f"{command}: not compared: {', '.join(sorted(reference.not_compared))}")
         if command in config.commands:
             tally = Tally()
             for each in range(3 * config.kills):  # some moments come too late
                 if tally.kills < config.kills:
-                    kill(command, peace, tally, dice.random(), folder / f"{command}-{each}", console.print)
+                    kill(command, reference, tally, dice.random(), folder / f"{command}-{each}", console.print)
             tallies.append(tally)
-            numbers = (tally.kills, tally.finished, tally.same, tally.litter, len(peace.unsteady))
-            table.add_row(command, f"{peace.seconds:.1f}", *map(str, numbers))
+            numbers = (tally.kills, tally.finished, tally.same, tally.litter, len(reference.unsteady))
+            table.add_row(command, f"{reference.seconds:.1f}", *map(str, numbers))
             console.print(f"{command}: {tally}", highlight=False)
-        before = peace.after
+        before = reference.after
     console.print(table)
     return tallies
 
 
 def preload() -> None:
-    """Let the processes that commands are given in begin with all imports, on one thread, without a compiler."""
+    """Start the processes of commands with all imports, on one thread, without a compiler."""
     os.environ |= {"OMP_NUM_THREADS": "1", "SHELLGS_COMPILE": "0"}
     multiprocessing.get_context("forkserver").set_forkserver_preload(
         ["method_configs", "nerfstudio.scripts.train", "shellgs_method.cli", "shellgs_method.compare.results"]

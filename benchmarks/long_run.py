@@ -1,10 +1,10 @@
-"""Do memory, files and threads stay within bounds in long and large runs?
+"""Check that memory, open files and threads stay within bounds in long and large runs.
 
     python -m benchmarks.long_run steps views triangles
 
-``steps`` trains 20 000 steps at 64x36 and shows what the process holds at each tenth of the run; ``views`` trains on
-600 views of 1920x1080 (two kinds of maps, 27 GB in memory, which the disk must have half of); ``triangles`` casts a
-shell of 20 million triangles. Each is a process of its own, which is watched with its children (Linux).
+``steps`` trains 20 000 steps at 64x36 and prints what the process holds at each tenth of the run; ``views`` trains on
+600 views of 1920x1080 (two kinds of maps, 27 GB in memory and half of that on disk); ``triangles`` casts a shell of
+20 million triangles. Each runs in a process of its own, which is monitored with its children (Linux).
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 PLACES = 12
-"""Different photographs of the large scene: the others are these again, under names of their own."""
+"""Different photographs of the large scene: the others are copies under other names."""
 DRIFT = 0.02
-"""Share by which memory may grow from the middle of a long run to its end."""
+"""Largest relative growth of memory from the middle of a long run to its end."""
 CONSOLE = Console()
 
 
 @dataclass(frozen=True)
 class LongRun:
-    """What to try.
+    """What to run.
 
     Attributes:
-        cases: which of them.
-        steps: of the long training.
-        views: of the large scene.
-        size: of its photographs.
-        large_steps: trained on it.
-        triangles: of the large shell, at least.
-        folder: for the scenes, in a folder that is removed; that of temporary files if not set.
+        cases: which cases.
+        steps: steps of the long training.
+        views: views of the large scene.
+        size: size of its photographs.
+        large_steps: training steps on it.
+        triangles: minimum number of triangles of the large shell.
+        folder: folder for the temporary folders of the scenes; the system's if not set.
     """
 
     cases: Annotated[tuple[Literal["steps", "views", "triangles"], ...], tyro.conf.Positional] = (
@@ -80,7 +80,7 @@ class Held:
 
 
 def held_by(process: psutil.Process) -> Held:
-    """Now; what is shared counts for each."""
+    """What a process holds now; shared memory counts for each child."""
     megabytes, files, threads = 0.0, 0, 0
     with suppress(psutil.Error):
         for each in (process, *process.children(recursive=True)):
@@ -92,7 +92,7 @@ def held_by(process: psutil.Process) -> Held:
 
 
 def watched(words: Sequence[str], log: Path, look: Callable[[Held], None]) -> None:
-    """Run a command, looking at what it holds five times a second."""
+    """Run a command, and pass what it holds to ``look`` five times a second."""
     with log.open("w") as file:
         command = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.long_run", "--", *words], stdout=file, stderr=file
@@ -106,7 +106,7 @@ def watched(words: Sequence[str], log: Path, look: Callable[[Held], None]) -> No
 
 
 def peak_of(words: Sequence[str], log: Path) -> float:
-    """Most resident megabytes of a command, and the time that it took, are told."""
+    """Peak resident megabytes of a command; also prints its duration."""
     peaks, since = [0.0], time.perf_counter()
     watched(words, log, lambda held: peaks.append(held.megabytes))
     seconds = time.perf_counter() - since
@@ -115,13 +115,13 @@ def peak_of(words: Sequence[str], log: Path) -> float:
 
 
 def training(method: str, scene: Path, steps: int, *more: str) -> list[str]:
-    """Words of ns-train."""
+    """Arguments of ns-train."""
     words = ["ns-train", method, "--data", str(scene), "--output-dir", str(scene.parent / "outputs"), *more]
     return [*words, "--experiment-name", "x", "--timestamp", "run", "--max-num-iterations", str(steps)]
 
 
 def many_steps(config: LongRun, folder: Path) -> bool:
-    """A long training on a small scene: nothing may grow once the densification is over."""
+    """A long training on a small scene: nothing may grow after densification."""
     write_scene(folder / "scene", FacadeConfig(width=64, height=36, views=12, points=300, supersampling=1))
     cast(folder / "scene")
     events = folder / "outputs/x/shellgs-metric/run"
@@ -149,7 +149,7 @@ def many_steps(config: LongRun, folder: Path) -> bool:
 
 
 def done(run: Path) -> int:
-    """Steps that a training has saved."""
+    """Number of steps at a training's last checkpoint."""
     return max((int(path.stem[5:]) + 1 for path in run.glob("nerfstudio_models/step-*.ckpt")), default=0)
 
 
@@ -170,7 +170,7 @@ def many_views(config: LongRun, folder: Path) -> bool:
 
 
 def repeat(scene: Path, count: int) -> list[View]:
-    """Give each photograph of a scene many names, and return the views that it then has."""
+    """Repeat the photographs of a scene under other names, and return all views."""
     path = scene / "transforms.json"
     cameras = json.loads(path.read_text())
     frames = [dict(cameras["frames"][k % PLACES]) for k in range(count)]
@@ -186,7 +186,7 @@ def repeat(scene: Path, count: int) -> list[View]:
 
 
 def repeat_maps(scene: Path, kind: str, views: Sequence[View]) -> None:
-    """Maps of a kind for all views from the shell's of the places, packed once for each place."""
+    """Write maps of a kind for all views from the shell maps of the photographs, each packed once."""
     shell = CueMaps.open(scene, "shell")
     maps = shell if kind == "shell" else CueMaps.create(scene, kind, command="none", metres_per_unit=1.0)
     packed: dict[int, tuple[bytes, MapRecord]] = {}
@@ -208,7 +208,7 @@ def repeat_maps(scene: Path, kind: str, views: Sequence[View]) -> None:
 
 
 def without_record(file: Path) -> bytes:
-    """A map's file with its arrays alone."""
+    """A map's file without its record."""
     bare = io.BytesIO()
     with zipfile.ZipFile(file) as whole, zipfile.ZipFile(bare, "w") as archive:
         for info in whole.infolist():
@@ -233,7 +233,7 @@ def many_triangles(config: LongRun, folder: Path) -> bool:
 
 
 def divide(path: Path, count: int) -> int:
-    """Divide each triangle of a mesh into a lattice, so that there are so many or more; returns how many there are."""
+    """Subdivide each triangle of a mesh into a lattice until there are at least ``count``; return their number."""
     mesh = o3d.io.read_triangle_mesh(str(path))
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
     n = int(np.ceil(np.sqrt(count / len(corners))))
@@ -252,7 +252,7 @@ def divide(path: Path, count: int) -> int:
 
 
 def main(config: LongRun) -> bool:
-    """All that is asked for."""
+    """Run the chosen cases; return whether all stay within bounds."""
     tried = {"steps": many_steps, "views": many_views, "triangles": many_triangles}
     kept = {}
     for case in config.cases:
@@ -263,7 +263,7 @@ def main(config: LongRun) -> bool:
 
 
 def act(words: Sequence[str]) -> None:
-    """Give a command in this process, as its own entry point does."""
+    """Run a command in this process, as its own entry point does."""
     from nerfstudio.scripts import train
 
     from shellgs_method import cli

@@ -1,4 +1,4 @@
-"""The rasterizer's naive twin: the same pictures, tile after tile in eager torch, differentiated by autograd."""
+"""A naive twin of the rasterizer: the same renders, tile by tile in eager torch, differentiated by autograd."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def rasterize(
     camera: Camera,
     primitive: Literal["3d", "2d"] = "3d",
 ) -> tuple[Float[Tensor, "height width C"], Float[Tensor, "height width 1"], dict[str, Tensor]]:
-    """As :func:`shellgs_method.rasterizer.rasterize`, of whose info there are only the maps."""
+    """Same as :func:`shellgs_method.rasterizer.rasterize`, with only the maps in the info."""
     projection = PROJECT[primitive](means, quats, scales, opacities, [camera])
     values = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
     rows = []
@@ -37,8 +37,8 @@ def rasterize(
             width, height = min(TILE, camera.width - left), min(TILE, camera.height - top)
             row.append(_tile(projection, values, primitive, left, top, width, height))
         rows.append(torch.cat(row, dim=1))
-    picture = torch.cat(rows)
-    composited, alpha, maps = picture.tensor_split([features.shape[1], features.shape[1] + 1], dim=-1)
+    image = torch.cat(rows)
+    composited, alpha, maps = image.tensor_split([features.shape[1], features.shape[1] + 1], dim=-1)
     return composited, alpha, disc_maps(alpha, maps) if primitive == "2d" else {}
 
 
@@ -78,7 +78,7 @@ def _tile(
 
 
 def _touching(projection: Projection, left: int, top: int, width: int, height: int) -> Tensor:
-    """Splats with an outline whose box touches a tile."""
+    """Indices of the splats with an outline whose box touches a tile."""
     low, high = torch.tensor([left, top]), torch.tensor([left + width, top + height])
 
     outlines = projection.outlines[0]
@@ -96,7 +96,7 @@ def _meet(
     width: int,
     height: int,
 ) -> tuple[Float[Tensor, "pixels splats"], Float[Tensor, "pixels splats"]]:
-    """Exponents as the kernels have them, and inverse depths, which Gaussians do not have: 1."""
+    """Exponents as in the kernels, and inverse depths, which are 1 for Gaussians."""
     y, x = torch.meshgrid(torch.arange(top, top + height) + 0.5, torch.arange(left, left + width) + 0.5, indexing="ij")
     u, v = projection.means2d[0, splats].unbind(-1)
     dx, dy = x.reshape(-1, 1) - u, y.reshape(-1, 1) - v

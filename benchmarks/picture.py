@@ -1,4 +1,4 @@
-"""The README's picture, from a demo: a held-out photograph, photo-gs and shellgs-metric, their normals, and a mesh."""
+"""The README's image, from a demo: a held-out photograph, photo-gs and shellgs-metric, their normals, and a mesh."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from shellgs_method.evaluation.colours import normal_colours
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh
 
 LIGHT = np.array([-0.5, -0.6, -0.6]) / np.linalg.norm([0.5, 0.6, 0.6])
-"""Where the light comes from, in the camera's frame: the left, above and behind it."""
+"""Direction of the light, in the camera frame: from the left, above and behind."""
 ENLARGED = 2
 
 
 def picture(
     demo: Annotated[Path, tyro.conf.Positional], output: Annotated[Path, tyro.conf.Positional], view: int = 2
 ) -> None:
-    """Draw it.
+    """Draw the image.
 
     Args:
         demo: Folder that `shellgs demo` wrote.
-        output: The picture, png or jpg.
-        view: Which of the held-out views.
+        output: Output image, png or jpg.
+        view: Index of the held-out view.
     """
     photo, ours = (demo / "runs/scene" / name / name / "seed-0" for name in ("photo-gs", "shellgs-metric"))
     mesh = ours / "mesh.ply"
@@ -60,7 +60,7 @@ def picture(
 
 
 def mesh_image(scene: Path, path: Path, stem: str) -> UInt8[np.ndarray, "H W 3"]:
-    """A mesh that `shellgs mesh` wrote, in plaster, as the camera of a photograph sees it."""
+    """Shade a mesh that `shellgs mesh` wrote in grey, from the camera of a photograph."""
     mesh = trimesh.load(path, process=False)
     offset = np.array(json.loads(path.with_suffix(".json").read_text())["offset"])
     placed = ShellMesh(np.asarray(mesh.vertices, float) + offset, np.asarray(mesh.faces))

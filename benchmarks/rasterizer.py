@@ -1,7 +1,7 @@
 """Time the rasterizer: Gaussians and discs, few and many channels, against a naive twin in plain autograd.
 
-All contenders on a scene take turns, round after round, so that what else the machine does meets them alike; tables
-give the least and the median time of the rounds, and ratios of the least.
+All contenders on a scene take turns in every round, so that other load on the machine affects them alike; tables give
+the least and the median time of the rounds, and ratios of the least.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from benchmarks.scenes import Scene, make_camera, make_scene
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer import rasterize
 
-BACKWARD_UP_TO = 960 * 540  # pixels; larger pictures are only looked at
+BACKWARD_UP_TO = 960 * 540  # pixels; larger images are only rendered forward
 PROCESS = Path("/proc/self")  # Linux
 
 
@@ -38,16 +38,16 @@ class Benchmark:
 
     Attributes:
         splats: numbers of splats.
-        sizes: of the image, as 480x270; those larger than 960x540 forward only.
+        sizes: image sizes, as 480x270; those larger than 960x540 forward only.
         channels: numbers of features.
         primitives: Gaussians (3d), discs (2d).
-        rounds: that every contender is timed, after one that is not.
-        twin_up_to: number of splats up to which the twin takes part; it is slow.
-        threads: of torch.
-        memory: also measure it, in a fresh process for each row.
+        rounds: timed rounds, after one that is not timed.
+        twin_up_to: largest number of splats to time the twin on; it is slow.
+        threads: number of torch threads.
+        memory: also measure memory, in a fresh process for each row.
         save_scene: write the scene of the first number and size here (npz), for other programs, and stop.
-        scenes: files (npz) of scenes to time instead of the seeded ones, as ``benchmarks.step --save`` writes them of a
-            trained run; they have a camera of their own.
+        scenes: scene files (npz) to time instead of the seeded scenes, as ``benchmarks.step --save`` writes them for a
+            trained run; each has its own camera.
         figure: draw time against (splat, pixel) pairs here.
     """
 
@@ -74,7 +74,7 @@ class Case:
     primitive: Literal["3d", "2d"]
     n_features: int
     file: Path | None = None
-    """Of the scene, if it is not a seeded one."""
+    """File of the scene, if it is not a seeded one."""
 
     @functools.cached_property
     def scene(self) -> tuple[Scene, Camera]:
@@ -96,7 +96,7 @@ class Timing:
 
 
 def main(benchmark: Benchmark) -> None:
-    """Time every scene and print a table of each."""
+    """Time every scene and print a table for each."""
     torch.set_num_threads(benchmark.threads)
     sizes = [tuple(map(int, size.split("x"))) for size in benchmark.sizes]
     if benchmark.save_scene is not None:
@@ -121,7 +121,7 @@ def measured(file: Path) -> tuple[int, int, int, Path]:
 
 
 def time_in_turns(cases: list[Case], rounds: int, with_twins: bool) -> tuple[dict[Case, Timing], dict[Case, Timing]]:
-    """Timings of the rasterizer, and of its twin, which has fewer rounds."""
+    """Timings of the rasterizer and of its twin."""
     own = {case: prepare(case, rasterize) for case in cases}
     twins = {case: prepare(case, naive.rasterize) for case in cases} if with_twins else {}
     seconds: dict[Callable, list[tuple[float, float]]] = {run: [] for run in [*own.values(), *twins.values()]}
@@ -136,7 +136,7 @@ def time_in_turns(cases: list[Case], rounds: int, with_twins: bool) -> tuple[dic
 
 
 def prepare(case: Case, renderer: Callable[..., tuple[Tensor, Tensor, dict]]) -> Callable[[], tuple[float, float]]:
-    """A function that renders a case, backward too, and returns the seconds."""
+    """A function that renders a case, forward and backward, and returns the seconds of both."""
     scene, camera = case.scene
     splats = [each.requires_grad_(case.backward) for each in scene.splats(case.n_features)]
     generator = torch.Generator().manual_seed(7)
@@ -210,8 +210,8 @@ def tabulate(own: dict[Case, Timing], twins: dict[Case, Timing], memory: dict[Ca
     return table
 
 
-def _both(timing: Timing, figure: Callable[[tuple[float, ...]], float]) -> str:
-    return f"{figure(timing.forward):.1f} / {figure(timing.both):.1f}"
+def _both(timing: Timing, statistic: Callable[[tuple[float, ...]], float]) -> str:
+    return f"{statistic(timing.forward):.1f} / {statistic(timing.both):.1f}"
 
 
 def _ratios(timing: Timing, reference: Timing) -> str:
@@ -219,7 +219,7 @@ def _ratios(timing: Timing, reference: Timing) -> str:
 
 
 def draw(timings: dict[Case, Timing], path: Path) -> None:
-    """Time against pairs of all scenes, a colour for each primitive and number of channels."""
+    """Plot time against pairs over all scenes, with a colour for each primitive and number of channels."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     forward, both = figure.subplots(1, 2, sharey=True)
     for primitive, n_features in dict.fromkeys((case.primitive, case.n_features) for case in timings):

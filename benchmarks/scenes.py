@@ -1,4 +1,4 @@
-"""Scenes to time rasterizers on: a facade and the clutter before it, with footprints like those of trained scenes."""
+"""Scenes to time rasterizers on: a facade and clutter around it, with footprints like those of trained scenes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MEDIAN_RADIUS = {2_000: 8.0, 10_000: 6.0, 20_000: 5.3, 50_000: 4.5, 200_000: 3.3
 
 @dataclass(frozen=True)
 class Scene:
-    """Splats around z = 6 and before it; the spherical harmonics double as features."""
+    """Splats around z = 6 and clutter; the spherical harmonics double as features."""
 
     means: Float[Tensor, "N 3"]
     quats: Float[Tensor, "N 4"]
@@ -30,7 +30,7 @@ class Scene:
     sh: Float[Tensor, "N 16 3"]
 
     def splats(self, n_features: int) -> list[Tensor]:
-        """Arguments of ``rasterize`` before the camera, copied."""
+        """Copies of the arguments of ``rasterize`` that precede the camera."""
         features = self.sh.flatten(1)[:, :n_features]
         return [each.clone() for each in (self.means, self.quats, self.scales, self.opacities, features)]
 
@@ -51,7 +51,7 @@ class Scene:
 
 
 def make_scene(n: int, seed: int = 0) -> Scene:
-    """A scene of n splats, 70 % of them on the facade; between the tabled numbers footprints are interpolated."""
+    """A scene of n splats, 70 % of them on the facade; footprints are interpolated between the tabled numbers."""
     rng = np.random.default_rng(seed + n)
     n_facade = int(n * 0.7)
     n_clutter = n - n_facade
@@ -90,7 +90,7 @@ def make_scene(n: int, seed: int = 0) -> Scene:
 
 
 def make_camera(width: int, height: int) -> Camera:
-    """A camera near the origin that looks at the facade, turned a little so that nothing is aligned with its axes."""
+    """A camera near the origin that looks at the facade, rotated slightly so that nothing is aligned with its axes."""
     focal = 0.5 * width / math.tan(FIELD_OF_VIEW / 2)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     yaw, pitch = 0.06, -0.04

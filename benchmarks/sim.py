@@ -1,8 +1,8 @@
-"""The figures of `shellgs sim` on the synthetic facade, whose true geometry is known.
+"""Metrics of `shellgs sim` on the synthetic facade, whose true geometry is known.
 
     python -m benchmarks.sim outputs/scene/shellgs-metric/TIME/config.yml facade-sim/
 
-writes the folder, and prints lidar, budgets of parts, and how well the list of deviations names what the shell lacks.
+writes the folder, and prints lidar errors, budgets of parts, and how well the deviations show what the shell lacks.
 The run must be of the scene that `shellgs demo` makes. ``--coacd`` also decomposes the shell with CoACD (minutes).
 """
 
@@ -39,39 +39,39 @@ from shellgs_method.synthetic.scene import FacadeConfig
 BUDGETS = 256, 128, 64, 32, 16
 FANS = {"Ouster OS1, ±22.5°": (-22.5, 22.5), "Velodyne VLP-16, ±15°": (-15, 15), "Livox Mid-360, -7 to 52°": (-7, 52)}
 BEFORE = 0.03
-"""Metres that the true building stands before its shell where a deviation is one."""
+"""Metres in front of the shell from which the true building deviates from it."""
 _LAYOUT = Layout(FacadeConfig.bays, FacadeConfig.storeys)
 
 
 def main(
     config: Annotated[Path, tyro.conf.Positional], out: Annotated[Path, tyro.conf.Positional], coacd: bool = False
 ) -> None:
-    """Make the folder and print its figures.
+    """Write the folder and print its metrics.
 
     Args:
         config: config.yml of a run of the demo's scene.
-        out: the folder.
-        coacd: decompose the shell with CoACD too.
+        out: output folder.
+        coacd: also decompose the shell with CoACD.
     """
     console, started = Console(width=150), time.perf_counter()
-    figures, (chapter,) = simulate([config], out, SimSettings(), console.print, truths=[true_building])
+    metrics, (chapter,) = simulate([config], out, SimSettings(), console.print, truths=[true_building])
     console.print(f"{time.perf_counter() - started:.0f} s")
-    for sentence in figures["summary"]:
+    for sentence in metrics["summary"]:
         console.print(sentence, highlight=False)
     _fans(console, out, chapter)
     _budgets(console, chapter, coacd)
-    _named(console, chapter)
+    _deviations(console, chapter)
 
 
 def true_building(to_world: np.ndarray, materials: tuple[Material, ...] = ()) -> Surface:
-    """The synthetic building, or what of it is made of some materials, in the simulation's frame."""
+    """The synthetic building, or only its parts of some materials, in the simulation frame."""
     mesh = building(_LAYOUT)
     chosen = np.isin(mesh.material, materials) if materials else np.ones(len(mesh.triangles), bool)
     return Surface(transformed(mesh.vertices, to_world @ SCENE_FROM_BUILDING), mesh.triangles[chosen])
 
 
 def _fans(console: Console, out: Path, chapter: Chapter) -> None:
-    """Lidars of several fields of view."""
+    """Print lidar errors for several fields of view."""
     assert chapter.truth is not None
     front, usual = Front.of(chapter.collider.surface, chapter.made.eyes), engine.BEAMS
     for name, engine.BEAMS in FANS.items():
@@ -81,10 +81,10 @@ def _fans(console: Console, out: Path, chapter: Chapter) -> None:
 
 
 def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
-    """Colliders of the shell alone, by their number of parts."""
+    """Print metrics of collision geometry of the shell alone, by the number of parts."""
     shell, eyes = chapter.shell, chapter.made.eyes
     assert shell is not None
-    table = Table("collider", "parts", "s", "m³ of air", "to it, 95 % (cm)", "from it, 95 % (cm)", "leaks")
+    table = Table("collision geometry", "parts", "s", "m³ of air", "to it, 95 % (cm)", "from it, 95 % (cm)", "leaks")
     makers = {f"planes, --parts {most}": partial(_of_planes, shell, most) for most in BUDGETS}
     if coacd:
         makers |= {f"CoACD, resolution {k}": partial(_of_coacd, shell, k) for k in (50, 100)}
@@ -113,8 +113,8 @@ def _of_coacd(shell: Surface, resolution: int) -> Collider:
     return Collider([part for part in parts if part is not None], float("nan"))
 
 
-def _named(console: Console, chapter: Chapter) -> None:
-    """Precision and recall, by area, of what the deviations say the shell lacks."""
+def _deviations(console: Console, chapter: Chapter) -> None:
+    """Print precision and recall, by area, of the deviations in front of the shell."""
     found = chapter.deviations
     assert found is not None
     assert chapter.truth is not None
@@ -122,20 +122,20 @@ def _named(console: Console, chapter: Chapter) -> None:
     seen = np.isfinite(found.distance)
     claimed = seen & found.flagged & (found.distance > 0)
     lacking = np.nan_to_num(along_normals(small, small.centres, chapter.truth)) > BEFORE
-    # Between two bars of a railing a place is as much before the shell as behind a bar.
+    # A place between two bars of a railing deviates as much as one behind a bar.
     away, _ = KDTree(small.centres[lacking]).query(small.centres)
     beside = np.asarray(away) < EDGE
     exact, near = (
         small.areas[claimed & true].sum() / max(small.areas[claimed].sum(), 1e-9) for true in (lacking, beside)
     )
     console.print(
-        f"{len(found.regions)} regions; of what is said to stand before the shell, {exact:.0%} does, and {near:.0%} "
-        f"with what is within {100 * EDGE:.0f} cm of what does."
+        f"{len(found.regions)} regions; precision of the area in front of the shell {exact:.0%}, and {near:.0%} "
+        f"within {100 * EDGE:.0f} cm."
     )
     for name, material in (("railings", Material.RAILING), ("flower boxes", Material.FLOWERS)):
         there = seen & np.isfinite(along_normals(small, small.centres, true_building(to_world, (material,))))
         recall = small.areas[there & claimed].sum() / max(small.areas[there].sum(), 1e-9)
-        console.print(f"{recall:.0%} of the wall behind {name} ({small.areas[there].sum():.1f} m²) is named.")
+        console.print(f"{recall:.0%} of the wall behind {name} ({small.areas[there].sum():.1f} m²) is found.")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Time the steps of a trained run by their parts, against the rasterizer alone on the same Gaussians.
+"""Time the parts of a training step of trained runs, against the rasterizer alone on the same Gaussians.
 
     python -m benchmarks.step outputs/scene/shellgs/TIME/config.yml
 
-goes on from the last checkpoint for some steps and prints the median milliseconds of each part; the run is left alone.
+resumes from the last checkpoint for some steps and prints the median milliseconds of each part; the run is not changed.
 With ``--save scene.npz`` it writes the Gaussians and a camera for ``benchmarks.rasterizer --scenes`` instead.
 """
 
@@ -46,7 +46,7 @@ PARTS = {
     "optimizers": (Optimizers, "optimizer_scaler_step_some"),
     "densification": (FacadeModel, "step_post_backward"),
 }
-"""What is timed apart, none inside another."""
+"""Functions timed separately, none inside another."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class Benchmark:
 
     Attributes:
         configs: config.yml of trained runs; they take turns.
-        steps: of each run, after some that are not counted.
-        threads: of torch; 0 leaves it to the load, as in training.
+        steps: steps of each run, after some that are not counted.
+        threads: number of torch threads; 0 chooses it by the load, as in training.
         save: write the Gaussians of the first run and its first camera here (npz), and stop.
     """
 
@@ -79,7 +79,7 @@ def main(benchmark: Benchmark) -> None:
         whole = {config: [] for config in trainers}
         parts = {config: defaultdict(list) for config in trainers}
         bare = {config: [] for config in trainers}
-        # What is kept of a view is made when it is first seen: each is, before anything counts.
+        # A view's cached data is computed when it is first seen: see each before anything counts.
         warm_up = max(len(_cameras(trainer)) for trainer in trainers.values()) + 5
         for round_ in range(-warm_up, benchmark.steps):
             for config, trainer in trainers.items():
@@ -100,7 +100,7 @@ def main(benchmark: Benchmark) -> None:
 
 
 def resumed(config_path: Path, folder: Path) -> FacadeTrainer:
-    """A trainer that goes on from the last checkpoint of a run, and writes into another folder."""
+    """A trainer that resumes from the last checkpoint of a run, and writes into another folder."""
     config = yaml.load(config_path.read_text(), Loader=yaml.Loader)
     assert isinstance(config, FacadeTrainerConfig)
     config.output_dir, config.vis, config.load_dir = folder, "tensorboard", config_path.parent / "nerfstudio_models"
@@ -115,7 +115,7 @@ def resumed(config_path: Path, folder: Path) -> FacadeTrainer:
 
 
 def step(trainer: FacadeTrainer) -> None:
-    """What nerfstudio's loop does for a step."""
+    """Train one step, as nerfstudio's loop does."""
     trainer.step = trainer._start_step
     for callback in trainer.callbacks:
         callback.run_callback_at_location(trainer.step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
@@ -137,7 +137,7 @@ def rasterizer_alone(trainer: FacadeTrainer) -> float:
 
 @contextlib.contextmanager
 def timed_parts() -> Iterator[dict[str, float]]:
-    """Seconds that each part takes meanwhile."""
+    """Collect the seconds that each part takes in the context."""
     seconds = dict.fromkeys(PARTS, 0.0)
     originals = {part: getattr(owner, name) for part, (owner, name) in PARTS.items()}
 

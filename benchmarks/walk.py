@@ -1,4 +1,4 @@
-"""The synthetic building as its owner would have it: a video by a phone, and a scan in national coordinates."""
+"""The synthetic building as a user would have it: a phone's video, and a scan in national coordinates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shellgs_method.synthetic.building import shell
 from shellgs_method.synthetic.scene import Facade, FacadeConfig, write_scan
 
 RATE = 5
-"""Frames a second: as many as `shellgs capture` takes at most."""
+"""Frames per second: the most that `shellgs capture` takes."""
 
 
 def walk(
@@ -25,11 +25,11 @@ def walk(
     """Write FOLDER/walk.mp4 and FOLDER/scan.ply, from which the tutorial in docs/tutorial.md starts.
 
     Args:
-        folder: Where they go.
-        frames: Frames of the video, 5 a second.
-        width: Of the video, in pixels.
-        height: Of the video, in pixels.
-        seed: Of the building and the walk.
+        folder: Output folder.
+        frames: Number of frames of the video, 5 per second.
+        width: Width of the video in pixels.
+        height: Height of the video in pixels.
+        seed: Seed of the building and the walk.
     """
     facade = Facade.build(FacadeConfig(width, height, frames, seed))
     folder.mkdir(parents=True, exist_ok=True)

@@ -13,10 +13,9 @@ from dataparsers.camera import Camera
 def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[Tensor, "H W 3"]:
     """Unit normals in the camera frame, from central differences of the back-projected depth; differentiable.
 
-    They face the camera without being flipped: whatever the four (positive) depths around a pixel, right minus left
-    crossed with top minus bottom points against the pixel's ray. Zero on the image's border and where the pixel or
-    one of its four neighbours has no depth, which the Sobel windows of kornia's ``depth_to_normals`` would take for a
-    surface.
+    They face the camera without being flipped: for any four positive depths around a pixel, (right - left) x
+    (top - bottom) points against the pixel's ray. Zero on the image's border and where the pixel or one of its four
+    neighbours has no depth, which the Sobel windows of kornia's ``depth_to_normals`` would take for a surface.
     """
     points = depth * camera.rays().to(depth)
     horizontal = points[1:-1, 2:] - points[1:-1, :-2]

@@ -1,4 +1,4 @@
-"""Pictures inside an HTML file that needs no other."""
+"""Embed images in a self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from PIL import Image
 
 
 def encoded(image: UInt8[np.ndarray, "H W C"], form: str = "PNG") -> bytes:
-    """The bytes of an image's file; JPEG for what the eye will forgive."""
+    """Encode an image as PNG or JPEG."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, form, quality=88)
     return buffer.getvalue()
 
 
 def data_uri(content: bytes) -> str:
-    """What an image's ``src`` says in place of a file's name, of a PNG's or JPEG's bytes."""
+    """Data URI of PNG or JPEG content, for the ``src`` of an image."""
     kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,4 +1,4 @@
-"""What the geometry of a view is supervised by, and measured against."""
+"""Reference geometry of a view, for supervision and metrics."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import Tensor
 
 
 class Reference(NamedTuple):
-    """Maps of the true geometry for a view: the shell's, or another's."""
+    """Maps of a view's reference geometry: the shell, or other true geometry."""
 
     depth: Float[Tensor, "H W 1"]
     """Forward z-depth in scene units, 0 where there is none."""
     normal: Float[Tensor, "H W 3"]
     """Normals in the camera frame."""
     mask: Bool[Tensor, "H W 1"]
-    """True where the geometry counts."""
+    """True where the reference is valid."""

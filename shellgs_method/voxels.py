@@ -1,4 +1,4 @@
-"""Points thinned to the cells of a grid."""
+"""Downsample points on a voxel grid."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ def voxel_means(points: Float[ndarray, "N 3"], voxel: float) -> Float[ndarray, "
 
 
 def cell_means(values: Float[ndarray, "N C"], cells: Int[ndarray, " N"]) -> Float[ndarray, "M C"]:
-    """Mean of the values in each cell, by the cells' numbers from :func:`voxel_cells`."""
+    """Mean of the values in each cell, given the cell indices from :func:`voxel_cells`."""
     count = np.bincount(cells)
     return np.stack([np.bincount(cells, weights=column) / count for column in values.T], axis=1)
 
 
 def voxel_cells(points: Float[ndarray, "N 3"], voxel: float) -> Int[ndarray, " N"]:
-    """Number of the occupied cell of a grid through the origin that each point lies in."""
+    """Index of each point's cell among the occupied cells of a grid through the origin."""
     cell = np.zeros(len(points), dtype=np.int64)
     for column in np.floor(points / voxel).astype(np.int64).T if len(points) else ():
         # Renumbered after each axis, so that no product of three extents can overflow.

@@ -1,4 +1,4 @@
-"""Gaussians written to a file and read back: the picture must be the model's own."""
+"""Gaussians written to a file and read back must render like the model."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shellgs_method.environment import examine
 from shellgs_method.evaluation import lpips_network
 from shellgs_method.export import Splats, write_splats
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.export.splats import turned_harmonics
+from shellgs_method.export.splats import harmonics_rotation
 from shellgs_method.geometry import Primitive
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.trainer import FacadeTrainer
@@ -56,8 +56,8 @@ def columns_of(path: Path) -> dict[str, Tensor]:
     return {name: torch.from_numpy(cloud[name].numpy().copy()) for name in cloud}
 
 
-def picture_of_file(path: Path, camera: Camera, primitive: Primitive) -> Tensor:
-    """What a viewer does: Open3D reads the file, and its Gaussians are rasterized before black."""
+def render_of_file(path: Path, camera: Camera, primitive: Primitive) -> Tensor:
+    """Render a file as a viewer does: Open3D reads it, and its Gaussians are rasterized on black."""
     column = columns_of(path)
     means, count = column["positions"], len(column["positions"])
     coefficients = column["f_dc"].view(count, 1, 3)
@@ -75,18 +75,18 @@ def ns_export(trainer: FacadeTrainer, folder: Path) -> Path:
     return folder / "splat.ply"
 
 
-def test_what_ns_export_writes_renders_as_the_model(trainer, tmp_path):
+def test_the_file_of_ns_export_renders_like_the_model(trainer, tmp_path):
     camera, primitive = pinhole_camera(held_out(trainer)[0]), model_of(trainer).config.primitive
-    read = picture_of_file(ns_export(trainer, tmp_path), camera, primitive)
+    read = render_of_file(ns_export(trainer, tmp_path), camera, primitive)
     assert read.std() > 0.05
     assert (read - render(trainer)["rgb"]).abs().max() < 2e-3
 
 
-def test_viewers_of_gaussians_show_discs_as_the_model(pristine_scene, tmp_path):
-    """They know no discs but Gaussians, which a thin third scale makes nearly the same."""
+def test_viewers_of_gaussians_show_discs_like_the_model(pristine_scene, tmp_path):
+    """They only support Gaussians, which are nearly discs if the third scale is tiny."""
     trainer = trained(pristine_scene, tmp_path, "two_dgs")
     path = ns_export(trainer, tmp_path)
-    as_gaussians = picture_of_file(path, pinhole_camera(held_out(trainer)[0]), "3d")
+    as_gaussians = render_of_file(path, pinhole_camera(held_out(trainer)[0]), "3d")
     assert (as_gaussians - render(trainer)["rgb"]).square().mean() < 10 ** (-25 / 10)
     scales = columns_of(path)["scale"]
     assert (scales > 0).all()
@@ -95,7 +95,7 @@ def test_viewers_of_gaussians_show_discs_as_the_model(pristine_scene, tmp_path):
 
 def test_colours_without_harmonics_are_exported_too(pristine_scene, tmp_path):
     trainer = trained(pristine_scene, tmp_path, "photo_gs", degree=0)
-    read = picture_of_file(ns_export(trainer, tmp_path), pinhole_camera(held_out(trainer)[0]), "3d")
+    read = render_of_file(ns_export(trainer, tmp_path), pinhole_camera(held_out(trainer)[0]), "3d")
     assert (read - render(trainer)["rgb"]).abs().max() < 2e-3
 
 
@@ -103,7 +103,7 @@ def test_splats_in_the_shells_frame_look_the_same_from_the_same_place(trainer, t
     cli.splats(trainer.base_dir / "config.yml", tmp_path / "splats.ply")
     run = TrainedRun(model_of(trainer), data_of(trainer))
     camera = run.frame.camera(data_of(trainer).eval_dataset.views[0].camera)
-    read = picture_of_file(tmp_path / "splats.ply", camera, model_of(trainer).config.primitive)
+    read = render_of_file(tmp_path / "splats.ply", camera, model_of(trainer).config.primitive)
     difference = (read - render(trainer)["rgb"]).abs()
     assert difference.mean() < 1e-3
     assert difference.quantile(0.999) < 0.02
@@ -139,22 +139,22 @@ def rotations(count: int) -> list[Tensor]:
     ]
 
 
-def test_turned_harmonics_have_in_a_turned_direction_the_value_of_before():
+def test_rotated_harmonics_have_the_same_values_in_rotated_directions():
     generator = torch.Generator().manual_seed(2)
     directions = torch.randn(50, 3, generator=generator, dtype=torch.float64)
     coefficients = torch.randn(16, 3, generator=generator, dtype=torch.float64)
     for R in rotations(5):
-        turned = turned_harmonics(R, 3) @ coefficients
+        turned = harmonics_rotation(R, 3) @ coefficients
         before = spherical_harmonics(3, directions, coefficients.expand(50, 16, 3))
         torch.testing.assert_close(spherical_harmonics(3, directions @ R.T, turned.expand(50, 16, 3)), before)
 
 
-def test_turning_harmonics_is_a_representation_of_the_rotations():
+def test_rotating_harmonics_is_a_representation_of_the_rotations():
     """D(I) = I, D(R S) = D(R) D(S), D orthogonal, each degree by itself, and the first as the vectors (y, z, x)."""
     R, S = rotations(2)
-    D = turned_harmonics(R, 3)
-    torch.testing.assert_close(turned_harmonics(torch.eye(3, dtype=torch.float64), 3), torch.eye(16).double())
-    torch.testing.assert_close(turned_harmonics(R @ S, 3), D @ turned_harmonics(S, 3))
+    D = harmonics_rotation(R, 3)
+    torch.testing.assert_close(harmonics_rotation(torch.eye(3, dtype=torch.float64), 3), torch.eye(16).double())
+    torch.testing.assert_close(harmonics_rotation(R @ S, 3), D @ harmonics_rotation(S, 3))
     torch.testing.assert_close(D @ D.T, torch.eye(16).double())
     degrees = torch.arange(16).double().sqrt().long()
     assert D[degrees[:, None] != degrees].abs().max() < 1e-12
@@ -162,7 +162,7 @@ def test_turning_harmonics_is_a_representation_of_the_rotations():
     torch.testing.assert_close(D[1:4, 1:4], signs[:, None] * R[order][:, order] * signs)
 
 
-def test_gaussians_that_are_no_numbers_are_left_out(tmp_path):
+def test_gaussians_with_nan_are_left_out(tmp_path):
     one = torch.ones(3, 1)
     splats = Splats(one.expand(3, 3).clone(), one.expand(3, 4), one.expand(3, 3), one, torch.ones(3, 4, 3))
     splats.means[1] = torch.nan
@@ -170,7 +170,7 @@ def test_gaussians_that_are_no_numbers_are_left_out(tmp_path):
     assert len(columns_of(tmp_path / "splats.ply")["positions"]) == 2
 
 
-def test_the_doctor_says_where_the_weights_of_lpips_are_looked_for(tmp_path, monkeypatch):
+def test_the_doctor_reports_where_it_looks_for_lpips_weights(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr("urllib.request.urlopen", None)  # it must not ask the network
     lpips_network.cache_clear()

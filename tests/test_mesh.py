@@ -54,11 +54,11 @@ def test_views_of_a_sphere_fuse_to_a_sphere(sphere):
     radius = np.linalg.norm(sphere.vertices, axis=1)
     assert abs(np.median(radius) - 1.5) < 0.01
     assert np.quantile(np.abs(radius - 1.5), 0.95) < 0.05
-    # A camera 5 away sees the cap before 1.5²/5; so does the fused mesh, from both sides of the circle.
+    # A camera 5 away sees the cap more than 1.5²/5 from the centre; the cameras on the arc together see more.
     assert 0.3 < sphere.area / (4 * np.pi * 1.5**2) < 0.7
 
 
-def test_the_mesh_has_the_colour_of_the_pictures(sphere):
+def test_the_mesh_has_the_colour_of_the_images(sphere):
     colours = np.asarray(sphere.visual.vertex_colors)[:, :3]
     np.testing.assert_allclose(np.median(colours, axis=0), [255, 128, 0], atol=1)
 
@@ -70,7 +70,7 @@ def test_the_mesh_ends_at_the_box():
     assert half.vertices[:, 1].max() > 1
 
 
-def test_a_voxel_is_a_pixel_on_the_surface_unless_told():
+def test_a_voxel_is_a_pixel_on_the_surface_by_default():
     mesh = fuse([view_of_sphere(camera_at(angle)) for angle in (-0.1, 0.0, 0.1)], ROOM)
     # 80 pixels of focal length; the sphere is 3.5 to 4.8 away.
     assert 3.5 / 80 < mesh.metadata["voxel"] < 4.8 / 80
@@ -82,7 +82,7 @@ def test_views_that_see_nothing_of_the_box_are_refused():
         fuse([empty, empty], ROOM)
 
 
-def test_views_that_agree_on_nothing_are_refused():
+def test_views_without_a_common_surface_are_refused():
     with pytest.raises(SceneError, match="no surface in common"):
         fuse([view_of_sphere(camera_at(0.0), 1.0), view_of_sphere(camera_at(np.pi), 1.0)], ROOM, 0.02)
 
@@ -95,7 +95,7 @@ def test_decimation_keeps_the_surface_and_its_colours(sphere):
     assert small.metadata == sphere.metadata
 
 
-def test_a_mesh_of_no_triangles_or_voxels_of_no_size_are_refused(sphere):
+def test_a_mesh_without_triangles_and_voxels_of_negative_size_are_refused(sphere):
     with pytest.raises(SceneError, match="nothing is left"):
         decimate(sphere, 0)
     with pytest.raises(SceneError, match="a voxel cannot be -1"):
@@ -111,8 +111,8 @@ def test_a_box_has_the_size_of_a_turned_cuboid():
     assert not box.contains(turned.mean(axis=0) + 10 * (turned[0] - turned[-1])).any()
 
 
-def test_a_camera_of_the_frame_sees_what_it_sees_of_the_scene_with_depth_in_metres():
-    """A shell in millimetres, of which the scene's unit is 2.5 metres long."""
+def test_a_camera_in_the_frame_has_the_same_view_with_depth_in_metres():
+    """A shell in millimetres, in a scene whose unit is 2.5 metres."""
     rotation = Rotation.from_euler("xyz", [20, -40, 70], degrees=True).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 0.0004 * rotation, [3, -1, 2]
@@ -136,7 +136,7 @@ def test_a_shell_near_its_origin_is_not_shifted():
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
-def test_a_mesh_file_gives_the_mesh_back(sphere, tmp_path, suffix):
+def test_a_mesh_file_is_read_back_unchanged(sphere, tmp_path, suffix):
     write_mesh(tmp_path / f"mesh{suffix}", sphere, FRAME)
     read = load_shell(tmp_path / f"mesh{suffix}")
     # glTF is y-up: z of the survey becomes y, and y, which is into the page of a map, becomes -z.
@@ -201,7 +201,7 @@ def test_the_mesh_of_a_run_is_the_building_in_metres_in_the_shells_frame(run, fa
     assert abs(on_wall[:, 1].mean()) < 0.01
 
 
-def test_the_mesh_of_the_truth_is_near_truth_and_shell(run, facade):
+def test_the_mesh_of_the_true_building_is_near_the_truth_and_the_shell(run, facade):
     metrics = mesh_errors(run, facade)
     assert metrics["truth_chamfer_m"] < 0.15  # of pixels of 0.2
     assert metrics["truth_f_score_20cm"] > 0.8
@@ -214,7 +214,7 @@ def test_the_mesh_of_the_truth_is_near_truth_and_shell(run, facade):
     assert mesh_errors(run, both)["area_near_shell"] == pytest.approx(metrics["area_near_shell"] / 2, abs=1e-3)
 
 
-def test_what_is_far_from_the_shell_is_no_part_of_the_facade(run, facade):
+def test_surfaces_far_from_the_shell_are_not_part_of_the_facade(run, facade):
     lifted = trimesh.Trimesh(np.add(facade.vertices, [0, 0, 30]), facade.faces, process=False)
     both = trimesh.util.concatenate([facade, lifted])
     kept = run.facade(both, 0.5)
@@ -235,7 +235,7 @@ def test_a_scene_without_alignment_is_meshed_in_its_own_frame(run, pristine_scen
     assert mesh_errors(alone, mesh)["truth_chamfer_units"] < 0.1
 
 
-def test_a_trained_run_becomes_a_mesh_with_its_figures(pristine_scene, tmp_path):
+def test_a_trained_run_becomes_a_mesh_with_metrics(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, iterations=5)
     trainer.train()
     trainer.config.save_config()
@@ -251,7 +251,7 @@ def test_a_trained_run_becomes_a_mesh_with_its_figures(pristine_scene, tmp_path)
     ("config", "output", "sentence"),
     [
         ("nowhere/config.yml", "mesh.ply", "config.yml of a trained run"),
-        ("config.yml", "mesh.fbx", "is written as one"),
+        ("config.yml", "mesh.fbx", "can be written as"),
     ],
 )
 def test_a_mistake_is_refused_before_anything_is_loaded(tmp_path, config, output, sentence):
@@ -259,6 +259,6 @@ def test_a_mistake_is_refused_before_anything_is_loaded(tmp_path, config, output
         cli.mesh(tmp_path / config, tmp_path / output)
 
 
-def test_the_scene_frame_has_no_metres():
+def test_the_scene_frame_is_not_metric():
     assert not scene_frame().metric
     assert scene_frame("y").up == "y"

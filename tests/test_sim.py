@@ -1,4 +1,4 @@
-"""Colliders, frames, textures and deviations: what a simulation is made of, before any simulator."""
+"""Collision geometry, frames, textures and deviations, tested without a simulator."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LAYOUT = Layout(bays=2, storeys=2)
 
 
 def surface_of(mesh: Any) -> Surface:
-    """A mesh of trimesh's, which hardly knows its own types."""
+    """Convert a mesh of trimesh, whose types are incomplete."""
     return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
@@ -57,14 +57,14 @@ def eyes() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def facade(eyes) -> Surface:
-    """The shell of a small building, as cameras before it see it."""
+    """The shell of a small building, wound towards the cameras in front of it."""
     mesh = shell(LAYOUT)
     return outward(Surface(mesh.vertices, mesh.triangles), eyes)[0]
 
 
 @pytest.fixture(scope="module")
 def nothing() -> Surface:
-    """A reconstruction of which nothing stands on its own."""
+    """A reconstruction without anything in front of the shell."""
     return Surface(np.eye(3), np.array([[0, 1, 2]]))
 
 
@@ -73,7 +73,7 @@ def collider(facade, nothing) -> Collider:
     return make_collider(facade, nothing, np.array([False]))
 
 
-def test_planes_cover_a_building_without_noise_and_no_more(facade):
+def test_planes_cover_exactly_a_building_without_noise(facade):
     planes, rest = find_planes(facade.vertices, facade.faces)
     assert len(rest) == 0
     points, face = facade.samples(2000)
@@ -108,7 +108,7 @@ def test_convex_pieces_are_convex_and_cover_the_outline_once():
     assert len(pieces) < len(shapely.get_coordinates(outline)) / 2  # triangles would be more than corners
 
 
-def test_fewer_pieces_cost_what_they_cover():
+def test_the_cost_of_fewer_pieces_is_the_area_that_they_cover():
     row = [[shapely.box(x, 0, x + 1, 1) for x in (0, 1.1, 4, 7)]]
     pieces, cost = fewer_pieces(row, 3, lambda _, covered: float(shapely.area(covered)))
     assert [len(plane) for plane in pieces] == [3]
@@ -116,7 +116,7 @@ def test_fewer_pieces_cost_what_they_cover():
     assert fewer_pieces(row, 4, lambda _, covered: float(shapely.area(covered)))[1] == 0
 
 
-def test_what_a_part_contains():
+def test_a_part_contains_the_points_inside_its_hull():
     """Against the Delaunay triangulation of its corners."""
     rng = np.random.default_rng(1)
     corners, points = rng.normal(size=(30, 3)), rng.normal(size=(2000, 3))
@@ -128,15 +128,15 @@ def test_what_a_part_contains():
     assert mesh.volume > 0  # wound outwards
 
 
-def test_a_flat_thing_has_no_hull():
+def test_flat_points_have_no_hull():
     assert Part.hull(np.eye(3), "surface") is None
 
 
-def test_the_collider_is_the_shell_as_cameras_see_it(collider, facade, eyes):
+def test_the_collider_matches_the_visible_shell(collider, facade, eyes):
     both = collider.surface.distance(visible(facade, eyes)), facade.distance(visible(collider.surface, eyes))
     assert np.quantile(both[0], 0.95) < 1e-4
     assert np.quantile(both[1], 0.95) < 1e-4
-    assert np.quantile(np.concatenate(both), 0.995) < 0.011  # what others cover up to a centimetre is left out
+    assert np.quantile(np.concatenate(both), 0.995) < 0.011  # parts that protrude by up to a centimetre are left out
     assert leaks(collider.surface, facade, eyes) == 0
     assert collider.filled == 0
 
@@ -154,7 +154,7 @@ def test_a_budget_of_parts_is_kept_and_leaves_no_hole(most, facade, nothing, eye
     assert leaks(small.surface, facade, eyes) == 0
 
 
-def test_parts_stay_inside_what_they_are_behind():
+def test_parts_stay_inside_the_wall():
     wall = box([0, 0, 0], [4, 0.1, 3])
     made = make_collider(wall, wall, np.zeros(len(wall.faces), bool))
     assert np.abs(made.surface.vertices - [2, 0.05, 1.5]).max(axis=0) == pytest.approx([2, 0.05, 1.5], abs=0.011)
@@ -162,8 +162,8 @@ def test_parts_stay_inside_what_they_are_behind():
     assert thickness(plane, wall) == pytest.approx(0.1, abs=0.011)
 
 
-def test_what_stands_before_the_shell_is_in_the_collider_and_what_is_beside_it_is_not(facade, eyes):
-    """A flower box on the wall, and a flap that goes on where the building ends."""
+def test_surfaces_in_front_of_the_shell_are_in_the_collider_but_not_those_beside_it(facade, eyes):
+    """A flower box on the wall, and a flap beyond the building's end."""
     right = LAYOUT.ends[1]
     planter: Any = trimesh.creation.box(bounds=[[2.6, -0.4, 1], [3.4, -0.001, 1.4]]).subdivide_to_size(0.1)
     flap = trimesh.creation.box(bounds=[[right + 0.12, -0.02, 1], [right + 0.5, 0, 5]]).subdivide_to_size(0.1)
@@ -189,8 +189,8 @@ def test_surfaces_without_planes_become_parts_too(eyes):
     assert np.quantile(made.surface.distance(visible(fused, eyes)), 0.95) < 0.03
 
 
-def test_a_collider_of_nothing_is_refused(nothing):
-    with pytest.raises(SceneError, match="the collider is empty"):
+def test_an_empty_collider_is_refused(nothing):
+    with pytest.raises(SceneError, match="there is nothing to collide with"):
         make_collider(None, nothing, np.array([False]))
     with pytest.raises(SceneError, match="cannot have 0 parts"):
         make_collider(None, nothing, np.array([True]), most=0)
@@ -217,7 +217,7 @@ def metric_frame(up: str = "z") -> tuple[Frame, np.ndarray]:
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
-def test_the_origin_is_on_the_ground_before_the_facade(up):
+def test_the_origin_is_on_the_ground_in_front_of_the_facade(up):
     frame, points = metric_frame(up)
     made, motion = sim_frame(frame, points, cameras_of_scene())
     from_building = np.linalg.inv(made.to_scene) @ SCENE_FROM_BUILDING
@@ -230,7 +230,7 @@ def test_the_origin_is_on_the_ground_before_the_facade(up):
     )
 
 
-def test_national_coordinates_come_back():
+def test_national_coordinates_are_recovered():
     frame, points = metric_frame()
     made, motion = sim_frame(frame, points, cameras_of_scene())
     national = transformed(shell(LAYOUT).vertices, SHELL_FROM_BUILDING)
@@ -247,15 +247,15 @@ def test_a_scene_without_a_shell_is_turned_upright():
     assert not made.metric
 
 
-def test_the_ground_can_be_told():
+def test_the_ground_height_can_be_set():
     frame, points = metric_frame()
     made, _ = sim_frame(frame, points, cameras_of_scene(), ground=215.0)
     assert made.to_national[2, 3] == 215.0
     assert isinstance(made, SimFrame)
 
 
-def test_a_second_building_comes_into_the_frame_of_the_first():
-    """Through national coordinates; not from another country, nor without any."""
+def test_a_second_building_is_moved_into_the_frame_of_the_first():
+    """By national coordinates; refused if they are far apart or unknown."""
     frame, points = metric_frame()
     home, to_home = sim_frame(frame, points, cameras_of_scene())
     moved = np.eye(4)
@@ -273,7 +273,7 @@ def test_a_second_building_comes_into_the_frame_of_the_first():
 
 
 def frontal(x: float, distance: float = 4.0, size: int = 120) -> Camera:
-    """A camera before the plane y = 0, looking along y."""
+    """A camera in front of the plane y = 0, looking along y."""
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([x, -distance, 1.0], dtype=torch.float64)
@@ -282,13 +282,13 @@ def frontal(x: float, distance: float = 4.0, size: int = 120) -> Camera:
 
 
 def pattern(points: np.ndarray) -> np.ndarray:
-    """Colours of places of the plane: smooth, and different everywhere."""
+    """Colours of points of the plane: smooth, and different everywhere."""
     x, z = points[..., 0], points[..., 2]
     return 127 + 100 * np.stack([np.sin(1.3 * x), np.cos(1.7 * z), np.sin(x + z)], axis=-1)
 
 
 def photo_of(camera: Camera, light: float = 1.0) -> Photo:
-    """What a camera sees of the plane."""
+    """A photograph of the plane."""
     pose = np.linalg.inv(camera.viewmat.numpy())
     rays = camera.rays().numpy() @ pose[:3, :3].T
     points = pose[:3, 3] - rays * (pose[1, 3] / rays[..., 1])[..., None]
@@ -296,7 +296,7 @@ def photo_of(camera: Camera, light: float = 1.0) -> Photo:
 
 
 def texture_at(textured, points: np.ndarray) -> np.ndarray:
-    """Colours of the texture at places of a mesh."""
+    """Colours of the texture at points of a mesh."""
     mesh = trimesh.Trimesh(textured.vertices, textured.faces, process=False)
     near, _, face = trimesh.proximity.closest_point(mesh, points)
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], near)
@@ -333,15 +333,15 @@ def places(count: int = 400, width: float = 1.2) -> np.ndarray:
     return np.stack([rng.uniform(-width, width, count), np.zeros(count), rng.uniform(0.1, 1.9, count)], axis=1)
 
 
-def test_the_texture_is_what_was_photographed(wall):
+def test_the_texture_has_the_photographed_colours(wall):
     textured = bake(wall, np.zeros((len(wall.vertices), 3)), [photo_of(frontal(x)) for x in (-0.8, 0.0, 0.8)])
     error = np.abs(texture_at(textured, places()) - pattern(places()))
     assert np.median(error) < 3
     assert np.quantile(error, 0.95) < 12
 
 
-def test_views_blend_where_one_takes_over_from_the_other(wall):
-    """Two views of other exposures: no step between neighbouring places is as large as that between the views."""
+def test_views_blend_into_each_other(wall):
+    """Two views of different exposure: no step between neighbouring points is as large as that between the views."""
     photos = [photo_of(frontal(-1.2), 0.8), photo_of(frontal(1.2), 1.0)]
     textured = bake(wall, np.zeros((len(wall.vertices), 3)), photos)
     line = np.stack([np.linspace(-0.9, 0.9, 200), np.zeros(200), np.ones(200)], axis=1)
@@ -351,8 +351,8 @@ def test_views_blend_where_one_takes_over_from_the_other(wall):
     assert np.abs(light[5:] - light[:-5]).max() < 0.1
 
 
-def test_what_hides_the_wall_is_not_painted_on_it(wall):
-    """A post 50 cm before the wall, black in the photograph, and grey where no photograph sees."""
+def test_an_object_that_hides_the_wall_is_not_in_its_texture(wall):
+    """A post 50 cm in front of the wall, black in the photograph, and grey where no photograph sees."""
     camera = frontal(0.0)
     post = trimesh.creation.box(bounds=[[-0.1, -0.6, -1], [0.1, -0.5, 3]])
     together = Surface(
@@ -371,7 +371,7 @@ def test_what_hides_the_wall_is_not_painted_on_it(wall):
 
 
 def shell_and_bump() -> tuple[Surface, Surface]:
-    """A wall of 4 x 2 m, and a reconstruction that stands 12 cm before it on 0.8 x 0.5 m."""
+    """A wall of 4 x 2 m, and a reconstruction 12 cm in front of it on 0.8 x 0.5 m."""
     flat = surface_of(trimesh.creation.box(bounds=[[-2, 0, 0], [2, 3, 2]]))
     built = [
         trimesh.creation.box(bounds=[[-2, 0.01, 0], [2, 3, 2]]),
@@ -380,7 +380,7 @@ def shell_and_bump() -> tuple[Surface, Surface]:
     return flat, surface_of(trimesh.util.concatenate(built))
 
 
-def test_a_deviation_is_where_and_as_large_as_it_is():
+def test_a_deviation_has_the_right_position_and_size():
     flat, built = shell_and_bump()
     found = find_deviations(flat, built, [("a.jpg", photo_of(frontal(-1.0))), ("b.jpg", photo_of(frontal(0.6)))], 0.05)
     assert [region.what for region in found.regions] == ["before"]
@@ -391,7 +391,7 @@ def test_a_deviation_is_where_and_as_large_as_it_is():
     assert region.photograph == "b.jpg"
 
 
-def test_what_no_photograph_sees_is_not_known(tmp_path):
+def test_distances_are_unknown_where_no_photograph_sees_the_shell(tmp_path):
     flat, built = shell_and_bump()
     found = find_deviations(flat, built, [("a.jpg", photo_of(frontal(0.0)))], 0.05)
     behind = found.surface.centres[:, 1] > 2.9
@@ -404,7 +404,7 @@ def test_what_no_photograph_sees_is_not_known(tmp_path):
     assert (colours[bump, 0] > colours[bump, 1] + 50).all()  # red
 
 
-def test_what_photographs_contradict_goes_before_what_was_reconstructed():
+def test_photographs_take_precedence_over_the_reconstruction():
     flat, built = shell_and_bump()
 
     def contradicted(points: np.ndarray) -> np.ndarray:
@@ -424,7 +424,7 @@ def test_a_turned_building_has_the_same_collider(facade, nothing, collider):
     assert np.quantile(made.surface.distance(points @ turn.T), 0.99) < 1e-3
 
 
-def test_details_of_the_true_building_are_seen_to_stand_before_its_shell(facade, eyes):
+def test_details_of_the_true_building_are_found_in_front_of_its_shell(facade, eyes):
     """The synthetic building's own railings, as a perfect reconstruction would have them."""
     mesh = building(LAYOUT)
     true, _ = outward(

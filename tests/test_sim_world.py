@@ -1,4 +1,4 @@
-"""Worlds as simulators load them: MuJoCo, URDF, SDF, USD, and the command that makes them."""
+"""Worlds for simulators as MJCF, URDF, SDF and USD, and the command that writes them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def collider(eyes) -> Collider:
 
 
 def painted(surface: Surface) -> TexturedMesh:
-    """The surface in four colours, by where it is."""
+    """The surface in four colours, by position."""
     uv = (surface.vertices[:, [0, 2]] - surface.vertices[:, [0, 2]].min(0)) / np.ptp(
         surface.vertices[:, [0, 2]], axis=0
     )
@@ -70,7 +70,7 @@ def some_splats(count: int = 5) -> Splats:
     return Splats(*(torch.randn(count, *shape, generator=generator) for shape in shapes))
 
 
-def made(folder: Path, collider: Collider, name: str = "facade", place: str = "") -> Building:
+def write_building(folder: Path, collider: Collider, name: str = "facade", place: str = "") -> Building:
     (folder / place).mkdir(parents=True, exist_ok=True)
     write_parts(folder / place, collider.parts)
     look = painted(collider.surface)
@@ -82,7 +82,7 @@ def made(folder: Path, collider: Collider, name: str = "facade", place: str = ""
 @pytest.fixture(scope="module")
 def world(collider, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("world")
-    building = made(folder, collider)
+    building = write_building(folder, collider)
     write_worlds(folder, [building])
     write_usd_world(folder / "facade.usda", [building], 1.0, True)
     return folder
@@ -90,18 +90,18 @@ def world(collider, tmp_path_factory) -> Path:
 
 def test_mujoco_loads_the_world_without_a_warning(world, collider):
     model = load(world / "facade.xml")
-    assert model.ngeom == len(collider.parts) + 2  # and the ground, and the look
+    assert model.ngeom == len(collider.parts) + 2  # and the ground, and the visual mesh
     assert model.ntex == 1
 
 
-def test_a_world_that_mujoco_refuses_is_one_sentence(world, tmp_path):
+def test_a_world_that_mujoco_refuses_is_reported_in_one_sentence(world, tmp_path):
     shutil.copytree(world, tmp_path / "world")
     (tmp_path / "world" / "collision" / "part_000.obj").write_text("v 0 0 0\n")
     with pytest.raises(SceneError, match="MuJoCo refuses it"):
         load(tmp_path / "world" / "facade.xml")
 
 
-def test_what_mujoco_warns_of_in_a_simulation_is_kept_after_a_model_was_compiled(tmp_path, monkeypatch):
+def test_warnings_of_a_simulation_are_still_kept_after_compiling_a_model(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     mujoco = import_mujoco()
     spec = mujoco.MjSpec.from_string(
@@ -117,7 +117,7 @@ def test_what_mujoco_warns_of_in_a_simulation_is_kept_after_a_model_was_compiled
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_that_is_thrown_gets_through_sticks_or_gains_energy(world, collider, eyes):
+def test_no_thrown_body_gets_through_sticks_or_gains_energy(world, collider, eyes):
     with warnings_kept() as warnings:
         thrown = throw(world / "facade.xml", collider.surface, eyes, count=60, seconds=2.5)
     assert not warnings
@@ -126,14 +126,14 @@ def test_nothing_that_is_thrown_gets_through_sticks_or_gains_energy(world, colli
     assert thrown.deepest < 0.05
 
 
-def test_a_hole_in_the_wall_is_found_by_throwing(collider, eyes, tmp_path):
-    """The trial itself: parts left out of the model, though not of the surface that must not be crossed."""
+def test_throwing_finds_a_hole_in_the_wall(collider, eyes, tmp_path):
+    """Parts are missing from the model, but not from the surface that must not be crossed."""
     holed = [part for part in collider.parts if np.ptp(part.vertices, axis=0).max() < 2]
-    write_worlds(tmp_path, [made(tmp_path, Collider(holed, 0.0))])
+    write_worlds(tmp_path, [write_building(tmp_path, Collider(holed, 0.0))])
     assert throw(tmp_path / "facade.xml", collider.surface, eyes, count=30, seconds=1).through > 3
 
 
-def test_a_lidar_in_mujoco_measures_what_rays_do(world, collider, eyes):
+def test_a_lidar_in_mujoco_agrees_with_ray_casting(world, collider, eyes):
     surface = collider.surface
     places, rays = places_before(surface, Front.of(surface, eyes), count=3), beams(6, 40)
     measured = lidar(world / "facade.xml", places, rays, group=3)
@@ -158,17 +158,17 @@ def test_a_capsule_walks_along_the_facade_and_touches_it(world, collider, eyes):
     assert walked.deepest < 0.03
 
 
-def test_mujoco_draws_what_a_camera_sees(world, collider):
+def test_mujoco_renders_what_a_camera_sees(world, collider):
     """Colours of the texture in the right places, seen by a camera whose principal point is off the middle."""
     camera = stroll(LAYOUT.length, 8, 96, 64, np.random.default_rng(0))[2]
     K = camera.K.clone()
     K[0, 2] += 9
     camera = type(camera)(camera.viewmat, K, 96, 64)
     try:
-        (picture,) = rendered(world / "facade.xml", [camera])
+        (render,) = rendered(world / "facade.xml", [camera])
     except SceneError as error:
         pytest.skip(str(error))
-    assert picture.shape == (64, 96, 3)
+    assert render.shape == (64, 96, 3)
     pose = np.linalg.inv(camera.viewmat.numpy())
     rays = camera.rays().numpy() @ pose[:3, :3].T
     surface, look = collider.surface, painted(collider.surface)
@@ -182,7 +182,7 @@ def test_mujoco_draws_what_a_camera_sees(world, collider):
     image = np.asarray(look.image)
     column, row = (np.nan_to_num(uv).clip(0, 0.999) * 64).astype(int).transpose(2, 0, 1)
     expected = image[63 - row, column].astype(int)
-    alike = np.abs(picture.astype(int) - expected).max(axis=-1) < 60
+    alike = np.abs(render.astype(int) - expected).max(axis=-1) < 60
     assert (face >= 0).mean() > 0.3
     assert alike[face >= 0].mean() > 0.9
 
@@ -192,7 +192,7 @@ def files_named(tree: ET.Element) -> set[str]:
     return {name for name in named | {element.text for element in tree.iter("uri")} if name}
 
 
-def test_all_worlds_name_the_same_files_and_these_are_there(world):
+def test_all_worlds_refer_to_the_same_files_which_exist(world):
     named = {kind: files_named(ET.parse(world / f"facade.{kind}").getroot()) for kind in ("xml", "urdf", "sdf")}
     assert named["urdf"] == named["sdf"] == named["xml"] - {"visual.png"}
     assert all((world / name).is_file() for name in named["xml"])
@@ -214,7 +214,7 @@ def test_the_sdf_is_a_static_world(world, collider):
 
 
 @pytest.mark.parametrize("look", ["mesh", "splats"])
-def test_the_usd_complies(world, look):
+def test_the_usd_is_compliant(world, look):
     pxr = import_pxr()
     stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
     assert pxr.UsdGeom.GetStageUpAxis(stage) == "Z"
@@ -271,7 +271,7 @@ def test_the_glb_is_upright_textured_and_small_enough(collider, tmp_path):
     assert list(mesh.visual.material.baseColorTexture.size) == facts["texture"]
 
 
-def test_an_older_colliders_parts_are_removed(collider, tmp_path):
+def test_the_parts_of_an_earlier_collider_are_removed(collider, tmp_path):
     write_parts(tmp_path, collider.parts)
     write_parts(tmp_path, collider.parts[:2])
     assert len(list((tmp_path / "collision").iterdir())) == 2
@@ -281,7 +281,7 @@ def test_two_buildings_are_one_world(collider, tmp_path):
     away = Collider(
         [part for part in (Part.hull(p.vertices + np.array([20, 0, 0]), p.source) for p in collider.parts) if part], 0
     )
-    buildings = [made(tmp_path, one, name, name) for one, name in ((collider, "left"), (away, "right"))]
+    buildings = [write_building(tmp_path, one, name, name) for one, name in ((collider, "left"), (away, "right"))]
     write_worlds(tmp_path, buildings)
     write_usd_world(tmp_path / "facade.usda", buildings, 1.0, True)
     model = load(tmp_path / "facade.xml")
@@ -304,7 +304,7 @@ def config(pristine_scene: Path, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def quick(monkeypatch) -> None:
-    """Fewer throws, in less time: that they hold is tested above."""
+    """Fewer and shorter throws; the results of the full trial are tested above."""
     from shellgs_method.sim import report
 
     monkeypatch.setattr(report, "throw", lambda *args: throw(*args, count=8, seconds=0.5))
@@ -343,30 +343,30 @@ def joined_file(out: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def test_a_run_without_a_shell_says_what_its_frame_is(config, eager, monkeypatch):
+def test_a_run_without_a_shell_reports_its_frame(config, eager, monkeypatch):
     monkeypatch.setattr(TrainedRun, "shell", None)
     built = Reconstruction.of(TrainedRun.load(config), SMALL.faces, None, None, None)
     said: list[str] = []
-    built.say(said.append)
-    assert "has no aligned shell: the frame is the scene's own" in said[0]
+    built.warn_if_unaligned(said.append)
+    assert "has no aligned shell: the frame is the scene's" in said[0]
     assert built.shell is None
     assert not built.frame.metric
     fused, seen = outward(Surface(np.asarray(built.fused.vertices), np.asarray(built.fused.faces)), built.eyes)
     assert len(make_collider(None, fused, seen, most=20).parts) <= 20
 
 
-def test_without_a_config_or_a_folder_there_is_one_sentence(tmp_path):
+def test_a_missing_config_or_folder_is_refused(tmp_path):
     for configs, out in (((), tmp_path), ((), tmp_path / "config.yml")):
         with pytest.raises(SceneError, match=r"give the config\.yml"):
             simulate(configs, out, SMALL)
 
 
-def test_walls_far_apart_are_said_to_be(collider):
-    from shellgs_method.sim.simulate import _say_pieces
+def test_walls_far_apart_are_reported(collider):
+    from shellgs_method.sim.simulate import _report_gaps
 
     away = [part for part in (Part.hull(p.vertices + np.array([30, 0, 0]), p.source) for p in collider.parts) if part]
     said: list[str] = []
-    _say_pieces(Collider(collider.parts, 0.0), "street", said.append)
+    _report_gaps(Collider(collider.parts, 0.0), "street", said.append)
     assert not said
-    _say_pieces(Collider([*collider.parts, *away], 0.0), "street", said.append)
+    _report_gaps(Collider([*collider.parts, *away], 0.0), "street", said.append)
     assert "2 pieces" in said[0]

@@ -1,6 +1,6 @@
-"""What leaves ShellGS: a triangle mesh to collide with, and the Gaussians, in metres where a shell knows them.
+"""Export results: a triangle mesh for collisions, and the Gaussians, in metres if the scene has a shell.
 
-:mod:`shellgs_method.export.runs` takes trained runs; everything else is plain numpy, torch and Open3D.
+:mod:`shellgs_method.export.runs` works on trained runs; everything else is plain numpy, torch and Open3D.
 """
 
 from shellgs_method.export.frame import Box, Frame, scene_frame, shell_frame

@@ -1,4 +1,4 @@
-"""The frame that results are written in: the shell's, in metres, or the scene's where there is no shell."""
+"""The frame of exported results: the shell's, in metres, or the scene's if there is no shell."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from shellgs_method.shell import Alignment, ShellMesh
 UpAxis = Literal["y", "z"]
 
 FAR = 1000.0
-"""Distance from the origin from which coordinates are shifted: there float32 has steps of 0.06 mm."""
+"""Distance from the origin above which coordinates are shifted: there float32 has steps of 0.06 mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A box along any three perpendicular axes.
+    """An oriented box.
 
     Attributes:
-        axes: its axes as rows.
-        low: least coordinate along each.
-        high: greatest coordinate along each.
+        axes: orthonormal axes as rows.
+        low: lowest coordinate along each axis.
+        high: highest coordinate along each axis.
     """
 
     axes: Float64[np.ndarray, "3 3"]
@@ -40,9 +40,9 @@ class Box:
         """The box of points along their principal axes, wider by ``margin`` on each side.
 
         Args:
-            points: at least one.
-            margin: in the points' unit.
-            trim: share of the points that may lie beyond each face, before the margin.
+            points: at least one point.
+            margin: margin in the points' unit.
+            trim: share of the points that may lie beyond each face, before the margin is added.
         """
         axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2] if len(points) > 2 else np.eye(3)
         low, high = np.quantile(points @ axes.T, [trim, 1 - trim], axis=0)
@@ -61,13 +61,13 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame to write results in; all of them are similar to the scene's.
+    """A frame for results, related to the scene's by a similarity.
 
     Attributes:
         name: "shell" or "scene".
         to_scene: similarity from this frame to the scene's.
-        offset: what brings coordinates back to where the shell, or the scene, has them, added; in this frame's unit.
-        metric: whether the unit is the metre; else it is unknown.
+        offset: to add to coordinates to get those of the shell, or of the scene, in this frame's unit.
+        metric: whether the unit is the metre; otherwise it is unknown.
         up: the axis that points up.
     """
 
@@ -83,13 +83,13 @@ class Frame:
         return float(np.cbrt(np.linalg.det(self.to_scene[:3, :3])))
 
     def camera(self, camera: Camera) -> Camera:
-        """A camera of the scene in this frame, where its depths are in this frame's unit."""
+        """A camera of the scene in this frame, with depths in this frame's unit."""
         rescaled = np.diag([1 / self.scale] * 3 + [1.0])
         viewmat = torch.from_numpy(rescaled @ camera.viewmat.double().cpu().numpy() @ self.to_scene)
         return Camera(viewmat, camera.K, camera.width, camera.height)
 
     def describe(self, path: Path, facts: dict) -> None:
-        """Write beside ``path`` (as .json) what a reader of that file must know of its coordinates, and ``facts``."""
+        """Write a .json beside ``path`` that describes the coordinates in that file, with ``facts`` added."""
         description = {
             "frame": self.name,
             "unit": "metre" if self.metric else "unknown",
@@ -102,7 +102,7 @@ class Frame:
 
 
 def shell_frame(alignment: Alignment, shell: ShellMesh, up: UpAxis = "z") -> Frame:
-    """The shell's axes in metres; a georeferenced shell's are shifted by whole hundreds of metres to its middle."""
+    """The shell's frame in metres; for a georeferenced shell shifted by whole hundreds of metres to its middle."""
     metres = alignment.metres_per_shell_unit
     bounds = shell.bounds * metres
     offset = np.round(bounds.mean(axis=0), -2) if np.abs(bounds).max() > FAR else np.zeros(3)
@@ -112,11 +112,11 @@ def shell_frame(alignment: Alignment, shell: ShellMesh, up: UpAxis = "z") -> Fra
 
 
 def scene_frame(up: UpAxis = "z", middle: Float64[np.ndarray, " 3"] | None = None) -> Frame:
-    """The scene's own frame, whose unit nobody knows; large coordinates are shifted as those of a shell.
+    """The scene's own frame, whose unit is unknown; large coordinates are shifted as those of a shell.
 
     Args:
         up: the axis that points up.
-        middle: somewhere in the middle of the scene; the origin if not given.
+        middle: a point in the middle of the scene; the origin if None.
     """
     middle = np.zeros(3) if middle is None else middle
     offset = np.round(middle, -2) if np.abs(middle).max() > FAR else np.zeros(3)

@@ -1,4 +1,4 @@
-"""Mesh files: ply, obj, glb, and USD with what a physics engine needs to collide with it."""
+"""Mesh files: ply, obj, glb, and USD with a static collider for physics engines."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MESH_FORMATS = (".ply", ".obj", ".glb", *USD_FORMATS)
 
 
 def check_mesh_format(path: Path) -> None:
-    """Refuse what cannot be written, before hours of work.
+    """Refuse an output that cannot be written, before hours of work.
 
     Raises:
-        SceneError: the format is none of :data:`MESH_FORMATS`, its library is missing, or the place takes no file.
+        SceneError: the format is none of :data:`MESH_FORMATS`, its library is missing, or the path is not writable.
     """
     if path.suffix.lower() not in MESH_FORMATS:
-        raise SceneError(f"{path}: a mesh is written as one of {', '.join(MESH_FORMATS)}")
+        raise SceneError(f"{path}: a mesh can be written as {', '.join(MESH_FORMATS)}")
     if path.suffix.lower() in USD_FORMATS:
         _usd_modules(path)
     check_output(path)
@@ -37,8 +37,8 @@ def check_mesh_format(path: Path) -> None:
 def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | None = None) -> None:
     """Write a mesh, and beside it (``.json``) its frame, the offset of georeferenced coordinates, and ``facts``.
 
-    glTF is y-up by its specification, and coordinates are turned for it; USD states its up axis and unit; ply and obj
-    know of neither. Coordinates in the files are float32, which is why the frame is near the facade.
+    glTF is y-up by its specification, so coordinates are rotated for it; USD states its up axis and unit; ply and obj
+    state neither. Coordinates in the files are float32, which is why the frame is near the facade.
     """
     check_mesh_format(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,9 +63,9 @@ def _usd_modules(path: Path) -> tuple[Any, ...]:
 
 
 def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
-    """A stage whose default prim is a static collider made of the triangles themselves.
+    """Write a stage whose default prim is a static collider made of the triangles themselves.
 
-    A convex hull, which engines take where nothing is said, would close the windows and doors.
+    A convex hull, the default of physics engines, would close the windows and doors.
     """
     Usd, UsdGeom, UsdPhysics, Vt = _usd_modules(path)
     temporary = unfinished(path, path.suffix)
@@ -90,7 +90,7 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
         collider.CreateApproximationAttr(UsdPhysics.Tokens.none)
         stage.GetRootLayer().Save()
         os.replace(temporary, path)
-    except RuntimeError as error:  # pxr's, who says little
+    except RuntimeError as error:  # pxr's, whose message says little
         raise SceneError(f"{path} cannot be written: is there room on the disk? ({str(error)[:200]})") from error
     finally:
         temporary.unlink(missing_ok=True)

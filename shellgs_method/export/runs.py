@@ -31,34 +31,34 @@ if TYPE_CHECKING:
     import trimesh
 
 NEAR = 0.2
-"""Metres from the shell up to which a mesh is near it: more than the details that a shell leaves out."""
+"""Distance in metres up to which a mesh is near the shell: more than the details that a shell leaves out."""
 SCENE_MARGIN = 0.05
-"""Margin around the SfM points as a share of their box, where no shell says how far the facade goes."""
+"""Margin around the SfM points as a share of their box, if there is no shell to bound the facade."""
 SCENE_TRIM = 0.02
-"""Share of the SfM points beyond each face of that box."""
+"""Share of the SfM points beyond each face of that box, before the margin is added."""
 
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """A trained method with its scene."""
+    """A trained model with its scene."""
 
     model: FacadeModel
     datamanager: FacadeDataManager
     up: UpAxis | None = None
-    """The axis of the shell's (else the scene's) frame that points up; None: y of a glTF shell, else z."""
+    """Up axis of the shell's frame, or else of the scene's; if None, y for a glTF shell, else z."""
 
     @classmethod
     def load(cls, config: Path, up: UpAxis | None = None) -> TrainedRun:
-        """The last checkpoint of the run that ``config`` (config.yml) belongs to.
+        """Load the last checkpoint of the run that ``config`` (config.yml) belongs to.
 
         Raises:
             FileNotFoundError: there is no such file.
-            SceneError: the run is of a method that is not ours.
+            SceneError: the run is not of a ShellGS method.
         """
         _, pipeline, _ = load_run(config, "inference")
         model, datamanager = pipeline.model, pipeline.datamanager
         if not isinstance(model, FacadeModel) or not isinstance(datamanager, FacadeDataManager):
-            raise SceneError(f"{config} is of another method: only those of ShellGS render the depth that is needed")
+            raise SceneError(f"{config} is not a run of a ShellGS method: only these render the depth that is needed")
         return cls(model, datamanager, up)
 
     @property
@@ -89,23 +89,23 @@ class TrainedRun:
 
     @property
     def shell_in_frame(self) -> ShellMesh:
-        """The shell, which must be there, in the frame."""
+        """The shell in the frame; the scene must have one."""
         assert self.shell is not None
         alignment, shell = self.shell
         return ShellMesh(shell.vertices * alignment.metres_per_shell_unit - self.frame.offset, shell.faces)
 
     @property
     def model_scale(self) -> float:
-        """Units of nerfstudio's rescaled world, which the model lives in, in one scene unit."""
+        """Units of the model's frame, nerfstudio's rescaled world, in one scene unit."""
         return float(self.datamanager.train_dataparser_outputs.dataparser_scale)
 
     @property
     def model_to_scene(self) -> Float64[np.ndarray, "4 4"]:
-        """The similarity from nerfstudio's rescaled world to the scene."""
+        """The similarity from the model's frame, nerfstudio's rescaled world, to the scene."""
         return np.linalg.inv(self.datamanager.scene_to_world)
 
     def box(self, margin: float) -> Box:
-        """Where the facade is: the shell's box, wider by ``margin`` metres, else that of most SfM points."""
+        """The facade's box: the shell's, wider by ``margin`` metres, or else that of most SfM points."""
         if self.shell is not None:
             return Box.around(self.shell_in_frame.vertices, margin)
         assert self.model.seed_points is not None
@@ -116,12 +116,12 @@ class TrainedRun:
         return replace(box, low=box.low - widened, high=box.high + widened)
 
     def facade(self, mesh: trimesh.Trimesh, margin: float) -> trimesh.Trimesh:
-        """What of a mesh in the frame is within ``margin`` metres of the shell; all of it where there is none.
+        """The part of a mesh within ``margin`` metres of the shell; all of it if there is no shell.
 
-        Views from one side leave flaps where a depth falls from the building's edge to what is behind it.
+        Views from one side leave flaps where the depth falls from the building's edge to the background.
 
         Raises:
-            SceneError: nothing is.
+            SceneError: no triangle is that near.
         """
         if self.shell is None:
             return mesh
@@ -129,12 +129,12 @@ class TrainedRun:
         mesh.update_faces(_distances(mesh, self.shell_in_frame) < margin)
         mesh.remove_unreferenced_vertices()
         if len(mesh.faces) == 0:
-            raise SceneError(f"there is no mesh: nothing that is rendered is within {margin:g} m of the shell")
+            raise SceneError(f"there is no mesh: no rendered surface is within {margin:g} m of the shell")
         return mesh
 
     @torch.no_grad()
     def views(self) -> Iterator[DepthView]:
-        """All views, rendered, in the frame: depth of what is at least half opaque and not masked out."""
+        """Render all views in the frame, with depth where they are at least half opaque and not masked out."""
         depth_scale = 1 / (self.model_scale * self.frame.scale)
         indexed = [(dataset, index) for dataset in self.datasets for index in range(len(dataset.views))]
         for dataset, index in track(indexed, "rendering", transient=True):
@@ -154,11 +154,11 @@ class TrainedRun:
 
 
 def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
-    """Metrics of :func:`geometry_errors` of the mesh as the held-out cameras see it, averaged over the views.
+    """Metrics of :func:`reference_errors` of the mesh, seen from the held-out cameras, averaged over the views.
 
-    They can be compared with those of ns-eval: against the shell, and as ``truth_…`` against the true geometry where
-    the scene has it. What no reference supports, such as flaps beside the building, only ``area_near_shell`` tells of:
-    the share of the mesh's area within :data:`NEAR` of the shell.
+    They can be compared with those of ns-eval: against the shell, and as ``truth_…`` against the true geometry if the
+    scene has it. Surfaces without a reference, such as flaps beside the building, are only measured by
+    ``area_near_shell``, the share of the mesh's area within :data:`NEAR` of the shell.
     """
     caster = ShellCaster(ShellMesh(mesh.vertices, mesh.faces), run.frame.to_scene)
     held_out, metrics = run.datasets[1], []
@@ -178,6 +178,6 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
 
 
 def _distances(mesh: trimesh.Trimesh, shell: ShellMesh) -> Float32[np.ndarray, " F"]:
-    """Metres from the centre of each of a mesh's triangles to a shell in the same frame."""
+    """Distance in metres of the centre of each triangle of a mesh from a shell in the same frame."""
     surface = ShellSurface(shell)
     return surface.distance(transformed(mesh.triangles_center, surface.survey_from_shell))

@@ -1,4 +1,4 @@
-"""The Gaussians as a file that the viewers of splats open, in any frame similar to theirs."""
+"""Write Gaussians to a ply for splat viewers, in any frame related to theirs by a similarity."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from shellgs_method.rasterizer import spherical_harmonics
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """Gaussians as they are trained; a disc is one whose third scale is next to nothing.
+    """Gaussians with the parameters that are trained; a disc has a third scale of nearly zero.
 
     Attributes:
         means: centres.
         quats: rotations (w, x, y, z), of any norm.
         scales: logarithms of the standard deviations.
         opacities: logits.
-        harmonics: coefficients of the colours' spherical harmonics, degree by degree.
+        harmonics: spherical harmonics coefficients of the colours, degree by degree.
     """
 
     means: Float[Tensor, "N 3"]
@@ -35,14 +35,14 @@ class Splats:
     harmonics: Float[Tensor, "N K 3"]
 
     def transformed(self, similarity: Float64[np.ndarray, "4 4"]) -> Splats:
-        """The same Gaussians in the frame that the similarity leads to; computed in float64.
+        """Apply a similarity to the Gaussians, in float64.
 
-        Views from there look the same: the harmonics turn with the Gaussians.
+        The harmonics rotate with the Gaussians, so that renders stay the same.
         """
         scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
         rotation = similarity[:3, :3] / scale
         turned = Rotation.from_matrix(rotation) * Rotation.from_quat(self.quats.double().numpy()[:, [1, 2, 3, 0]])
-        bands = turned_harmonics(torch.from_numpy(rotation), math.isqrt(self.harmonics.shape[1]) - 1)
+        bands = harmonics_rotation(torch.from_numpy(rotation), math.isqrt(self.harmonics.shape[1]) - 1)
         return Splats(
             self.means.double() @ torch.from_numpy(similarity[:3, :3].T) + torch.from_numpy(similarity[:3, 3]),
             torch.from_numpy(turned.as_quat()[:, [3, 0, 1, 2]]),
@@ -52,11 +52,11 @@ class Splats:
         )
 
 
-def turned_harmonics(rotation: Float64[Tensor, "3 3"], degree: int) -> Float64[Tensor, "K K"]:
-    """The matrix D of a rotation R with Y(d) D c = Y(Rᵀ d) c for every direction d: c turned by R.
+def harmonics_rotation(rotation: Float64[Tensor, "3 3"], degree: int) -> Float64[Tensor, "K K"]:
+    """The matrix D that rotates harmonics coefficients c by R: Y(d) D c = Y(Rᵀ d) c for every direction d.
 
-    Each degree's harmonics turn among themselves, so that Y(d) D = Y(Rᵀ d) has an exact solution, found from more
-    directions than there are unknowns.
+    A rotation maps the harmonics of each degree to each other, so that Y(d) D = Y(Rᵀ d) has an exact solution, found
+    by least squares from more directions than unknowns.
     """
     count = (degree + 1) ** 2
     directions = torch.randn(16 * count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -66,9 +66,9 @@ def turned_harmonics(rotation: Float64[Tensor, "3 3"], degree: int) -> Float64[T
 
 
 def write_splats(path: Path, splats: Splats) -> int:
-    """Write the ply of 3D Gaussian Splatting (Kerbl et al. 2023): float32, quaternions of norm 1, harmonics by colour.
+    """Write the ply of 3D Gaussian Splatting (Kerbl et al. 2023): float32, unit quaternions, harmonics by channel.
 
-    A Gaussian with a NaN or infinite number, which viewers stumble over, is left out. Returns how many are written.
+    Gaussians with a NaN or infinite value, which break viewers, are left out. Returns the number written.
     """
     rest = splats.harmonics[:, 1:].transpose(1, 2).flatten(1)
     columns = {

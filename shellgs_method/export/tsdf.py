@@ -1,4 +1,4 @@
-"""Rendered depth of many views -> one triangle mesh: a truncated signed distance field (Curless and Levoy 1996)."""
+"""Fuse the rendered depth of many views into a triangle mesh, by TSDF fusion (Curless and Levoy 1996)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     import trimesh
 
 TRUNCATION = 6.0
-"""Voxels on each side of the surface in which the distance is kept; fewer leave holes, more round off reveals."""
+"""Truncation distance in voxels; less leaves holes, more rounds off reveals."""
 MIN_VIEWS = 2
-"""Views that must have seen a voxel."""
+"""Minimum number of views that see a voxel."""
 SPECK = 100.0
-"""Least area of a separate piece of surface, in faces of a voxel; what is smaller floats."""
+"""Minimum area of a connected component, in faces of a voxel; smaller ones are floaters."""
 
 
 class DepthView(NamedTuple):
-    """What one camera sees, in the frame of the mesh to be made; on the CPU."""
+    """Depth and colours rendered from one camera, in the frame of the mesh; on the CPU."""
 
     depth: Float[Tensor, "H W 1"]
     """Forward z-depth, 0 where there is none."""
@@ -37,19 +37,19 @@ class DepthView(NamedTuple):
 
 
 def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> trimesh.Trimesh:
-    """Fuse views into a coloured mesh of what they see inside a box.
+    """Fuse views into a coloured mesh of the surface inside a box.
 
-    Open3D's ``VoxelBlockGrid`` does it, near the frame's origin: its coordinates are float32. (The older
-    ``ScalableTSDFVolume`` of Open3D 0.20 returns nothing without a word.)
+    Open3D's ``VoxelBlockGrid`` has float32 coordinates, so the box must be near the frame's origin. (The older
+    ``ScalableTSDFVolume`` of Open3D 0.20 silently returns nothing.)
 
     Args:
         views: rendered views, taken one at a time.
-        box: where the surface is wanted.
-        voxel: size of a voxel; if not given, the size of a pixel on the surface in the first view that sees the box,
-            but no less than a thousandth of the box. It is in the mesh's ``metadata``.
+        box: box around the surface.
+        voxel: voxel size; if None, a pixel's size on the surface in the first view that sees the box, but at least a
+            thousandth of the box. It is stored in the mesh's ``metadata``.
 
     Raises:
-        SceneError: no surface is left in the box, or a voxel has no size.
+        SceneError: no surface is left in the box, or the voxel size is not positive.
     """
     if voxel is not None and not voxel > 0:
         raise SceneError(f"a voxel cannot be {voxel} long: give a --voxel above 0")
@@ -79,10 +79,10 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
 
 
 def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """The mesh with at most about ``faces`` triangles, by quadric error (Garland and Heckbert 1997); colours stay.
+    """Decimate a mesh to about ``faces`` triangles by quadric error (Garland and Heckbert 1997), with its colours.
 
     Raises:
-        SceneError: nothing is left of it.
+        SceneError: no triangle is left.
     """
     import trimesh
 
@@ -95,7 +95,7 @@ def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     dense.vertex_colors = o3d.utility.Vector3dVector(mesh.visual.vertex_colors[:, :3] / 255)  # pyright: ignore
     sparse = dense.simplify_quadric_decimation(max(faces, 0))
     if len(sparse.triangles) == 0:
-        raise SceneError(f"nothing is left of a mesh of {len(mesh.faces)} triangles that is thinned to {faces}")
+        raise SceneError(f"nothing is left of a mesh of {len(mesh.faces)} triangles decimated to {faces}")
     colours = np.round(255 * np.asarray(sparse.vertex_colors)).clip(0, 255).astype(np.uint8)
     return trimesh.Trimesh(
         np.asarray(sparse.vertices),
@@ -107,7 +107,7 @@ def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def _inside(view: DepthView, box: Box) -> Bool[np.ndarray, "H W"]:
-    """Pixels whose depth lies in the box."""
+    """Mask of the pixels whose depth lies in the box."""
     camera = view.camera.to(torch.float64)
     to_world = torch.linalg.inv(camera.viewmat)
     points = (view.depth.double() * camera.rays()) @ to_world[:3, :3].T + to_world[:3, 3]
@@ -127,12 +127,12 @@ def _voxel_grid(voxel: float):
 
 
 def _integrate(grid, view: DepthView, inside: Bool[np.ndarray, "H W"]) -> None:
-    """Add one view. Open3D truncates a projection to its pixel: centres are at 0.5 there as here."""
+    """Add one view. Open3D truncates projections to pixels, so its pixel centres are at 0.5, as ours are."""
     o3d = import_open3d()
     kept = np.where(inside[..., None], view.depth.numpy(), 0).astype(np.float32)
     depth, colour = (
-        o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(picture, dtype=np.float32)))
-        for picture in (kept, view.rgb.numpy())
+        o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(image, dtype=np.float32)))
+        for image in (kept, view.rgb.numpy())
     )
     K, viewmat = (o3d.core.Tensor(matrix.double().numpy()) for matrix in (view.camera.K, view.camera.viewmat))
     unit, far = 1.0, 2 * float(kept.max())
@@ -141,13 +141,13 @@ def _integrate(grid, view: DepthView, inside: Bool[np.ndarray, "H W"]) -> None:
 
 
 def _extract(grid, views: int) -> trimesh.Trimesh:
-    """The zero crossing between voxels that so many views saw; without faces where there is none."""
+    """The zero crossing between voxels that at least ``views`` views saw; without faces if there is none."""
     import trimesh
 
     try:
         surface = grid.extract_triangle_mesh(weight_threshold=views - 0.5)
     except RuntimeError as error:
-        if "colors" not in str(error).lower():  # Open3D trips over the colours of no vertices
+        if "colors" not in str(error).lower():  # Open3D fails on the colours of an empty mesh
             raise
         return trimesh.Trimesh()
     colours = np.round(255 * surface.vertex.colors.numpy()).clip(0, 255).astype(np.uint8)
@@ -156,7 +156,7 @@ def _extract(grid, views: int) -> trimesh.Trimesh:
 
 
 def _without_specks(mesh: trimesh.Trimesh, area: float) -> Bool[np.ndarray, " F"]:
-    """Faces that hang together with enough others."""
+    """Mask of the faces in connected components of at least this area."""
     import trimesh
 
     piece = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))

@@ -1,4 +1,4 @@
-"""One building of a trained run, brought to the frame of a simulation."""
+"""A trained run's building in the simulation frame."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo
 
 MARGIN = 0.5
-"""Metres around the shell that the fused surface is taken from."""
+"""Margin around the shell, in metres, within which the fused surface is kept."""
 HIDDEN_SIZE = 800
-"""Pixels of the longer side of what is kept of each view."""
-TOGETHER = 5000.0
-"""Metres that buildings of one world may be apart: coordinates in files are float32."""
+"""Longer side of the occlusion masks, in pixels."""
+MAX_SEPARATION = 5000.0
+"""Largest distance between buildings of one world, in metres: coordinates in files are float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What a trained run knows of a building, in the frame of a simulation.
+    """A trained run's reconstruction of a building, in the simulation frame.
 
     Attributes:
-        folder: the scene's.
-        frame: the simulation's.
-        fused: the surface that the run renders, with colours at its vertices.
-        shell: the shell, of any winding; None where the scene has none.
-        splats: the Gaussians.
-        views: the photographs, training's and held-out ones.
-        hidden: for each, where something that was reconstructed stands well before the shell: poles, trees, cars.
-        held_out: names of the held-out ones.
+        folder: scene folder.
+        frame: simulation frame.
+        fused: surface fused from the rendered depth, with vertex colours.
+        shell: shell of any winding; None if the scene has none.
+        splats: Gaussians.
+        views: training and held-out views.
+        hidden: for each view, mask of reconstructed objects well in front of the shell: poles, trees, cars.
+        held_out: names of the held-out views.
     """
 
     folder: Path
@@ -60,21 +60,21 @@ class Reconstruction:
     def of(
         cls, run: TrainedRun, faces: int, voxel: float | None, ground: float | None, home: SimFrame | None
     ) -> Reconstruction:
-        """Render, fuse and place a trained run.
+        """Render and fuse a trained run, and move it to the simulation frame.
 
         Args:
-            run: the run.
-            faces: triangles that the fused surface is thinned to.
-            voxel: size of a voxel in metres; a pixel's on the facade if None.
-            ground: height of the ground in the shell's coordinates; the shell's lower edge if None.
-            home: frame of a world that it is to be part of; its own if None.
+            run: trained run.
+            faces: number of triangles to decimate the fused surface to.
+            voxel: voxel size in metres; a pixel's size on the facade if None.
+            ground: ground height in the shell's coordinates; the shell's lower edge if None.
+            home: frame of the world to join; a frame of its own if None.
 
         Raises:
-            SceneError: nothing is rendered, or it does not belong to that world.
+            SceneError: nothing is rendered, or the building does not fit into that world.
         """
         views = [view for dataset in run.datasets for view in dataset.views]
         hidden: list[np.ndarray] = []
-        fused = decimate(run.facade(fuse(_watched(run, hidden), run.box(MARGIN), voxel), MARGIN), faces)
+        fused = decimate(run.facade(fuse(_views_and_occlusions(run, hidden), run.box(MARGIN), voxel), MARGIN), faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
         frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground)
         folder = Path(run.datamanager.config.dataparser.data)
@@ -99,12 +99,12 @@ class Reconstruction:
 
     @property
     def eyes(self) -> Float64[np.ndarray, "V 3"]:
-        """The cameras' places."""
+        """Camera positions in the simulation frame."""
         return transformed(positions(view.camera for view in self.views), np.linalg.inv(self.frame.to_scene))
 
     @property
     def photos(self) -> Iterator[Photo]:
-        """The photographs with their cameras in the frame, and what in them is of the building."""
+        """Photographs with cameras in the simulation frame, and masks of the building."""
         for view, hidden in zip(self.views, self.hidden, strict=True):
             image, kept = np.ascontiguousarray(load_photograph(view)[..., :3]), load_mask(view)
             rows, columns = (
@@ -113,28 +113,28 @@ class Reconstruction:
             clear = ~hidden[np.ix_(rows, columns)]
             yield Photo(image, self.frame.camera(view.camera), clear if kept is None else clear & kept)
 
-    def contradicted(self, places: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-        """Metres before places of the shell at which photographs show something else; NaN where they do not.
+    def contradicted(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+        """Metres in front of points of the shell at which photographs contradict it; NaN where they do not.
 
-        Places in the simulation's frame. Half of the photographs that see a place must say so: what stands on its own
-        before the wall hides another place in each.
+        Points are in the simulation frame. Half of the photographs that see a point must contradict it: an object in
+        front of the wall hides a different point in each.
         """
         if "checked" not in find_cues(self.folder):
-            return np.full(len(places), np.nan)
-        verdicts = shell_verdicts(self.folder, self.views, transformed(places, self.frame.to_scene))
+            return np.full(len(points), np.nan)
+        verdicts = shell_verdicts(self.folder, self.views, transformed(points, self.frame.to_scene))
         return np.where(verdicts.differs, verdicts.distance / self.frame.scale, np.nan)
 
-    def say(self, tell: Callable[[str], None]) -> None:
-        """What a user must know of the input."""
+    def warn_if_unaligned(self, log: Callable[[str], None]) -> None:
+        """Tell the user what is different without an aligned shell."""
         if self.shell is None:
-            tell(
-                f"{self.scene} has no aligned shell: the frame is the scene's own, turned upright as the cameras were "
-                "held, the size of its unit is unknown, and the collider is the reconstruction alone."
+            log(
+                f"{self.scene} has no aligned shell: the frame is the scene's, rotated upright by the cameras' up "
+                "axes, its unit is unknown, and the collision geometry comes from the reconstruction alone."
             )
 
 
-def _watched(run: TrainedRun, hidden: list[np.ndarray]) -> Iterator[DepthView]:
-    """The run's views; on the way, where they show something well before the shell goes to ``hidden``."""
+def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray]) -> Iterator[DepthView]:
+    """Yield the run's views; append to ``hidden`` the mask of what is well in front of the shell in each."""
     caster = ShellCaster(run.shell_in_frame, np.eye(4)) if run.shell else None
     for view in run.views():
         step = view.camera.thinning(HIDDEN_SIZE)
@@ -151,14 +151,14 @@ def _watched(run: TrainedRun, hidden: list[np.ndarray]) -> Iterator[DepthView]:
 def moved_into(
     frame: SimFrame, motion: np.ndarray, home: SimFrame, scene: str
 ) -> tuple[SimFrame, Float64[np.ndarray, "4 4"]]:
-    """A frame and the motion into it, exchanged for those of a world that is georeferenced in the same way."""
+    """Replace a frame and the motion into it by those of a world with the same georeference."""
     if not (frame.metric and home.metric):
         raise SceneError(f"{scene} and the scenes before it have no common frame: each needs an aligned shell")
     between = np.linalg.inv(home.to_national) @ frame.to_national
     away = float(np.linalg.norm(between[:3, 3]))
-    if away > TOGETHER:
+    if away > MAX_SEPARATION:
         raise SceneError(
-            f"{scene} is {away / 1000:.0f} km from the first building: are both shells in one system of coordinates?"
+            f"{scene} is {away / 1000:.0f} km from the first building: are both shells in the same coordinate system?"
         )
     to_scene = frame.to_scene @ np.linalg.inv(between)
     return SimFrame(frame.name, to_scene, home.offset, True, "z", home.to_national), between @ motion

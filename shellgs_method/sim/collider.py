@@ -1,4 +1,4 @@
-"""The collider: convex parts behind the shell's planes, and behind the fused surface where it stands before these."""
+"""Collision geometry: convex parts behind the shell's planes, and behind the fused surface in front of these."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from shellgs_method.sim.planes import Plane, find_planes, grid_in, polygons_of
 from shellgs_method.sim.rays import Surface, spread
 
 THICKNESS = 0.3
-"""Metres that parts reach behind a surface, where nothing says that the building ends before."""
+"""Depth of parts behind a surface in metres, unless the building is known to be thinner."""
 THINNEST = 0.03
-"""Metres; what is thinner, fast bodies pass between two steps of a simulation."""
+"""Minimum thickness in metres: fast bodies pass through thinner parts between two time steps."""
 FOR_SURFACES = 0.4
-"""Share of the parts for what is no plane, at most; that of its area if this is more."""
+"""Largest share of the parts for non-planar surfaces, or their share of the area if that is larger."""
 COVERED = 0.01
-"""Metres before other parts up to which a part adds nothing to them."""
+"""Parts that protrude from the others by no more than this, in metres, are left out."""
 MANY = 4
-"""Times as many parts as wanted from which outlines are joined by area alone."""
+"""Multiple of the wanted number of parts above which outlines are first merged by area alone."""
 DEEP = 1.0
-"""Metres of air behind a plane that count at most, where parts are joined over an opening."""
+"""Largest depth of air counted behind a plane, in metres, where parts are merged across an opening."""
 GROUND = 0.1
-"""Metres above the ground up to which the fused surface is taken for it: simulators have a plane there."""
+"""Height in metres up to which the fused surface counts as ground: simulators have a plane there."""
 BACKED = 0.9
-"""Share of the eyes that see something before the shell which must see the shell behind it."""
+"""Share of the cameras that see something in front of the shell which must also see the shell behind it."""
 ROUNDS = 3
-"""Of filling the budget up with patches."""
+"""Attempts to fill the rest of the budget with patches."""
 SPECK = 0.01
-"""Square metres below which a separate piece of surface before the shell is noise."""
+"""Area in square metres below which a separate piece of surface in front of the shell is noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Collider:
-    """Convex parts that together are a building's outside.
+    """Convex parts that together form a building's exterior.
 
     Attributes:
-        parts: convex, overlapping; in metres, in the simulation's frame.
-        filled: cubic metres of air, in openings and notches, that the budget of parts covers up.
+        parts: overlapping convex parts, in metres, in the simulation frame.
+        filled: cubic metres of air in openings and notches that were filled to keep the budget of parts.
     """
 
     parts: list[Part]
@@ -60,19 +60,19 @@ class Collider:
 
 
 def make_collider(shell: Surface | None, fused: Surface, standing: Bool[np.ndarray, " F"], most: int = 256) -> Collider:
-    """The collider of a building: prisms behind the shell's planes, patches of what else stands out.
+    """Build collision geometry: prisms behind the shell's planes, and patches of the surfaces that are left.
 
     Args:
-        shell: wound outwards; None where the scene has none.
-        fused: the surface that was reconstructed, wound outwards.
-        standing: which of its triangles stand on their own, as :func:`standing_before` says.
-        most: convex parts.
+        shell: shell, wound outwards; None if the scene has none.
+        fused: reconstructed surface, wound outwards.
+        standing: mask of its triangles in front of the shell, from :func:`standing_before`.
+        most: maximum number of convex parts.
 
     Raises:
-        SceneError: there is nothing to collide with.
+        SceneError: there is no surface to collide with, or ``most`` is below 1.
     """
     if most < 1:
-        raise SceneError(f"a collider cannot have {most} parts: give --parts above 0")
+        raise SceneError(f"collision geometry cannot have {most} parts: give --parts above 0")
     planes, rest = ([], np.empty(0, np.int64)) if shell is None else find_planes(shell.vertices, shell.faces)
     surfaces = [] if shell is None else [(shell, group) for group in connected(shell.faces, rest)]
     groups = connected(fused.faces, np.flatnonzero(standing))
@@ -81,32 +81,34 @@ def make_collider(shell: Surface | None, fused: Surface, standing: Bool[np.ndarr
     share = 1.0 if not planes else max(FOR_SURFACES, rough / (flat + rough)) if surfaces else 0.0
     solid, filled = [], 0.0
     if planes and shell is not None:
-        solid, filled = _behind([_facing(plane, shell) for plane in planes], shell, max(1, round((1 - share) * most)))
+        solid, filled = _prisms([_facing(plane, shell) for plane in planes], shell, max(1, round((1 - share) * most)))
     parts, asked = uncovered(solid), most - len(solid)
-    for _ in range(ROUNDS if surfaces else 0):  # planes hide some patches, and leave room for others
-        tried = uncovered([*solid, *_patched(surfaces, asked)])
+    for _ in range(ROUNDS if surfaces else 0):  # planes cover some patches, which leaves room for others
+        tried = uncovered([*solid, *_patch_parts(surfaces, asked)])
         if len(tried) > most or len(tried) <= len(parts):
             break
         parts, asked = tried, round(asked * most / max(len(tried), 1))
     if not parts:
-        raise SceneError("the collider is empty: neither shell nor reconstruction has a surface that cameras see")
+        raise SceneError(
+            "there is nothing to collide with: neither shell nor reconstruction has a surface that cameras see"
+        )
     return Collider(parts, filled)
 
 
 def standing_before(
     shell: Surface, fused: Surface, eyes: Float64[np.ndarray, "E 3"], least: float, count: int = 24
 ) -> Bool[np.ndarray, " F"]:
-    """Which triangles of a surface stand before the shell by ``least`` metres, and above the ground, as eyes see it.
+    """Mask of a surface's triangles that are visible, above the ground and over ``least`` metres in front of the shell.
 
-    Nearly all eyes that see them must have the shell behind them: beside a building's outline, a reconstruction goes
-    on where the shell ends.
+    Nearly all cameras that see a triangle must see the shell behind it: beside a building's outline, a reconstruction
+    continues where the shell ends.
 
     Args:
-        shell: wound outwards.
-        fused: wound outwards.
-        eyes: the cameras' places.
-        least: metres; a reconstruction is noisy up to there.
-        count: of eyes to ask.
+        shell: shell, wound outwards.
+        fused: reconstructed surface, wound outwards.
+        eyes: camera positions.
+        least: distance in metres up to which a reconstruction is noisy.
+        count: number of cameras to test.
     """
     near = np.flatnonzero((shell.signed_distance(fused.centres) > least) & (fused.centres[:, 2] > GROUND))
     places = fused.centres[near]
@@ -121,8 +123,8 @@ def standing_before(
     return standing
 
 
-def _patched(groups: Sequence[tuple[Surface, np.ndarray]], most: int) -> list[Part]:
-    """Parts of pieces of surfaces, each surface getting its share by area; ``most`` at most."""
+def _patch_parts(groups: Sequence[tuple[Surface, np.ndarray]], most: int) -> list[Part]:
+    """At most ``most`` parts for groups of triangles, shared out among the surfaces by area."""
     parts, areas = [], [surface.areas[group].sum() for surface, group in groups]
     for surface in dict.fromkeys(surface for surface, _ in groups):
         own = [group for other, group in groups if other is surface]
@@ -131,8 +133,8 @@ def _patched(groups: Sequence[tuple[Surface, np.ndarray]], most: int) -> list[Pa
     return sorted(parts, key=_size, reverse=True)[:most]
 
 
-def _behind(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Part], float]:
-    """Prisms behind planes, ``most`` if that can be, and the cubic metres of air that joining them costs."""
+def _prisms(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Part], float]:
+    """Prisms behind planes, at most ``most``, and the cubic metres of air that merging them fills."""
     depths = [thickness(plane, shell) for plane in planes]
 
     def solid(cut: Sequence[Sequence[shapely.Polygon]]) -> dict[Part, tuple[int, shapely.Polygon]]:
@@ -141,7 +143,7 @@ def _behind(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Pa
         return {part: made[part] for part in uncovered([part for part in made if part is not None])}
 
     cut, spent = [convex_pieces(plane.outline) for plane in planes], 0.0
-    if sum(map(len, cut)) > MANY * most:  # ragged outlines: bring them down before anything is cast
+    if sum(map(len, cut)) > MANY * most:  # ragged outlines: merge by area before casting rays
         cut, _ = fewer_pieces(cut, MANY * most, lambda _, area: float(shapely.area(area)))
     parts = solid(cut)
     if len(parts) > most:
@@ -170,7 +172,7 @@ def _size(part: Part) -> float:
 
 
 def _facing(plane: Plane, shell: Surface) -> Plane:
-    """The plane with its normal to the side that most of its triangles face."""
+    """The plane with its normal on the side that most of its triangles face."""
     if shell.areas[plane.faces] @ (shell.normals[plane.faces] @ plane.normal) >= 0:
         return plane
     mirrored = shapely.affinity.scale(plane.outline, xfact=-1, origin=(0, 0))
@@ -178,7 +180,7 @@ def _facing(plane: Plane, shell: Surface) -> Plane:
 
 
 def thickness(plane: Plane, shell: Surface) -> float:
-    """How far parts may reach behind a plane until they come out of the building somewhere."""
+    """Depth in metres that parts can have behind a plane without leaving the building."""
     points = plane.samples(max(0.1, np.sqrt(plane.outline.area) / 20))
     back = np.broadcast_to(-plane.normal, points.shape)
     t, hit = shell.cast(points + 0.01 * back, back)
@@ -188,7 +190,7 @@ def thickness(plane: Plane, shell: Surface) -> float:
 
 
 def uncovered(parts: Sequence[Part]) -> list[Part]:
-    """The parts that stand out of the others somewhere; small ones are asked first."""
+    """The parts that others do not cover; small ones are tested first."""
     parts = sorted(parts, key=_size)
     low, high = (np.array([end(part.vertices, axis=0) for part in parts]).reshape(-1, 3) for end in (np.min, np.max))
     kept = np.ones(len(parts), bool)
@@ -206,7 +208,7 @@ def uncovered(parts: Sequence[Part]) -> list[Part]:
 
 
 def _face_points(part: Part) -> Float64[np.ndarray, "N 3"]:
-    """Points all over a part's faces."""
+    """A grid of points on each face of a part."""
     return np.einsum("kw,fwc->fkc", _WEIGHTS, part.vertices[part.faces]).reshape(-1, 3)
 
 
@@ -214,7 +216,7 @@ _WEIGHTS = np.array([[i, j, 6 - i - j] for i in range(7) for j in range(7 - i)])
 
 
 def connected(faces: Int64[np.ndarray, "F 3"], chosen: Int64[np.ndarray, " C"]) -> list[Int64[np.ndarray, " G"]]:
-    """The chosen triangles in groups that share corners."""
+    """Connected components of the chosen triangles, by shared vertices."""
     if not len(chosen):
         return []
     corners = faces[chosen]
@@ -228,7 +230,7 @@ def connected(faces: Int64[np.ndarray, "F 3"], chosen: Int64[np.ndarray, " C"]) 
 
 
 def leaks(collider: Surface, shell: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 20_000) -> float:
-    """Share of the rays from the eyes to the shell, as far as these reach it, that pass the collider by 10 cm."""
+    """Share of the camera rays that reach the shell and pass 10 cm behind it without hitting the collision geometry."""
     points, _ = shell.samples(count)
     origins = eyes[np.arange(count) % len(eyes)]
     away = points - origins

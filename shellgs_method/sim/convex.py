@@ -1,4 +1,4 @@
-"""Outlines cut into convex polygons, and these joined until they are few."""
+"""Decompose outlines into convex polygons, and merge these until few are left."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import shapely
 import trimesh
 
 EXACT = 1e-3
-"""Square metres that a convex polygon may have more than what it is made of, at no cost."""
+"""Area in square metres that merging two polygons may add at no cost."""
 NEIGHBOURS = 6
-"""Pieces of a plane that one is tried to be joined with."""
+"""Number of nearest pieces of the same plane to try to merge with."""
 
 
 def convex_pieces(outline: shapely.MultiPolygon) -> list[shapely.Polygon]:
-    """Areas with holes as convex polygons.
+    """Decompose polygons with holes into convex polygons.
 
-    Triangles are joined along common edges while their hull has no more area than they have, the longest edges first
-    (Hertel and Mehlhorn 1983): four times as many pieces as need be at most.
+    Triangles are merged across common edges, the longest first, while their hull has no more area than they have
+    (Hertel and Mehlhorn 1983): at most four times as many pieces as necessary.
     """
     pieces: list[shapely.Polygon] = []
     pairs: set[tuple[int, int]] = set()
@@ -34,21 +34,21 @@ def convex_pieces(outline: shapely.MultiPolygon) -> list[shapely.Polygon]:
                     pairs.add((edges[key], len(pieces)))
                 edges[key] = len(pieces)
             pieces.append(shapely.Polygon(vertices[face]))
-    joined, _ = _join(pieces, pairs, lambda _, __, ___: np.inf, 0)
+    joined, _ = _merge(pieces, pairs, lambda _, __, ___: np.inf, 0)
     return [piece for piece, _ in joined]
 
 
 def fewer_pieces(
     planes: Sequence[Sequence[shapely.Polygon]], most: int, cost: Callable[[int, shapely.Geometry], float]
 ) -> tuple[list[list[shapely.Polygon]], float]:
-    """Pieces of planes, joined where that costs least until there are no more than ``most``, and the whole cost.
+    """Merge the cheapest pairs of pieces until ``most`` are left; return the pieces of each plane and the total cost.
 
-    A plane keeps one piece at least, so that with many planes more are left.
+    A plane keeps at least one piece, so that with many planes more are left.
 
     Args:
-        planes: convex polygons of each.
-        most: pieces of all planes.
-        cost: of covering an area of the plane with that index.
+        planes: convex polygons of each plane.
+        most: number of pieces over all planes.
+        cost: cost of covering an area of the plane with the given index.
     """
     pieces = [piece for plane in planes for piece in plane]
     owner = [index for index, plane in enumerate(planes) for _ in plane]
@@ -64,22 +64,22 @@ def fewer_pieces(
     def price(hull: shapely.Geometry, one: shapely.Polygon, other: tuple[shapely.Polygon, int]) -> float:
         return cost(owner[other[1]], shapely.difference(hull, shapely.union(one, other[0])))
 
-    left, spent = _join(pieces, pairs, price, most)
+    left, spent = _merge(pieces, pairs, price, most)
     cut: list[list[shapely.Polygon]] = [[] for _ in planes]
     for piece, origin in left:
         cut[owner[origin]].append(piece)
     return cut, spent
 
 
-def _join(
+def _merge(
     start: Sequence[shapely.Polygon],
     pairs: set[tuple[int, int]],
     price: Callable[[shapely.Geometry, shapely.Polygon, tuple[shapely.Polygon, int]], float],
     most: int,
 ) -> tuple[list[tuple[shapely.Polygon, int]], float]:
-    """Join pairs of pieces into their hulls: all that cost nothing, then the cheapest while there are too many.
+    """Merge pairs of pieces into their hulls: all that cost nothing, then the cheapest while there are too many.
 
-    Returns the pieces, each with the number of one that it was made of, and what was paid.
+    Returns the pieces, each with the index of one of its original pieces, and the total cost.
     """
     pieces = dict(enumerate(start))
     origin = {number: number for number in pieces}

@@ -1,4 +1,4 @@
-"""Where the building and its shell differ, as the photographs have it."""
+"""Regions where the photographed building differs from its shell."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo
 
 EDGE = 0.15
-"""Metres between the places of the shell that are compared."""
+"""Longest edge in metres of the triangles into which the shell is subdivided."""
 REACH = 0.5
-"""Metres before and behind the shell in which the building is looked for."""
+"""Search range in front of and behind the shell, in metres."""
 GREY = (150, 150, 150)
 FULL = 0.2
-"""Metres at which colours are full: red before the shell, blue behind it."""
+"""Distance in metres of the full colours: red in front of the shell, blue behind it."""
 
 Contradicted = Callable[[Float64[np.ndarray, "N 3"]], Float64[np.ndarray, " N"]]
-"""For places of the shell, in the simulation's frame, how far the photographs say that the building stands before them
-(positive) or behind them, in metres; NaN where they say nothing."""
+"""Maps points of the shell, in the simulation frame, to the distance in metres at which the photographs show the
+building in front of them (positive) or behind them; NaN where the photographs do not contradict the shell."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A piece of the shell that the building differs from.
+    """A region of the shell from which the building differs.
 
     Attributes:
-        what: "before", the scan lacks something, or "behind", something is gone or deeper.
-        area: of the shell, in square metres.
-        distance: median signed distance in metres, positive before the shell.
-        centre: in the simulation's frame.
-        photograph: that shows it best.
+        what: "before" (the scan lacks something) or "behind" (something is gone or deeper).
+        area: area of the shell, in square metres.
+        distance: median signed distance in metres, positive in front of the shell.
+        centre: centre in the simulation frame.
+        photograph: name of the photograph that shows it best.
     """
 
     what: str
@@ -50,13 +50,13 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """The shell in small triangles, and the building's distance at each.
+    """Distance of the building from the shell, at each triangle of the subdivided shell.
 
     Attributes:
-        surface: the shell, subdivided.
-        distance: metres that the building stands before the shell at each triangle; NaN where that was not seen.
-        flagged: triangles that differ by more than the threshold.
-        regions: of these, that hang together, the largest first.
+        surface: subdivided shell.
+        distance: signed distance in metres at each triangle, positive in front of the shell; NaN where unseen.
+        flagged: triangles whose distance exceeds the threshold.
+        regions: connected regions of these, the largest first.
     """
 
     surface: Surface
@@ -65,7 +65,7 @@ class Deviations:
     regions: list[Region]
 
     def write(self, path: Path) -> None:
-        """The shell as a ply with colours: red before it, blue behind it, grey where not seen."""
+        """Write the coloured shell as ply: red where the building is in front of it, blue behind, grey where unseen."""
         mesh = trimesh.Trimesh(
             self.surface.vertices, self.surface.faces, face_colors=coloured(self.distance), process=False
         )
@@ -82,15 +82,15 @@ def find_deviations(
     contradicted: Contradicted | None = None,
     least: float = 0.05,
 ) -> Deviations:
-    """Compare the shell with what was reconstructed, along its normals.
+    """Compare the shell with the reconstruction along its normals.
 
     Args:
-        shell: wound so that normals point outside.
-        fused: the reconstruction.
-        photos: with their names.
-        threshold: metres from which they differ.
-        contradicted: what the photographs themselves say, which goes before the reconstruction where it says anything.
-        least: square metres of a region.
+        shell: shell, wound so that normals point outside.
+        fused: reconstruction.
+        photos: photographs with their names.
+        threshold: distance in metres above which they differ.
+        contradicted: distances from the photographs themselves, used instead of the reconstruction where not NaN.
+        least: minimum area of a region in square metres.
     """
     small = Surface(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
     centres = small.centres
@@ -120,13 +120,13 @@ def find_deviations(
 
 
 def along_normals(small: Surface, places: Float64[np.ndarray, "F 3"], other: Surface) -> Float64[np.ndarray, " F"]:
-    """How far another surface stands before each triangle, looked at from outside; NaN where there is none near."""
+    """Signed distance of another surface along each triangle's normal, seen from outside; NaN if none is in reach."""
     t, _ = other.cast(places + REACH * small.normals, -small.normals)
     return np.where(t < 2 * REACH, REACH - t, np.nan)
 
 
 def coloured(distance: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 4"]:
-    """White at 0, red before the shell, blue behind it, grey where nothing is known."""
+    """RGBA colours: white at 0, red in front of the shell, blue behind it, grey where unknown."""
     strength = np.clip(np.nan_to_num(distance) / FULL, -1, 1)[:, None]
     colours = 255 - 255 * np.where(strength > 0, strength * [0.1, 1, 1], -strength * [1, 1, 0.1])
     colours = np.where(np.isnan(distance)[:, None], GREY, colours)

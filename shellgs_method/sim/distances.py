@@ -1,4 +1,4 @@
-"""How far a collider is from what it stands for, both ways."""
+"""Distances between collision geometry and the surface that it approximates, in both directions."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SLANT = 0.17
 
 @dataclass(frozen=True)
 class Distances:
-    """Metres between two surfaces, from points of one to the other, where cameras see them.
+    """Distances in metres from the visible points of one surface to another.
 
     Attributes:
-        median: half of the points are nearer.
-        p95: 95 % are nearer.
-        within: share nearer than 10 cm.
+        median: median distance.
+        p95: 95th percentile.
+        within: share of the points nearer than 10 cm.
     """
 
     median: float
@@ -32,7 +32,7 @@ class Distances:
 
     @classmethod
     def of(cls, distances: np.ndarray) -> Distances | None:
-        """Of some distances; None of none."""
+        """Summarize distances; None if there are none."""
         if not len(distances):
             return None
         median, p95 = np.quantile(distances, [0.5, 0.95])
@@ -46,14 +46,14 @@ def both_ways(
     cameras: Sequence[Camera],
     before: float,
 ) -> dict[str, Distances]:
-    """Distances of a collider from another surface and back; of points on the shell, and of those before it.
+    """Distances from collision geometry to another surface and back; also separately on the shell and in front of it.
 
     Args:
-        collider: the collider.
-        other: shell, reconstruction or truth.
-        shell: wound outwards; None where there is none, and nothing is told apart.
-        cameras: what is in none of their images, or at a slant of less than 10°, does not count: side walls, say.
-        before: metres from the shell from which a point stands before it.
+        collider: collision geometry.
+        other: shell, reconstruction or true geometry.
+        shell: shell, wound outwards; None for no separate distances.
+        cameras: only points in one of their images count, seen at more than 10° from the surface (not side walls, say).
+        before: distance in metres above which a point is in front of the shell.
     """
     found = {}
     for name, one, two in (("from the collider", collider, other), ("to the collider", other, collider)):
@@ -64,11 +64,11 @@ def both_ways(
             ahead = shell.signed_distance(points) > before
             found[f"{name}, on the shell"] = Distances.of(distance[~ahead])
             found[f"{name}, before the shell"] = Distances.of(distance[ahead])
-    return {name: figures for name, figures in found.items() if figures is not None}
+    return {name: distances for name, distances in found.items() if distances is not None}
 
 
 def visible(surface: Surface, cameras: Sequence[Camera]) -> Float64[np.ndarray, "N 3"]:
-    """Points spread over what is in some camera's image of a surface, above the ground."""
+    """Random points of a surface, above the ground and visible in the image of some camera."""
     points, faces = surface.samples(COUNT)
     above = points[:, 2] > 0.02
     points, normals = points[above], surface.normals[faces[above]]

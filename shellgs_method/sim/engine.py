@@ -1,4 +1,4 @@
-"""Worlds in MuJoCo: loaded without a warning, and looked at by a lidar."""
+"""Load worlds in MuJoCo without warnings, and simulate a lidar in them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from jaxtyping import Float64
 from dataparsers.errors import SceneError
 
 BEAMS = -22.5, 22.5
-"""Degrees above the horizon between which a lidar looks: those of an Ouster OS1."""
+"""Vertical field of view of the lidar in degrees: that of an Ouster OS1."""
 
 
 def import_mujoco() -> ModuleType:
-    """MuJoCo.
+    """Import MuJoCo.
 
     Raises:
-        SceneError: it is not installed.
+        SceneError: MuJoCo is not installed.
     """
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # read once, when MuJoCo is imported
@@ -33,7 +33,7 @@ def import_mujoco() -> ModuleType:
 
 
 def read_spec(path: Path):
-    """MuJoCo's editable form of a model, its files found from anywhere."""
+    """Read a model into MuJoCo's editable form; its files are found from any working directory."""
     mujoco = import_mujoco()
     try:
         return mujoco.MjSpec.from_file(str(path))
@@ -43,9 +43,9 @@ def read_spec(path: Path):
 
 @contextmanager
 def warnings_kept() -> Iterator[list[str]]:
-    """What MuJoCo warns of meanwhile; without it, warnings go to MUJOCO_LOG.TXT in the working directory.
+    """Collect MuJoCo's warnings, which otherwise go to MUJOCO_LOG.TXT in the working directory.
 
-    Within another one, as where a trial compiles its model, what is warned of is kept by the inner alone.
+    When nested, as where a trial compiles its model, only the inner one collects them.
     """
     mujoco, warnings = import_mujoco(), []
     outer = mujoco.get_mju_user_warning()
@@ -68,7 +68,7 @@ def compiled(spec, path: Path):
 
 
 def load(path: Path):
-    """The compiled model of an MJCF file.
+    """Load and compile an MJCF file.
 
     Raises:
         SceneError: MuJoCo refuses it, or warns.
@@ -80,10 +80,10 @@ def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarr
     """Distances [P, R] in metres that a lidar measures in MuJoCo; inf where nothing is hit.
 
     Args:
-        path: of the model.
-        places: where the lidar stands.
+        path: model file.
+        places: positions of the lidar.
         rays: unit directions.
-        group: of geoms that count: 3 the colliders, 2 what is to be seen.
+        group: group of the geoms to hit: 3 for collision geometry, 2 for visual meshes.
     """
     mujoco, model = import_mujoco(), load(path)
     data = mujoco.MjData(model)
@@ -101,7 +101,7 @@ def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarr
 
 
 def beams(elevations: int = 24, azimuths: int = 180) -> Float64[np.ndarray, "R 3"]:
-    """Directions of a lidar that looks all around."""
+    """Unit directions of a lidar with a horizontal field of view of 360 degrees."""
     up, around = np.meshgrid(
         np.radians(np.linspace(*BEAMS, elevations)), np.linspace(0, 2 * np.pi, azimuths, endpoint=False), indexing="ij"
     )

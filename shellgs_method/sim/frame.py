@@ -1,4 +1,4 @@
-"""The frame of a simulation: metres, z up, the origin on the ground before the facade."""
+"""The simulation frame: metres, z up, the origin on the ground in front of the facade."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from shellgs_method.shell.geometry.similarity import transformed
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """Turns y-up coordinates into z-up ones."""
 LOWEST = 0.002
-"""Share of a shell's points that may lie below the ground: its edge is never quite even."""
+"""Share of a shell's points that may lie below the ground: its lower edge is never quite even."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimFrame(Frame):
-    """A frame for simulators. Its axes are those of the shell, turned upright only where that has another one up.
+    """A frame for simulators: the axes of the shell, rotated only if z is not up in it.
 
     Attributes:
-        to_national: rigid motion to the shell's own coordinates in metres, which are national ones if the shell is
-            georeferenced; the identity where there is no shell.
+        to_national: rigid motion to the shell's own coordinates in metres, which are national coordinates if the shell
+            is georeferenced; the identity if there is no shell.
     """
 
     to_national: Float64[np.ndarray, "4 4"]
@@ -41,16 +41,16 @@ def sim_frame(
     cameras: Sequence[Camera],
     ground: float | None = None,
 ) -> tuple[SimFrame, Float64[np.ndarray, "4 4"]]:
-    """The simulation's frame for what is in ``frame``, and the rigid motion there.
+    """The simulation frame for results in ``frame``, and the rigid motion into it.
 
-    The origin is where the cameras stand, on the median and on whole metres of the shell's coordinates, at the height
-    of the surface's lower edge.
+    The origin is the median camera position, rounded to whole metres of the shell's coordinates, at the height of the
+    surface's lower edge.
 
     Args:
-        frame: of the exported results; z up, y up, or the scene's, which is turned upright as the cameras are held.
+        frame: frame of the exported results; z up, y up, or the scene's, rotated upright by the cameras' up axes.
         surface: points of the shell, or else of the reconstruction, in that frame.
-        cameras: of the photographs, in the scene.
-        ground: height of the ground in the shell's own coordinates, in metres; the surface's lower edge if None.
+        cameras: cameras of the photographs, in the scene.
+        ground: ground height in the shell's own coordinates, in metres; the surface's lower edge if None.
     """
     from_scene = np.linalg.inv(frame.to_scene)
     turn = np.eye(4)
@@ -68,7 +68,7 @@ def sim_frame(
     back = np.linalg.inv(motion)
     to_national = np.eye(4)
     to_national[:3, :3], to_national[:3, 3] = turn[:3, :3].T, turn[:3, :3].T @ origin
-    made = SimFrame(
+    sim = SimFrame(
         frame.name,
         frame.to_scene @ back,
         to_national[:3, 3],
@@ -76,11 +76,11 @@ def sim_frame(
         "z",
         to_national if frame.metric else np.eye(4),
     )
-    return made, motion
+    return sim, motion
 
 
 def _upright(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The smallest rotation that turns a direction upwards (Rodrigues)."""
+    """The smallest rotation of a direction to the z axis (Rodrigues)."""
     up = up / np.linalg.norm(up)
     axis, cosine = np.cross(up, [0.0, 0, 1]), up[2]
     if cosine < -1 + 1e-9:

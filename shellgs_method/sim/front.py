@@ -1,4 +1,4 @@
-"""The facade as a robot finds it: how long it is, where its outside is, where one can stand."""
+"""The facade's extent and outward direction, and places for a robot in front of it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from shellgs_method.sim.rays import Surface, spread
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """The facade's length and its outside, on the ground.
+    """Extent and outward direction of the facade, on the ground.
 
     Attributes:
-        along: horizontal unit vector along it.
-        outwards: horizontal unit vector away from it.
-        foot: its middle.
-        length: from end to end.
+        along: horizontal unit vector along the facade.
+        outwards: horizontal unit vector away from the facade.
+        foot: middle of the facade, at height 0.
+        length: length of the facade.
     """
 
     along: Float64[np.ndarray, " 3"]
@@ -28,7 +28,7 @@ class Front:
 
     @classmethod
     def of(cls, surface: Surface, eyes: Float64[np.ndarray, "E 3"]) -> Front:
-        """That of the upright surfaces that eyes see."""
+        """The front of the vertical surfaces that are visible from the cameras."""
         points, triangle = surface.samples(4000)
         normals, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
         for eye in spread(eyes, 12):
@@ -51,7 +51,7 @@ class Front:
         return cls(along, outwards, foot * [1, 1, 0], float(last - first))
 
     def before(self, surface: Surface, share: float, distance: float, height: float) -> Float64[np.ndarray, " 3"]:
-        """The place so far before the surface and above the ground, at a share of the length."""
+        """The point at a share of the length, ``distance`` in front of the surface and ``height`` above the ground."""
         far = self.foot + (share - 0.5) * self.length * self.along + [0, 0, height] + 30 * self.outwards
         wide = far + np.linspace(-0.5, 0.5, 11)[:, None] * self.along
         reached = float(surface.cast(wide, np.broadcast_to(-self.outwards, wide.shape))[0].min())
@@ -59,6 +59,6 @@ class Front:
 
 
 def places_before(surface: Surface, front: Front, count: int = 20, height: float = 0.6) -> Float64[np.ndarray, "P 3"]:
-    """Places where a robot could stand: along the facade, from one to five metres before it."""
+    """Places where a robot could stand: along the facade, one to five metres in front of it."""
     shares = np.linspace(0.02, 0.98, count)
     return np.stack([front.before(surface, share, 1.0 + k % 5, height) for k, share in enumerate(shares)])

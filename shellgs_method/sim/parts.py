@@ -1,4 +1,4 @@
-"""Convex parts, and what is known of them from their planes."""
+"""Convex parts, described by their corners and by the planes of their faces."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Part:
     Attributes:
         vertices: its corners, in metres.
         faces: triangles between them, counter-clockwise seen from outside.
-        source: what it was made from: a plane of the shell, or a surface that is no plane.
-        planes: of its faces: n · x + d <= 0 inside.
+        source: origin of the part: a plane of the shell, or a surface that is not planar.
+        planes: planes of its faces: n · x + d <= 0 inside.
     """
 
     vertices: Float64[np.ndarray, "V 3"]
@@ -32,7 +32,7 @@ class Part:
 
     @classmethod
     def hull(cls, points: Float64[np.ndarray, "N 3"], source: Literal["plane", "surface"]) -> Part | None:
-        """The convex hull of points; None where they have no volume."""
+        """The convex hull of points; None if they have no volume."""
         try:
             hull = ConvexHull(points)
         except (QhullError, ValueError):
@@ -56,13 +56,13 @@ class Part:
 
 
 def prism(plane: Plane, polygon: shapely.Polygon, thickness: float) -> Part | None:
-    """A convex polygon of a plane, extruded against its normal."""
+    """Extrude a convex polygon of a plane against its normal."""
     flat = np.array(polygon.exterior.coords)[:-1]
     return Part.hull(np.concatenate([plane.to_space(flat), plane.to_space(flat, thickness)]), "plane")
 
 
 def joined(parts: Sequence[Part]) -> tuple[Float64[np.ndarray, "V 3"], Int64[np.ndarray, "F 3"]]:
-    """All parts as one mesh."""
+    """Vertices and faces of all parts as one mesh."""
     first = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     return (
         np.concatenate([part.vertices for part in parts]),

@@ -1,4 +1,4 @@
-"""Surfaces that are no planes as convex parts: patches with their hulls, thickened backwards."""
+"""Convex parts for surfaces that are not planar: hulls of patches, thickened backwards."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from shellgs_method.sim.parts import Part
 from shellgs_method.sim.rays import Surface
 
 EVEN = 0.02
-"""A patch whose points are within this of its plane, in metres, is not cut further."""
+"""Standard deviation from its plane, in metres, up to which a patch is not split further."""
 FEWEST = 4
-"""Triangles in a patch; what is smaller is noise."""
+"""Minimum number of triangles in a patch; smaller ones are noise."""
 
 
 def convex_patches(surface: Surface, groups: list[Int64[np.ndarray, " F"]], most: int, thickness: float) -> list[Part]:
-    """Convex parts of groups of triangles, ``most`` in all: the worst patch is halved until there are so many.
+    """Cover groups of triangles with convex parts: the costliest patch is split in two until there are ``most``.
 
-    A patch's part is the hull of its corners and of these moved backwards, so that it is solid however thin the
-    surface. What a patch costs is the area of its triangles times their standard deviation across it.
+    A patch's part is the hull of its corners and of copies moved backwards, so that it is solid however thin the
+    surface. The cost of a patch is the area of its triangles times their standard deviation from its plane.
 
     Args:
         surface: wound so that normals point outside.
-        groups: triangles that hang together.
-        most: parts.
-        thickness: how far parts reach behind the surface, in metres.
+        groups: connected triangles.
+        most: maximum number of parts.
+        thickness: depth of the parts behind the surface, in metres.
     """
     queue = [_patch(surface, group) for group in groups if len(group) >= FEWEST]
     queue = heapq.nsmallest(most, queue)
@@ -45,7 +45,7 @@ def convex_patches(surface: Surface, groups: list[Int64[np.ndarray, " F"]], most
 
 
 def _patch(surface: Surface, faces: np.ndarray) -> tuple[float, int, np.ndarray]:
-    """A patch with what it costs, negative, to sort by."""
+    """A patch with its negative cost, to sort by."""
     corners, areas = surface.vertices[surface.faces[faces]], surface.areas[faces]
     centres = corners.mean(axis=1)
     spread = centres - areas @ centres / areas.sum()
@@ -54,7 +54,7 @@ def _patch(surface: Surface, faces: np.ndarray) -> tuple[float, int, np.ndarray]
 
 
 def _halved(surface: Surface, faces: np.ndarray) -> list[np.ndarray]:
-    """The two halves of a patch across its longest direction."""
+    """Split a patch in two across its longest direction."""
     centres = surface.vertices[surface.faces[faces]].mean(axis=1)
     along = (centres - centres.mean(0)) @ np.linalg.svd(centres - centres.mean(0), full_matrices=False)[2][0]
     first = along <= np.median(along)

@@ -1,4 +1,4 @@
-"""A triangle mesh as planes with an outline each, and what lies on none."""
+"""Find the planes of a triangle mesh, with their outlines."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float64, Int64
 
-HYPOTHESES, JUDGES = 200, 4000
+HYPOTHESES, VOTERS = 200, 4000
 AGREEMENT = np.cos(np.radians(20))
-"""Of a triangle's normal with its plane's: scans are noisy."""
+"""Minimum cosine between a triangle's normal and its plane's: scans are noisy."""
 LEAST_AREA = 0.02
-"""Of a plane, in square metres."""
+"""Minimum area of a plane, in square metres."""
 LEAST_SHARE = 1e-3
-"""Of the mesh's area that a plane has in a mesh of many small triangles: what is smaller is ornament or noise."""
+"""Minimum share of the mesh's area for a plane of a scan: smaller ones are ornament or noise."""
 SMALL = 0.01
-"""Square metres that the triangles of a scan have, on average, at most."""
+"""Mean area of triangles in square metres below which a mesh is taken for a scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Plane:
     Attributes:
         origin: a point of the plane.
         axes: rows u, v and the unit normal, right-handed; u is horizontal where the plane is not.
-        outline: what of the plane there is, in coordinates along u and v.
+        outline: the part of the plane that is covered, in coordinates along u and v.
         faces: indices of the triangles that lie on it.
     """
 
@@ -42,16 +42,16 @@ class Plane:
         return self.axes[2]
 
     def to_space(self, flat: Float64[np.ndarray, "N 2"], behind: float = 0.0) -> Float64[np.ndarray, "N 3"]:
-        """Points of the plane, moved against its normal."""
+        """3D points from plane coordinates, moved ``behind`` metres against the normal."""
         return self.origin + flat @ self.axes[:2] - behind * self.normal
 
     def samples(self, step: float) -> Float64[np.ndarray, "N 3"]:
-        """Points on a grid inside the outline, and one in each of its pieces at least."""
+        """Grid points inside the outline, at least one in each of its pieces."""
         return self.to_space(np.concatenate([grid_in(piece, step) for piece in self.outline.geoms]))
 
 
 def grid_in(piece: shapely.Polygon, step: float) -> Float64[np.ndarray, "N 2"]:
-    """Points on a grid inside a polygon; where none is, a point inside."""
+    """Grid points inside a polygon, or any point inside if there are none."""
     x0, y0, x1, y1 = piece.bounds
     grid = np.stack(np.meshgrid(*(np.arange(a + step / 2, b, step) for a, b in ((x0, x1), (y0, y1)))), -1).reshape(
         -1, 2
@@ -65,13 +65,13 @@ def find_planes(
 ) -> tuple[list[Plane], Int64[np.ndarray, " R"]]:
     """The planes of a mesh, the largest first, and the triangles that lie on none.
 
-    One triangle makes a hypothesis, which a sample of the others judges by area, as RANSAC does (Fischler and Bolles
-    1981); pieces of a plane need not touch, so that all panes of a facade are one.
+    Each RANSAC hypothesis (Fischler and Bolles 1981) comes from one triangle and is scored by area on a sample of the
+    others. Pieces of a plane need not touch, so that all panes of a facade are one.
 
     Args:
         vertices: in metres.
-        faces: three vertices each.
-        tolerance: how far a triangle's corners may lie from its plane, in metres.
+        faces: vertex indices.
+        tolerance: largest distance of a triangle's corners from its plane, in metres.
         gap: cracks up to this width in the outline are closed, in metres.
     """
     corners = vertices[faces]
@@ -82,7 +82,7 @@ def find_planes(
     left, rest = np.flatnonzero(areas > 1e-8), []
     scanned = len(left) > 0 and areas[left].mean() < SMALL
     least = LEAST_SHARE * areas.sum() if scanned else 0.0
-    # A scan's outlines are ragged by its triangles' size: they are smoothed, and crumbs are left to the rest.
+    # A scan's outlines are as ragged as its triangles are large: smooth them, and leave small pieces to the rest.
     even, crumb = (
         (float(np.clip(1.5 * np.sqrt(2 * areas[left].mean()), tolerance, 0.1)), 0.1) if scanned else (0.0, 0.005)
     )
@@ -107,7 +107,7 @@ def find_planes(
 def _largest(
     corners: np.ndarray, normals: np.ndarray, areas: np.ndarray, tolerance: float, rng: np.random.Generator
 ) -> Bool[np.ndarray, " F"]:
-    """The triangles on the plane that has most area, after fitting it to them until it settles."""
+    """Mask of the triangles on the plane with the most area, refitted until it stops growing."""
     centres = corners.mean(axis=1)
 
     def on(points: np.ndarray, axes: np.ndarray, among: np.ndarray | slice) -> np.ndarray:
@@ -118,8 +118,8 @@ def _largest(
     share = areas / areas.sum()
     count = min(HYPOTHESES, len(areas))
     hypotheses = rng.choice(len(areas), count, replace=False, p=share) if (share > 0).sum() >= count else slice(None)
-    judges = rng.permutation(len(areas))[:JUDGES]
-    votes = areas[judges] @ on(centres[hypotheses], normals[hypotheses], judges)
+    voters = rng.permutation(len(areas))[:VOTERS]
+    votes = areas[voters] @ on(centres[hypotheses], normals[hypotheses], voters)
     best = np.arange(len(areas))[hypotheses][votes.argmax()]
     members = on(centres[[best]], normals[[best]], slice(None))[:, 0]
     members[best] = True
@@ -133,7 +133,7 @@ def _largest(
 
 
 def _fit(corners: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares plane through triangles, by area: a point and a normal."""
+    """Least-squares plane through triangles, weighted by area: a point and a normal."""
     weights, points = np.repeat(areas, 3), corners.reshape(-1, 3)
     origin = weights @ points / weights.sum()
     spread = points - origin
@@ -150,11 +150,11 @@ def _outlined(
     gap: float,
     crumb: float,
 ) -> Plane | None:
-    """The plane of triangles with their union as its outline; None where that is too small."""
+    """The plane of triangles with their union as its outline; None if that is too small."""
     if areas.sum() < LEAST_AREA:
         return None
     origin, normal = _fit(corners, areas)
-    if areas @ (normals @ normal) < 0:  # as most of them wind
+    if areas @ (normals @ normal) < 0:  # to the side that most of them face
         normal = -normal
     axes = upright_axes(normal)
     flat = (corners - origin) @ axes[:2].T
@@ -175,7 +175,7 @@ def upright_axes(normal: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"
 
 
 def _pieces(shape: shapely.Geometry, least: float) -> shapely.MultiPolygon:
-    """The polygons of a shape that are large enough, without holes that are not."""
+    """The polygons of a shape of at least ``least`` area, without smaller holes."""
     pieces = [part for part in polygons_of(shape) if part.area >= least]
     return shapely.MultiPolygon(
         [shapely.Polygon(p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= least]) for p in pieces]
@@ -183,7 +183,7 @@ def _pieces(shape: shapely.Geometry, least: float) -> shapely.MultiPolygon:
 
 
 def polygons_of(shape: shapely.Geometry) -> Iterator[shapely.Polygon]:
-    """The polygons that a shape is made of."""
+    """The polygons of a shape."""
     for part in getattr(shape, "geoms", [shape]):
         if isinstance(part, shapely.Polygon) and not part.is_empty:
             yield part

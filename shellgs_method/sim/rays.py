@@ -1,4 +1,4 @@
-"""Rays against triangles and distances from them, near the origin."""
+"""Ray casting and distances on triangle meshes near the origin."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from shellgs_method.open3d import import_open3d
 
 
 class Surface:
-    """A triangle mesh to cast rays at and to measure from; in float32, so its frame must be near it.
+    """A triangle mesh for ray casting and distances, in float32, so the origin must be near.
 
     Attributes:
-        vertices: in metres.
-        faces: three vertices each, which wind counter-clockwise seen from outside where the caller needs sides.
-        centres: middle of each triangle.
+        vertices: vertices in metres.
+        faces: vertex indices, counter-clockwise seen from outside where the caller needs sides.
+        centres: centre of each triangle.
         normals: unit normal of each triangle.
-        areas: of each triangle.
+        areas: area of each triangle.
     """
 
     def __init__(self, vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> None:
@@ -35,7 +35,7 @@ class Surface:
     def cast(
         self, origins: Float64[np.ndarray, "*N 3"], directions: Float64[np.ndarray, "*N 3"]
     ) -> tuple[Float32[np.ndarray, " *N"], Int64[np.ndarray, " *N"]]:
-        """Multiple of its direction at which each ray first hits, inf where it does not, and the triangle, else -1."""
+        """First hit of each ray: the multiple of its direction (inf if none) and the triangle (-1 if none)."""
         answer = self._scene.cast_rays(self._rays(origins, directions))
         t = answer["t_hit"].numpy()
         return t, np.where(np.isfinite(t), answer["primitive_ids"].numpy().astype(np.int64), -1)
@@ -43,7 +43,7 @@ class Surface:
     def sees(
         self, points: Float64[np.ndarray, "*N 3"], targets: Float64[np.ndarray, "*N 3"], slack: float = 1e-3
     ) -> Bool[np.ndarray, " *N"]:
-        """Whether nothing stands between points and targets, but for the ``slack`` metres before these."""
+        """Whether nothing is between points and targets, except in the last ``slack`` metres."""
         away = targets - points
         length = np.linalg.norm(away, axis=-1, keepdims=True)
         t, _ = self.cast(np.broadcast_to(points, away.shape), away / np.maximum(length, 1e-9))
@@ -61,7 +61,7 @@ class Surface:
         return np.where(side < 0, -1.0, 1.0) * np.linalg.norm(away, axis=1)
 
     def samples(self, count: int, seed: int = 0) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
-        """Points spread evenly by area, and the triangle that each lies on; the same ones each time."""
+        """Random points, uniform by area, and the triangle of each; the same for the same seed."""
         rng = np.random.default_rng(seed)
         chosen = rng.choice(len(self.areas), count, p=self.areas / self.areas.sum())
         weights = rng.dirichlet(np.ones(3), count)
@@ -76,14 +76,14 @@ class Surface:
 def outward(
     surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 24
 ) -> tuple[Surface, Bool[np.ndarray, " F"]]:
-    """The surface wound so that normals point to where the eyes are that see them; and which triangles any eye sees.
+    """Wind triangles so that their normals point to the eyes that see them; also return which are seen.
 
-    What no eye sees keeps its winding.
+    Unseen triangles keep their winding.
 
     Args:
-        surface: of any winding.
-        eyes: places outside, cameras' say.
-        count: of eyes to ask, spread over all.
+        surface: surface of any winding.
+        eyes: positions outside, such as those of cameras.
+        count: number of eyes to test, spread over all.
     """
     centres = surface.centres
     votes, seen = np.zeros(len(centres)), np.zeros(len(centres), bool)
@@ -95,5 +95,5 @@ def outward(
 
 
 def spread(eyes: Float64[np.ndarray, "E 3"], count: int) -> Float64[np.ndarray, "C 3"]:
-    """At most so many of the eyes, evenly in their order."""
+    """At most ``count`` of the eyes, evenly spaced in their order."""
     return eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]

@@ -17,14 +17,14 @@ scene's cameras (`to_scene`) and to national coordinates (`to_national`), whose 
 | file | what it is |
 |---|---|
 | `facade.xml` | MuJoCo's model (MJCF) |
-| `facade.urdf`, `facade.sdf` | the same for robots' tools and for Gazebo |
-| `facade.usda` | the same for Isaac Sim and other readers of USD: look, colliders, splats (variant `look`) |
-| `{folder}collision/part_*.obj` | {parts} convex parts; engines may take their hulls as they are |
-| `{folder}visual.obj`, `.mtl`, `.png` | the look, with a texture from the photographs |
-| `{folder}visual.glb` | the same for browsers; y-up, as glTF wants it |
+| `facade.urdf`, `facade.sdf` | the same for URDF readers and for Gazebo |
+| `facade.usda` | the same for Isaac Sim and other USD readers: visual mesh, colliders, splats (variant `look`) |
+| `{folder}collision/part_*.obj` | {parts} convex parts, which are their own convex hulls |
+| `{folder}visual.obj`, `.mtl`, `.png` | the visual mesh, with a texture from the photographs |
+| `{folder}visual.glb` | the same for browsers; y-up, as glTF requires |
 | `{folder}splats.ply` | the Gaussians |
-| `{folder}deviations.ply`, `.json` | the shell: red where the building stands before it, blue behind, grey not seen |
-| `report.html`, `metrics.json` | how far off all of it is, and images |
+| `{folder}deviations.ply`, `.json` | the shell: red where the building is in front of it, blue behind, grey unseen |
+| `report.html`, `metrics.json` | the accuracy of all this, and images |
 
 {summary}
 
@@ -36,7 +36,7 @@ model = mujoco.MjModel.from_xml_path("facade.xml")
 data = mujoco.MjData(model)
 ```
 
-To put a robot in: `spec = mujoco.MjSpec.from_file("facade.xml")`, then `spec.attach(...)`.
+To add a robot: `spec = mujoco.MjSpec.from_file("facade.xml")`, then `spec.attach(...)`.
 
 ## Isaac Sim
 
@@ -63,9 +63,9 @@ pybullet.loadURDF("facade.urdf", useFixedBase=True)
 
 
 def write_readme(out: Path, buildings: Sequence[Building], frame: SimFrame, metrics: dict) -> None:
-    """Write what is in the folder, and how each simulator loads it."""
+    """Write a README with the folder's contents and how each simulator loads it."""
     where = (
-        "Coordinates are metres along the shell's axes; the origin is on the ground before the facade."
+        "Coordinates are metres along the shell's axes; the origin is on the ground in front of the facade."
         if frame.metric
         else "The scene has no aligned shell: the unit of length is unknown."
     )

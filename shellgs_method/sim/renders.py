@@ -1,4 +1,4 @@
-"""Pictures of a world: MuJoCo's beside the photographs, and the collider over these."""
+"""Images of a world: MuJoCo's renders, and photographs with the collision geometry drawn on them."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.texture import Photo
 
 LARGEST = 1280
-"""Pixels of a picture's longer side."""
+"""Longer side of an image, in pixels."""
 EDGE = (255, 0, 140)
 
 
 def rendered(path: Path, cameras: Sequence[Camera], group: int = 2) -> list[UInt8[np.ndarray, "H W 3"]]:
-    """What cameras see of a world in MuJoCo's own renderer, off screen.
+    """Render a world off screen with MuJoCo's own renderer.
 
     Args:
-        path: of the model.
-        cameras: in its frame.
-        group: of geoms to draw: 2 what is to be seen, 3 the colliders.
+        path: model file.
+        cameras: cameras in the model's frame.
+        group: group of the geoms to draw: 2 for visual meshes, 3 for collision geometry.
 
     Raises:
-        SceneError: there is no OpenGL to draw with.
+        SceneError: OpenGL is not available.
     """
     mujoco, spec = import_mujoco(), read_spec(path)
-    # A camera of MuJoCo's looks through the middle of its picture: around another middle, a larger one is drawn.
+    # MuJoCo's principal point is the image centre: for any other, render a larger image and crop it.
     sizes = [tuple(int(np.ceil(2 * max(c, n - c))) for c, n in _centres(camera)) for camera in cameras]
     for number, (camera, (_, height)) in enumerate(zip(cameras, sizes, strict=True)):
         pose = np.linalg.inv(camera.viewmat.double().numpy())
@@ -51,7 +51,7 @@ def rendered(path: Path, cameras: Sequence[Camera], group: int = 2) -> list[UInt
     option = mujoco.MjvOption()
     option.geomgroup[:] = 0
     option.geomgroup[group] = 1
-    pictures = []
+    images = []
     for number, (camera, (width, height)) in enumerate(zip(cameras, sizes, strict=True)):
         try:
             renderer = mujoco.Renderer(model, height, width)
@@ -59,23 +59,23 @@ def rendered(path: Path, cameras: Sequence[Camera], group: int = 2) -> list[UInt
             raise SceneError(f"MuJoCo found no OpenGL to draw with ({error}): install libegl1 or libosmesa6") from error
         with renderer:
             renderer.update_scene(data, f"photograph_{number}", option)
-            picture = renderer.render()
+            image = renderer.render()
         (cx, w), (cy, h) = _centres(camera)
         left, top = round(width / 2 - cx), round(height / 2 - cy)
-        pictures.append(picture[top : top + h, left : left + w].copy())
-    return pictures
+        images.append(image[top : top + h, left : left + w].copy())
+    return images
 
 
 def overlaid(photo: Photo, collider: Surface) -> UInt8[np.ndarray, "H W 3"]:
-    """A photograph with the edges of the collider drawn on it."""
+    """A photograph with the edges of the collision geometry drawn on it."""
     mesh = ShellMesh(collider.vertices, collider.faces)
-    picture = photo.image.copy()
-    picture[shell_edges(ShellCaster(mesh, np.eye(4)).cast(photo.camera), 1.0)] = EDGE
-    return picture
+    image = photo.image.copy()
+    image[shell_edges(ShellCaster(mesh, np.eye(4)).cast(photo.camera), 1.0)] = EDGE
+    return image
 
 
 def shown(photo: Photo) -> Photo:
-    """A photograph as large as a report needs it."""
+    """A photograph scaled down for the report."""
     camera = photo.camera.shrunk(LARGEST)
     image = Image.fromarray(photo.image).resize((camera.width, camera.height), Image.Resampling.BOX)
     return Photo(np.asarray(image), camera, None)

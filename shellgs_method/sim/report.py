@@ -1,4 +1,4 @@
-"""The report on a folder for simulators: images, distances, trials, deviations; one HTML file."""
+"""The report on a simulation folder: images, distances, trials and deviations in one HTML file."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from shellgs_method.sim.trials import throw, walk
 from shellgs_method.sim.world import Building
 
 IMAGES = 3
-"""Photographs of each building that are shown."""
+"""Number of photographs shown of each building."""
 REGIONS = 20
-"""Deviations that are listed."""
+"""Number of deviations listed."""
 _STYLE = """
 :root { color-scheme: light }
 body { font: 16px/1.5 system-ui, sans-serif; color: #1f2328; max-width: 80rem; margin: 2rem auto; padding: 0 1rem }
@@ -42,18 +42,18 @@ img { width: 100%; display: block } figure { margin: 0 } figcaption { color: #59
 
 @dataclass(frozen=True, eq=False)
 class Chapter:
-    """What is reported of a building.
+    """What the report covers of a building.
 
     Attributes:
-        made: the reconstruction.
-        shell: wound outwards; None where there is none.
-        collider: its collider.
-        facts: of its files.
-        photos: of it, in the order of the reconstruction's views.
-        deviations: from the shell; None where there is none.
-        distances: of the collider from other surfaces.
-        truth: true geometry, where it is known.
-        with_splats: whether they are in the USD.
+        made: reconstruction.
+        shell: shell, wound outwards; None if there is none.
+        collider: collision geometry.
+        facts: sizes of the visual mesh and its files.
+        photos: photographs in the order of the reconstruction's views.
+        deviations: deviations from the shell; None if there is none.
+        distances: distances between the collision geometry and other surfaces.
+        truth: true geometry, if known.
+        with_splats: whether the USD has the splats.
     """
 
     made: Reconstruction
@@ -68,9 +68,9 @@ class Chapter:
 
 
 def write_report(
-    out: Path, buildings: Sequence[Building], chapters: Sequence[Chapter], tell: Callable[[str], None]
+    out: Path, buildings: Sequence[Building], chapters: Sequence[Chapter], log: Callable[[str], None]
 ) -> dict:
-    """Try the world in MuJoCo, draw it, and write ``report.html``; returns the metrics.
+    """Test and render the world in MuJoCo, write ``report.html``, and return the metrics.
 
     Raises:
         SceneError: MuJoCo refuses the world.
@@ -91,7 +91,7 @@ def write_report(
         made, sentences = _metrics(world, building, chapter)
         metrics["buildings"][building.name] = made
         summary += sentences
-        sections += _section(world, building, chapter, made, tell)
+        sections += _section(world, building, chapter, made, log)
     page += [f"<p>{escape(sentence)}</p>" for sentence in summary]
     with atomic_write(out / "report.html") as file:
         file.write("".join([*page, *sections]).encode())
@@ -99,7 +99,7 @@ def write_report(
 
 
 def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, list[str]]:
-    """A building's metrics, and the sentences that say them."""
+    """A building's metrics, and sentences that summarize them."""
     collider, surface = chapter.collider, chapter.collider.surface
     front = Front.of(surface, chapter.made.eyes)
     with warnings_kept() as warnings:
@@ -118,13 +118,13 @@ def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
     }
     sentences = [
         f"{building.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; "
-        f"their budget costs {collider.filled:.2g} m³ of air.",
+        f"merging them to keep the budget filled {collider.filled:.2g} m³ of air.",
         str(walked),
         *(f"MuJoCo warns: {warning}" for warning in warnings),
     ]
     if chapter.shell is not None:
         made["leaks"] = leaks(surface, chapter.shell, chapter.made.eyes)
-        sentences.append(f"{made['leaks']:.2%} of the rays from the cameras to the shell pass the collider by 10 cm.")
+        sentences.append(f"{made['leaks']:.2%} of the camera rays to the shell pass the collision geometry by 10 cm.")
     if chapter.truth is not None:
         made["lidar"] = lidar_errors(world, surface, front, chapter.truth)
         sentences += [f"Lidar of the {name} against the truth: {text(e)}" for name, e in made["lidar"].items()]
@@ -132,7 +132,7 @@ def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
 
 
 def lidar_errors(world: Path, collider: Surface, front: Front, truth: Surface) -> dict[str, dict]:
-    """Errors of a lidar in MuJoCo, from 20 places before a building, of the rays that meet the true one."""
+    """Errors of a lidar in MuJoCo at 20 places in front of a building, over the rays that hit the true building."""
     places, rays = places_before(collider, front), beams()
     origins = np.repeat(places, len(rays), axis=0)
     true, _ = truth.cast(origins, np.tile(rays, (len(places), 1)))
@@ -156,23 +156,23 @@ def lidar_errors(world: Path, collider: Surface, front: Front, truth: Surface) -
 
 
 def text(errors: Mapping[str, float]) -> str:
-    """A lidar's errors in words."""
+    """A lidar's errors as a sentence."""
     return (
         f"median {100 * errors['median']:.1f} cm, 95 % within {100 * errors['p95']:.1f} cm, "
         f"{errors['within_10cm']:.1%} within 10 cm of {errors['rays']} rays; {errors['from_nothing']:.2%} of the "
-        "others see what is not there."
+        "others hit what is not there."
     )
 
 
 def _section(
-    world: Path, building: Building, chapter: Chapter, metrics: dict, tell: Callable[[str], None]
+    world: Path, building: Building, chapter: Chapter, metrics: dict, log: Callable[[str], None]
 ) -> Iterator[str]:
     yield f"<h2>{escape(building.name)}</h2>"
     width, height = chapter.facts["texture"]
     yield f"<p>{chapter.facts['triangles']} triangles with a texture of {width} x {height} pixels; "
     yield f"visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB.</p>"
-    yield from _images(world, chapter, tell)
-    yield "<h3>Distances of the collider</h3>"
+    yield from _images(world, chapter, log)
+    yield "<h3>Distances of the collision geometry</h3>"
     rows = [
         (name, way, f"{100 * d.median:.1f}", f"{100 * d.p95:.1f}", f"{d.within:.1%}")
         for name, ways in chapter.distances.items()
@@ -196,15 +196,15 @@ def _section(
         yield _table(("what", "area (m²)", "distance (cm)", "place (m)", "photograph"), rows)
 
 
-def _images(world: Path, chapter: Chapter, tell: Callable[[str], None]) -> Iterator[str]:
-    """Photographs, what MuJoCo draws from their cameras, and the collider's edges on them."""
+def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:
+    """Photographs, MuJoCo's renders from the same cameras, and photographs with the edges of the collision geometry."""
     held_out = [k for k, view in enumerate(chapter.made.views) if view.name in chapter.made.held_out]
     chosen = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, IMAGES).round().astype(int))]
     photos = [shown(chapter.photos[k]) for k in chosen]
     try:
         drawn = rendered(world, [photo.camera for photo in photos])
     except SceneError as error:
-        tell(f"{error}; the report has no images of MuJoCo.")
+        log(f"{error}; the report has no MuJoCo renders.")
         drawn = [None] * len(photos)
     surface = chapter.collider.surface
     for k, photo, image in zip(chosen, photos, drawn, strict=True):
@@ -212,7 +212,7 @@ def _images(world: Path, chapter: Chapter, tell: Callable[[str], None]) -> Itera
         yield _figure(photo.image, chapter.made.views[k].name)
         if image is not None:
             yield _figure(image, "MuJoCo")
-        yield _figure(overlaid(photo, surface), "the collider's edges")
+        yield _figure(overlaid(photo, surface), "edges of the collision geometry")
         yield "</div>"
 
 

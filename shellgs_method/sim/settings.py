@@ -1,4 +1,4 @@
-"""How a folder for simulators is made; apart, so that the command line need not import what makes it."""
+"""Settings of a simulation folder, separate so that the command line need not import the code behind them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Optional
 
 @dataclass(frozen=True)
 class SimSettings:
-    """How a folder for simulators is made."""
+    """Settings of a simulation folder."""
 
     parts: int = 256
-    """Convex parts of each building's collider, at most."""
+    """Maximum number of convex collision parts of each building."""
     faces: int = 50_000
-    """Triangles that the reconstruction is thinned to."""
+    """Number of triangles to decimate the reconstruction to."""
     voxel: Optional[float] = None
-    """Size in metres of a voxel that views are fused in. If not set: a pixel's size on the facade."""
+    """Voxel size in metres for fusing the views. If not set: a pixel's size on the facade."""
     texel: Optional[float] = None
-    """Size in metres of a pixel of the texture. If not set: a little finer than the photographs."""
+    """Size of a texture pixel in metres. If not set: a little finer than the photographs."""
     megabytes: float = 30.0
-    """Size of visual.glb at most; its texture is made smaller for it."""
+    """Maximum size of visual.glb; its texture is scaled down to fit."""
     ground: Optional[float] = None
     """Height of the ground in the shell's coordinates. If not set: the shell's lower edge."""

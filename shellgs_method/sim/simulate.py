@@ -1,4 +1,4 @@
-"""A folder that simulators load, from trained runs."""
+"""Export trained runs to a folder that simulators load."""
 
 from __future__ import annotations
 
@@ -29,39 +29,39 @@ from shellgs_method.sim.usd import write_usd_layers, write_usd_world
 from shellgs_method.sim.visual import write_visual
 from shellgs_method.sim.world import Building, write_parts, write_worlds
 
-STANDS = 0.05
-"""Metres before the shell from which the fused surface stands on its own, or two voxels if that is more."""
-NEIGHBOURING = 2.0
-"""Metres between pieces of a collider from which it is said to be in several."""
+AHEAD = 0.05
+"""Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
+MAX_GAP = 2.0
+"""Gap in metres from which the pieces of a building's collision geometry are reported as separate."""
 
 
 def simulate(
     configs: Sequence[Path],
     out: Path,
     settings: SimSettings,
-    tell: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
     up: UpAxis | None = None,
     truths: Sequence[Callable[[np.ndarray], Surface]] = (),
 ) -> tuple[dict, list[Chapter]]:
-    """Write one folder with everything that simulators load of the buildings of trained runs.
+    """Export the buildings of trained runs to one folder that simulators load.
 
     Args:
-        configs: config.yml of each run; the first one's frame is the world's.
-        out: the folder.
-        settings: how.
-        tell: told what a user should know, a sentence each.
+        configs: config.yml of each run; the first run's frame is the world's.
+        out: output folder.
+        settings: export settings.
+        log: called with each message for the user.
         up: axis of the shells' frames that points up; that of their format if None.
-        truths: for each run, its true geometry by the similarity from the scene to the world, where it is known.
+        truths: for each run, a function from the similarity (scene to world) to the true geometry, where known.
 
     Returns:
-        The metrics of ``metrics.json``, and what they were taken from.
+        The metrics of ``metrics.json``, and the chapters that they were computed from.
 
     Raises:
         SceneError: a run cannot be used, or the runs have no common frame.
     """
     if not configs or out.suffix in (".yml", ".yaml") or out.is_file():
-        raise SceneError(f"give the config.yml of one run or more, and last a folder to write: {out} is none")
-    import_mujoco()  # refused before hours of work
+        raise SceneError(f"give the config.yml of at least one run, then an output folder (last was {out})")
+    import_mujoco()  # fail before hours of work
     out.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
     buildings, chapters, home = [], [], None
@@ -69,11 +69,11 @@ def simulate(
         run = TrainedRun.load(config, up)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
-        made.say(tell)
+        made.warn_if_unaligned(log)
         names.append(_name(made.scene, names) if len(configs) > 1 else "facade")
         folder = names[-1] if len(configs) > 1 else ""
         truth = truths[number](np.linalg.inv(made.frame.to_scene)) if number < len(truths) else None
-        chapter = _building(made, out / folder, settings, tell, truth)
+        chapter = _building(made, out / folder, settings, log, truth)
         chapters.append(chapter)
         buildings.append(Building(names[-1], folder, len(chapter.collider.parts)))
     assert home is not None
@@ -81,7 +81,7 @@ def simulate(
     unit = 1.0 if home.metric else None
     write_usd_world(out / "facade.usda", buildings, unit, all(chapter.with_splats for chapter in chapters))
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
-    metrics = write_report(out, buildings, chapters, tell)
+    metrics = write_report(out, buildings, chapters, log)
     write_readme(out, buildings, home, metrics)
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
@@ -89,63 +89,63 @@ def simulate(
 
 
 def _building(
-    made: Reconstruction, folder: Path, settings: SimSettings, tell: Callable[[str], None], truth: Surface | None
+    made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None], truth: Surface | None
 ) -> Chapter:
     """Write the files of one building."""
     folder.mkdir(parents=True, exist_ok=True)
-    stands = max(STANDS, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
+    ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
     fused, seen = outward(Surface(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
     shell, standing, beside = None, seen & (fused.centres[:, 2] > GROUND), np.zeros(len(seen), bool)
     if made.shell is not None:
         shell, _ = outward(made.shell, eyes)
-        standing = standing_before(shell, fused, eyes, stands)
-        beside = (shell.signed_distance(fused.centres) > stands) & ~standing
+        standing = standing_before(shell, fused, eyes, ahead)
+        beside = (shell.signed_distance(fused.centres) > ahead) & ~standing
     collider = make_collider(shell, fused, standing, settings.parts)
-    # Beside the shell's outline and below its foot the reconstruction goes on: nothing that follows is about that.
+    # The reconstruction continues beside the shell's outline and below its foot: leave that out from here on.
     mesh = made.fused
     mesh.update_faces(~beside)
     mesh.remove_unreferenced_vertices()
     fused, _ = outward(Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
-    _say_pieces(collider, made.scene, tell)
+    _report_gaps(collider, made.scene, log)
     write_parts(folder, collider.parts)
     photos = list(made.photos)
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
-    look = bake(fused, colours, photos, settings.texel)
-    facts = write_visual(folder, look, settings.megabytes)
+    textured = bake(fused, colours, photos, settings.texel)
+    facts = write_visual(folder, textured, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
-    with_splats = write_usd_layers(folder, look, collider.parts, made.splats, 1.0 if made.frame.metric else None)
+    with_splats = write_usd_layers(folder, textured, collider.parts, made.splats, 1.0 if made.frame.metric else None)
     deviations: Deviations | None = None
     if shell is not None:
         named = list(zip([view.name for view in made.views], photos, strict=True))
-        deviations = find_deviations(shell, fused, named, stands, made.contradicted)
+        deviations = find_deviations(shell, fused, named, ahead, made.contradicted)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
     surfaces = {"shell": shell, "fused surface": fused, "truth": truth}
     distances = {
-        name: both_ways(collider.surface, other, shell, [photo.camera for photo in photos], stands)
+        name: both_ways(collider.surface, other, shell, [photo.camera for photo in photos], ahead)
         for name, other in surfaces.items()
         if other is not None
     }
     return Chapter(made, shell, collider, facts, photos, deviations, distances, truth, with_splats)
 
 
-def _say_pieces(collider: Collider, scene: str, tell: Callable[[str], None]) -> None:
-    """That a collider is in pieces far from each other, if it is."""
+def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> None:
+    """Report collision geometry in pieces that are far from each other."""
     low = np.array([part.vertices.min(0) for part in collider.parts])
     high = np.array([part.vertices.max(0) for part in collider.parts])
     gaps = np.linalg.norm(np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None])), axis=2)
     group = np.arange(len(low))
     for k in range(len(low)):
-        near = np.unique(group[gaps[k] < NEIGHBOURING])
+        near = np.unique(group[gaps[k] < MAX_GAP])
         group[np.isin(group, near)] = near.min()
     if (count := len(np.unique(group))) > 1:
-        tell(f"The collider of {scene} is in {count} pieces, more than {NEIGHBOURING:g} m apart, with nothing between.")
+        log(f"The collision geometry of {scene} is in {count} pieces, more than {MAX_GAP:g} m apart.")
 
 
 def _name(scene: str, taken: Sequence[str]) -> str:
-    """A name for a building that XML, USD and file systems allow, and no other has."""
+    """A unique name for a building that is valid in XML, USD and file systems."""
     name = re.sub(r"\W", "_", scene, flags=re.ASCII)
     name = name if re.match(r"[A-Za-z]", name) else f"building_{name}"
     return next(made for made in (name, *(f"{name}_{k}" for k in range(2, 100))) if made not in taken)

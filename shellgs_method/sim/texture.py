@@ -1,4 +1,4 @@
-"""A texture for a mesh, baked from photographs."""
+"""Bake a texture for a mesh from photographs."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from dataparsers.errors import SceneError
 from shellgs_method.sim.rays import Surface
 
 SHARPNESS = 6.0
-"""Power of the views' weights: the best views of a place count, and yet pass over into each other."""
+"""Exponent of the view weights: the best views of a point dominate, yet blend into each other."""
 SLACK = 0.05
-"""Metres that a place may lie behind the first surface of a view and still be seen."""
+"""Metres that a point may lie behind the first surface in a view and still count as visible."""
 LARGEST = 8192
-"""Pixels of a texture's side: what all graphics cards take."""
+"""Largest side of a texture in pixels that all graphics cards support."""
 FINER = 0.6
-"""Texels in a pixel, along each axis: several photographs together show more than one."""
+"""Size of a texel in pixels of the photographs, which together resolve more than one does."""
 GUTTER = 4
-"""Pixels between the charts of an atlas."""
+"""Padding between the charts of an atlas, in pixels."""
 
 
 class Photo(NamedTuple):
@@ -34,7 +34,7 @@ class Photo(NamedTuple):
     image: UInt8[np.ndarray, "H W 3"]
     camera: Camera
     mask: np.ndarray | None
-    """True where a pixel counts; None where all do."""
+    """True where a pixel counts; None if all do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +42,11 @@ class TexturedMesh:
     """Triangles with a texture.
 
     Attributes:
-        vertices: in metres; one for each place in the texture.
-        faces: three vertices each.
-        uv: places in the texture, in [0, 1], v upwards.
-        image: the texture.
-        seen: share of the vertices that some photograph sees.
+        vertices: vertices in metres, one for each texture coordinate.
+        faces: vertex indices.
+        uv: texture coordinates in [0, 1], v upwards.
+        image: texture.
+        seen: share of the vertices that are visible in some photograph.
     """
 
     vertices: Float64[np.ndarray, "V 3"]
@@ -59,16 +59,16 @@ class TexturedMesh:
 def bake(
     surface: Surface, colours: Float64[np.ndarray, "V 3"], photos: Iterable[Photo], texel: float | None = None
 ) -> TexturedMesh:
-    """The surface with an atlas and a texture from photographs; where none sees it, its own colours.
+    """Unwrap a surface and texture it from photographs, or with its own colours where no photograph sees it.
 
-    Each view's weight at a vertex is the area that a piece of surface has in it, 0 where it is hidden; raised to a
-    power, weights are interpolated over triangles, so that views blend across the seams between them.
+    A view's weight at a vertex is its pixels per square metre of surface, 0 where the vertex is hidden. Weights are
+    raised to a power and interpolated over triangles, so that views blend across the seams between them.
 
     Args:
-        surface: the mesh.
-        colours: of its vertices, in [0, 255].
-        photos: in its frame.
-        texel: size of the texture's pixels, in metres; that of the photographs' pixels on the mesh if not set.
+        surface: mesh.
+        colours: vertex colours in [0, 255].
+        photos: photographs with cameras in the mesh's frame.
+        texel: size of the texture's pixels, in metres; a little finer than the photographs' on the mesh if None.
     """
     photos = list(photos)
     weights = np.stack([_weights(surface, photo) for photo in photos], axis=1)
@@ -80,26 +80,26 @@ def bake(
     pixels, corners, barycentric = _texels(uv, faces, size)
     at = vertex[faces[corners]]  # the mesh's vertices around each texel
     points = np.einsum("nk,nkc->nc", barycentric, surface.vertices[at])
-    own = 1e-3  # what no photograph sees has its own colour, and what hardly one does passes over into it
+    own = 1e-3  # what no photograph sees keeps its own colour, and what hardly any sees blends into it
     total = np.full(len(points), own)
     blend = own * np.einsum("nk,nkc->nc", barycentric, colours[at])
     for number, photo in enumerate(photos):
         weight = np.einsum("nk,nk->n", barycentric, sharp[at, number])
         seeing = np.flatnonzero(weight > 1e-4)
         total[seeing] += weight[seeing]
-        blend[seeing] += weight[seeing, None] * _looked_up(photo, points[seeing])
-    picture, known = np.zeros((*size, 3)), np.zeros(size, bool)
+        blend[seeing] += weight[seeing, None] * _sample(photo, points[seeing])
+    texture, known = np.zeros((*size, 3)), np.zeros(size, bool)
     rows, columns = pixels.T
-    picture[rows, columns], known[rows, columns] = blend / total[:, None], True
+    texture[rows, columns], known[rows, columns] = blend / total[:, None], True
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     assert isinstance(nearest, np.ndarray)
-    filled = picture[nearest[0], nearest[1]].round().clip(0, 255).astype(np.uint8)
+    filled = texture[nearest[0], nearest[1]].round().clip(0, 255).astype(np.uint8)
     image = Image.fromarray(filled[::-1])  # its first row is at the top, and v points up
     return TexturedMesh(surface.vertices[vertex], faces, uv, image, float((best > 0).mean()))
 
 
 def _weights(surface: Surface, photo: Photo) -> Float64[np.ndarray, " V"]:
-    """Pixels per square metre of the surface at each vertex in a photograph, 0 where it does not see it."""
+    """Pixels per square metre of the surface at each vertex in a photograph, 0 where it is not visible."""
     camera, vertices = photo.camera, surface.vertices
     pixels, depth = project(camera, vertices)
     height, width = photo.image.shape[:2]
@@ -116,7 +116,7 @@ def _weights(surface: Surface, photo: Photo) -> Float64[np.ndarray, " V"]:
     weights = np.zeros(len(vertices))
     focal = float(camera.K[0, 0] * camera.K[1, 1])
     weights[seen] = cosine * focal / distance**2 * np.minimum(edge[seen], 1.0)
-    # A vertex is as visible as the least visible around it: no triangle is half a photograph of what hides it.
+    # A vertex gets the least weight around it, so that no triangle is partly textured with what hides it.
     lowest = np.full(len(vertices), np.inf)
     least = weights[surface.faces].min(axis=1)
     np.minimum.at(lowest, surface.faces.ravel(), np.repeat(least, 3))
@@ -131,8 +131,8 @@ def _vertex_normals(surface: Surface) -> Float64[np.ndarray, "V 3"]:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def _looked_up(photo: Photo, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
-    """The photograph's colours at points, between pixels linearly."""
+def _sample(photo: Photo, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """The photograph's colours at points, interpolated bilinearly."""
     pixels, _ = project(photo.camera, points)
     where = pixels.T[::-1] - 0.5
     return np.stack(
@@ -143,7 +143,7 @@ def _looked_up(photo: Photo, points: Float64[np.ndarray, "N 3"]) -> Float32[np.n
 def _atlas(
     surface: Surface, texel: float
 ) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, "M 2"], Int64[np.ndarray, "F 3"], tuple[int, int]]:
-    """Each atlas vertex's vertex of the mesh, its place in [0, 1]², the faces, and the texture's height and width."""
+    """For each atlas vertex its mesh vertex and its UV in [0, 1]², the faces, and the texture's height and width."""
     try:
         import xatlas
     except ImportError as error:

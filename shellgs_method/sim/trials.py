@@ -16,24 +16,24 @@ from shellgs_method.sim.rays import Surface
 
 GRAVITY = 9.81
 PROJECTILES = 2, 1
-"""contype and conaffinity of what is thrown: it meets the world, and nothing else that is thrown."""
+"""contype and conaffinity of thrown bodies: they collide with the world, but not with each other."""
 SINKING = 0.01
-"""Metres of penetration that count as stuck: contacts are soft."""
+"""Penetration in metres above which a body counts as stuck: contacts are soft."""
 GAIN = 0.02
 """Share of its energy that a body may gain from rounding."""
 
 
 @dataclass(frozen=True)
 class Throws:
-    """What became of bodies thrown at a world.
+    """Results of throwing bodies at a world.
 
     Attributes:
-        thrown: how many.
-        hits: of these, how many touched a building.
-        through: whose centre crossed a surface.
-        stuck: held at the end by something that is not below them, or sunk in by a centimetre.
-        gained: that had more energy after a contact than when they were thrown.
-        deepest: penetration in metres at the worst contact.
+        thrown: number of bodies.
+        hits: bodies that touched a building.
+        through: bodies whose centre crossed a surface.
+        stuck: bodies held at the end by something not below them, or penetrating it by more than a centimetre.
+        gained: bodies with more energy after a contact than when they were thrown.
+        deepest: largest penetration at a contact, in metres.
     """
 
     thrown: int
@@ -47,21 +47,21 @@ class Throws:
         """One sentence."""
         return (
             f"{self.thrown} spheres and boxes thrown, {self.hits} hit: {self.through} got through, {self.stuck} stuck, "
-            f"{self.gained} gained energy; at most {100 * self.deepest:.1f} cm deep in a contact."
+            f"{self.gained} gained energy; penetration of at most {100 * self.deepest:.1f} cm."
         )
 
 
 @dataclass(frozen=True)
 class Walk:
-    """A capsule pushed against the facade on its way along it.
+    """Results of pushing a capsule against the facade and along it.
 
     Attributes:
-        metres: from one end to the other that it came.
-        length: of the facade.
+        metres: distance that it covered.
+        length: length of the facade, in metres.
         touching: share of the steps in contact with a building.
-        deepest: penetration in metres at the worst of these.
-        faster: simulated seconds in a second.
-        microseconds: a step takes.
+        deepest: largest penetration at a contact, in metres.
+        faster: simulated seconds per second.
+        microseconds: time of a step.
     """
 
     metres: float
@@ -75,7 +75,7 @@ class Walk:
         """One sentence."""
         return (
             f"A capsule walked {self.metres:.1f} m along {self.length:.1f} m of facade, {self.touching:.0%} of the "
-            f"steps in contact, at most {100 * self.deepest:.1f} cm deep; {self.faster:.0f} times real time "
+            f"steps in contact, penetration of at most {100 * self.deepest:.1f} cm; {self.faster:.0f} times real time "
             f"({self.microseconds:.0f} µs a step)."
         )
 
@@ -83,18 +83,18 @@ class Walk:
 def throw(
     path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 200, seconds: float = 4
 ) -> Throws:
-    """Throw spheres and boxes at 5 to 15 m/s at what eyes see of a world: half anywhere on it, half at its corners.
+    """Throw spheres and boxes at 5 to 15 m/s at the visible surface of a world: half at any point, half at corners.
 
     Args:
-        path: of the model.
-        surface: its colliders.
-        eyes: places outside.
-        count: of bodies, which do not meet each other.
-        seconds: that they have.
+        path: model file.
+        surface: its collision geometry.
+        eyes: positions outside, such as those of cameras.
+        count: number of bodies, which do not collide with each other.
+        seconds: simulated time.
     """
     mujoco, spec = import_mujoco(), read_spec(path)
     rng = np.random.default_rng(0)
-    starts, velocities = _aimed(surface, eyes, count, rng)
+    starts, velocities = _launches(surface, eyes, count, rng)
     for number, start in enumerate(starts):
         body = spec.worldbody.add_body(pos=start, name=f"thrown_{number}")
         body.add_freejoint()
@@ -136,13 +136,13 @@ def throw(
 
 
 def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4) -> Walk:
-    """Send an upright capsule along a facade, pushed against it; where something stops it, it steps back.
+    """Push an upright capsule against a facade and along it; where something stops it, it steps back.
 
     Args:
-        path: of the model.
-        surface: its colliders.
-        front: the facade.
-        speed: wanted along it, in metres per second; 0.5 towards it.
+        path: model file.
+        surface: its collision geometry.
+        front: facade.
+        speed: target speed along the facade, in metres per second; towards it, it is 0.5.
     """
     mujoco, spec = import_mujoco(), read_spec(path)
     body = spec.worldbody.add_body(pos=front.before(surface, 0.05, 0.35, 0.91), name="walker")
@@ -185,10 +185,10 @@ def _energy(model, data, bodies: np.ndarray) -> Float64[np.ndarray, " N"]:
     return kinetic / 2 + mass * GRAVITY * data.xipos[bodies, 2]
 
 
-def _aimed(
+def _launches(
     surface: Surface, eyes: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
-    """Places to throw from, 1.5 to 4 m from what is aimed at and in its sight, and velocities."""
+    """Positions to throw from, 1.5 to 4 m from a visible target, and velocities."""
     starts, velocities = [], []
     areas = surface.areas / surface.areas.sum()
     for _ in range(100 * count):
@@ -212,5 +212,5 @@ def _aimed(
             starts.append(start)
             velocities.append(rng.uniform(5, 15) * away / np.linalg.norm(away))
     if len(starts) < count:
-        raise SceneError("there is no place before the building to throw from: do the cameras stand outside?")
+        raise SceneError("there is no place in front of the building to throw from: are the cameras outside?")
     return np.array(starts), np.array(velocities)

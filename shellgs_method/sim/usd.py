@@ -1,4 +1,4 @@
-"""A world of buildings as USD: look, colliders with physics, and splats as UsdVol's particle fields."""
+"""Write a world of buildings as USD: visual mesh, colliders with physics, and splats as UsdVol's particle fields."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ LAYERS = "usd"
 def write_usd_layers(
     folder: Path, mesh: TexturedMesh, parts: Sequence[Part], splats: Splats, unit: float | None
 ) -> bool:
-    """Write look, colliders and splats of a building as a layer each.
+    """Write visual mesh, colliders and splats of a building, each as a layer.
 
     Args:
-        folder: of the building; the layers are in its folder ``usd``.
-        mesh: the look, with a place in the texture for each vertex.
-        parts: convex.
-        splats: in the frame of the mesh.
-        unit: metres of the frame's unit, None if unknown.
+        folder: folder of the building; the layers are in its folder ``usd``.
+        mesh: visual mesh, with one texture coordinate for each vertex.
+        parts: convex parts.
+        splats: Gaussians in the frame of the mesh.
+        unit: metres per unit of the frame; None if unknown.
 
     Returns:
-        Whether this USD knows splats: their schema is standard since 26.03.
+        Whether this USD supports splats: their schema is standard since 26.03.
     """
     pxr = import_pxr()
     (folder / LAYERS).mkdir(exist_ok=True)
     with _Stage(pxr, folder / LAYERS / "visual.usdc", unit) as stage:
-        _look(pxr, stage, mesh)
+        _visual(pxr, stage, mesh)
     with _Stage(pxr, folder / LAYERS / "collision.usdc", unit) as stage:
         _colliders(pxr, stage, parts)
     if not hasattr(pxr.UsdVol, "ParticleField3DGaussianSplat"):
@@ -54,7 +54,7 @@ def write_usd_layers(
 def write_usd_world(path: Path, buildings: Sequence[Building], unit: float | None, with_splats: bool) -> None:
     """Write the stage that places the buildings' layers on level ground, with gravity.
 
-    The splats and the mesh are the same thing twice: a variant ``look`` of each building shows the mesh or the splats.
+    Mesh and splats show the same surface: a variant set ``look`` of each building selects one of them.
     """
     pxr = import_pxr()
     with _Stage(pxr, path, unit, root="World") as stage:
@@ -82,7 +82,7 @@ def write_usd_world(path: Path, buildings: Sequence[Building], unit: float | Non
 
 
 def compliance_errors(stage: Path | Any) -> list[str]:
-    """What usd-core's own validators, ``usdchecker``'s, have against a stage or its file; a line each."""
+    """Errors that usd-core's own validators, those of ``usdchecker``, find in a stage or its file; a line each."""
     pxr = import_pxr()
     registry = pxr.UsdValidation.ValidationRegistry()
     validators = registry.GetOrLoadAllValidators()
@@ -99,7 +99,7 @@ def _refer(pxr: SimpleNamespace, stage, prim, building: Building, child: str) ->
 
 
 class _Stage:
-    """A stage with metres and z up, whose file takes its name once it is whole."""
+    """A z-up stage with its unit; the file gets its name once it is complete."""
 
     def __init__(self, pxr: SimpleNamespace, path: Path, unit: float | None, root: str = "") -> None:
         self._path, self._temporary = path, unfinished(path, path.suffix)
@@ -122,7 +122,7 @@ class _Stage:
             self._temporary.unlink(missing_ok=True)
 
 
-def _look(pxr: SimpleNamespace, stage, mesh: TexturedMesh) -> None:
+def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh) -> None:
     root = pxr.UsdGeom.Xform.Define(stage, "/visual")
     stage.SetDefaultPrim(root.GetPrim())
     prim = _mesh(pxr, stage, "/visual/mesh", mesh.vertices, mesh.faces)
@@ -154,7 +154,7 @@ def _shader(pxr: SimpleNamespace, stage, path: str, kind: str):
 
 
 def _colliders(pxr: SimpleNamespace, stage, parts: Sequence[Part]) -> None:
-    """Static colliders: convex hulls, which these parts are already."""
+    """Add static colliders, as convex hulls, which the parts already are."""
     root = pxr.UsdGeom.Xform.Define(stage, "/collision")
     stage.SetDefaultPrim(root.GetPrim())
     pxr.UsdGeom.Imageable(root).CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
@@ -177,7 +177,7 @@ def _mesh(pxr: SimpleNamespace, stage, path: str, vertices: np.ndarray, faces: n
 
 
 def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
-    """Gaussians of finite numbers; coefficients of a particle follow each other, degree by degree, as here."""
+    """Add the Gaussians without NaN or infinity; a particle's coefficients are contiguous, by degree, as in Splats."""
     columns = (splats.means, splats.quats, splats.scales, splats.opacities, splats.harmonics)
     kept = torch.stack([column.flatten(1).isfinite().all(dim=1) for column in columns]).all(dim=0)
     means, quats, scales, opacities, harmonics = (column[kept].float() for column in columns)
@@ -201,10 +201,10 @@ def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
 
 
 def import_pxr() -> SimpleNamespace:
-    """The modules of usd-core.
+    """Import the modules of usd-core.
 
     Raises:
-        SceneError: it is not installed.
+        SceneError: usd-core is not installed.
     """
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation, UsdVol, Vt

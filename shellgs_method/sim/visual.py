@@ -1,4 +1,4 @@
-"""The textured mesh as files: glb for browsers, obj with its picture for simulators."""
+"""Write the textured mesh: glb for browsers, obj with its texture for simulators."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ TEXTURE = "visual.png"
 
 
 def write_visual(folder: Path, mesh: TexturedMesh, megabytes: float) -> dict:
-    """Write ``visual.glb`` (y-up, as glTF wants it), and ``visual.obj`` with ``visual.mtl`` and ``visual.png``.
+    """Write ``visual.glb`` (y-up, as glTF requires), and ``visual.obj`` with ``visual.mtl`` and ``visual.png``.
 
     Args:
-        folder: where they go.
-        mesh: z-up, with a texture.
-        megabytes: the glb has at most; the texture is made smaller for it.
+        folder: output folder.
+        mesh: textured mesh, z up.
+        megabytes: maximum size of the glb; the texture is scaled down to fit.
 
     Returns:
         Size of the glb in bytes and of the texture in pixels.
@@ -49,7 +49,7 @@ def write_visual(folder: Path, mesh: TexturedMesh, megabytes: float) -> dict:
 
 
 def _glb(mesh: TexturedMesh, image: Image.Image) -> bytes:
-    """The glb with its texture as JPEG; matt, since the light is in the photographs."""
+    """The glb with its texture as JPEG; matt, since the lighting is in the photographs."""
     buffer = io.BytesIO()
     image.save(buffer, "JPEG", quality=90)
     material = PBRMaterial(
@@ -63,7 +63,7 @@ def _glb(mesh: TexturedMesh, image: Image.Image) -> bytes:
 
 
 def _obj(mesh: TexturedMesh) -> str:
-    """An obj whose vertices have one place in the texture each."""
+    """The obj, with one texture coordinate for each vertex."""
     lines = ["mtllib visual.mtl", "o visual", "usemtl visual"]
     lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"vt {u:.6f} {v:.6f}" for u, v in mesh.uv.tolist()]

@@ -1,4 +1,4 @@
-"""A world of buildings in the forms of MuJoCo, URDF and SDF; all name the same files."""
+"""Write a world of buildings as MJCF, URDF and SDF, which all refer to the same files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataparsers.files import atomic_write
 from shellgs_method.sim.parts import Part
 
 TIMESTEP = 0.002
-"""Seconds: MuJoCo's default."""
+"""Time step in seconds: MuJoCo's default."""
 STIFF = 2.5 * TIMESTEP
 """Time constant of contacts in seconds; MuJoCo allows no less than two time steps."""
 VISUAL = "visual.obj"
@@ -21,12 +21,12 @@ VISUAL = "visual.obj"
 
 @dataclass(frozen=True)
 class Building:
-    """What a world names of a building.
+    """A building as world files refer to it.
 
     Attributes:
-        name: of its model, link or prim.
-        folder: where its files are, relative to the world's; "" is beside it.
-        parts: how many there are.
+        name: name of its model, link or prim.
+        folder: folder of its files, relative to the world's; "" for the same folder.
+        parts: number of its convex parts.
     """
 
     name: str
@@ -34,12 +34,12 @@ class Building:
     parts: int
 
     def path(self, file: str) -> str:
-        """A file of it as the world's files name it."""
+        """Path of one of its files, relative to the world's folder."""
         return f"{self.folder}/{file}" if self.folder else file
 
     @property
     def colliders(self) -> list[str]:
-        """The files of its parts."""
+        """Paths of the files of its parts."""
         return [self.path(part_file(k)) for k in range(self.parts)]
 
 
@@ -68,15 +68,15 @@ def write_worlds(folder: Path, buildings: Sequence[Building]) -> None:
 
 
 def mjcf(buildings: Sequence[Building]) -> ET.Element:
-    """MuJoCo's model: static geoms in the world; group 2 is seen, group 3 collides, as in MuJoCo's menagerie.
+    """MuJoCo model of static geoms: visual ones in group 2, collision ones in group 3, as in MuJoCo Menagerie.
 
-    Contacts are as stiff as the time step allows, whatever meets them (``solmix``): with MuJoCo's default of 0.02
-    seconds a ball of 15 m/s sinks 13 cm into a wall.
+    Contacts are as stiff as the time step allows, with any body (``solmix``): with MuJoCo's default of 0.02 seconds a
+    ball at 15 m/s sinks 13 cm into a wall.
     """
     root = ET.Element("mujoco", model="facade")
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     ET.SubElement(root, "option", timestep=f"{TIMESTEP}", integrator="implicitfast")
-    # The map of the depth buffer is in units of the model's extent, which is the street's.
+    # znear is in units of the model's extent, which is that of the street.
     visual = ET.SubElement(root, "visual")
     ET.SubElement(visual, "headlight", ambient="1 1 1", diffuse="0 0 0", specular="0 0 0")
     ET.SubElement(visual, "map", znear="0.002")
@@ -117,7 +117,7 @@ def mjcf(buildings: Sequence[Building]) -> ET.Element:
 
 
 def urdf(buildings: Sequence[Building]) -> ET.Element:
-    """A robot that is a building: URDF knows nothing else. Links without a mass are fixed to the world."""
+    """A robot whose links are the buildings, since URDF describes only robots. Links without a mass are static."""
     root = ET.Element("robot", name="facade")
     ET.SubElement(root, "link", name="world")
     for building in buildings:
@@ -138,7 +138,7 @@ def _urdf_mesh(parent: ET.Element, file: str) -> None:
 
 
 def sdf(buildings: Sequence[Building]) -> ET.Element:
-    """A world of Gazebo with sun, ground and one static model for each building."""
+    """Gazebo world with sun, ground and one static model for each building."""
     root = ET.Element("sdf", version="1.9")
     world = ET.SubElement(root, "world", name="facade")
     physics = ET.SubElement(world, "physics", name="default", type="ode")
@@ -166,7 +166,7 @@ def sdf(buildings: Sequence[Building]) -> ET.Element:
 
 
 def _sdf_model(world: ET.Element, name: str) -> ET.Element:
-    """A static model's link."""
+    """Add a static model, and return its link."""
     model = ET.SubElement(world, "model", name=name)
     ET.SubElement(model, "static").text = "true"
     return ET.SubElement(model, "link", name="link")

@@ -1,0 +1,95 @@
+"""Ray casting against triangles and distances from them: Embree, through Open3D."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int64
+
+from shellgs_method.open3d import import_open3d
+
+_FEW = 2000
+"""Number of points below which waking other threads costs more than it saves, many times over on busy cores."""
+
+
+class Hits(NamedTuple):
+    """First hits of rays.
+
+    Attributes:
+        t: multiple of the ray's direction at the hit; inf where the ray misses.
+        triangle: index of the triangle; -1 where the ray misses.
+        normal: unit normal of the triangle, by its winding; 0 where the ray misses.
+    """
+
+    t: Float32[np.ndarray, " *N"]
+    triangle: Int64[np.ndarray, " *N"]
+    normal: Float32[np.ndarray, "*N 3"]
+
+
+class Closest(NamedTuple):
+    """Points of the surface that are nearest to given points.
+
+    Attributes:
+        point: the nearest point.
+        triangle: index of its triangle.
+        normal: unit normal of the triangle, by its winding.
+    """
+
+    point: Float32[np.ndarray, "N 3"]
+    triangle: Int64[np.ndarray, " N"]
+    normal: Float32[np.ndarray, "N 3"]
+
+
+class Triangles:
+    """Triangles prepared for queries.
+
+    Embree computes in float32: coordinates must be relative to an origin near the triangles.
+
+    Args:
+        vertices: in any unit.
+        faces: indices of three vertices each.
+
+    Raises:
+        ImportError: Open3D cannot be loaded.
+    """
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
+        o3d = import_open3d()
+        self._tensor = o3d.core.Tensor.from_numpy
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices, np.float32)),
+            self._tensor(np.ascontiguousarray(faces, np.uint32)),
+        )
+
+    def cast(self, rays: Float32[np.ndarray, "*N 6"]) -> Hits:
+        """First hits of rays, made by :func:`rays_from`."""
+        answer = self._scene.cast_rays(self._tensor(rays))
+        t, triangle = answer["t_hit"].numpy(), answer["primitive_ids"].numpy().astype(np.int64)
+        triangle[np.isinf(t)] = -1
+        return Hits(t, triangle, answer["primitive_normals"].numpy())
+
+    def blocked(self, rays: Float32[np.ndarray, "*N 6"]) -> Bool[np.ndarray, " *N"]:
+        """Whether rays hit anything at all."""
+        return self._scene.test_occlusions(self._tensor(rays)).numpy()
+
+    def closest(self, points: Float[np.ndarray, "N 3"]) -> Closest:
+        """The nearest point of the surface to each point."""
+        threads = 1 if len(points) < _FEW else 0  # 0: all
+        answer = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, np.float32)), threads)
+        triangle = answer["primitive_ids"].numpy().astype(np.int64)
+        return Closest(answer["points"].numpy(), triangle, answer["primitive_normals"].numpy())
+
+    def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
+        """Unsigned distance of each point from the surface."""
+        return self._scene.compute_distance(self._tensor(np.ascontiguousarray(points, np.float32))).numpy()
+
+
+def rays_from(
+    origins: Float[np.ndarray, "*#N 3"], directions: Float[np.ndarray, "*#N 3"]
+) -> Float32[np.ndarray, "*N 6"]:
+    """Origins and directions of rays side by side, in float32; both are broadcast."""
+    rays = np.empty((*np.broadcast_shapes(origins.shape, directions.shape)[:-1], 6), np.float32)
+    rays[..., :3], rays[..., 3:] = origins, directions
+    return rays
