@@ -684,7 +684,7 @@ def test_judging_what_was_cast_writes_the_figures_and_tells_the_maps(scene, shel
     assert maps.manifest.error == judged.error is not None
     for view in read_views(FacadeDataParserConfig(data=scene)):
         assert maps.read(view.name, view.camera) is not None
-    assert "0 views cast, 10 there already" in shellgs("cast", scene)
+    assert "0 views cast, 10 already there" in shellgs("cast", scene)
 
 
 def test_another_place_makes_the_maps_stale(scene, shellgs):
@@ -722,7 +722,7 @@ def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
     assert "10 views cast" in shellgs("cast", scanned)
     judged.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
     assert set(used) == {"bpa"}
-    assert "judged with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
+    assert "validated with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
     assert Alignment.load(scanned / ALIGNMENT) == replace(judged, mesher="planes", verdict="", metrics={})
 
 

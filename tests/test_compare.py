@@ -425,7 +425,7 @@ REFUSED = {
     "a seed below 0": (["--seeds", "-1"], "no seed"),
     "no iteration": (["--iterations", "-5"], "at least one iteration"),
     "no points": (["--curve-points", "-1"], "at least one iteration"),
-    "no job": (["--jobs", "0"], "--jobs 0"),
+    "no job": (["--jobs", "0"], "--jobs must be at least 1, not 0"),
     "a flag that is none": (["--methods", "a=shellgs --window 3"], "ns-train shellgs --window 3 is refused"),
     "a setting beyond its limits": (["--methods", "a=shellgs --pipeline.model.sh-degree=7"], "sh_degree cannot be 7"),
     "an open quote": (["--methods", "a=shellgs '"], "is no method with its flags"),

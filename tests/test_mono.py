@@ -569,7 +569,7 @@ def test_a_second_run_keeps_the_first_ones_maps(scene: Path, tmp_path: Path, mon
     assert "9 maps made" in output
     assert "No map for images/frame_00003.png: there is no map of it." in output
     before = {path: path.stat().st_mtime_ns for path in scene.glob("cues/mono/images/*.npz")}
-    assert "0 maps made, 10 views decided before" in run(monkeypatch, capsys, *words)
+    assert "0 maps made, 10 views already processed" in run(monkeypatch, capsys, *words)
     assert {path: path.stat().st_mtime_ns for path in scene.glob("cues/mono/images/*.npz")} == before
 
 
