@@ -1,4 +1,4 @@
-"""The `shellgs` command: everything around the training."""
+"""The `shellgs` command."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ COMMANDS = (demo, capture, align, cast, mono, compare, evaluate, mesh, splats, s
 
 def main() -> None:
     """Entry point."""
-    warnings.filterwarnings("ignore", category=FutureWarning)  # of the libraries below, and nothing to a user
+    warnings.filterwarnings("ignore", category=FutureWarning)  # raised by dependencies, no use to a user
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             {command.__name__: command for command in COMMANDS},
-            description="Everything around the training of the methods; these are trained by `ns-train`.",
+            description="Prepare scenes, compare methods, evaluate and export runs. `ns-train` trains the methods.",
         )

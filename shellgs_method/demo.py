@@ -20,21 +20,21 @@ METHODS = ("photo-gs", "shellgs", "shellgs-metric")
 
 
 def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Console) -> None:
-    """Make the facade, cast its shell, train and evaluate the methods, show tables and pictures.
+    """Make the facade, cast its shell, train and evaluate the methods, show tables and images.
 
-    What an earlier, interrupted demo finished is kept.
+    Results of an earlier, interrupted demo are kept.
 
     Raises:
-        SceneError: the folder holds a demo of another facade, or there is nothing to train.
+        SceneError: the folder holds a demo of another facade, or ``iterations`` is below 1.
     """
     if iterations < 1:
-        raise SceneError(f"a training has at least one iteration, not {iterations}")
+        raise SceneError(f"--iterations must be at least 1, not {iterations}")
     scene = folder / "scene"
     if scene.exists():
         made, asked = settings_of(scene), asdict(config)
         if other := [name for name in asked if made.get(name, asked[name]) != asked[name]]:
             what = ", ".join(f"--{name} {made[name]}, not {asked[name]}" for name in other)
-            raise SceneError(f"{scene} was made with {what}: name another folder for this demo, or remove {folder}")
+            raise SceneError(f"{scene} was made with {what}: give another folder for this demo, or remove {folder}")
     else:
         size = f"{config.width} x {config.height}"
         console.print(f"A synthetic facade, {config.views} photographs of {size} pixels: {scene}", highlight=False)
@@ -45,17 +45,17 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
     runs = grid([scene], METHODS, [0], iterations, folder)
-    # On a CPU runs side by side get more done than one after the other: much of each is a single thread's work.
+    # On a CPU two runs at once are faster in total: much of each is single-threaded.
     jobs = 1 if torch.cuda.is_available() else 2
     if compare(runs, partial(launch_locally, jobs=jobs, console=console), folder, console).failures:
-        raise SystemExit("shellgs: a run of the demo failed; its last lines are above.")
+        raise SystemExit("shellgs: a run of the demo failed; the end of its output is above.")
     viewer = "ns-viewer" if shutil.which("ns-viewer") else BIN / "ns-viewer"
     console.print(
         "Look first at\n"
         f"  1. {folder / 'strip.png'}: a held-out view of each method, its normals and their error\n"
         f"  2. {folder / 'report.html'}: all held-out views with sliders between the methods\n"
         f"  3. {viewer} --load-config {runs[-1].config}: walk around {runs[-1].variant.name} in a browser\n"
-        f"The tables above are in {folder / 'results.md'}, what the shell teaches in {scene / 'cues/shell/panel.png'}.",
+        f"The tables above are in {folder / 'results.md'}, a view's shell maps in {scene / 'cues/shell/panel.png'}.",
         highlight=False,
         soft_wrap=True,
     )

@@ -684,7 +684,7 @@ def test_validating_a_cast_alignment_writes_its_metrics_and_the_maps_error(scene
     assert maps.manifest.error == validated.error is not None
     for view in read_views(FacadeDataParserConfig(data=scene)):
         assert maps.read(view.name, view.camera) is not None
-    assert "0 views cast, 10 there already" in shellgs("cast", scene)
+    assert "0 views cast, 10 already there" in shellgs("cast", scene)
 
 
 def test_another_alignment_makes_the_maps_stale(scene, shellgs):
@@ -722,7 +722,7 @@ def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
     assert "10 views cast" in shellgs("cast", scanned)
     validated.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
     assert set(used) == {"bpa"}
-    assert "judged with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
+    assert "validated with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
     assert Alignment.load(scanned / ALIGNMENT) == replace(validated, mesher="planes", verdict="", metrics={})
 
 

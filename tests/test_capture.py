@@ -1,4 +1,4 @@
-"""Capture: frames, photographs, masks and pairs by themselves, then structure from motion against true cameras."""
+"""Capture: frames, photographs, masks and pairs, then structure from motion against true cameras."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from shellgs_method.synthetic import FacadeConfig, write_scene
 QUIET = Progress(disable=True)
 
 
-def picture(width: int = 64, height: int = 48, seed: int = 0) -> Image.Image:
-    """Smooth noise, whose upper left corner is red."""
+def photograph(width: int = 64, height: int = 48, seed: int = 0) -> Image.Image:
+    """Smooth noise with a red upper left corner."""
     noise = np.random.default_rng(seed).uniform(0, 255, (height, width, 3))
     pixels = gaussian_filter(noise, (1, 1, 0)).astype(np.uint8)
     pixels[: height // 4, : width // 4] = (255, 0, 0)
@@ -41,9 +41,9 @@ def is_red(image: Image.Image, x: int, y: int) -> bool:
 
 
 def save_rotated(image: Image.Image, path: Path) -> None:
-    """Save an upright picture as a camera held on its side does: turned, and EXIF says so."""
+    """Save an upright image as a camera held on its side does: rotated, with the orientation in EXIF."""
     exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6  # to be turned clockwise
+    exif[ExifTags.Base.Orientation] = 6  # to be rotated clockwise
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 26
     image.rotate(90, expand=True).save(path, exif=exif, quality=95)
 
@@ -58,7 +58,7 @@ def write_video(path: Path, frames: list[Image.Image], rate: int = 10) -> None:
 
 
 def turn_video(path: Path) -> None:
-    """Set the display matrix of an mp4 to a turn by 90 degrees clockwise, as phones do that are held upright."""
+    """Set the display matrix of an mp4 to a clockwise rotation by 90 degrees, as phones held upright do."""
     data = bytearray(path.read_bytes())
     matrix = data.index(b"tkhd") + 4 + 40  # after version, flags, times, track, duration, layer and volume
     one = (1 << 16).to_bytes(4, "big")
@@ -75,9 +75,9 @@ def numbers(folder: Path) -> list[int]:
 # Frames
 
 
-def test_no_blurred_frame_of_a_video_is_taken(tmp_path):
+def test_no_blurred_frame_of_a_video_is_extracted(tmp_path):
     blurred = {k for k in range(40) if k % 4 != k // 10}
-    frames = [picture(seed=k) for k in range(40)]
+    frames = [photograph(seed=k) for k in range(40)]
     write_video(
         tmp_path / "walk.mp4",
         [f.filter(ImageFilter.GaussianBlur(3)) if k in blurred else f for k, f in enumerate(frames)],
@@ -100,8 +100,8 @@ def test_a_video_gives_at_most_five_frames_a_second():
     assert len(sharpest(np.ones(60), np.arange(60) / 30, 200)) == 10
 
 
-def test_frames_of_a_turned_video_are_upright(tmp_path):
-    write_video(tmp_path / "walk.mp4", [picture(64, 48)] * 3, rate=2)
+def test_frames_of_a_rotated_video_are_upright(tmp_path):
+    write_video(tmp_path / "walk.mp4", [photograph(64, 48)] * 3, rate=2)
     turn_video(tmp_path / "walk.mp4")
     (tmp_path / "frames").mkdir()
     extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 3, QUIET)
@@ -139,13 +139,13 @@ def test_photographs_that_would_share_a_name_are_refused(tmp_path):
 
 
 def test_an_ordinary_photograph_is_kept_byte_for_byte(tmp_path):
-    picture().save(tmp_path / "a.jpg")
+    photograph().save(tmp_path / "a.jpg")
     add_photograph(tmp_path / "a.jpg", tmp_path / "copy" / "a.jpg")
     assert (tmp_path / "copy" / "a.jpg").read_bytes() == (tmp_path / "a.jpg").read_bytes()
 
 
-def test_a_photograph_is_turned_as_exif_says_and_keeps_its_focal_length(tmp_path):
-    save_rotated(picture(), tmp_path / "a.jpg")
+def test_a_photograph_is_rotated_by_exif_and_keeps_its_focal_length(tmp_path):
+    save_rotated(photograph(), tmp_path / "a.jpg")
     add_photograph(tmp_path / "a.jpg", tmp_path / "b.jpg")
     with Image.open(tmp_path / "b.jpg") as image:
         assert image.size == (64, 48)
@@ -169,7 +169,7 @@ def test_an_unreadable_photograph_is_refused_by_name(tmp_path):
     photographs = tmp_path / "photographs"
     photographs.mkdir()
     for name in "abc":
-        picture().save(photographs / f"{name}.jpg")
+        photograph().save(photographs / f"{name}.jpg")
     (photographs / "b.jpg").write_bytes((photographs / "a.jpg").read_bytes()[:500])
     with pytest.raises(SceneError, match=r"b\.jpg cannot be read as an image"):
         capture(photographs, tmp_path / "scene")
@@ -180,8 +180,8 @@ def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
     exif = Image.Exif()
     exif[ExifTags.Base.Model] = "another phone"
     for name, size in {"a.jpg": (64, 48), "b.jpg": (64, 48), "c.jpg": (48, 64)}.items():
-        picture(*size).save(tmp_path / name)
-    picture().save(tmp_path / "d.jpg", exif=exif)
+        photograph(*size).save(tmp_path / name)
+    photograph().save(tmp_path / "d.jpg", exif=exif)
     groups = group_by_lens(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"], "auto")
     assert [lens.names for lens in groups] == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"]]
 
@@ -191,13 +191,13 @@ def test_the_sharing_of_cameras_can_be_chosen(tmp_path, cameras, count):
     names = ["left/a.jpg", "left/b.jpg", "right/a.jpg"]
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
-        picture().save(tmp_path / name)
+        photograph().save(tmp_path / name)
     assert len(group_by_lens(tmp_path, names, cameras)) == count
 
 
 def test_photographs_of_two_sizes_cannot_share_a_camera(tmp_path):
-    picture().save(tmp_path / "a.jpg")
-    picture(48, 64).save(tmp_path / "b.jpg")
+    photograph().save(tmp_path / "a.jpg")
+    photograph(48, 64).save(tmp_path / "b.jpg")
     with pytest.raises(SceneError, match=r"a\.jpg \(64x48\) and b\.jpg \(48x64\) cannot share a camera"):
         group_by_lens(tmp_path, ["a.jpg", "b.jpg"], "single")
 
@@ -206,8 +206,8 @@ def test_photographs_of_two_sizes_cannot_share_a_camera(tmp_path):
 
 
 def masked(tmp_path: Path, mask: Image.Image) -> Image.Image:
-    """The mask of a photograph that EXIF turns, as the work folder holds it."""
-    save_rotated(picture(), tmp_path / "a.jpg")
+    """The mask that the work folder gets for a photograph with an EXIF rotation."""
+    save_rotated(photograph(), tmp_path / "a.jpg")
     add_photograph(tmp_path / "a.jpg", tmp_path / "upright.jpg")
     mask.save(tmp_path / "a.jpg.png")
     add_mask(tmp_path / "a.jpg.png", tmp_path / "a.jpg", tmp_path / "upright.jpg", tmp_path / "kept.png")
@@ -217,7 +217,7 @@ def masked(tmp_path: Path, mask: Image.Image) -> Image.Image:
 
 
 @pytest.mark.parametrize("as_stored", [True, False])
-def test_a_mask_is_turned_with_its_photograph(tmp_path, as_stored):
+def test_a_mask_is_rotated_with_its_photograph(tmp_path, as_stored):
     upright = np.zeros((48, 64), np.uint8)
     upright[:12, :16] = 255
     mask = Image.fromarray(upright)
@@ -250,7 +250,7 @@ def test_masks_that_belong_to_no_photograph_are_refused(tmp_path):
         ("sequential", 5, False, "sequential"),
     ],
 )
-def test_matching_follows_the_material_unless_it_is_chosen(asked, count, is_video, chosen):
+def test_matching_depends_on_the_input_unless_it_is_chosen(asked, count, is_video, chosen):
     assert choose_matching(asked, count, is_video) == chosen
 
 
@@ -262,14 +262,14 @@ def test_sequential_pairs_reach_as_far_as_the_overlap():
 # Work folder
 
 
-def test_what_was_interrupted_is_no_product(tmp_path):
+def test_an_interrupted_stage_leaves_no_product(tmp_path):
     making = Work(tmp_path).making("model", "key")
     (making.__enter__() / "half").touch()
     making.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
     assert not Work(tmp_path).has("model", "key")
 
 
-def test_a_product_lasts_until_it_is_made_from_something_else(tmp_path):
+def test_a_product_is_kept_until_it_is_made_with_another_key(tmp_path):
     with Work(tmp_path).making("model", "old") as folder:
         (folder / "old").touch()
     assert Work(tmp_path).has("model", "old")
@@ -279,20 +279,20 @@ def test_a_product_lasts_until_it_is_made_from_something_else(tmp_path):
     assert list((tmp_path / "model").iterdir()) == []
 
 
-def test_a_growing_product_is_kept_for_the_same_key_alone(tmp_path):
+def test_a_growing_product_is_kept_only_for_the_same_key(tmp_path):
     (Work(tmp_path).growing("features", "old") / "database").touch()
     assert (Work(tmp_path).growing("features", "old") / "database").exists()
     assert not (Work(tmp_path).growing("features", "new") / "database").exists()
 
 
-# The whole
+# The whole capture
 
 
 @pytest.mark.parametrize(
     ("prepare", "message"),
     [
         (lambda folder: None, "there are no photographs in"),
-        (lambda folder: [picture().save(folder / f"{k}.jpg") for k in range(2)], "at least 3 photographs, not 2"),
+        (lambda folder: [photograph().save(folder / f"{k}.jpg") for k in range(2)], "at least 3 photographs, not 2"),
     ],
 )
 def test_too_few_photographs_are_refused(tmp_path, prepare, message):
@@ -307,18 +307,18 @@ def test_a_missing_source_is_refused(tmp_path):
         capture(tmp_path / "nowhere", tmp_path / "scene")
 
 
-def test_a_scene_among_the_photographs_is_refused(tmp_path):
-    picture().save(tmp_path / "a.jpg")
+def test_a_scene_inside_the_folder_of_photographs_is_refused(tmp_path):
+    photograph().save(tmp_path / "a.jpg")
     with pytest.raises(SceneError, match="outside of it"):
         capture(tmp_path, tmp_path / "scene")
 
 
 @pytest.mark.parametrize("name", ["images", "colmap", "transforms.json"])
-def test_a_scene_that_is_there_already_is_left_alone(tmp_path, name):
+def test_an_existing_scene_is_refused_and_undisturbed(tmp_path, name):
     (tmp_path / "photographs").mkdir()
-    picture().save(tmp_path / "photographs" / "a.jpg")
+    photograph().save(tmp_path / "photographs" / "a.jpg")
     (tmp_path / "scene" / name).mkdir(parents=True)
-    with pytest.raises(SceneError, match=f"{name} is there already"):
+    with pytest.raises(SceneError, match=f"{name} already exists"):
         capture(tmp_path / "photographs", tmp_path / "scene")
     assert [path.name for path in (tmp_path / "scene").iterdir()] == [name]
 
@@ -327,14 +327,14 @@ def test_photographs_that_do_not_belong_together_are_refused_with_advice(tmp_pat
     folder = tmp_path / "fotos från gården"
     folder.mkdir()
     for k in range(3):
-        picture(200, 150, seed=k).save(folder / f"{k}.png")
-    Image.new("RGB", (200, 150), "grey").save(folder / "plain.png")  # without a single feature
+        photograph(200, 150, seed=k).save(folder / f"{k}.png")
+    Image.new("RGB", (200, 150), "grey").save(folder / "plain.png")  # has no features
     with pytest.raises(SceneError, match=r"only 0 of 4 photographs were found.*--matching exhaustive"):
         capture(folder, tmp_path / "scen å")
     assert [path.name for path in (tmp_path / "scen å").iterdir()] == ["capture"]
 
 
-def test_a_failure_of_colmap_is_one_sentence(tmp_path):
+def test_a_failure_of_colmap_is_reported_in_one_sentence(tmp_path):
     (tmp_path / "database.db").write_bytes(b"this is no database" * 100)
     with pytest.raises(SceneError, match=r"finding features failed in COLMAP \(.+\); all its messages are in"):
         run_step(
@@ -347,9 +347,9 @@ def test_a_failure_of_colmap_is_one_sentence(tmp_path):
         )
 
 
-def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_in_one_sentence(tmp_path, monkeypatch):
     (tmp_path / "photographs").mkdir()
-    picture().save(tmp_path / "photographs" / "a.jpg")
+    photograph().save(tmp_path / "photographs" / "a.jpg")
 
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -361,7 +361,7 @@ def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
 
 @pytest.fixture
 def without_colmap(monkeypatch) -> list[str]:
-    """Structure from motion that finds every camera at once; the steps that were run."""
+    """Fake structure from motion that finds every camera; returns the list of steps run."""
     steps: list[str] = []
 
     def run_step(step: str, arguments: dict, **_):
@@ -380,10 +380,10 @@ def without_colmap(monkeypatch) -> list[str]:
 
 
 @pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])
-def test_what_was_deleted_from_a_captured_scene_is_made_again(tmp_path, without_colmap, deleted):
+def test_deleted_parts_of_a_captured_scene_are_made_again(tmp_path, without_colmap, deleted):
     for k in range(3):
         (tmp_path / "photographs").mkdir(exist_ok=True)
-        picture(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
+        photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
     scene = tmp_path / "scene"
     for _ in range(2):  # the second time too
         capture(tmp_path / "photographs", scene)
@@ -402,7 +402,7 @@ def test_what_was_deleted_from_a_captured_scene_is_made_again(tmp_path, without_
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Where the points of the source come to lie on the target's (Umeyama 1991)."""
+    """Fit the source points to the target by a similarity (Umeyama 1991) and return them."""
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     U, S, Vt = np.linalg.svd(b.T @ a)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
@@ -419,7 +419,7 @@ def truth(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def captured(truth) -> Path:
-    """The scene captured from its photographs."""
+    """A scene captured from the photographs of the synthetic facade."""
     scene = truth.parent / "scene"
     capture(truth / "images", scene)
     return scene
@@ -432,18 +432,18 @@ def test_cameras_of_the_synthetic_facade_are_found(truth, captured):
     assert len(found) >= 22
     positions = np.stack([true[name].camera.position.numpy() for name in found])
     errors = similarity(np.stack([view.camera.position.numpy() for view in found.values()]), positions) - positions
-    # A pixel is 2 cm of the wall; over steps of 0.7 m past identical windows that has come to 0.7 % of the path.
+    # A pixel is 2 cm of the wall; with steps of 0.7 m past identical windows the error was 0.7 % of the path.
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.02 * np.ptp(positions, axis=0).max()
     focal = next(iter(true.values())).camera.K[0, 0].item()
     assert next(iter(found.values())).camera.K[0, 0].item() == pytest.approx(focal, rel=0.03)
 
 
 @pytest.mark.slow
-def test_a_finished_capture_is_not_repeated_and_an_unlike_one_refused(truth, captured):
+def test_a_finished_capture_is_not_repeated_and_other_settings_are_refused(truth, captured):
     before = (captured / "colmap" / "sparse" / "0" / "images.bin").stat()
     capture(truth / "images", captured)
     assert (captured / "colmap" / "sparse" / "0" / "images.bin").stat() == before
-    with pytest.raises(SceneError, match="is there already"):
+    with pytest.raises(SceneError, match="already exists"):
         capture(truth / "images", captured, CaptureConfig(quality="high"))
 
 

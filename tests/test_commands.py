@@ -22,7 +22,7 @@ DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterati
 
 def run(*words: object, cwd: Path, status: int = 0) -> str:
     """Output of a command of this environment, without the terminal's line breaks."""
-    # Runs this short would spend their time compiling.
+    # Compiling would take longer than these short runs.
     environment = os.environ | {"SHELLGS_COMPILE": "0", "OMP_WAIT_POLICY": "passive", "COLUMNS": "200"}
     command = [BIN / str(words[0]), *map(str, words[1:])]
     done = subprocess.run(command, cwd=cwd, env=environment, text=True, capture_output=True)
@@ -33,7 +33,7 @@ def run(*words: object, cwd: Path, status: int = 0) -> str:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a small `shellgs demo` leaves behind; what it said is in log.txt beside it."""
+    """Folder of a small `shellgs demo`; its output is in log.txt beside it."""
     folder = tmp_path_factory.mktemp("demo")
     (folder / "log.txt").write_text(run("shellgs", *DEMO, cwd=folder))
     return folder / "demo"
@@ -43,19 +43,19 @@ def config(demo: Path) -> Path:
     return demo / "runs" / "scene" / "shellgs" / "shellgs" / "seed-0" / "config.yml"
 
 
-def test_the_demo_ends_with_a_table_and_pictures(demo):
+def test_the_demo_writes_a_table_and_images(demo):
     table = (demo / "results.md").read_text()
     assert all(word in table for word in ("photo-gs", "shellgs", "PSNR", "Normal (°)", "CD (m)"))
-    for picture in (demo / "strip.png", demo / "contradicted.png", demo / "scene" / "cues" / "shell" / "panel.png"):
-        with Image.open(picture) as image:
+    for path in (demo / "strip.png", demo / "contradicted.png", demo / "scene" / "cues" / "shell" / "panel.png"):
+        with Image.open(path) as image:
             assert np.asarray(image).std() > 10
 
 
-def test_a_log_of_the_demo_says_what_is_done_and_what_to_look_at_first(demo):
-    said = demo.with_name("log.txt").read_text()
-    assert "A synthetic facade, 10 photographs of 64 x 48 pixels: demo/scene" in said
-    assert "seed-0 finished, 3 of 3." in said
-    first = said[said.index("Look first at") :].splitlines()[1:4]
+def test_the_demo_prints_its_progress_and_what_to_look_at_first(demo):
+    output = demo.with_name("log.txt").read_text()
+    assert "A synthetic facade, 10 photographs of 64 x 48 pixels: demo/scene" in output
+    assert "seed-0 finished, 3 of 3." in output
+    first = output[output.index("Look first at") :].splitlines()[1:4]
     assert [(demo.parent / line.split(": ")[0].split()[-1]).exists() for line in first[:2]] == [True, True]
     assert "ns-viewer --load-config" in first[2]
 
@@ -71,13 +71,13 @@ def test_a_second_demo_keeps_what_the_first_finished(demo):
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
-        (["--width", 640], "was made with --width 64, not 640: name another folder"),
+        (["--width", 640], "was made with --width 64, not 640: give another folder"),
         (["--views", 12, "--seed", 3], "--views 10, not 12, --seed 0, not 3"),
-        (["--iterations", -5], "at least one iteration, not -5"),
+        (["--iterations", -5], "--iterations must be at least 1, not -5"),
         (["--width", 0], "width must be at least 16, not 0"),
     ],
 )
-def test_a_demo_of_another_facade_is_not_shown_as_this_one(demo, monkeypatch, flags, sentence):
+def test_a_demo_with_other_settings_is_refused_and_changes_nothing(demo, monkeypatch, flags, sentence):
     before = {path: path.stat().st_mtime_ns for path in demo.rglob("*")}
     monkeypatch.chdir(demo.parent)
     monkeypatch.setattr("sys.argv", ["shellgs", *map(str, [*DEMO, *flags])])
@@ -86,7 +86,7 @@ def test_a_demo_of_another_facade_is_not_shown_as_this_one(demo, monkeypatch, fl
     assert {path: path.stat().st_mtime_ns for path in demo.rglob("*")} == before
 
 
-def test_ns_eval_writes_all_figures(demo):
+def test_ns_eval_writes_all_metrics(demo):
     metrics = json.loads((config(demo).parent / "eval.json").read_text())["results"]
     assert {
         "psnr",
@@ -106,7 +106,7 @@ def test_ns_export_writes_the_gaussians(demo, tmp_path):
     assert len(cloud.vertices) > 100
 
 
-def test_ns_render_writes_pictures_of_every_output(demo, tmp_path):
+def test_ns_render_writes_images_of_every_output(demo, tmp_path):
     outputs = ("rgb", "depth", "normal", "accumulation")
     command = ("ns-render", "dataset", "--load-config", config(demo), "--output-path", tmp_path, "--split", "test")
     run(*command, "--rendered-output-names", *outputs, cwd=demo.parent)
@@ -154,27 +154,27 @@ def test_shellgs_cast_takes_a_shell_and_its_matrix(demo, tmp_path):
         (["cast", ".", "--shell", "scan.ply"], "--shell and --matrix go together"),
     ],
 )
-def test_a_users_mistake_is_answered_with_one_sentence(tmp_path, words, sentence):
+def test_a_users_mistake_ends_the_command_with_one_sentence(tmp_path, words, sentence):
     output = run("shellgs", *words, cwd=tmp_path, status=1)
     assert output.startswith("shellgs: ")
     assert sentence in output
     assert "Traceback" not in output
 
 
-def test_the_doctor_finds_this_machine_fit(tmp_path):
+def test_doctor_lists_the_parts_of_this_machine(tmp_path):
     output = run("shellgs", "doctor", cwd=tmp_path)
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
 
 
 @pytest.mark.parametrize("asked", [False, True])
-def test_apt_get_runs_when_asked_to_and_is_named_otherwise(shellgs, monkeypatch, asked):
+def test_doctor_runs_apt_get_when_asked_and_names_it_otherwise(shellgs, monkeypatch, asked):
     commands = []
     missing = environment.Finding("Open3D", False, "no libGL; remedy: as root, apt-get install libgl1")
     monkeypatch.setattr(environment, "_open3d", lambda: missing)
     monkeypatch.setattr(environment.os, "geteuid", lambda: 0)
     monkeypatch.setattr(environment.shutil, "which", lambda _: "/usr/bin/apt-get")
     monkeypatch.setattr(environment.subprocess, "run", lambda words, **_: commands.append(words[:2]))
-    said = shellgs("doctor", *["--install-libraries"] * asked)
+    output = shellgs("doctor", *["--install-libraries"] * asked)
     assert commands == [["apt-get", "update"], ["apt-get", "install"]] * asked
-    assert said.startswith("refused: shellgs: nothing runs here before this is mended: Open3D: no libGL")
-    assert "as root, apt-get install libgl1" in said
+    assert output.startswith("refused: shellgs: nothing runs here until this is fixed: Open3D: no libGL")
+    assert "as root, apt-get install libgl1" in output

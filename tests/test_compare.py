@@ -1,4 +1,4 @@
-"""`shellgs compare`: tables, runs that are kept, and the report."""
+"""`shellgs compare`: tables, resumed runs, and the report."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_tables_gather_the_seeds_and_leave_out_the_spread_over_views(pristine_sc
     assert main.rows["shellgs"] == {"psnr": [20.0, 21.0], "normal_deg": [10.0, 10.0]}
 
 
-def test_the_paper_stands_beside_scenes_of_the_same_part(pristine_scene, tmp_path):
+def test_the_papers_rows_are_beside_scenes_of_the_same_role(pristine_scene, tmp_path):
     other = tmp_path / "copy"
     other.mkdir()
     for file in pristine_scene.iterdir():
@@ -131,7 +131,7 @@ def test_the_paper_stands_beside_scenes_of_the_same_part(pristine_scene, tmp_pat
 
 
 def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
-    """Of a shell in the place of the truth it lacks only what the shell lacks."""
+    """Its errors are small: it lacks only some detail of the truth."""
     shell = measure_shell(SceneLayout(data=pristine_scene))
     assert 0 < shell["truth_normal_deg"] < 15
     assert 0 < shell["truth_chamfer_m"] < 0.1
@@ -142,7 +142,7 @@ def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
 
 
 def test_the_paths_of_a_scene_reach_every_run(pristine_scene, tmp_path):
-    """And what a run's settings are hashed from."""
+    """The hashes in a run's settings use them too."""
     paths = ScenePaths(images_path=Path("photos"), colmap_path=Path("model"))
     ours, splatfacto = grid([pristine_scene], ["shellgs", "splatfacto"], [0], 20, tmp_path, paths=paths)
     for run in (ours, splatfacto):
@@ -170,13 +170,13 @@ def test_a_variant_is_a_method_an_ablation_or_the_users_own():
     assert Variant.parse("wide=shellgs --pipeline.model.geometry.ncc-window 11").method == "shellgs"
 
 
-def test_the_registry_is_named_to_who_asks_for_another_method(pristine_scene, tmp_path):
-    with pytest.raises(SceneError, match=r"no method 'shelgs': take photo-gs, .*shellgs-depth"):
+def test_an_unknown_method_is_refused_with_the_names_of_the_known_ones(pristine_scene, tmp_path):
+    with pytest.raises(SceneError, match=r"no method 'shelgs': use photo-gs, .*shellgs-depth"):
         fake_grid([pristine_scene], ["shelgs"], tmp_path)
 
 
 def test_a_name_that_leaves_its_folder_is_refused(pristine_scene, tmp_path):
-    with pytest.raises(SceneError, match="is to name a folder"):
+    with pytest.raises(SceneError, match="cannot name a folder"):
         fake_grid([pristine_scene], ["../mine=shellgs"], tmp_path)
 
 
@@ -185,9 +185,9 @@ def test_wandb_gets_each_table_with_mean_and_deviation_and_each_figure(pristine_
     runs = fake_grid([pristine_scene], ["photo-gs", "shellgs"], tmp_path / "comparison", seeds=(0, 1))
     for run in runs:
         fabricate(run, psnr=20.0 + 2 * run.seed, chamfer_m=0.1)
-    picture = tmp_path / "strip.png"
-    Image.new("RGB", (4, 3)).save(picture)
-    log_comparison("facades", Comparison(list(tables(runs)), {"a caption": picture}, {}), runs)
+    image = tmp_path / "strip.png"
+    Image.new("RGB", (4, 3)).save(image)
+    log_comparison("facades", Comparison(list(tables(runs)), {"a caption": image}, {}), runs)
     (files,) = (tmp_path / "comparison" / "wandb").glob("offline-run-*/files/media")
     (main,) = files.glob("table/tables/main_*.json")
     table = json.loads(main.read_text())
@@ -199,7 +199,7 @@ def test_wandb_gets_each_table_with_mean_and_deviation_and_each_figure(pristine_
     assert len(list(files.glob("images/figures/strip_*.png"))) == 1
 
 
-# runs are kept
+# finished, killed and failed runs
 
 FAKE_TRAIN = """
 import os, pathlib, signal, sys, time
@@ -238,7 +238,7 @@ def write_fake_commands(folder: Path) -> None:
 
 @pytest.fixture
 def fake_commands(tmp_path, monkeypatch) -> None:
-    """Trainer and evaluation that take no time: photo-gs is killed at its first start, mono-gs always fails."""
+    """Instant training and evaluation: photo-gs is killed at its first start, mono-gs always fails."""
     folder = tmp_path / "bin"
     folder.mkdir()
     write_fake_commands(folder)
@@ -263,42 +263,42 @@ def test_one_failure_stops_no_other_run(pristine_scene, tmp_path, jobs):
 
 @pytest.mark.usefixtures("fake_commands")
 @pytest.mark.parametrize("terminal", [False, True])
-def test_the_console_says_that_results_are_written(pristine_scene, tmp_path, terminal):
-    said = io.StringIO()
-    console = Console(file=said, force_terminal=terminal)
+def test_the_console_shows_that_results_are_written(pristine_scene, tmp_path, terminal):
+    output = io.StringIO()
+    console = Console(file=output, force_terminal=terminal)
     runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
     compare(runs, partial(launch_locally, jobs=1, console=console), tmp_path / "out", console)
-    assert WRITING in said.getvalue()
+    assert WRITING in output.getvalue()
 
 
 @pytest.mark.usefixtures("fake_commands")
 @pytest.mark.parametrize("terminal", [False, True])
-def test_a_log_says_where_a_run_is(pristine_scene, tmp_path, monkeypatch, terminal):
-    monkeypatch.setattr(launch, "EVERY", 0.05)
+def test_a_log_shows_the_progress_of_a_run(pristine_scene, tmp_path, monkeypatch, terminal):
+    monkeypatch.setattr(launch, "PROGRESS_SECONDS", 0.05)
     monkeypatch.setenv("FAKE_SECONDS", "0.5")
-    said = io.StringIO()
+    output = io.StringIO()
     launch_locally(
-        fake_grid([pristine_scene], ["shellgs", "mono-gs"], tmp_path), 1, Console(file=said, force_terminal=terminal)
+        fake_grid([pristine_scene], ["shellgs", "mono-gs"], tmp_path), 1, Console(file=output, force_terminal=terminal)
     )
-    standing = "scene/shellgs/seed-0: 10 of 20 iterations" in said.getvalue()
-    assert standing == (not terminal)
-    assert "scene/shellgs/seed-0 finished, 1 of 2." in said.getvalue()
-    assert "scene/mono-gs/seed-0 failed, 2 of 2." in said.getvalue()
+    status = "scene/shellgs/seed-0: 10 of 20 iterations" in output.getvalue()
+    assert status == (not terminal)
+    assert "scene/shellgs/seed-0 finished, 1 of 2." in output.getvalue()
+    assert "scene/mono-gs/seed-0 failed, 2 of 2." in output.getvalue()
 
 
-def test_what_is_left_of_a_run_is_reckoned_from_the_time_so_far():
+def test_the_time_left_is_estimated_from_the_time_so_far():
     now = 0.0
     progress = Progress(get_time=lambda: now)
     task = progress.add_task("scene/shellgs/seed-0", total=1500)
     for now, iterations in ((60.0, 100), (60.1, 200), (60.2, 300), (90.0, 400), (90.1, 500)):  # noqa: B007  # the clock reads it
         progress.update(task, completed=iterations)
     now = 120.0
-    (standing,) = map(launch._standing, progress.tasks)
-    assert standing == "scene/shellgs/seed-0: 500 of 1500 iterations, 2.0 min, at most about 4.0 min left"
+    (status,) = map(launch._status, progress.tasks)
+    assert status == "scene/shellgs/seed-0: 500 of 1500 iterations, 2.0 min, at most about 4.0 min left"
 
 
 @pytest.mark.usefixtures("fake_commands")
-def test_a_finished_run_is_not_touched_again(pristine_scene, tmp_path):
+def test_a_finished_run_is_not_changed_again(pristine_scene, tmp_path):
     runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
     finish_all(runs)
     before = {path: path.stat().st_mtime_ns for path in runs[0].folder.rglob("*")}
@@ -307,7 +307,7 @@ def test_a_finished_run_is_not_touched_again(pristine_scene, tmp_path):
 
 
 @pytest.mark.usefixtures("fake_commands")
-def test_a_killed_run_goes_on_from_its_checkpoint(pristine_scene, tmp_path):
+def test_a_killed_run_resumes_from_its_checkpoint(pristine_scene, tmp_path):
     runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path / "out")
     assert list(finish_all(runs)) == runs
     assert not finish_all(runs)
@@ -315,8 +315,8 @@ def test_a_killed_run_goes_on_from_its_checkpoint(pristine_scene, tmp_path):
     assert f"--load-dir {runs[0].checkpoints}" in resumed
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's doing")
-def test_a_killed_comparison_takes_its_commands_with_it(tmp_path):
+@pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
+def test_killing_a_comparison_ends_its_commands(tmp_path):
     sleep = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     comparison = multiprocessing.get_context("fork").Process(target=follow, args=(["python", "-c", sleep],))
     comparison.start()
@@ -332,7 +332,7 @@ def test_a_killed_comparison_takes_its_commands_with_it(tmp_path):
 def test_a_changed_setting_is_refused_before_anything_starts(pristine_scene, tmp_path):
     finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
     longer = fake_grid([pristine_scene], ["2dgs", "shellgs"], tmp_path / "out", iterations=30)
-    with pytest.raises(SceneError, match=r"seed-0 is a run of other settings \(iterations: 20, now 30\)"):
+    with pytest.raises(SceneError, match=r"seed-0 is a run with other settings \(iterations: 20, now 30\)"):
         finish_all(longer)
     assert not longer[0].trained
 
@@ -347,7 +347,7 @@ def test_a_run_that_failed_before_its_first_checkpoint_may_change(pristine_scene
 
 @pytest.mark.usefixtures("fake_commands")
 @pytest.mark.parametrize("kind", ["shell", "checked"])
-def test_other_maps_make_another_run(scene, tmp_path, kind):
+def test_a_run_with_changed_maps_is_refused(scene, tmp_path, kind):
     CueMaps.create(scene, "checked", command="shellgs cast {scene}")
     finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
     manifest = scene / "cues" / kind / "manifest.json"
@@ -356,7 +356,7 @@ def test_other_maps_make_another_run(scene, tmp_path, kind):
         finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
 
 
-def test_a_folder_of_somebody_elses_run_is_left_alone(pristine_scene, tmp_path):
+def test_a_run_that_compare_did_not_make_is_refused_and_undisturbed(pristine_scene, tmp_path):
     (run,) = fake_grid([pristine_scene], ["shellgs"], tmp_path)
     run.folder.mkdir(parents=True)
     run.config.write_text("mine")
@@ -365,16 +365,16 @@ def test_a_folder_of_somebody_elses_run_is_left_alone(pristine_scene, tmp_path):
     assert [path.name for path in run.folder.iterdir()] == ["config.yml"]
 
 
-def test_methods_that_do_not_undistort_are_refused_resized_photographs(scene, tmp_path):
+def test_a_method_that_does_not_undistort_is_refused_for_resized_photographs(scene, tmp_path):
     manifest = scene / "cues" / "shell" / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"max_image_size": null', '"max_image_size": 32'))
-    with pytest.raises(SceneError, match="splatfacto takes photographs as they are"):
+    with pytest.raises(SceneError, match="splatfacto does not undistort or resize photographs"):
         fake_grid([scene], ["splatfacto"], tmp_path)[0].settle()
 
 
 @pytest.fixture
 def fake_environment(tmp_path) -> Path:
-    """Folder of programs of a virtual environment like this one, with the fake commands; also in Ray's workers."""
+    """The bin folder of a copy of this virtual environment with the fake commands, which Ray's workers run too."""
     home = tmp_path / "environment"
     (home / "bin").mkdir(parents=True)
     (home / "bin" / "python").symlink_to(Path(sys.executable).resolve())
@@ -386,7 +386,7 @@ def fake_environment(tmp_path) -> Path:
 
 @pytest.mark.slow
 def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pristine_scene, tmp_path, fake_environment):
-    """photo-gs takes its worker with it at its first start, mono-gs always fails, and all results come back."""
+    """photo-gs kills its worker at its first start, mono-gs always fails, and all results are returned."""
     pytest.importorskip("ray")
     words = ["compare", pristine_scene, "--methods", "photo-gs", "mono-gs", "shellgs", "--iterations", "20"]
     command = [fake_environment / "python", "-c", "from shellgs_method.cli import main; main()", *words]
@@ -412,7 +412,7 @@ def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pris
 
 
 def refusal(monkeypatch, *words: object) -> str:
-    """What `shellgs` ends with."""
+    """The sentence that `shellgs` ends with."""
     monkeypatch.setattr("sys.argv", ["shellgs", *map(str, words)])
     with pytest.raises(SystemExit, match=r"^shellgs: [^\n]*$") as end:
         cli.main()
@@ -420,15 +420,15 @@ def refusal(monkeypatch, *words: object) -> str:
 
 
 REFUSED = {
-    "no method": (["--methods"], "name methods"),
-    "no seed": (["--seeds"], "name seeds"),
-    "a seed below 0": (["--seeds", "-1"], "no seed"),
-    "no iteration": (["--iterations", "-5"], "at least one iteration"),
-    "no points": (["--curve-points", "-1"], "at least one iteration"),
-    "no job": (["--jobs", "0"], "--jobs 0"),
+    "no method": (["--methods"], "give methods"),
+    "no seed": (["--seeds"], "give seeds"),
+    "a seed below 0": (["--seeds", "-1"], "--seeds and --curve-points at least 0"),
+    "no iteration": (["--iterations", "-5"], "--iterations must be at least 1"),
+    "no points": (["--curve-points", "-1"], "--curve-points at least 0"),
+    "no job": (["--jobs", "0"], "--jobs must be at least 1, not 0"),
     "a flag that is none": (["--methods", "a=shellgs --window 3"], "ns-train shellgs --window 3 is refused"),
     "a setting beyond its limits": (["--methods", "a=shellgs --pipeline.model.sh-degree=7"], "sh_degree cannot be 7"),
-    "an open quote": (["--methods", "a=shellgs '"], "is no method with its flags"),
+    "an open quote": (["--methods", "a=shellgs '"], "is not a method with its flags"),
     "another length": (["--methods", "a=shellgs --max-num-iterations 3"], "a sets max_num_iterations"),
     "another folder": (["--methods", "a=shellgs --output-dir=elsewhere"], "a sets output_dir"),
     "two of one name": (
@@ -443,7 +443,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_what_makes_no_comparison_is_refused_with_a_sentence(pristine_scene, tmp_path, monkeypatch, what):
+def test_an_impossible_comparison_is_refused_with_one_sentence(pristine_scene, tmp_path, monkeypatch, what):
     words, why = REFUSED[what]
     output = tmp_path / "out"
     said = refusal(monkeypatch, "compare", pristine_scene, "--methods", "photo-gs", *words, "--output", output)
@@ -454,14 +454,14 @@ def test_what_makes_no_comparison_is_refused_with_a_sentence(pristine_scene, tmp
 
 def test_a_cluster_that_never_answers_is_refused(pristine_scene, tmp_path, monkeypatch):
     pytest.importorskip("ray")
-    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    monkeypatch.setattr(cluster, "TIMEOUT", 1)
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
         words = ["--methods", "photo-gs", "--launcher", "ray", "--address", address, "--output", tmp_path]
         assert f"no Ray cluster at {address}" in refusal(monkeypatch, "compare", pristine_scene, *words)
 
 
-def test_flags_mean_what_ns_train_takes_them_for(pristine_scene, tmp_path):
+def test_flags_are_read_as_ns_train_reads_them(pristine_scene, tmp_path):
     for flag in (["--pipeline.datamanager.holdout", "B"], ["--pipeline.datamanager.holdout=B"]):
         assert Variant.parse(f"half=shellgs {' '.join(flag)}").held_out == "B"
     twice = fake_grid(
@@ -490,7 +490,7 @@ def move_points(path: Path) -> None:
     ("file", "change", "what"),
     [("images/frame_00003.png", repaint, "photographs"), ("sparse_pc.ply", move_points, "cameras")],
 )
-def test_a_photograph_or_points_replaced_after_a_run_make_another_run(scene, tmp_path, file, change, what):
+def test_a_run_whose_photographs_or_points_changed_is_refused(scene, tmp_path, file, change, what):
     finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
     change(scene / file)
     with pytest.raises(SceneError, match=rf"other settings \({what}: "):
@@ -498,7 +498,7 @@ def test_a_photograph_or_points_replaced_after_a_run_make_another_run(scene, tmp
 
 
 @pytest.mark.usefixtures("fake_commands")
-def test_a_setting_that_an_earlier_build_did_not_have_makes_no_other_run(pristine_scene, tmp_path):
+def test_a_setting_that_an_earlier_version_lacked_counts_as_its_default(pristine_scene, tmp_path):
     (run,) = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
     finish_all([run])
     path = run.folder / "settings.json"
@@ -513,9 +513,9 @@ def test_a_setting_that_an_earlier_build_did_not_have_makes_no_other_run(pristin
 
 
 @pytest.mark.usefixtures("fake_commands")
-def test_two_comparisons_do_not_work_in_one_folder(pristine_scene, tmp_path):
+def test_two_comparisons_cannot_run_in_one_folder(pristine_scene, tmp_path):
     runs = fake_grid([pristine_scene], ["shellgs"], tmp_path)
-    with held(tmp_path), pytest.raises(SceneError, match="another comparison works in"):
+    with held(tmp_path), pytest.raises(SceneError, match="another comparison is running in"):
         finish_all(runs)
     assert not finish_all(runs)
 
@@ -542,7 +542,7 @@ def test_a_damaged_file_of_one_run_stops_no_other_and_is_made_again(pristine_sce
     (damaged.folder / name).parent.mkdir(exist_ok=True)
     (damaged.folder / name).write_bytes(content)
     failures = finish_all(fake_grid([pristine_scene], names, tmp_path / "out"))
-    if name == "settings.json":  # nobody knows what the run is of
+    if name == "settings.json":  # the settings of the run are unknown
         assert [run.variant.name for run in failures] == ["shellgs"]
         assert (damaged.folder / name).read_bytes() == content
     else:
@@ -552,7 +552,7 @@ def test_a_damaged_file_of_one_run_stops_no_other_and_is_made_again(pristine_sce
     assert other.metrics().stat().st_mtime_ns == before
 
 
-def test_a_folder_is_replaced_whole_and_what_a_kill_put_aside_comes_back(tmp_path):
+def test_a_folder_is_replaced_whole_and_recovered_after_a_kill(tmp_path):
     folder, fresh = tmp_path / "run", tmp_path / "run.new"
     for each in (folder, fresh):
         each.mkdir()
@@ -560,12 +560,12 @@ def test_a_folder_is_replaced_whole_and_what_a_kill_put_aside_comes_back(tmp_pat
     replace_folder(folder, fresh)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     assert (folder / "name").read_text() == "run.new"
-    folder.rename(tmp_path / "run.old")  # where a kill between the two leaves it
+    folder.rename(tmp_path / "run.old")  # as after a kill between the two renames
     recover_folder(folder)
     assert (folder / "name").read_text() == "run.new"
 
 
-def test_a_folder_goes_to_a_cluster_in_pieces_and_is_the_same_there(tmp_path, monkeypatch):
+def test_a_folder_is_unchanged_by_packing_in_pieces_and_unpacking(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "PIECE", 4096)
     folder = tmp_path / "folder"
     (folder / "deep").mkdir(parents=True)
@@ -578,20 +578,20 @@ def test_a_folder_goes_to_a_cluster_in_pieces_and_is_the_same_there(tmp_path, mo
     assert filecmp.cmpfiles(folder, tmp_path / "there", names, shallow=False) == (names, [], [])
 
 
-def test_a_folder_among_the_temporary_files_that_others_can_write_is_not_used(tmp_path, monkeypatch):
+def test_a_temporary_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert stat.S_IMODE(cluster._own_folder().stat().st_mode) == stat.S_IRWXU
     cluster._own_folder().chmod(0o777)
-    with pytest.raises(SceneError, match="is not this user's alone"):
+    with pytest.raises(SceneError, match="is not a folder only you can write to"):
         cluster._own_folder()
 
 
-# measurements and pictures
+# metrics and images
 
 
 @pytest.fixture(scope="module")
 def measured(pristine_scene, tmp_path_factory) -> list[Run]:
-    """Two methods, trained in process for a moment and measured, as the launcher leaves them."""
+    """Two methods trained in this process for four iterations and measured, in the launcher's folders."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SHELLGS_COMPILE", "0")
         runs = grid([pristine_scene], ["photo-gs", "shellgs"], [0], 4, tmp_path_factory.mktemp("compare"))
@@ -599,11 +599,11 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
         for run, method in zip(runs, methods, strict=True):
             run.settle()
 
-            def place(config, run=run):
+            def set_folder(config, run=run):
                 config.output_dir, config.experiment_name = run.folder.parents[2], run.variant.name
                 config.timestamp, config.steps_per_eval_all_images = "seed-0", 2
 
-            trainer = trainer_of(pristine_scene, run.output, method, 4, change=place)
+            trainer = trainer_of(pristine_scene, run.output, method, 4, change=set_folder)
             trainer.config.save_config()
             trainer.train()
             write_metrics(run.config, run.metrics(), renders=run.renders)
@@ -611,7 +611,7 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
 
 
 @pytest.mark.usefixtures("eager")
-def test_our_figures_are_those_of_ns_eval(measured):
+def test_our_metrics_are_those_of_ns_eval(measured):
     _, pipeline, _, _ = eval_setup(measured[1].config)
     assert isinstance(pipeline, FacadePipeline)
     theirs = pipeline.get_average_eval_image_metrics(get_std=True)
@@ -622,16 +622,16 @@ def test_our_figures_are_those_of_ns_eval(measured):
 
 @pytest.mark.usefixtures("eager")
 @pytest.mark.parametrize("background", ["black", "white", "random"])
-def test_our_figures_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_path, background):
+def test_our_metrics_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_path, background):
     for path in (scene / "images").iterdir():
         image = Image.open(path).convert("RGBA")
         image.putalpha(Image.linear_gradient("L").resize(image.size))
         image.save(path)
 
-    def on(config):
+    def set_background(config):
         config.pipeline.model.background_color = background
 
-    trainer = trainer_of(scene, tmp_path, "photo_gs", iterations=2, change=on)
+    trainer = trainer_of(scene, tmp_path, "photo_gs", iterations=2, change=set_background)
     trainer.config.save_config()
     trainer.train()
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
@@ -643,22 +643,22 @@ def test_our_figures_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_
 
 
 @pytest.mark.usefixtures("eager")
-def test_a_half_is_measured_of_a_run_that_knows_no_halves(measured):
+def test_a_half_can_be_measured_of_a_run_without_holdout(measured):
     whole = json.loads(measured[0].metrics().read_text())["results"]
     halves = [measure(measured[0].config, half)["results"]["supported"] for half in ("A", "B")]
     assert sum(halves) == pytest.approx(whole["supported"], rel=1e-5)
     assert min(halves) > 0.1 * whole["supported"]
 
 
-def test_snapshots_are_pictures_of_the_views(measured):
+def test_snapshots_hold_renders_of_the_views(measured):
     shot = Snapshot.load(sorted(measured[0].renders.glob("*.npz"))[0])
     assert shot.rgb.shape == shot.photograph.shape == (32, 48, 3)
     assert shot.mask.any()
     assert shot.error[shot.mask].max() <= 90
 
 
-def test_a_thinned_picture_has_the_rays_of_the_pixels_it_keeps(measured, tmp_path, monkeypatch):
-    """Every third pixel: pixel (i, j) of the picture is pixel (3 i, 3 j) of the view."""
+def test_a_subsampled_image_has_the_rays_of_the_pixels_it_keeps(measured, tmp_path, monkeypatch):
+    """Every third pixel: pixel (i, j) of the image is pixel (3 i, 3 j) of the view."""
     monkeypatch.setattr("shellgs_method.compare.measure.IMAGE_SIZE", 16)
     measure(measured[0].config, renders=tmp_path)
     thin, full = (Snapshot.load(sorted(folder.glob("*.npz"))[0]) for folder in (tmp_path, measured[0].renders))
@@ -670,7 +670,7 @@ def test_a_thinned_picture_has_the_rays_of_the_pixels_it_keeps(measured, tmp_pat
     assert (thin.shell_depth == full.shell_depth[::3, ::3]).all()
 
 
-def test_the_report_needs_no_other_file_and_shows_every_view(measured, tmp_path):
+def test_the_report_is_self_contained_and_shows_every_view(measured, tmp_path):
     write_results(measured, tmp_path, {})
     report = (tmp_path / "report.html").read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", report)
@@ -680,17 +680,17 @@ def test_the_report_needs_no_other_file_and_shows_every_view(measured, tmp_path)
     assert len(views) == 2
     for methods in views.values():
         assert list(methods) == ["photograph, shell", "photo-gs", "shellgs"]
-    for picture in ("strip.png", "surfaces.png", "curves.png"):
-        with Image.open(tmp_path / picture) as image:
+    for name in ("strip.png", "surfaces.png", "curves.png"):
+        with Image.open(tmp_path / name) as image:
             assert np.asarray(image).std() > 5
 
 
-def test_of_two_points_the_nearer_is_seen():
+def test_the_nearer_of_two_points_is_in_front():
     red, green = np.array([[255, 0, 0], [0, 255, 0]], np.uint8)
-    picture = dotted(np.array([[0.0, 0, 2], [0, 0, 1], [1e9, 0, 3]]), np.stack([red, green, green]))
-    painted = (picture != 255).any(axis=-1)
+    image = dotted(np.array([[0.0, 0, 2], [0, 0, 1], [1e9, 0, 3]]), np.stack([red, green, green]))
+    painted = (image != 255).any(axis=-1)
     assert painted.sum() == DOT**2
-    assert (picture[painted] == red).all()
+    assert (image[painted] == red).all()
 
 
 def test_ablations_without_their_method_have_a_report(measured, tmp_path):
@@ -701,5 +701,5 @@ def test_ablations_without_their_method_have_a_report(measured, tmp_path):
     assert '<option value="photo-gs-flat"' in (tmp_path / "report.html").read_text()
 
 
-def test_curves_are_of_all_held_out_views(measured):
+def test_curves_hold_all_held_out_views(measured):
     assert sorted(recorded_metrics(measured[1])["normal_deg"]) == [2]

@@ -45,7 +45,7 @@ def disparity_of(depth: np.ndarray) -> np.ndarray:
 
 
 def points_on(depth: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels at random positions, and what the depth map says there (bilinear in the inverse depth)."""
+    """Random pixel positions and the depth of the plane there."""
     rng = np.random.default_rng(seed)
     height, width = depth.shape
     pixels = rng.uniform([1, 1], [width - 1, height - 1], (count, 2))
@@ -71,7 +71,7 @@ def test_scale_and_shift_are_found_exactly():
 def test_thirty_percent_of_wrong_points_do_not_matter():
     depth = plane_depth()
     pixels, z = points_on(depth, 200)
-    z[:60] *= np.random.default_rng(1).uniform(1.5, 4, 60)  # as mirror images behind the glass: all on one side
+    z[:60] *= np.random.default_rng(1).uniform(1.5, 4, 60)  # like mirror images behind the glass: all too far
     fit = fit_disparity(disparity_of(depth), pixels, z)
     assert (fit.scale, fit.shift) == pytest.approx((A, B), rel=1e-5)
     assert fit.inliers == pytest.approx(0.7)
@@ -92,16 +92,16 @@ def test_noise_is_averaged_over_the_points():
     ("change", "problem"),
     [
         (lambda d, p, z: (d, p[:12], z[:12]), "12 SfM points"),
-        (lambda d, p, z: (d, p, np.full_like(z, 5.0)), "spread over 0.0% only"),
-        (lambda d, p, z: (np.full_like(d, 0.4), p, z), "does not grow towards the camera"),
-        (lambda d, p, z: (1 / d, p, z), "does not grow towards the camera"),
+        (lambda d, p, z: (d, p, np.full_like(z, 5.0)), "spread over only 0.0%"),
+        (lambda d, p, z: (np.full_like(d, 0.4), p, z), "does not increase towards the camera"),
+        (lambda d, p, z: (1 / d, p, z), "does not increase towards the camera"),
         (lambda d, p, z: (np.full_like(d, np.nan), p, z), "0 SfM points"),
         (lambda d, p, z: (d, p, np.where(np.arange(len(z)) < 45, z * 3, z)), "55% of the points"),
-        (lambda d, p, z: (d, p, z * np.where(np.arange(len(z)) % 2, 1.08, 1 / 1.08)), "median depth error of [67]"),
+        (lambda d, p, z: (d, p, z * np.where(np.arange(len(z)) % 2, 1.08, 1 / 1.08)), "median depth error is [67]"),
     ],
     ids=["few", "one depth", "flat map", "depth taken for disparity", "empty map", "wrong points", "noise"],
 )
-def test_a_view_that_cannot_be_trusted_is_told_why(change: Callable, problem: str):
+def test_a_view_that_cannot_be_trusted_has_a_reason(change: Callable, problem: str):
     depth = plane_depth()
     fit = fit_disparity(*change(disparity_of(depth), *points_on(depth, 100)))
     assert fit.problem is not None
@@ -115,7 +115,7 @@ def test_depth_ends_where_the_fit_is_extrapolation():
     np.testing.assert_allclose(depth, [[5, 10, 20 / 1.01, 0, 0, 0]], rtol=1e-6)
 
 
-def test_disparity_is_larger_where_nearer_whatever_was_stored():
+def test_disparity_is_larger_where_nearer_for_all_stored_values():
     nan = np.nan
     stored = np.array([[2.0, 4.0, 0.0, -1.0, nan, np.inf]])
     np.testing.assert_array_equal(as_disparity(stored, "disparity"), [[2, 4, nan, -1, nan, nan]])
@@ -147,18 +147,18 @@ def cue_of(normal: np.ndarray) -> CueMap:
     return CueMap(depth, normal, np.ones(depth.shape, bool))
 
 
-def test_right_axes_are_not_doubted():
+def test_right_axes_are_accepted():
     assert disagreement(cue_of(WALL + np.array([0.1, 0.1, 0])), CAMERA, "opencv") is None
 
 
-def test_wrong_axes_are_found_out_and_the_right_ones_named():
+def test_wrong_axes_are_detected_and_the_right_ones_named():
     problem = disagreement(cue_of(to_opencv(WALL, "opengl")), CAMERA, "opencv")
     assert problem is not None
     assert problem.startswith("read as opencv they are 52° from")
     assert problem.endswith("as opengl 0°")
 
 
-def test_the_gradients_normals_are_the_planes():
+def test_gradient_normals_of_a_plane_are_its_normal():
     normal = gradient_normals(plane_depth(), CAMERA)
     np.testing.assert_allclose(normal[1:-1, 1:-1], np.broadcast_to(WALL, (46, 62, 3)), atol=1e-4)
     assert not normal[0].any()
@@ -167,7 +167,7 @@ def test_the_gradients_normals_are_the_planes():
 # SfM points
 
 
-def test_points_are_seen_where_the_scene_says_so():
+def test_a_view_sees_the_points_that_the_scene_lists_for_it():
     positions = np.array([[0, 0, 5.0], [0.5, 0, 5], [0, 0, -5], [50, 0, 5]])
     points = SparsePoints(positions, {"images/a.png": np.array([1, 2])})
     pixels, depth = points.seen_in(view_of())
@@ -177,7 +177,7 @@ def test_points_are_seen_where_the_scene_says_so():
     assert len(SparsePoints(positions).seen_in(view_of())[1]) == 2
 
 
-def test_the_clouds_points_come_back_in_the_scenes_own_frame(scene: Path):
+def test_points_of_a_cloud_are_read_in_the_scenes_frame(scene: Path):
     positions = exact_points(scene)
     write_cloud(scene, positions)
     found = read_sparse_points(FacadeDataParserConfig(data=scene))
@@ -267,7 +267,7 @@ def test_a_distorted_photographs_map_is_undistorted_with_it(scene: Path, tmp_pat
     np.testing.assert_allclose(found[inside], expected[inside], atol=0.1)
 
 
-def test_maps_belong_to_the_photograph_of_their_name(tmp_path: Path):
+def test_maps_are_matched_to_photographs_by_name(tmp_path: Path):
     for number, name in enumerate(("b/0001.npy", "a/0001.npy", "0002.jpg.npy"), start=1):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         np.save(tmp_path / name, np.full((48, 64), number, np.float32))
@@ -289,7 +289,7 @@ def two_files(folder: Path) -> None:
         (lambda folder: (folder / "a.npy").write_bytes(b"\x93NUMPY\x01"), r"a\.npy of view 'images/a\.png'.*again"),
         (lambda folder: (folder / "a.png").write_bytes(b"\x89PNG\r\n"), r"a\.png of view 'images/a\.png'.*again"),
         (lambda folder: np.save(folder / "a.npy", np.ones((48, 64, 3))), r"float64 \[48, 64, 3\], not one number"),
-        (lambda folder: np.save(folder / "a.npy", plane_depth().T), "48x64 pixels, which is not the shape"),
+        (lambda folder: np.save(folder / "a.npy", plane_depth().T), "48x64 pixels, not the aspect ratio"),
         (lambda folder: np.savez(folder / "a.npz", x=np.ones(2), y=np.ones(2)), "none of its arrays x, y is named"),
         (lambda folder: Image.new("L", (64, 48)).save(folder / "a.png"), "8 bits are too few"),
         (two_files, r"two maps: .*a\.npy, .*a\.npz"),
@@ -302,7 +302,7 @@ def test_an_unusable_map_is_refused_with_its_view(tmp_path: Path, write: Callabl
         Precomputed(tmp_path).load().predict(view_of())
 
 
-def test_a_map_that_two_views_claim_is_refused(tmp_path: Path):
+def test_a_map_that_matches_two_views_is_refused(tmp_path: Path):
     np.save(tmp_path / "0001.npy", plane_depth())
     predict = Precomputed(tmp_path).load().predict
     predict(view_of(name="images/left/0001.jpg"))
@@ -315,7 +315,7 @@ def test_a_map_that_two_views_claim_is_refused(tmp_path: Path):
 
 @pytest.fixture(scope="module")
 def depth_anything(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A Depth Anything V2 of 20 000 random weights, saved as its authors save theirs."""
+    """A Depth Anything V2 with 20 000 random weights, saved in the format of the published ones."""
     transformers = pytest.importorskip("transformers")
     folder = tmp_path_factory.mktemp("weights") / "tiny"
     torch.manual_seed(0)
@@ -339,7 +339,7 @@ def depth_anything(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     model = transformers.DepthAnythingForDepthEstimation(config)
     with torch.no_grad():
-        for parameter in model.parameters():  # the untrained network would say the same everywhere
+        for parameter in model.parameters():  # the untrained network would be almost constant
             parameter.mul_(3)
         model.head.conv3.bias.fill_(20.0)  # above the last ReLU's zero
     model.save_pretrained(folder)
@@ -348,7 +348,7 @@ def depth_anything(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_depth_anything_goes_through_its_real_loader(depth_anything: Path, pristine_scene: Path):
+def test_depth_anything_is_loaded_by_its_own_package(depth_anything: Path, pristine_scene: Path):
     view = read_views(FacadeDataParserConfig(data=pristine_scene))[0]
     predictor = DepthAnything(str(depth_anything)).load()
     prediction = predictor.predict(view)
@@ -380,7 +380,7 @@ def test_other_weights_are_another_revision(depth_anything: Path, tmp_path: Path
         ("tags: []", "not stated", False),
     ],
 )
-def test_the_model_card_tells_the_licence(depth_anything: Path, header: str, licence: str, non_commercial: bool):
+def test_the_licence_is_read_from_the_model_card(depth_anything: Path, header: str, licence: str, non_commercial: bool):
     card = depth_anything / "README.md"
     card.write_text(f"---\n{header}\n---\n# A model\n")
     try:
@@ -396,11 +396,13 @@ def test_no_default_is_for_non_commercial_use_only():
     assert MoGe2().weights.startswith("Ruicheng/moge-2-")
 
 
-def test_weights_that_cannot_be_had_name_the_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_weights_that_cannot_be_downloaded_suggest_importing_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("transformers")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(SceneError, match=r"weights nobody/nothing cannot be had .*shellgs mono SCENE from FOLDER"):
+    with pytest.raises(
+        SceneError, match=r"weights nobody/nothing cannot be downloaded .*shellgs mono SCENE from FOLDER"
+    ):
         DepthAnything("nobody/nothing").load()
 
 
@@ -408,7 +410,7 @@ def test_weights_that_cannot_be_had_name_the_import(tmp_path: Path, monkeypatch:
     ("source", "module", "remedy"),
     [(MoGe2(), "moge", "github.com/microsoft/MoGe"), (DepthAnything(), "transformers", r"shellgs\[mono\]")],
 )
-def test_a_missing_package_names_the_remedy_and_the_import(source, module: str, remedy: str, monkeypatch):
+def test_a_missing_package_names_remedy_and_import(source, module: str, remedy: str, monkeypatch):
     for name in [name for name in sys.modules if name.split(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
@@ -416,14 +418,14 @@ def test_a_missing_package_names_the_remedy_and_the_import(source, module: str, 
         source.load()
 
 
-def test_foreign_files_are_no_weights(tmp_path: Path):
+def test_files_of_another_network_are_refused(tmp_path: Path):
     pytest.importorskip("transformers")
     (tmp_path / "config.json").write_text('{"model_type": "bert"}')
     with pytest.raises(SceneError, match="cannot be loaded as weights of Depth Anything"):
         DepthAnything(str(tmp_path)).load()
 
 
-def test_moge_goes_through_its_real_loader(tmp_path: Path, pristine_scene: Path):
+def test_moge_is_loaded_by_its_own_package(tmp_path: Path, pristine_scene: Path):
     moge = pytest.importorskip("moge.model.v2", reason="moge is on no package index")
     head = {"dim_in": [32] * 5, "dim_res_blocks": [32] * 5, "num_res_blocks": 1, "resamplers": ["bilinear"] * 4}
     torch.manual_seed(0)
@@ -448,7 +450,7 @@ def test_moge_goes_through_its_real_loader(tmp_path: Path, pristine_scene: Path)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, *words: object, status: bool = True) -> str:
-    """What `shellgs mono` prints, without line breaks, or the sentence that it ends with."""
+    """Output of `shellgs mono` without line breaks, or the sentence that it ends with."""
     monkeypatch.setattr(sys, "argv", ["shellgs", "mono", *map(str, words)])
     capsys.readouterr()
     if status:
@@ -476,14 +478,14 @@ def exact_points(scene: Path) -> list[np.ndarray]:
 
 
 def points_at(depth: np.ndarray, rows: np.ndarray, columns: np.ndarray, camera: Camera) -> np.ndarray:
-    """Points in the world that a camera sees at the centres of some pixels."""
+    """Points in the world that project to the centres of some pixels."""
     in_camera = depth[rows, columns, None] * camera.rays().numpy()[rows, columns]
     viewmat = camera.viewmat.numpy()
     return (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 
 def write_cloud(scene: Path, points: list[np.ndarray]) -> None:
-    """A cloud that does not tell which view observes which point."""
+    """Write a cloud, which does not list the points that a view observes."""
     positions = np.concatenate(points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions))
     cloud.paint_uniform_color([0.5, 0.5, 0.5])
@@ -491,7 +493,7 @@ def write_cloud(scene: Path, points: list[np.ndarray]) -> None:
 
 
 def write_colmap(scene: Path, views: Sequence[View], points: Sequence[np.ndarray]) -> None:
-    """A COLMAP text model in which each view observes the points of its own."""
+    """Write a COLMAP text model in which each view observes its own points."""
     folder = scene / "sparse" / "0"
     folder.mkdir(parents=True)
     images, cloud = [], []
@@ -519,7 +521,7 @@ def write_maps(scene: Path, folder: Path, convention: Convention | None = None) 
         np.savez(folder / f"{Path(view.name).stem}.npz", **arrays)
 
 
-def test_imported_true_depth_is_the_truth(scene: Path, tmp_path: Path, monkeypatch, capsys):
+def test_imported_true_maps_are_the_truth(scene: Path, tmp_path: Path, monkeypatch, capsys):
     expected = truths(scene)
     maps = tmp_path / "Tiefen – 深度"
     write_maps(scene, maps, "opengl")
@@ -550,7 +552,7 @@ def test_batches_hold_the_monocular_maps(scene: Path, tmp_path: Path, monkeypatc
     assert batch["mono_normal"].shape == (32, 48, 3)
 
 
-def test_wrong_axes_end_the_command_with_the_view_and_the_right_ones(scene: Path, tmp_path: Path, monkeypatch, capsys):
+def test_wrong_axes_are_refused_with_the_view_and_the_right_ones(scene: Path, tmp_path: Path, monkeypatch, capsys):
     write_cloud(scene, exact_points(scene))
     write_maps(scene, tmp_path / "maps", "opengl")
     words = (scene, "from", tmp_path / "maps", "--values", "depth", "--normals", tmp_path / "maps")
@@ -567,13 +569,13 @@ def test_a_second_run_keeps_the_first_ones_maps(scene: Path, tmp_path: Path, mon
     words = (scene, "from", tmp_path / "maps", "--values", "depth")
     output = run(monkeypatch, capsys, *words)
     assert "9 maps made" in output
-    assert "No map for images/frame_00003.png: there is no map of it." in output
+    assert "No map for images/frame_00003.png: there is no prediction for it." in output
     before = {path: path.stat().st_mtime_ns for path in scene.glob("cues/mono/images/*.npz")}
-    assert "0 maps made, 10 views decided before" in run(monkeypatch, capsys, *words)
+    assert "0 maps made, 10 views already processed" in run(monkeypatch, capsys, *words)
     assert {path: path.stat().st_mtime_ns for path in scene.glob("cues/mono/images/*.npz")} == before
 
 
-def test_a_view_that_lost_its_trust_loses_its_map(scene: Path, tmp_path: Path, monkeypatch, capsys):
+def test_a_view_that_can_no_longer_be_trusted_loses_its_map(scene: Path, tmp_path: Path, monkeypatch, capsys):
     write_cloud(scene, exact_points(scene))
     write_maps(scene, tmp_path / "maps")
     words = (scene, "from", tmp_path / "maps", "--values", "depth")
@@ -583,7 +585,7 @@ def test_a_view_that_lost_its_trust_loses_its_map(scene: Path, tmp_path: Path, m
     assert "images/frame_00003.png" not in CueMaps.open(scene, "mono").names
 
 
-def test_what_cannot_be_trusted_costs_nothing_that_was_there(scene: Path, tmp_path: Path, monkeypatch, capsys):
+def test_untrusted_predictions_leave_existing_maps_unchanged(scene: Path, tmp_path: Path, monkeypatch, capsys):
     write_cloud(scene, exact_points(scene))
     write_maps(scene, tmp_path / "maps", "opengl")
     words = (scene, "from", tmp_path / "maps", "--values")
@@ -591,15 +593,15 @@ def test_what_cannot_be_trusted_costs_nothing_that_was_there(scene: Path, tmp_pa
     before = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()}
     sentence = run(monkeypatch, capsys, *words, "disparity", status=False)
     assert "no view has a monocular map that can be trusted" in sentence
-    assert "does not grow towards the camera" in sentence
+    assert "does not increase towards the camera" in sentence
     run(monkeypatch, capsys, *words, "depth", "--normals", tmp_path / "maps", "--convention", "opencv", status=False)
     assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == before
 
 
-def test_a_networks_disparity_is_aligned_to_what_each_view_observes(
+def test_a_networks_disparity_is_aligned_to_the_points_of_each_view(
     scene: Path, depth_anything: Path, monkeypatch, capsys
 ):
-    """Where the scene is as the random network sees it, its maps are the scene, view by view."""
+    """From SfM points on surfaces that the random network predicts, its maps are these surfaces, view by view."""
     views, predict = read_views(FacadeDataParserConfig(data=scene)), DepthAnything(str(depth_anything)).load().predict
     rng, depths, points = np.random.default_rng(0), {}, []
     for number, view in enumerate(views):
@@ -623,7 +625,7 @@ def test_a_networks_disparity_is_aligned_to_what_each_view_observes(
         np.testing.assert_allclose(cue.depth[cue.mask], depths[view.name][cue.mask], rtol=1e-3)
 
 
-def test_maps_follow_the_size_of_the_shells(scene: Path, tmp_path: Path, monkeypatch, capsys):
+def test_maps_have_the_size_of_the_shell_maps(scene: Path, tmp_path: Path, monkeypatch, capsys):
     write_cloud(scene, exact_points(scene))
     write_maps(scene, tmp_path / "maps")
     manifest = scene / "cues/shell/manifest.json"

@@ -1,4 +1,4 @@
-"""The synthetic facade: its geometry against closed forms, its images and files against what they promise."""
+"""The synthetic facade: its geometry against closed forms, and the contents of its images and files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def pose(frame: dict) -> np.ndarray:
 
 
 def read_camera(scene, index: int) -> tuple[str, Camera]:
-    """The camera as a reader of transforms.json understands it, without this package's help."""
+    """Name and camera of a photograph, read from transforms.json without this package."""
     meta = json.loads((scene / "transforms.json").read_text())
     frame = meta["frames"][index]
     K = torch.tensor([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1]], dtype=torch.float64)
@@ -61,7 +61,7 @@ def files(folder) -> list[str]:
 
 
 def points_of(facade: Facade):
-    """SfM points of the facade, of larger images than the scene's."""
+    """Simulated SfM points of the facade, from images of noise."""
     rng = np.random.default_rng(0)
     noise = rng.uniform(0, 255, (CONFIG.height, CONFIG.width, 3)).astype(np.uint8)
     found = [features(facade.daylight.world, camera, noise, 200, rng) for camera in facade.cameras]
@@ -72,7 +72,7 @@ def test_same_seed_writes_the_same_files(scene, tmp_path):
     write_scene(tmp_path / "again", CONFIG)
     assert files(tmp_path / "again") == files(scene)
     _, mismatch, errors = filecmp.cmpfiles(scene, tmp_path / "again", files(scene), shallow=False)
-    # npz files carry the time of writing; their arrays are compared below.
+    # npz files store the time of writing; their arrays are compared below.
     assert not errors
     assert all(name.endswith(".npz") for name in mismatch)
     for name in mismatch:
@@ -86,7 +86,7 @@ def test_another_seed_moves_the_walk_but_not_the_building(facade):
     assert not torch.equal(other.cameras[0].viewmat, facade.cameras[0].viewmat)
 
 
-def test_depth_on_the_wall_is_that_of_its_plane(facade):
+def test_depth_on_the_wall_is_the_depth_of_its_plane(facade):
     """The wall is y = 0: with rays of z = 1 in the camera, depth = -origin.y / direction.y."""
     for camera in facade.cameras:
         origin, directions = rays(camera)
@@ -98,7 +98,7 @@ def test_depth_on_the_wall_is_that_of_its_plane(facade):
         np.testing.assert_allclose(cue.depth[wall], expected[wall], rtol=1e-5)
 
 
-def test_normal_on_the_panes_is_the_facades_turned_into_the_camera(facade):
+def test_normals_of_the_panes_are_the_facades_in_the_camera_frame(facade):
     for camera in facade.cameras:
         origin, directions = rays(camera)
         glass = facade.daylight.world.cast(origin, directions).material == Material.GLASS
@@ -113,7 +113,7 @@ def test_panes_lie_at_the_recess_in_building_and_shell():
         assert (panes[..., 1] == RECESS).all()
 
 
-def test_truth_faces_the_camera_and_leaves_out_street_and_sky(facade):
+def test_true_normals_face_the_camera_and_the_mask_excludes_street_and_sky(facade):
     for camera in facade.cameras:
         cue = facade.truth(camera)
         material = facade.daylight.world.cast(*rays(camera)).material
@@ -122,8 +122,8 @@ def test_truth_faces_the_camera_and_leaves_out_street_and_sky(facade):
         assert (cue.depth[material == 255] == 0).all()
 
 
-def test_predictions_are_affine_in_the_true_disparity_but_for_errors_of_some_percent(scene):
-    """A robust line is fitted to what both say of the wall; blurred edges are the outliers."""
+def test_predictions_are_affine_in_the_true_disparity_up_to_errors_of_some_percent(scene):
+    """A robust line is fitted to both on the building; blurred edges are the outliers."""
     truth = CueMaps.open(scene, "truth")
     lines = []
     for i in range(CONFIG.views):
@@ -139,8 +139,8 @@ def test_predictions_are_affine_in_the_true_disparity_but_for_errors_of_some_per
     assert np.std(lines, axis=0).min() > 0  # no two views share their scale and shift
 
 
-def test_backprojected_truth_of_one_view_lands_on_that_of_another(scene):
-    """Only the files are used: pose, intrinsics, depth and units must all fit together."""
+def test_backprojected_truth_of_one_view_agrees_with_another(scene):
+    """Only the files are used: pose, intrinsics, depth and units must be consistent."""
     truth = CueMaps.open(scene, "truth")
     (name_a, a), (name_b, b) = read_camera(scene, 3), read_camera(scene, 4)
     map_a, map_b = truth.read(name_a, a), truth.read(name_b, b)
@@ -154,16 +154,16 @@ def test_backprojected_truth_of_one_view_lands_on_that_of_another(scene):
     pixels = v[inside].astype(int), u[inside].astype(int)
     both = map_b.mask[pixels]
     assert both.sum() > 500
-    # A pixel is 6 % of a radian wide at most here: the median point agrees far better than that, edges need not.
+    # A pixel is at most 6 % of a radian wide here: the median point agrees much better, edges need not.
     ratio = map_b.depth[pixels][both] / in_b[inside, 2][both]
     assert np.median(np.abs(ratio - 1)) < 0.01
 
 
-def test_shell_has_less_detail(facade):
+def test_shell_has_less_detail_than_the_building(facade):
     assert len(shell(facade.layout).triangles) < len(building(facade.layout).triangles) / 3
 
 
-def test_stored_shell_agrees_with_the_truth_where_it_has_detail(scene):
+def test_stored_shell_agrees_with_the_truth_on_its_surfaces(scene):
     """Georeferenced file, alignment and cameras against the true maps: most pixels within 0.1 mm."""
     alignment = Alignment.load(scene / "shell" / "alignment.json")
     mesh = load_shell(scene / alignment.shell)
@@ -178,11 +178,11 @@ def test_stored_shell_agrees_with_the_truth_where_it_has_detail(scene):
         both = cast.mask & true.mask
         metres = alignment.metres_per_unit * np.abs(cast.depth - true.depth)[both]
         assert np.mean(metres < 1e-4) > 0.75
-        # The shell lacks what stands before it, and has nothing that is not there.
+        # The shell lacks details in front of it, but has nothing that the building lacks.
         assert (cast.depth - true.depth)[both].min() > -1e-4
 
 
-def test_the_scenes_cameras_see_what_the_buildings_cameras_see(facade):
+def test_cameras_of_the_scene_are_the_buildings_up_to_scale(facade):
     points = np.array([[3.0, 0.0, 2.0], [7.5, 0.25, 5.0]])
     for camera in facade.cameras:
         moved = scene_camera(camera).viewmat.numpy()
@@ -221,7 +221,7 @@ def test_sfm_points_lie_on_surfaces_within_their_noise(facade):
     true = points.positions[~points.is_mirrored]
     assert len(true) > 200
     surface = o3d.t.geometry.RaycastingScene()
-    # On the building alone; leaves and ground would only make it easier.
+    # Only the building: leaves and ground would make it easier.
     mesh = building(facade.layout)
     surface.add_triangles(
         o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),
@@ -229,12 +229,12 @@ def test_sfm_points_lie_on_surfaces_within_their_noise(facade):
     )
     near = np.abs(true[:, 1]) < 0.5
     distance = surface.compute_distance(true[near].astype(np.float32)).numpy()
-    # One normal coordinate of noise of 0.2 % at 7 to 11 m: median 0.67 * (1.4 to 2.2 cm).
+    # One coordinate of normal noise of 0.2 % at 7 to 11 m: median 0.67 * (1.4 to 2.2 cm).
     assert NOISE * 5 * 0.2 < np.median(distance) < NOISE * 12
 
 
 def test_wrong_points_are_mirror_images_in_the_panes(facade):
-    """Mirrored back at the plane y = RECESS they lie on something before the glass, but for noise (0.2 % of 35 m)."""
+    """Mirrored back at the plane y = RECESS they lie on something in front of the glass, up to 0.2 % of 35 m."""
     points = points_of(facade)
     wrong = points.positions[points.is_mirrored]
     assert wrong[:, 1].max() > 10.0
@@ -251,7 +251,7 @@ def test_stored_points_are_in_the_scenes_frame(scene):
     assert abs(np.median(in_building[:, 1])) < 0.3
 
 
-def test_existing_folder_is_refused_and_left_alone(tmp_path):
+def test_existing_folder_is_refused_and_undisturbed(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="not an empty folder"):
         write_scene(tmp_path, CONFIG)
@@ -265,6 +265,6 @@ def test_failure_leaves_nothing_behind(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_senseless_configuration_is_refused():
+def test_invalid_configuration_is_refused():
     with pytest.raises(ValueError, match="views must be at least 3, not 2"):
         FacadeConfig(views=2)

@@ -1,4 +1,4 @@
-"""Photographs or a video to a scene folder, by structure from motion with pycolmap."""
+"""Make a scene folder from photographs or a video, by structure from motion with pycolmap."""
 
 from shellgs_method.capture.config import CaptureConfig
 from shellgs_method.capture.stages import SUSPICIOUS_ERROR, Summary, capture

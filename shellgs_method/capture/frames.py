@@ -1,4 +1,4 @@
-"""The sharpest frame of each stretch of a video."""
+"""Extract the sharpest frame of each segment of a video."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from scipy.ndimage import laplace, median_filter
 from dataparsers.errors import SceneError
 
 FRAMES_PER_SECOND = 5
-"""At most. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
+"""Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
 
-_NEIGHBOURHOOD = 31  # frames: about a second, in which the subject hardly changes
+_NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
 
 
 def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> None:
-    """Write the sharpest frame of each of at most ``count`` equal stretches of a video, upright, as JPEG.
+    """Write the sharpest frame of each of at most ``count`` equal segments of a video, upright, as JPEG.
 
-    A file's number is that of its frame in the video.
+    Files are numbered by their frames in the video.
 
     Raises:
         SceneError: the file cannot be read as a video, or holds no frame.
@@ -46,8 +46,8 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     with _opened(video) as container:
         for number, frame in enumerate(container.decode(video=0)):
             if number in chosen:
-                picture = frame.to_image().rotate(frame.rotation, expand=True)
-                picture.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
+                image = frame.to_image().rotate(frame.rotation, expand=True)
+                image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
                 progress.advance(task)
 
 
@@ -57,17 +57,16 @@ def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
 
 
 def sharpest(sharpnesses: Float[np.ndarray, " N"], times: Float[np.ndarray, " N"], count: int) -> set[int]:
-    """The index of the sharpest frame in each of at most ``count`` equal stretches of time.
+    """Indices of the sharpest frame in each of at most ``count`` equal segments of time.
 
-    Sharpness is taken relative to the median of its neighbourhood, or a textured wall, however blurred, would beat a
-    plain one.
+    Sharpness is relative to the median of neighbouring frames, or a blurred textured wall would beat a sharp plain one.
     """
     relative = sharpnesses / np.maximum(median_filter(sharpnesses, _NEIGHBOURHOOD), 1e-6)
     since = times - times.min()
     count = max(1, min(count, round(FRAMES_PER_SECOND * since.max())))
-    # A hair more, so that a frame on the border of two stretches does not fall short of its own by rounding.
-    stretch = np.minimum(since / max(since.max(), 1e-6) * count + 1e-6, count - 1).astype(int)
-    members = (np.flatnonzero(stretch == k) for k in range(count))
+    # The small offset keeps rounding from moving a frame on a border into the segment before.
+    segment = np.minimum(since / max(since.max(), 1e-6) * count + 1e-6, count - 1).astype(int)
+    members = (np.flatnonzero(segment == k) for k in range(count))
     return {int(m[relative[m].argmax()]) for m in members if len(m)}
 
 
@@ -81,6 +80,6 @@ def _opened(video: Path) -> Iterator[av.container.InputContainer]:
             yield container
     except av.error.FFmpegError as error:
         raise SceneError(
-            f"{video} cannot be read as a video ({error.strerror}): copy it again if it is cut off or damaged, and "
-            "convert it to mp4 if it is of another kind"
+            f"{video} cannot be read as a video ({error.strerror}): copy it again if it is cut off or damaged, or "
+            "convert it to mp4"
         ) from error

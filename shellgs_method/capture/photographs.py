@@ -1,4 +1,4 @@
-"""Photographs as COLMAP can take them: upright, 8 bits, names without blanks, masks of the same size."""
+"""Prepare photographs for COLMAP: upright, 8 bits, names without blanks, masks of the same size."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _LENS_TAGS = (
 
 
 def find_photographs(folder: Path) -> dict[str, Path]:
-    """The photographs in a folder and below it, by the name that each gets in the scene.
+    """The photographs in a folder and its sub-folders, by their names in the scene.
 
     Raises:
-        SceneError: there are none, or two would get one name.
+        SceneError: there are none, or two would get the same name.
     """
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
@@ -49,19 +49,19 @@ def find_photographs(folder: Path) -> dict[str, Path]:
 
 
 def add_photograph(source: Path, target: Path) -> None:
-    """Put a photograph into the work folder: a link where COLMAP reads it as it is, else a converted copy.
+    """Put a photograph into the work folder: a link if COLMAP can read it, else a converted copy.
 
     Raises:
-        SceneError: it is no readable image.
+        SceneError: it is not a readable image.
     """
-    from dataparsers.photograph import read_image  # torch is loaded when it is needed
+    from dataparsers.photograph import read_image  # imports torch, which is slow
 
     target.parent.mkdir(parents=True, exist_ok=True)
     wanted = _FORMATS[target.suffix.lower()]
     image = read_image(source)
     with Image.open(source) as stored:
-        as_it_is = stored.format == wanted and stored.mode in ("L", "RGB") and _orientation(stored) == 1
-    if not as_it_is:
+        is_usable = stored.format == wanted and stored.mode in ("L", "RGB") and _orientation(stored) == 1
+    if not is_usable:
         upright = ImageOps.exif_transpose(image).convert("RGB")
         upright.save(target, wanted, quality=95, subsampling=0, exif=upright.getexif())
         return
@@ -72,36 +72,36 @@ def add_photograph(source: Path, target: Path) -> None:
 
 
 def add_mask(mask: Path, source: Path, photograph: Path, target: Path) -> None:
-    """Put a photograph's mask into the work folder, upright, 255 where it is kept.
+    """Put a photograph's mask into the work folder, upright, 255 where the photograph is kept.
 
     Args:
-        mask: the mask, of the size of the photograph as it is stored or as it is seen.
-        source: the photograph as it came, maybe with an EXIF orientation.
-        photograph: the photograph in the work folder, upright.
-        target: where to put it, a png.
+        mask: the mask, of the size of the stored or of the upright photograph.
+        source: the original photograph, possibly with an EXIF orientation.
+        photograph: the upright photograph in the work folder.
+        target: png to write.
 
     Raises:
-        SceneError: the mask is no readable image, or its size is another.
+        SceneError: the mask is not a readable image, or has another size.
     """
     from dataparsers.photograph import read_image
 
-    with Image.open(source) as stored, Image.open(photograph) as seen:
-        stored_size, seen_size, exif = stored.size, seen.size, stored.getexif()
+    with Image.open(source) as stored, Image.open(photograph) as upright:
+        stored_size, upright_size, exif = stored.size, upright.size, stored.getexif()
     image = ImageOps.exif_transpose(read_image(mask)).convert("L")
-    if image.size == stored_size != seen_size:
+    if image.size == stored_size != upright_size:
         image.info["exif"] = exif.tobytes()
         image = ImageOps.exif_transpose(image)
-    if image.size != seen_size:
+    if image.size != upright_size:
         raise SceneError(
-            f"the mask {mask} is {image.width}x{image.height} pixels, its photograph {seen_size[0]}x{seen_size[1]}: "
-            "make it anew at the photograph's size"
+            f"the mask {mask} is {image.width}x{image.height} pixels, its photograph "
+            f"{upright_size[0]}x{upright_size[1]}: make it again at the photograph's size"
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.where(np.asarray(image) > 127, 255, 0).astype(np.uint8)).save(target)
 
 
 def find_masks(photographs: Mapping[str, Path], folder: Path, masks: Path) -> dict[str, Path]:
-    """The masks (``<masks>/<photograph's path in its folder>.png``) of the photographs that have one, by their names.
+    """The masks (``<masks>/<photograph's path in its folder>.png``) of the photographs that have one, by name.
 
     Raises:
         SceneError: no photograph has one.
@@ -117,11 +117,11 @@ def find_masks(photographs: Mapping[str, Path], folder: Path, masks: Path) -> di
 
 @dataclass(frozen=True)
 class Lens:
-    """Photographs that share a camera, to be calibrated together.
+    """Photographs that share a camera and are calibrated together.
 
     Attributes:
         size: width and height in pixels.
-        names: the photographs.
+        names: names of the photographs.
     """
 
     size: tuple[int, int]
@@ -129,10 +129,10 @@ class Lens:
 
 
 def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[Lens]:
-    """Which photographs share a camera: by default those of one size and, where EXIF tells, one lens and zoom.
+    """Group photographs that share a camera: by default those with the same size and, if in EXIF, lens and zoom.
 
     Raises:
-        SceneError: photographs that are said to share a camera differ in size.
+        SceneError: photographs that are to share a camera differ in size.
     """
     groups: dict[tuple, Lens] = {}
     for name in names:
@@ -149,7 +149,7 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
         if lens.size != size:
             raise SceneError(
                 f"{lens.names[0]} ({lens.size[0]}x{lens.size[1]}) and {name} ({size[0]}x{size[1]}) cannot share a "
-                f"camera, as --cameras {cameras} has it: leave that to --cameras auto"
+                f"camera, as --cameras {cameras} requires: use --cameras auto"
             )
         lens.names.append(name)
     return list(groups.values())

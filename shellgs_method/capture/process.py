@@ -1,4 +1,4 @@
-"""Runs a step of structure from motion in its own process."""
+"""Run a step of structure from motion in its own process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from dataparsers.errors import SceneError
 
-_SCRIPT = Path(__file__).with_name("sfm.py")  # not as a module: it is not to import the package's libraries
+_SCRIPT = Path(__file__).with_name("sfm.py")  # run as a file, to import none of the package's libraries
 _POLL = 0.3  # seconds
 
 
@@ -32,13 +32,13 @@ def run_step(
     """Run a function of ``sfm.py`` and return its result.
 
     Args:
-        step: the function's name.
-        arguments: what it is called with, as JSON can hold it.
+        step: name of the function.
+        arguments: its arguments, JSON-serializable.
         log: file that COLMAP's messages are appended to.
-        progress: bar, to be labelled with ``description`` and to reach ``total``.
-        description: what is being done.
-        total: number of things to do.
-        count: how many of them are done; if not given, the lines that the step has printed.
+        progress: where to show a progress bar.
+        description: label of the bar.
+        total: value of the finished bar.
+        count: returns the current value; if None, this is the number of lines that the step has printed.
 
     Raises:
         SceneError: the process failed.
@@ -58,7 +58,7 @@ def run_step(
     reader = Thread(target=lines.extend, args=(process.stdout,))
     reader.start()
     try:
-        with suppress(BrokenPipeError):  # it died at once; its status and messages tell
+        with suppress(BrokenPipeError):  # it ended at once; its status and messages say why
             process.stdin.write(json.dumps({"step": step, **arguments}) + "\n")
             process.stdin.flush()
         while reader.is_alive():
@@ -72,7 +72,7 @@ def run_step(
     if status != 0:
         raise SceneError(
             f"{description} failed in COLMAP ({_last_line(log)}); all its messages are in {log}, and the same command "
-            "goes on from here"
+            "resumes"
         )
     progress.update(task, completed=total)
     return json.loads(lines[-1])

@@ -1,8 +1,8 @@
-"""Structure from motion, one step at a time: a script, run in a process of its own.
+"""One step of structure from motion: a script that runs in its own process.
 
-A crash in COLMAP's C++ must not take the caller with it, and pycolmap does not live well with other libraries. The job
-comes as a line of JSON on standard input; each line on standard output is progress, the last one the result. The
-process ends with its parent, whose end closes standard input.
+A crash in COLMAP's C++ must not end the caller, and pycolmap conflicts with other libraries. The job is one line of
+JSON on standard input; each line on standard output is progress, the last one the result. The process ends with its
+parent, whose end closes standard input.
 """
 
 # pycolmap 4.1 to 4.2 imported before zlib corrupts it: the next png that is written aborts.
@@ -19,28 +19,28 @@ import pycolmap
 from PIL import Image
 
 SEED = 0
-_FEW = 10  # photographs: too few to calibrate OPENCV's four coefficients of distortion
+_MIN_OPENCV = 10  # photographs needed to calibrate OPENCV's four distortion coefficients
 
 
 def extract(database: str, photographs: str, lenses: list[dict], masks: str | None, sift: dict) -> None:
-    """Features of all photographs that have none yet; each lens is one camera.
+    """Extract features of all photographs that have none yet; each lens is one camera.
 
     Args:
         database: COLMAP's database.
         photographs: folder of the photographs.
         lenses: size and names of the photographs that share a camera.
         masks: folder of masks, ``<name>.png``, black where no features are wanted.
-        sift: the size that photographs are reduced to, the number of features, and the first octave of photographs of
-            a thousand pixels and more: 0 leaves out the doubled image, which smaller ones need.
+        sift: maximum image size, number of features, and first octave for photographs of 1000 pixels and more: 0 skips
+            the doubled image, which smaller photographs need.
     """
     for lens in lenses:
         options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
         options.sift.max_num_features = sift["max_num_features"]
         options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= 1000 else -1
         reader = pycolmap.ImageReaderOptions(
-            camera_model="OPENCV" if len(lens["names"]) >= _FEW else "SIMPLE_RADIAL", mask_path=masks or ""
+            camera_model="OPENCV" if len(lens["names"]) >= _MIN_OPENCV else "SIMPLE_RADIAL", mask_path=masks or ""
         )
-        with pycolmap.Database.open(database) as opened:  # what an interrupted run left
+        with pycolmap.Database.open(database) as opened:  # may hold the results of an interrupted run
             cameras = [image.camera_id for image in opened.read_all_images() if image.name in lens["names"]]
         if cameras:
             reader.existing_camera_id = cameras[0]
@@ -55,9 +55,9 @@ def extract(database: str, photographs: str, lenses: list[dict], masks: str | No
 
 
 def match(database: str, pairs: str) -> None:
-    """Verified matches of the listed pairs that have none yet."""
+    """Match and verify the listed pairs that have no matches yet."""
     with pycolmap.Database.open(database) as opened:
-        if opened.num_matched_image_pairs() > len(Path(pairs).read_text().splitlines()):  # of another way of pairing
+        if opened.num_matched_image_pairs() > len(Path(pairs).read_text().splitlines()):  # from other settings
             opened.clear_matches()
             opened.clear_two_view_geometries()
     verification = pycolmap.TwoViewGeometryOptions()
@@ -70,7 +70,7 @@ def match(database: str, pairs: str) -> None:
 
 
 def reconstruct(database: str, photographs: str, output: str) -> list[dict]:
-    """Cameras and points by incremental mapping; the largest model is written, all are described, largest first."""
+    """Run incremental mapping and write the largest model; return a description of all models, largest first."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
     models = pycolmap.incremental_mapping(
         database, photographs, output, options, next_image_callback=lambda: print(flush=True)
@@ -90,9 +90,9 @@ def reconstruct(database: str, photographs: str, output: str) -> list[dict]:
 
 
 def undistort(model: str, photographs: str, masks: str | None, output: str) -> None:
-    """Photographs, masks and model of pinhole cameras.
+    """Write undistorted photographs and masks and the model of their pinhole cameras.
 
-    Masks are named as nerfstudio's COLMAP dataparser looks for them, and there is one for every photograph.
+    Masks are named as nerfstudio's COLMAP dataparser expects, and every photograph gets one.
     """
     pycolmap.undistort_images(output, model, photographs, jpeg_quality=95)
     if masks is None:
@@ -110,7 +110,7 @@ def undistort(model: str, photographs: str, masks: str | None, output: str) -> N
 
 
 def main() -> None:
-    """Do the job on standard input."""
+    """Run the job given on standard input."""
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.set_random_seed(SEED)

@@ -1,4 +1,4 @@
-"""Photographs or a video to a scene folder: frames, features, matches, mapping, undistortion, each kept."""
+"""Stages from photographs or a video to a scene folder: frames, features, matches, mapping, undistortion."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work, listing
 
 WORK = Path("capture")
-"""Work folder, in the scene's."""
+"""Work folder in the scene folder."""
 
 SUSPICIOUS_ERROR = 0.75
-"""Mean reprojection error in pixels. Sound models of real and synthetic facades had 0.4 to 0.65, folded ones more."""
+"""Mean reprojection error in pixels: correct models of real and synthetic facades had 0.4 to 0.65, folded ones more."""
 
 _SIFT = {
     "fast": {"max_image_size": 1600, "max_num_features": 4096, "first_octave": 0},
@@ -38,13 +38,13 @@ _SIFT = {
 
 @dataclass(frozen=True)
 class Summary:
-    """What structure from motion found.
+    """Result of structure from motion.
 
     Attributes:
-        registered: photographs whose camera was found.
-        missing: the others.
+        registered: photographs with a camera.
+        missing: photographs without a camera.
         points: number of 3D points.
-        reprojection_error: mean, in pixels.
+        reprojection_error: mean reprojection error in pixels.
         track_length: mean number of photographs that observe a point.
     """
 
@@ -58,15 +58,15 @@ class Summary:
 def capture(
     source: Path, scene: Path, config: CaptureConfig | None = None, *, console: Console | None = None
 ) -> Summary:
-    """Make ``scene/images`` and ``scene/colmap/sparse/0``, of pinhole cameras, from photographs or a video.
+    """Make ``scene/images`` and ``scene/colmap/sparse/0``, with pinhole cameras, from photographs or a video.
 
-    With masks, ``scene/masks`` holds them undistorted. The model appears last and whole, so that no half-made scene is
-    taken for a finished one. An interrupted run goes on from the stage it was in, and a changed setting repeats only
-    the stages it touches: their products stay in ``scene/capture``.
+    Masks are undistorted into ``scene/masks``. The model is moved into the scene last, so that an unfinished scene is
+    not taken for a finished one. An interrupted run resumes from its last stage, and a changed setting repeats only
+    the stages that depend on it: results of all stages are kept in ``scene/capture``.
 
     Args:
         source: folder of photographs, or a video file.
-        scene: scene folder; what else it holds is left alone.
+        scene: scene folder; other files in it are not touched.
         config: settings.
         console: where progress is shown.
 
@@ -86,7 +86,7 @@ def capture(
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        raise SceneError(f"the disk of {scene} is full: make room, and the same command goes on from here") from error
+        raise SceneError(f"the disk of {scene} is full: make room; the same command resumes") from error
 
 
 class _Capture:
@@ -99,12 +99,12 @@ class _Capture:
         self.masks: dict[str, Path] = {}
         if config.masks and self.is_video:
             raise SceneError(
-                f"frames of a video have no masks yet: capture without, then again with masks from {scene / WORK}/"
-                "photographs into another scene folder"
+                "a video cannot have --masks: capture it without, then capture the frames in "
+                f"{scene / WORK}/photographs with masks into another scene folder"
             )
         if config.masks:
             self.masks = find_masks(self.photographs, source, config.masks)
-        # What each stage depends on; a stage depends on all before it.
+        # Keys of all that each stage depends on; a stage depends on all earlier ones.
         self.photographs_key = fingerprint(listing(self.photographs), config.frames if self.is_video else None)
         self.masks_key = fingerprint(self.photographs_key, listing(self.masks))
         self.features_key = fingerprint(self.masks_key, config.cameras, config.quality)
@@ -113,23 +113,23 @@ class _Capture:
     def run(self) -> Summary:
         self._refuse_to_overwrite()
         self.work = Work(self.scene / WORK)
-        if not self.work.has("undistorted", self.model_key) or self._lacking():
+        if not self.work.has("undistorted", self.model_key) or self._missing_parts():
             self._photographs()
             database = self._features()
             self._model(database)
-        summary = self._judged(read_json(self.work.folder / "model" / "models.json"))
+        summary = self._largest_model(read_json(self.work.folder / "model" / "models.json"))
         self._undistorted(summary)
         return summary
 
     def _refuse_to_overwrite(self) -> None:
-        """The scene's photographs and cameras are replaced by nothing but the end of their own capture."""
+        """Refuse a scene whose photographs or cameras are not those of this capture."""
         if (self.scene / WORK).is_dir() and Work(self.scene / WORK).has("undistorted", self.model_key):
             return
         for name in ("transforms.json", "colmap", "sparse", "images", *(["masks"] if self.masks else [])):
             if (self.scene / name).exists():
                 raise SceneError(
-                    f"{self.scene / name} is there already, and not from these photographs and settings: give another "
-                    "scene folder, or move it away (the photographs to be captured too, if they are there)"
+                    f"{self.scene / name} already exists and is not from these photographs and settings: give another "
+                    "scene folder, or move it away (also if it holds the photographs to capture)"
                 )
 
     def _photographs(self) -> None:
@@ -152,7 +152,7 @@ class _Capture:
                     add_mask(mask, self.photographs[name], self.folder / name, folder / f"{name}.png")
 
     def _features(self) -> Path:
-        """The database, with features and matches."""
+        """Extract features; return the database."""
         database = self.work.growing("features", self.features_key) / "database.db"
         lenses = group_by_lens(self.folder, self.names, self.config.cameras)
         self._step(
@@ -188,25 +188,29 @@ class _Capture:
             models = self._step("reconstruct", "finding cameras", len(self.names), None, **arguments)
             (folder / "models.json").write_text(json.dumps({"photographs": self.names, "models": models}))
 
-    def _judged(self, found: dict[str, Any]) -> Summary:
-        """The largest model, if it is large enough."""
+    def _largest_model(self, found: dict[str, Any]) -> Summary:
+        """Summary of the largest model.
+
+        Raises:
+            SceneError: it has too few of the photographs.
+        """
         names, models = found["photographs"], found["models"]
         largest: dict[str, Any] = models[0] if models else {"names": []}
         missing = sorted(set(names) - set(largest["names"]))
         registered = len(largest["names"])
         if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
-            groups = f", in {len(models)} groups that share too little" if len(models) > 1 else ""
+            groups = f", in {len(models)} groups without enough overlap" if len(models) > 1 else ""
             shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
             raise SceneError(
                 f"the cameras of only {registered} of {len(names)} photographs were found{groups}; a scene needs "
-                f"{LEAST_SHARE:.0%} of them and {LEAST_REGISTERED}. Not found: {shown}. Try --matching exhaustive and "
-                "--quality high; leave out photographs of other things; photograph with more overlap, in small "
-                "sidesteps rather than turns on the spot; from a video, take more --frames"
+                f"{LEAST_SHARE:.0%} of them and at least {LEAST_REGISTERED}. Not found: {shown}. Try --matching "
+                "exhaustive and --quality high; leave out photographs of other things; photograph with more overlap, "
+                "in small sidesteps rather than turns on the spot; from a video, take more --frames"
             )
         return Summary(missing=missing, registered=largest.pop("names"), **largest)
 
-    def _lacking(self) -> list[str]:
-        """What of the scene is neither in its place nor ready to be moved there."""
+    def _missing_parts(self) -> list[str]:
+        """Parts of the scene that are neither in place nor ready to be moved there."""
         ready = self.work.folder / "undistorted"
         names = ["images", *(["masks"] if self.masks else []), "colmap"]
         return [name for name in names if not (self.scene / name).exists() and not (ready / name).exists()]
@@ -215,7 +219,7 @@ class _Capture:
         if not self.work.has("undistorted", self.model_key):
             self._undistort("undistorted", summary)
         self._move("undistorted")
-        if self._lacking():  # somebody deleted what this capture had made
+        if self._missing_parts():  # deleted after an earlier capture
             self._undistort("restored", summary)
             self._move("restored")
             self.work.drop("restored")
@@ -236,7 +240,7 @@ class _Capture:
             os.replace(folder / "sparse", folder / "colmap" / "sparse" / "0")
 
     def _move(self, product: str) -> None:
-        """Put a product's parts into the scene; the model last: without it, no dataparser takes that for a scene."""
+        """Move a product's parts into the scene, the model last: without it no dataparser accepts the scene."""
         for name in ("images", "masks", "colmap"):
             part = self.work.folder / product / name
             if part.exists() and not (self.scene / name).exists():
@@ -253,9 +257,9 @@ class _Capture:
 
 
 def _rows(database: Path, table: str) -> int:
-    """Rows of a table that another process is writing."""
+    """Number of rows of a table that another process is writing."""
     try:
         with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection:
             return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
-    except sqlite3.Error:  # not there yet, or busy
+    except sqlite3.Error:  # does not exist yet, or is busy
         return 0

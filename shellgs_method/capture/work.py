@@ -1,4 +1,4 @@
-"""The work folder of a capture: what each stage made, and from what."""
+"""The work folder of a capture: the product of each stage, with a key of its inputs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dataparsers.files import atomic_write, read_json
 
 
 class Work:
-    """Products of stages, each a folder, with a key of all that it was made from.
+    """Products of stages: folders, each with a key of all its inputs.
 
-    An interrupted run finds the products that it finished; one whose key has changed is made anew.
+    Finished products are found again after an interruption; a product whose key has changed is made again.
     """
 
     def __init__(self, folder: Path):
@@ -24,16 +24,16 @@ class Work:
         self.folder = folder
         self._file = folder / "record.json"
         self._keys: dict[str, str] = {}
-        with suppress(SceneError, FileNotFoundError):  # damaged: all is made anew
+        with suppress(SceneError, FileNotFoundError):  # missing or damaged: everything is made again
             self._keys = read_json(self._file)
 
     def has(self, product: str, key: str) -> bool:
-        """Whether the product is there and was made from this."""
+        """Whether the product exists and was made with this key."""
         return self._keys.get(product) == key and (self.folder / product).exists()
 
     @contextmanager
     def making(self, product: str, key: str) -> Iterator[Path]:
-        """An empty folder to fill, which then becomes the product."""
+        """Yield an empty folder, which becomes the product at the end of the context."""
         part = self._cleared(f"{product}.part")
         part.mkdir()
         yield part
@@ -41,7 +41,7 @@ class Work:
         self._record(product, key)
 
     def growing(self, product: str, key: str) -> Path:
-        """A product that takes up by itself where it was interrupted; empty if it was made from something else."""
+        """Folder of a product that can be resumed; empty if the key has changed."""
         if not self.has(product, key):
             self._cleared(product).mkdir()
             self._record(product, key)
@@ -52,7 +52,7 @@ class Work:
         self._cleared(product)
 
     def _cleared(self, product: str) -> Path:
-        self._record(product, None)  # first: a product must never stand under another's key
+        self._record(product, None)  # first: a product must never have another's key
         path = self.folder / product
         if path.exists():
             shutil.rmtree(path)
@@ -67,5 +67,5 @@ class Work:
 
 
 def listing(files: Mapping[str, Path]) -> list[tuple[str, int, int]]:
-    """Names, sizes and times of change of files."""
+    """Names, sizes and modification times of files."""
     return [(name, (stat := path.stat()).st_size, stat.st_mtime_ns) for name, path in sorted(files.items())]

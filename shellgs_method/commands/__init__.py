@@ -1,1 +1,1 @@
-"""The commands of `shellgs`, a module each; their imports are inside, since each start of the program pays for them."""
+"""The commands of `shellgs`, one module each; slow imports are inside the functions, to keep every start fast."""

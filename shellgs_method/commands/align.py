@@ -1,4 +1,4 @@
-"""`shellgs align`: where the shell stands in the scene."""
+"""`shellgs align`: the pose of the shell in the scene."""
 
 from __future__ import annotations
 
@@ -30,25 +30,26 @@ def align(
     mesher: Optional[Mesher] = None,
     paths: Paths = PATHS,
 ) -> None:
-    """Find the shell's place in the scene, judge it, and write scene/shell/alignment.json unless it is refused.
+    """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.
 
     The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
-    verdict. Without --matrix, --picks and --positions, a place is proposed, for you to look at and to take with
-    --accept. Without a shell, the alignment that is there is judged again, or refined.
+    verdict. Without --matrix, --picks and --positions, an alignment is proposed: look at the report, then accept the
+    proposal with --accept. Without a shell, the existing alignment is validated again, or refined.
 
     Args:
         scene: Scene folder.
-        shell: The shell's file.
-        matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare's text, json or npy).
-        picks: Text file of picked points, a line each: X Y Z of the shell, x y in the photograph, image, name.
-        positions: Text file of camera positions by RTK, a line each: image, X Y Z in the shell's coordinates.
-        refine: Then fit the SfM points to the shell, from a start that is off by up to this many metres.
-        accept: Take the proposal made before.
+        shell: Mesh or point cloud of the shell.
+        matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy).
+        picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
+        positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
+        refine: Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres.
+        accept: Accept the earlier proposal.
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres.
-        mesher: Makes a mesh of a point cloud, here and wherever the alignment is used: planes (balls between), balls
-            alone (bpa), poisson for round things. If not set: the one of the alignment that is there, else planes.
-        paths: Where in the scene its files are.
+        mesher: How a point cloud is meshed, here and wherever the alignment is used: planes (ball pivoting between
+            them), bpa (ball pivoting alone) or poisson (for round shapes). If not set: that of the existing alignment,
+            else planes.
+        paths: Paths of the scene's files.
     """
     from dataparsers.cue_maps import relative_path
     from dataparsers.facade import read_views
@@ -67,7 +68,7 @@ def align(
     starts = [start for start in (matrix, picks, positions) if start]
     if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
         raise SceneError(
-            "give the shell with --matrix, --picks or --positions, or alone, or no shell to judge what is there"
+            "give a shell, alone or with one of --matrix, --picks and --positions, or none to validate what is there"
         )
     layout = paths.of(scene)
     views, points = read_views(layout), read_sparse_points(layout)
@@ -81,8 +82,8 @@ def align(
     elif positions:
         placement = place_by_positions(positions, views, name, metres_per_shell_unit)
     else:
-        guessed = load_shell(shell, cache=scene / "shell", mesher=mesher or "planes")
-        placement = place_by_guess(guessed, views, points, name, metres_per_shell_unit)
+        unaligned = load_shell(shell, cache=scene / "shell", mesher=mesher or "planes")
+        placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
     placement = replace(placement, alignment=placement.alignment.meshed_by(mesher))
     mesh = placement.alignment.load_shell(scene, views)
     if refine is not None:
@@ -92,7 +93,7 @@ def align(
 
 
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
-    """What the user needs to know of a judged alignment; a refused one ends the program."""
+    """Print the result of the validation; a refused alignment ends the program."""
     from shellgs_method.shell.registration.align import REPORT
     from shellgs_method.shell.validation.report import residual_table
 
@@ -108,11 +109,11 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
         console.print(f"[yellow]{reason}.", highlight=False)
     report = scene / REPORT / "index.html"
     if validation.verdict == "refused":
-        raise SceneError(f"the alignment is refused, and {target} left as it was: see {report}")
+        raise SceneError(f"the alignment is refused and {target} is unchanged: see {report}")
     console.print(
         f"Verdict: {validation.verdict}. Look at {report}: the shell's edges must lie on the photographed ones."
     )
     if placement.proposed:
-        console.print(f"This is a proposal. If the pictures agree: shellgs align {scene} --accept")
+        console.print(f"This is a proposal. If the images agree: shellgs align {scene} --accept")
     else:
         console.print(f"Written: {target}.")

@@ -1,4 +1,4 @@
-"""`shellgs capture`: photographs or a video to a scene."""
+"""`shellgs capture`: a scene from photographs or a video."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def capture(
     scene: Scene,
     config: Annotated[CaptureConfig, tyro.conf.arg(name="")] = _CAPTURE,
 ) -> None:
-    """Photographs or a video to a scene: cameras and points by structure from motion, photographs undistorted.
+    """Make a scene from photographs or a video: structure from motion and undistorted photographs.
 
-    An interrupted capture goes on where it stopped: give the same command again.
+    The same command resumes an interrupted capture.
 
     Args:
         source: Folder of photographs, or a video.
@@ -32,18 +32,18 @@ def capture(
     try:
         summary = capture(source, scene, config, console=console)
     except KeyboardInterrupt:
-        raise SystemExit("shellgs: interrupted; the same command goes on from here") from None
+        raise SystemExit("shellgs: interrupted; the same command resumes") from None
     total = len(summary.registered) + len(summary.missing)
     console.print(
-        f"{len(summary.registered)} of {total} photographs have a camera; {summary.points} points, each seen by "
-        f"{summary.track_length:.1f} photographs, reprojected to {summary.reprojection_error:.2f} px (means).",
+        f"{len(summary.registered)} of {total} photographs registered; {summary.points} points, mean track length "
+        f"{summary.track_length:.1f}, mean reprojection error {summary.reprojection_error:.2f} px.",
         highlight=False,
     )
     if summary.missing:
-        console.print(f"Without a camera: {', '.join(summary.missing)}.", highlight=False)
+        console.print(f"Not registered: {', '.join(summary.missing)}.", highlight=False)
     if summary.reprojection_error > SUSPICIOUS_ERROR:
         console.print(
-            f"[yellow]More than {SUSPICIOUS_ERROR} px is a sign that identical windows were taken for each other. Look "
-            f"at the cameras in {scene}/colmap: does their path jump or fold? Then try --overlap 5 (sequential), "
-            "more --frames, or --masks."
+            f"[yellow]More than {SUSPICIOUS_ERROR} px is a sign that identical windows were confused. Look at the "
+            f"cameras in {scene}/colmap: if their path jumps or folds, try --overlap 5 (sequential), more --frames, or "
+            "--masks."
         )

@@ -29,27 +29,27 @@ def cast(
 ) -> None:
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
-    Then the photographs are compared with each other, on the shell and before it: where they agree on something nearer
-    (a tree, a railing) the shell does not count. These maps are in scene/cues/checked. What they miss can be painted
-    black in masks, scene/shell/masks/<image path>.png. An interrupted cast goes on where it stopped.
+    Then the photographs are compared with each other, on the shell and in front of it: where they agree on something
+    nearer, such as a tree or a railing, the shell does not count. The result is in scene/cues/checked. Occluders that
+    it misses can be painted black in scene/shell/masks/<image path>.png. The same command resumes an interrupted cast.
 
     Args:
         scene: Scene folder.
-        shell: The shell's mesh or point cloud, with --matrix; else what scene/shell/alignment.json names.
+        shell: Mesh or point cloud of the shell, with --matrix. If not set: the one in scene/shell/alignment.json.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
-        max_image_size: Longer side in pixels that photographs are resized to for training; full size if not set.
-        mesher: Makes a mesh of a point cloud: planes (balls between), balls alone (bpa), poisson for round things. If
-            not set: the one that the alignment was judged with. Another one leaves it without a verdict.
-        check: Compare the photographs, to find what stands before the shell.
-        paths: Where in the scene its files are.
+        max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size.
+        mesher: How a point cloud is meshed: planes (ball pivoting between them), bpa (ball pivoting alone) or poisson
+            (for round shapes). If not set: as the alignment was validated; another one leaves it without a verdict.
+        check: Compare the photographs to find what occludes the shell.
+        paths: Paths of the scene's files.
     """
     from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, read_views
     from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 
     if (shell is None) != (matrix is None):
-        raise SceneError("--shell and --matrix go together: which mesh, and where it stands in the scene")
+        raise SceneError("--shell and --matrix go together: give both or neither")
     config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
     if shell is not None and matrix is not None:
@@ -58,13 +58,13 @@ def cast(
         alignment = Alignment.load(scene / ALIGNMENT)
     aligned = alignment.meshed_by(mesher)
     if aligned != alignment and alignment.verdict:
-        console.print(f"The alignment was judged with another mesher: judge it again with `shellgs align {scene}`.")
+        console.print(f"The alignment was validated with another mesher: run `shellgs align {scene}` again.")
     summary = cast_views(scene, views, aligned, max_image_size=max_image_size, flags=paths.flags)
     if summary.meshing:
-        console.print(f"The shell is a point cloud, whose mesh is kept in {scene / 'shell'}: {summary.meshing}")
+        console.print(f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}: {summary.meshing}")
     console.print(
-        f"{summary.cast} views cast, {summary.skipped} there already, in {summary.seconds:.1f} s; the shell is in "
-        f"{summary.seeing} of {len(views)} views and in {summary.supported:.0%} of their pixels."
+        f"{summary.cast} views cast, {summary.skipped} already there, in {summary.seconds:.1f} s; the shell is visible "
+        f"in {summary.seeing} of {len(views)} views and covers {summary.supported:.0%} of their pixels."
     )
     if check:
         _check(scene, config)
@@ -73,7 +73,7 @@ def cast(
 
 
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:
-    """Compare the photographs, and say how much of the shell they contradict, and where."""
+    """Compare the photographs, and print where and how much they contradict the shell."""
     from dataparsers.cue_maps import CueMaps
     from dataparsers.facade import held_out_names, read_views
     from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
@@ -81,23 +81,23 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     views = read_views(config)
     found = check_views(scene, views, held_out_names(config))
     console.print(
-        f"Photographs contradict {found.contradicted:.1%} of these pixels: something stands before the shell there "
-        f"({found.checked} views compared, {found.skipped} there already, in {found.seconds:.1f} s)."
+        f"Photographs contradict {found.contradicted:.1%} of these pixels: something occludes the shell there "
+        f"({found.checked} views compared, {found.skipped} already there, in {found.seconds:.1f} s)."
     )
     verdicts = shell_verdicts(scene, views)
     places = scene / CONTRADICTED_PLACES
     verdicts.write(places)
     if verdicts.share > 0:
         console.print(
-            f"{verdicts.share:.1%} of the shell is contradicted by {MANY} photographs or more, and half of "
-            f"those that see it: look at {verdicts.witness}, and at {places}, red where the building differs."
+            f"{verdicts.share:.1%} of the shell is contradicted by {MANY} or more photographs and half of those that "
+            f"see it: look at {verdicts.witness}, and at {places}, red where the building differs."
         )
     panel = _save_check_panel(CueMaps.open(scene, "checked"), views)
-    console.print(f"Look at {panel}: red is what stands before the shell, green is where they confirm it.")
+    console.print(f"Look at {panel}: red is what occludes the shell, green where they confirm it.")
 
 
 def _save_check_panel(maps: CueMaps, views: Sequence[View]) -> Path:
-    """Some views with what the photographs say of the shell."""
+    """Save an image of some views and where photographs contradict or confirm the shell."""
     from dataparsers.photograph import load_photograph
     from shellgs_method.evaluation.figures import save_figure
     from shellgs_method.shell import check_panel

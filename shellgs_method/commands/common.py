@@ -1,4 +1,4 @@
-"""What several commands share."""
+"""Arguments and texts that several commands share."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Mesher = Literal["planes", "bpa", "poisson"]
 
 
 def place(frame: Frame) -> str:
-    """Where a result stands, in words."""
+    """The frame and unit of a result, in words."""
     shift = f" less {' '.join(f'{value:.0f}' for value in frame.offset)}" if frame.offset.any() else ""
     if not frame.metric:
-        return f"The scene has no aligned shell: this is its own frame{shift}, and the size of its unit is unknown."
+        return f"The scene has no aligned shell: this is the scene's own frame{shift}, in units of unknown size."
     return f"In metres, in the shell's frame{shift}."

@@ -1,4 +1,4 @@
-"""`shellgs compare`: methods trained and evaluated on scenes."""
+"""`shellgs compare`: train and evaluate methods on scenes."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ def compare(
     wandb: Optional[str] = None,
     paths: Paths = PATHS,
 ) -> None:
-    """Train and evaluate methods on scenes; end with the paper's tables, its figures, and a report to look at.
+    """Train and evaluate methods on scenes, and write the paper's tables and figures and an HTML report.
 
-    Finished runs are kept, killed ones go on, and one that fails stops no other. Settings that changed are refused.
+    Finished runs are kept, interrupted ones resume, and a failed run stops no other. Changed settings are refused.
 
     Args:
-        scenes: Scene folders; the first has the part of the paper's primary scene, others that of its second.
-        methods: What is compared: methods of ShellGS, its ablations (docs/methods.md), other methods of nerfstudio that
+        scenes: Scene folders; the first is set beside the paper's primary scene, the others beside its second.
+        methods: Methods to compare: those of ShellGS, its ablations (docs/methods.md), other nerfstudio methods that
             render depth (splatfacto), NAME='METHOD FLAGS' for your own, or paper for all of the paper's tables.
-        seeds: Each method is trained once with each; tables show mean ± deviation.
-        iterations: Length of each training run.
-        output: Folder of the runs, tables, pictures and report.html.
-        curve_points: How often a run is evaluated on all held-out views while it trains, for the curves; 0: never.
-        launcher: local: on this machine; ray: on a Ray cluster.
-        jobs: Runs at once, with the local launcher.
-        address: Of a running Ray cluster, say auto. If not set: one is started on this machine.
-        wandb: Project of Weights & Biases that gets the tables and figures as a run. If not set: none.
-        paths: Where in the scenes their files are.
+        seeds: Seeds; each method is trained once with each. Tables show mean ± standard deviation.
+        iterations: Training iterations of each run.
+        output: Folder for the runs, tables, images and report.html.
+        curve_points: Evaluations on all held-out views during a training run, for the curves; 0 for none.
+        launcher: Where to run: on this machine (local) or on a Ray cluster (ray).
+        jobs: Number of runs at once, with the local launcher.
+        address: Address of a running Ray cluster, or auto. If not set: one is started on this machine.
+        wandb: Weights & Biases project to log the tables and figures to, as a run. If not set: none.
+        paths: Paths of the scenes' files.
     """
     from functools import partial
 
@@ -51,7 +51,7 @@ def compare(
     from shellgs_method.compare.wandb_report import log_comparison, log_in
 
     if jobs < 1:
-        raise SceneError(f"--jobs {jobs} would start nothing: give 1 or more")
+        raise SceneError(f"--jobs must be at least 1, not {jobs}")
     if wandb:
         log_in()
     runs = grid(scenes, methods, seeds, iterations, output, curve_points, paths)

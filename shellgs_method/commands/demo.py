@@ -18,13 +18,13 @@ def demo(
     views: int = 40,
     seed: int = 0,
 ) -> None:
-    """Make a synthetic facade, run the whole pipeline on it, and end with a table and pictures.
+    """Make a synthetic facade, run the whole pipeline on it, and show tables and images.
 
-    What an interrupted demo finished is kept: run it again to go on.
+    The same command resumes an interrupted demo.
 
     Args:
-        folder: Where everything is written.
-        iterations: Length of each training run.
+        folder: Output folder.
+        iterations: Training iterations of each run.
         width: Width of the photographs in pixels.
         height: Height of the photographs in pixels.
         views: Number of photographs.

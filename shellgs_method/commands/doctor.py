@@ -1,4 +1,4 @@
-"""`shellgs doctor`: what this machine can run."""
+"""`shellgs doctor`: check this machine."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from shellgs_method.commands.common import console
 
 
 def doctor(install_libraries: bool = False) -> None:
-    """What this machine can run, each with its remedy.
+    """Check what this machine can run, and name the remedy for what it cannot.
 
     Args:
-        install_libraries: Install the system libraries that are missing, where apt-get is there and may be used.
+        install_libraries: Install missing system libraries, if apt-get is available and permitted.
     """
     from shellgs_method.environment import examine, install_system_libraries
 
@@ -28,4 +28,4 @@ def doctor(install_libraries: bool = False) -> None:
         table.add_row(mark, finding.subject, finding.detail)
     console.print(table)
     if missing := [f"{found.subject}: {found.detail}" for found in findings if found.needed and not found.works]:
-        sys.exit(f"shellgs: nothing runs here before this is mended: {'; '.join(missing)}")
+        sys.exit(f"shellgs: nothing runs here until this is fixed: {'; '.join(missing)}")

@@ -16,16 +16,16 @@ def evaluate(
     holdout: Optional[Literal["A", "B"]] = None,
     renders: Optional[Path] = None,
 ) -> None:
-    """All metrics of a trained run, as `ns-eval` writes them, for any nerfstudio method that renders depth.
+    """Write all metrics of a trained run, as `ns-eval` does, for any nerfstudio method that renders depth.
 
     Args:
-        config: The run's config.yml. Other methods than ours are trained with `ns-train METHOD … facade-data`.
-        output_path: The json.
-        holdout: Measure these vertical bands of the facade alone, whatever the run was trained on.
-        renders: Folder that gets what was rendered for each held-out view, as npz.
+        config: The run's config.yml. Train methods other than ours with `ns-train METHOD … facade-data`.
+        output_path: Output JSON file.
+        holdout: Measure only these vertical bands of the facade, whatever the run held out.
+        renders: Folder for the renders of each held-out view, as npz.
     """
-    # First, and from here: nerfstudio's registry inspects the stack of calls 26 times, and deep in our imports that is
-    # a second and a half longer.
+    # First, and from here: nerfstudio's registry inspects the call stack 26 times, which takes 1.5 s longer deep in our
+    # imports.
     import nerfstudio.configs.method_configs  # noqa: F401
 
     from shellgs_method.compare.measure import write_metrics

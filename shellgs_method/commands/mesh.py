@@ -1,4 +1,4 @@
-"""`shellgs mesh`: a triangle mesh of a trained method."""
+"""`shellgs mesh`: triangle mesh of a trained run."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ def mesh(
     margin: float = 0.5,
     up: Optional[UpAxis] = None,
 ) -> None:
-    """Triangle mesh of a trained method, in metres in the shell's frame, and how far it is from shell and truth.
+    """Write a triangle mesh of a trained run, in metres in the shell's frame, and print its errors.
 
-    Beside it, a json says where it stands: a georeferenced shell's large offset is there, not in the coordinates.
+    They are against the shell and, if known, the truth. A json beside the mesh holds its frame: a georeferenced shell's
+    large offset is there, not in the coordinates.
 
     Args:
         config: The run's config.yml.
-        output: The mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
-        voxel: Size of a voxel in metres. If not set: a pixel's size on the facade.
-        faces: Number of triangles that the mesh is thinned to.
-        margin: What is farther than this from the shell, in metres, is left out.
+        output: Mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
+        voxel: Voxel size in metres. If not set: the size of a pixel on the facade.
+        faces: Number of triangles that the mesh is decimated to.
+        margin: Distance from the shell, in metres, beyond which geometry is left out.
         up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
@@ -39,7 +40,7 @@ def mesh(
     output = output or config.with_name("mesh.ply")
     check_mesh_format(output)
     if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
-        raise SceneError("a mesh has at least 4 --faces, a --voxel above 0 and a --margin from 0")
+        raise SceneError("--faces must be at least 4, --voxel above 0 and --margin at least 0")
     run = TrainedRun.load(config, up)
     made = decimate(run.facade(fuse(run.views(), run.box(margin), voxel), margin), faces)
     metrics = mesh_errors(run, made)

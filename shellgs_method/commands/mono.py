@@ -23,17 +23,17 @@ _MOGE = MoGe2()
 
 
 def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int] = None, paths: Paths = PATHS) -> None:
-    """Monocular depth and normals of every view, aligned to the SfM points, in scene/cues/mono.
+    """Make monocular depth and normals of every view, aligned to the SfM points, in scene/cues/mono.
 
-    They come from a network (moge, depth-anything) or from maps made elsewhere (from FOLDER). A view whose depth does
-    not fit its SfM points gets no map. An interrupted run goes on where it stopped.
+    They come from a network (moge, depth-anything) or from existing maps (from FOLDER). A view whose depth does not fit
+    its SfM points gets no map. The same command resumes an interrupted run.
 
     Args:
         scene: Scene folder.
-        source: What predicts.
+        source: Source of the predictions.
         max_image_size: Longer side in pixels that photographs are resized to for training. If not set: the size that
             the shell maps were cast at, else full size.
-        paths: Where in the scene its files are.
+        paths: Paths of the scene's files.
     """
     from dataparsers.cue_maps import CueMaps, find_cues
     from dataparsers.facade import read_views
@@ -41,7 +41,7 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
     from shellgs_method.cues.maps import make_maps
 
     if max_image_size is not None and max_image_size < 1:
-        raise SceneError(f"the longer side of the maps must be at least 1 pixel, not {max_image_size}")
+        raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
     layout = paths.of(scene)
     views, points, predictor = read_views(layout), read_sparse_points(layout), source.load()
     if max_image_size is None and "shell" in find_cues(scene):
@@ -51,14 +51,14 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
     if predictor.non_commercial:
         console.print("[yellow]The licence of these weights forbids commercial use.")
     if points.observed is None:
-        console.print("The scene does not say which points a view observes: all that project into it are used.")
+        console.print("The scene does not say which points a view observes: all points that project into it are used.")
     size = f" --max-image-size {max_image_size}" if max_image_size else ""
     command = f"shellgs mono {{scene}}{size}{paths.flags} {source.command}"
     summary = make_maps(scene, views, points, predictor, command=command, max_image_size=max_image_size)
     console.print(
-        f"{summary.made} maps made, {summary.skipped} views decided before, in {summary.seconds:.1f} s; "
-        f"{len(views) - len(summary.problems)} of {len(views)} views have a map, whose depth is {summary.residual:.1%} "
-        "off the SfM points (median)."
+        f"{summary.made} maps made, {summary.skipped} views already processed, in {summary.seconds:.1f} s; "
+        f"{len(views) - len(summary.problems)} of {len(views)} views have a map, with a median depth error of "
+        f"{summary.residual:.1%} at the SfM points."
     )
     for name, problem in summary.problems.items():
         console.print(f"No map for {name}: {problem}.", highlight=False)

@@ -1,4 +1,4 @@
-"""Images of some views beside their maps, for the user to look at."""
+"""Images of views and their maps, for the user to check."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
-    """The picture of the view whose map supports most pixels, among some spread over the scene."""
+    """Save an image of the view whose map covers most pixels, among some spread over the scene; return its path."""
     from dataparsers.photograph import load_photograph
     from shellgs_method.evaluation.figures import save_figure
     from shellgs_method.shell import supervision_panel
@@ -27,7 +27,7 @@ def save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
 
 
 def views_with_maps(maps: CueMaps, views: Sequence[View], count: int) -> list[tuple[View, CueMap]]:
-    """About so many views, spread over the scene, at the size of their maps, and these."""
+    """About ``count`` views spread over the scene, at the size of their maps, with the maps."""
     mapped = [view for view in views if maps.record(view.name)]
     shrunk = [
         replace(view, camera=view.camera.shrunk(maps.manifest.max_image_size))

@@ -1,4 +1,4 @@
-"""`shellgs sim`: a folder that simulators load."""
+"""`shellgs sim`: assets for simulators."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ def sim(
     settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
     up: Optional[UpAxis] = None,
 ) -> None:
-    """A folder that MuJoCo, Isaac Sim and Gazebo load: convex colliders, a textured look, splats, and a report.
+    """Write assets for MuJoCo, Isaac Sim and Gazebo: convex colliders, a textured mesh, splats, and a report.
 
-    With several runs, whose shells are in the same national coordinates, they stand in one world.
+    Several runs share one world; their shells must be in the same national coordinates.
 
     Args:
-        configs: The runs' config.yml.
-        out: The folder.
+        configs: config.yml of each run.
+        out: Output folder.
         settings: Settings.
         up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.sim.simulate import simulate
 
-    def tell(sentence: str) -> None:
+    def report(sentence: str) -> None:
         console.print(sentence, highlight=False)
 
-    metrics, _ = simulate(configs, out, settings, tell, up)
+    metrics, _ = simulate(configs, out, settings, report, up)
     for sentence in metrics["summary"]:
-        tell(sentence)
-    console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how far off it is.")
+        report(sentence)
+    console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how accurate it is.")

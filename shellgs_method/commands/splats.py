@@ -1,4 +1,4 @@
-"""`shellgs splats`: the Gaussians of a trained method as a ply."""
+"""`shellgs splats`: the Gaussians of a trained run as a ply."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def splats(
     output: Optional[Path] = None,
     up: Optional[UpAxis] = None,
 ) -> None:
-    """The Gaussians of a trained method as the ply that viewers open, in metres in the shell's frame.
+    """Write the Gaussians of a trained run as a ply for splat viewers, in metres in the shell's frame.
 
-    `ns-export gaussian-splat` writes the same in nerfstudio's own frame.
+    Use `ns-export gaussian-splat` to write them in nerfstudio's own frame.
 
     Args:
         config: The run's config.yml.
-        output: The ply. If not set: splats.ply beside the config.
-        up: Axis of the shell's frame that points up, for the json. If not set: y for a glTF shell, else z.
+        output: Output ply. If not set: splats.ply beside the config.
+        up: Axis of the shell's frame that points up, written to the json. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.export import write_splats
     from shellgs_method.export.runs import TrainedRun

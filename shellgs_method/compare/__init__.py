@@ -1,1 +1,1 @@
-"""Methods, seeds and scenes side by side: a grid of runs, launched, measured, and written as the paper's tables."""
+"""Compare methods, seeds and scenes: a grid of runs, launched, measured, and written as the paper's tables."""

@@ -1,8 +1,8 @@
-"""Runs on a Ray cluster: a task each, whose scene travels to a node once and whose folder comes back.
+"""Runs on a Ray cluster: one task per run, which returns the run's folder.
 
-A scene is packed and put into Ray's object store; a node unpacks it once, into its own temporary folder. Nothing is
-assumed to be shared but the package, which must be installed on all nodes. A task whose worker is killed is tried
-again: on the same node it goes on from its last checkpoint, on another from what the run's folder held at the start.
+A scene is packed and put into Ray's object store; a node unpacks it once, into its own temporary folder. No file system
+needs to be shared, but the package must be installed on all nodes. A task whose worker is killed is retried: on the
+same node it resumes from its last checkpoint, on another from what the run's folder held at the start.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ from rich.console import Console
 
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash, fingerprint
-from shellgs_method.compare.launch import BIN, EVERY, CommandError, finish
+from shellgs_method.compare.launch import BIN, PROGRESS_SECONDS, CommandError, finish
 from shellgs_method.compare.runs import Run
 from shellgs_method.config_file import load_config
 from shellgs_method.folders import replace_folder
 
 RETRIES = 3
-"""How often a task whose worker was killed is tried again; its command ends at the next line of output, unread."""
+"""Retries of a task whose worker was killed. The killed worker's command ends when its next line cannot be written."""
 
-PATIENCE = 30
-"""Seconds in which a running cluster answers."""
+TIMEOUT = 30
+"""Seconds within which a running cluster answers."""
 PIECE = 1 << 26
-"""Bytes of a packed folder that are in memory at once; the cluster keeps what it has on disk when it must."""
+"""Bytes of a packed folder held in memory at once; Ray spills its store to disk when necessary."""
 
 Pieces = list[Any]
-"""References to the pieces of a tar file, which are arrays of bytes."""
+"""Ray references to the pieces of a tar file, each an array of bytes."""
 Archive = UInt8[np.ndarray, " N"]
 """A tar file."""
 
 
 def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) -> dict[Run, str]:
-    """Finish all runs on a cluster; those that failed, with their last lines.
+    """Finish all runs on a cluster; return those that failed, with the end of their output.
 
     Args:
-        runs: settled.
-        address: of a running cluster; None starts one on this machine, which ends with the runs.
-        console: told of each run that ends.
+        runs: runs to finish, settled.
+        address: address of a running cluster; None starts one on this machine, which ends with the runs.
+        console: where progress is printed.
 
     Raises:
         SceneError: Ray is not installed, or there is no cluster at the address.
@@ -66,7 +66,7 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
         raise SceneError("the ray launcher needs Ray: pip install 'shellgs[ray]'") from error
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address:
-        _refuse_no_cluster(address)
+        _check_cluster(address)
     try:
         ray.init(address or "local", include_dashboard=None if address else False, log_to_driver=False)
     except (ConnectionError, RuntimeError, ValueError) as error:
@@ -74,12 +74,12 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
     failures: dict[Run, str] = {}
     try:
         resources = ray.cluster_resources()
-        gpus = min(1, int(resources.get("GPU", 0)))  # every method trains on one, where there is one
+        gpus = min(1, int(resources.get("GPU", 0)))  # every method trains on one GPU, if there is one
         at_once = max(1, int(resources.get("GPU" if gpus else "CPU", 1)))
         task = ray.remote(num_gpus=gpus, max_retries=RETRIES)(_finish_on_node)
         waiting, pending, scenes = list(runs), {}, {}
         while waiting or pending:
-            while waiting and len(pending) < at_once:  # what waits is not packed yet
+            while waiting and len(pending) < at_once:  # waiting runs are not packed yet, to save memory
                 run = waiting.pop(0)
                 if run.scene not in scenes:
                     scenes[run.scene] = content_hash(run.scene), _packed(run.scene, ray.put)
@@ -88,29 +88,29 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
                 pending[task.remote(run, key, scene_key, scene, _packed(run.folder, ray.put))] = run
                 if run.scene not in {later.scene for later in waiting}:
                     del scenes[run.scene]
-            ended, _ = ray.wait(list(pending), timeout=EVERY)
+            ended, _ = ray.wait(list(pending), timeout=PROGRESS_SECONDS)
             if not ended:
-                under_way = ", ".join(run.label for run in pending.values())
-                console.print(f"Under way: {under_way}; waiting: {len(waiting)}.", highlight=False)
+                running = ", ".join(run.label for run in pending.values())
+                console.print(f"Running: {running}; waiting: {len(waiting)}.", highlight=False)
                 continue
             run = pending.pop(done := ended[0])
             try:
-                folder, why = ray.get(done)
-                _take_back(folder, run)
-            except (RayError, tarfile.TarError, OSError) as error:
-                failures[run] = str(error)
+                folder, error = ray.get(done)
+                _store_result(folder, run)
+            except (RayError, tarfile.TarError, OSError) as failure:
+                failures[run] = str(failure)
                 continue
-            if why is not None:
-                failures[run] = why
+            if error is not None:
+                failures[run] = error
             left = len(pending) + len(waiting)
-            console.print(f"{run.label} {'failed' if why else 'is finished'}; {left} to go.", highlight=False)
+            console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
     finally:
         ray.shutdown()
     return {run: failures[run] for run in runs if run in failures}
 
 
-def _refuse_no_cluster(address: str) -> None:
-    """Ray itself would wait for minutes, or for ever.
+def _check_cluster(address: str) -> None:
+    """Refuse an address at once, where Ray itself would wait for minutes, or for ever.
 
     Raises:
         SceneError: nothing answers at the address.
@@ -120,62 +120,62 @@ def _refuse_no_cluster(address: str) -> None:
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=PATIENCE).close()
+        socket.create_connection((host.strip("[]"), int(port)), timeout=TIMEOUT).close()
         if not address.startswith("ray://"):
             words = [BIN / "ray", "health-check", "--address", address]
-            subprocess.run(words, check=True, capture_output=True, timeout=PATIENCE)
+            subprocess.run(words, check=True, capture_output=True, timeout=TIMEOUT)
     except (OSError, ValueError, OverflowError, subprocess.SubprocessError) as error:
         raise SceneError(refusal) from error
 
 
 def _finish_on_node(run: Run, key: str, scene_key: str, scene: Pieces, folder: Pieces) -> tuple[Archive, str | None]:
-    """The task: the run's folder after what was left to do, and the last lines of a command that failed.
+    """The Ray task: finish a run; return its packed folder and, if a command failed, the end of its output.
 
     Args:
-        run: with the paths of the machine that asks.
-        key: the same for every try of the run, and for no other.
-        scene_key: the same for the same content of the scene, and for no other.
-        scene: its folder, packed.
-        folder: of the run, packed, as it was at the start.
+        run: the run, with the paths of the machine that submits it.
+        key: identifies the run; the same for every retry.
+        scene_key: identifies the scene's content.
+        scene: the scene's folder, packed.
+        folder: the run's folder at the start, packed.
     """
     import ray
 
     root = _own_folder()
     scenes = root / "scenes" / sha256(scene_key.encode()).hexdigest()
-    there = replace(run, scene=scenes / run.scene.name, output=root / "runs" / key)
-    if not there.scene.exists():
-        _unpack(map(ray.get, scene), there.scene)
-    if not there.folder.exists():
-        _unpack(map(ray.get, folder), there.folder)
-        _point_to_its_folder(there)
+    local = replace(run, scene=scenes / run.scene.name, output=root / "runs" / key)
+    if not local.scene.exists():
+        _unpack(map(ray.get, scene), local.scene)
+    if not local.folder.exists():
+        _unpack(map(ray.get, folder), local.folder)
+        _set_paths_in_config(local)
+    error = None
     try:
-        finish(there)
-        why = None
-    except CommandError as error:
-        why = str(error)
-    result = np.concatenate(_packed(there.folder, lambda piece: piece))
-    shutil.rmtree(there.output)
-    return result, why
+        finish(local)
+    except CommandError as failure:
+        error = str(failure)
+    result = np.concatenate(_packed(local.folder, lambda piece: piece))
+    shutil.rmtree(local.output)
+    return result, error
 
 
 def _own_folder() -> Path:
-    """A folder among the temporary files that nobody else can write in, the same for every task of this user.
+    """The temporary folder of this user's tasks, which nobody else can write to.
 
     Raises:
-        SceneError: somebody else has taken its name.
+        SceneError: the folder belongs to somebody else, or others can write to it.
     """
     root = Path(tempfile.gettempdir()) / f"shellgs-{os.getuid()}"
     root.mkdir(mode=stat.S_IRWXU, exist_ok=True)
     found = root.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise SceneError(f"{root} is not this user's alone: remove it, or set TMPDIR to another folder")
+        raise SceneError(f"{root} is not a folder only you can write to: remove it, or set TMPDIR to another folder")
     return root
 
 
-def _point_to_its_folder(run: Run) -> None:
-    """Let a run's config.yml, which may come from another machine, name the scene and the folder where they are."""
+def _set_paths_in_config(run: Run) -> None:
+    """Set the scene's and the run's folders in config.yml, which may come from another machine."""
     if run.config.exists():
-        with suppress(SceneError):  # a damaged one is refused where it is read
+        with suppress(SceneError):  # a damaged config is refused where it is read
             config = load_config(run.config)
             config.data = config.pipeline.datamanager.data = run.scene
             config.output_dir, config.load_dir = run.output / "runs" / run.scene.name, None
@@ -184,11 +184,11 @@ def _point_to_its_folder(run: Run) -> None:
 
 
 class _Pieces(io.RawIOBase):
-    """A file that hands on what is written to it, piece by piece."""
+    """A writable file that splits its content into pieces and collects what ``store`` returns for each."""
 
-    def __init__(self, take: Callable[[Archive], Any]):
-        self.handed: Pieces = []
-        self._take, self._piece = take, bytearray()
+    def __init__(self, store: Callable[[Archive], Any]):
+        self.stored: Pieces = []
+        self._store, self._piece = store, bytearray()
 
     def writable(self) -> bool:
         return True
@@ -196,21 +196,21 @@ class _Pieces(io.RawIOBase):
     def write(self, data: Any) -> int:
         self._piece += data
         if len(self._piece) >= PIECE:
-            self._hand_on()
+            self._store_piece()
         return len(data)
 
     def close(self) -> None:
         if self._piece:
-            self._hand_on()
+            self._store_piece()
         super().close()
 
-    def _hand_on(self) -> None:
-        self.handed.append(self._take(np.frombuffer(bytes(self._piece), np.uint8)))
+    def _store_piece(self) -> None:
+        self.stored.append(self._store(np.frombuffer(bytes(self._piece), np.uint8)))
         self._piece.clear()
 
 
 class _Joined(io.RawIOBase):
-    """A file whose bytes are those of pieces, taken when they are read."""
+    """A readable file over pieces, each fetched when it is read."""
 
     def __init__(self, pieces: Iterator[Archive]):
         self._pieces, self._rest = pieces, memoryview(b"")
@@ -230,28 +230,28 @@ class _Joined(io.RawIOBase):
         return count
 
 
-def _packed(folder: Path, take: Callable[[Archive], Any]) -> Pieces:
-    """What ``take`` makes of the pieces of a folder's tar file."""
-    with _Pieces(take) as file, tarfile.open(fileobj=file, mode="w|", dereference=True) as archive:  # pyright: ignore
+def _packed(folder: Path, store: Callable[[Archive], Any]) -> Pieces:
+    """Pack a folder into a tar file; return the result of ``store`` for each of its pieces."""
+    with _Pieces(store) as file, tarfile.open(fileobj=file, mode="w|", dereference=True) as archive:  # pyright: ignore
         archive.add(folder, arcname=".")
-    return file.handed
+    return file.stored
 
 
 def _unpack(pieces: Iterable[Archive], folder: Path) -> None:
-    """Put a packed folder at its place, whole or not at all; one that is there already stays."""
+    """Unpack a folder, whole or not at all; an existing one is kept."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as partial:
-        whole = Path(partial) / folder.name
+        unpacked = Path(partial) / folder.name
         with tarfile.open(fileobj=io.BufferedReader(_Joined(iter(pieces))), mode="r|") as tar:
-            tar.extractall(whole, filter="data")
+            tar.extractall(unpacked, filter="data")
         with suppress(OSError):  # another worker of this node was faster
-            whole.rename(folder)
+            unpacked.rename(folder)
 
 
-def _take_back(archive: Archive, run: Run) -> None:
-    """Put what came back in the place of the run's folder, of which it is the continuation."""
+def _store_result(archive: Archive, run: Run) -> None:
+    """Replace the run's folder by the one that its task returned."""
     fresh = run.folder.with_name(f"{run.folder.name}.new")
     shutil.rmtree(fresh, ignore_errors=True)
     _unpack([archive], fresh)
     replace_folder(run.folder, fresh)
-    _point_to_its_folder(run)
+    _set_paths_in_config(run)

@@ -1,4 +1,4 @@
-"""Runs brought to their end on this machine, with the commands that a user would type."""
+"""Finish runs on this machine, with the commands that a user would type."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from shellgs_method.fusion import nothing_compiled_yet
 
 BIN = Path(sys.executable).parent
 LAST_LINES = 30
-EVERY = 30.0
-"""Seconds between two words on progress where no terminal shows it."""
+PROGRESS_SECONDS = 30.0
+"""Seconds between two progress messages where the output is not a terminal."""
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 _PR_SET_PDEATHSIG = 1
 _STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
 class CommandError(RuntimeError):
-    """A command failed; the message is its last lines."""
+    """A command failed; the message is the end of its output."""
 
 
 def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run, str]:
-    """Finish all runs, ``jobs`` at once; those that failed, with their last lines. One's failure stops no other."""
+    """Finish all runs, ``jobs`` at once; return the failed ones, with the end of their output. None stops another."""
     runs = list(runs)
     failures: dict[Run, str] = {}
     if runs and not torch.cuda.is_available() and nothing_compiled_yet():
-        console.print("The first run compiles the kernels, which takes a minute or two; all others load them.")
+        console.print("The first run compiles the kernels, which takes a minute or two; the others load them.")
     progress = Progress(console=console, transient=True)
     with (
         progress,
-        told_in_a_log(console, lambda: map(_standing, progress.tasks)),
+        progress_in_a_log(console, lambda: map(_status, progress.tasks)),
         ThreadPoolExecutor(max(jobs, 1)) as pool,
     ):
         futures = {pool.submit(_finish_visibly, run, console, progress): run for run in runs}
@@ -56,7 +56,7 @@ def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run
                 else:
                     future.result()
                 console.print(f"{run.label} {outcome}, {done} of {len(runs)}.", highlight=False)
-        except BaseException:  # Ctrl-C, which the commands get too: they end, and nothing new begins
+        except BaseException:  # Ctrl-C, which also ends the running commands: start no others
             pool.shutdown(wait=True, cancel_futures=True)
             raise
     return {run: failures[run] for run in runs if run in failures}
@@ -67,12 +67,12 @@ def finish(
     announce: Callable[[Sequence[str]], None] = lambda _: None,
     step: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Bring a run to its end from where it stands; its output goes to log.txt in its folder.
+    """Run the remaining commands of a run; their output is appended to log.txt in its folder.
 
     Args:
         run: the run, settled.
-        announce: told of each command before it starts.
-        step: told of each iteration that nerfstudio reports.
+        announce: called with each command before it starts.
+        step: called with each iteration that nerfstudio reports.
 
     Raises:
         CommandError: a command failed.
@@ -83,10 +83,10 @@ def finish(
 
 
 def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None, log: Path | None = None) -> None:
-    """Run a command of this environment, which is to be silent unless it fails.
+    """Run a command of this environment, without showing its output.
 
     Raises:
-        CommandError: it failed.
+        CommandError: the command failed.
     """
     output: list[str] = []
     with subprocess.Popen(
@@ -115,16 +115,16 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
 
 
 @contextmanager
-def told_in_a_log(console: Console, standing: Callable[[], Iterable[str]]) -> Iterator[None]:
-    """Every :data:`EVERY` seconds, print where things stand if the console is no terminal, which shows no bars."""
+def progress_in_a_log(console: Console, statuses: Callable[[], Iterable[str]]) -> Iterator[None]:
+    """Print the status of all runs every :data:`PROGRESS_SECONDS` if the console is no terminal and shows no bars."""
     stop = threading.Event()
 
-    def tell() -> None:
-        while not stop.wait(EVERY):
-            for sentence in standing():
+    def report() -> None:
+        while not stop.wait(PROGRESS_SECONDS):
+            for sentence in statuses():
                 console.print(sentence, highlight=False, soft_wrap=True)
 
-    thread = threading.Thread(target=tell, daemon=True)
+    thread = threading.Thread(target=report, daemon=True)
     if not console.is_terminal:
         thread.start()
     try:
@@ -135,15 +135,15 @@ def told_in_a_log(console: Console, standing: Callable[[], Iterable[str]]) -> It
             thread.join()
 
 
-def _standing(task: Task) -> str:
-    """Where a run is, in words.
+def _status(task: Task) -> str:
+    """The progress of a run, in words.
 
-    What is left is reckoned from the whole time so far: iterations are told in bursts, of which rich's own estimate
-    makes a multiple of the speed, and too long is the better error.
+    The time left is estimated from the whole time so far, which is rather too long: nerfstudio reports iterations in
+    bursts, from which rich's own estimate gets a multiple of the speed.
     """
     minutes, total = (task.elapsed or 0) / 60, task.total or 0
     if task.finished:
-        return f"{task.description}: trained, {minutes:.1f} min; measuring"
+        return f"{task.description}: trained in {minutes:.1f} min, evaluating"
     if not task.completed:
         return f"{task.description}: starting, {minutes:.1f} min"
     left = minutes * (total / task.completed - 1)
@@ -152,7 +152,7 @@ def _standing(task: Task) -> str:
 
 
 def _end_with_parent() -> None:
-    """Let the kernel end this process with its parent: a killed comparison's would train on beside the next."""
+    """Let the kernel end this process with its parent, or a killed comparison's runs would keep training."""
     assert _LIBC is not None
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 

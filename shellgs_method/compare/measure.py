@@ -1,4 +1,4 @@
-"""A trained run of any nerfstudio method that renders depth, measured on the held-out views of a facade."""
+"""Measure a trained run of any nerfstudio method that renders depth on the held-out views of a facade."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from shellgs_method.model import FacadeModel
 from shellgs_method.trained import load_run
 
 IMAGE_SIZE = 640
-"""Most pixels along the longer side of an image in a report."""
+"""Longer side of an image in a report, in pixels, at most."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a run rendered for a held-out view, thinned to an image's size; lengths in units of the rescaled world."""
+    """Renders of a held-out view, subsampled to :data:`IMAGE_SIZE`; lengths in units of the rescaled world."""
 
     photograph: UInt8[np.ndarray, "H W 3"]
     rgb: UInt8[np.ndarray, "H W 3"]
     normal: Float16[np.ndarray, "H W 3"]
-    """Composited normals, or those of the depth where a method has none."""
+    """Composited normals; for a method without any, those of its depth."""
     error: Float16[np.ndarray, "H W 1"]
     """Unsigned angle to the shell's normals in degrees."""
     depth: Float[np.ndarray, "H W 1"]
-    """0 where nothing is half opaque."""
+    """0 where the accumulation is below :data:`~shellgs_method.evaluation.view.OPAQUE`."""
     shell_normal: Float16[np.ndarray, "H W 3"]
     shell_depth: Float[np.ndarray, "H W 1"]
     mask: Bool[np.ndarray, "H W 1"]
@@ -58,7 +58,7 @@ class Snapshot:
 
     @property
     def camera(self) -> Camera:
-        """Of the image, in the rescaled world."""
+        """Camera of the subsampled image, in the rescaled world."""
         height, width = self.mask.shape[:2]
         return Camera(torch.from_numpy(self.viewmat), torch.from_numpy(self.K), width, height)
 
@@ -87,15 +87,15 @@ class Snapshot:
 
 @torch.no_grad()
 def measure(config_path: Path, half: Half | None = None, renders: Path | None = None) -> dict:
-    """What ns-eval writes of a run, with the geometric metrics of our methods for every method.
+    """Measure a run as ns-eval does, with our geometric metrics for every method.
 
     Args:
         config_path: config.yml of the run.
-        half: bands of the facade that alone are measured; None: what the run itself held out, or all.
-        renders: folder that gets a :class:`Snapshot` of each view that sees the shell.
+        half: bands of the facade to measure; None for those that the run held out, or for all.
+        renders: folder for a :class:`Snapshot` of each view in which the shell is visible.
 
     Raises:
-        FileNotFoundError: there is no such config.
+        FileNotFoundError: the config does not exist.
         SceneError: the run renders no depth, or was not trained on a facade of undistorted photographs.
     """
     config, pipeline, checkpoint = load_run(config_path, "test")
@@ -124,7 +124,7 @@ def measure(config_path: Path, half: Half | None = None, renders: Path | None = 
 
 
 def measure_shell(layout: SceneLayout) -> dict[str, float]:
-    """Metrics of the shell itself against the truth, in held-out views and where both are; empty without a truth."""
+    """Metrics of the shell itself against the truth, in held-out views where both exist; empty without a truth."""
     if not {"shell", "truth"} <= {*find_cues(layout.data)}:
         return {}
     dataparser, cpu = FacadeDataParserConfig(**vars(layout)), torch.device("cpu")
@@ -142,7 +142,7 @@ def measure_shell(layout: SceneLayout) -> dict[str, float]:
 
 
 def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDataManager:
-    """Our datamanager on the scene of any method's."""
+    """Our datamanager for the scene of any method's config."""
     if not isinstance(config, FacadeDataManagerConfig):
         if not isinstance(config.dataparser, FacadeDataParserConfig):
             raise SceneError("the run was not trained on a facade: end its ns-train command with `facade-data`")
@@ -154,16 +154,16 @@ def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDa
 
 def _rendering(model: Model, outputs: dict[str, Tensor], camera: Camera) -> Rendering:
     if "depth" not in outputs or "accumulation" not in outputs:
-        raise SceneError(f"{type(model).__name__} renders no depth, which all geometric metrics are made of")
+        raise SceneError(f"{type(model).__name__} renders no depth, which all geometric metrics need")
     depth = outputs["depth"]
-    if not isinstance(model, SplatfactoModel):  # along the ray, in nerfstudio's radiance fields
+    if not isinstance(model, SplatfactoModel):  # nerfstudio's radiance fields render it along the ray
         depth = depth / camera.rays().to(depth).norm(dim=-1, keepdim=True)
     normal = colours_to_normals(outputs["normal"]) if isinstance(model, FacadeModel) else None
     return Rendering(outputs["rgb"], depth, outputs["accumulation"], normal)
 
 
 def _photograph(model: Model, outputs: dict[str, Tensor], batch: dict) -> Float[Tensor, "H W 3"]:
-    """As the method is to see it: what is transparent shows the background that it renders; black, if it has none."""
+    """The photograph over the background that the method renders; black if it renders none."""
     image = batch["image"].to(model.device)
     image = image / 255 if image.dtype == torch.uint8 else image
     if image.shape[-1] == 3:
@@ -181,7 +181,7 @@ def _snapshot(
     step = camera.thinning(IMAGE_SIZE)
     K = camera.K.double().cpu().numpy().copy()
     K[:2] /= step
-    K[:2, 2] += 0.5 - 0.5 / step  # pixel i of the image is pixel step * i: centres at 0.5 in both
+    K[:2, 2] += 0.5 - 0.5 / step  # pixel i of the image is pixel step * i of the view; centres are at 0.5 in both
 
     def thin(values: Tensor, dtype: type) -> np.ndarray:
         return values[::step, ::step].cpu().numpy().astype(dtype)
@@ -202,10 +202,10 @@ def _snapshot(
 
 
 def write_metrics(config: Path, output: Path, half: Half | None = None, renders: Path | None = None) -> dict:
-    """:func:`measure`, as the json that ns-eval would write; returns the metrics."""
+    """Write the result of :func:`measure` as ns-eval would, and return the metrics."""
     check_output(output)
     if renders is not None and renders.exists() and not renders.is_dir():
-        raise SceneError(f"{renders} is a file: name a folder for the renders")
+        raise SceneError(f"{renders} is a file: give a folder for the renders")
     measured = measure(config, half, renders)
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(output) as file:

@@ -1,4 +1,4 @@
-"""The paper's figures of finished runs: qualitative strip, curves, point clouds."""
+"""The paper's figures: qualitative strip, curves, point clouds."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ CURVES = tuple(
 )
 _EVENTS = "Eval Images Metrics Dict (all images)/"
 AZIMUTHS = (-60, 0, 60)
-"""Degrees that the orbit of the point clouds stops at, from the front of the facade."""
+"""Views of the point clouds, in degrees from the front of the facade."""
 REFERENCE = "photograph, shell"
-"""What stands beside the methods."""
+"""Label of the reference beside the methods."""
 FAR = 10
-"""Voxels from which a point's colour is the last of the scale: 20 cm."""
+"""Distance, in voxels, at which the colour scale ends: 20 cm."""
 PANEL = (550, 880)
-"""Rows and columns of the image of one point cloud, about twice what the page shows of it."""
+"""Rows and columns of the image of one point cloud, about twice its size in the report."""
 DOT = 3
-"""Side of a point in that image in pixels."""
+"""Side of a point in that image, in pixels."""
 
 
 def strip(runs: Sequence[Run], view: str, path: Path) -> None:
-    """One held-out view: the photograph with the shell's normals, then each run; below, the errors of the normals."""
+    """Draw one held-out view: photograph and shell normals, then each run; below, the errors of the normals."""
     panels = []
     for run in runs:
         shot = Snapshot.load(run.renders / view)
@@ -56,9 +56,9 @@ def strip(runs: Sequence[Run], view: str, path: Path) -> None:
 
 
 def curves(runs: Sequence[Run], path: Path) -> bool:
-    """Figures of all held-out views against the iteration, a line a variant (mean over seeds); whether there are any.
+    """Plot metrics of all held-out views over iterations, one line per variant (mean over seeds).
 
-    They are in the tensorboard files of runs that were measured while they trained.
+    They come from the tensorboard files of runs that were evaluated during training; False if there are none.
     """
     recorded = {run: recorded_metrics(run) for run in runs}
     columns = [column for column in CURVES if any(column.key in curve for curve in recorded.values())]
@@ -79,9 +79,9 @@ def curves(runs: Sequence[Run], path: Path) -> bool:
 
 
 def surfaces(runs: Sequence[Run], path: Path) -> None:
-    """Visible points of all held-out views, seen from around the facade, coloured by their distance from the shell's.
+    """Draw the visible points of all held-out views, coloured by their distance from the shell's points.
 
-    A row an azimuth, a column a run. Points are thinned to the voxels that the figures are measured with.
+    One row per azimuth, one column per run. Points are thinned to the voxels that the metrics are measured with.
     """
     shots = {run.variant.name: [Snapshot.load(path) for path in sorted(run.renders.glob("*.npz"))] for run in runs}
     seen = next(iter(shots.values()))
@@ -94,7 +94,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
     colours = ScalarMappable(Normalize(0, FAR * voxel), colormaps["turbo"])
     for column, (name, views) in zip(axes.T, shots.items(), strict=True):
         points = voxel_means(np.concatenate([_world(shot, shot.depth) for shot in views]), voxel)
-        # Of points farther than the scale goes nothing more is asked: the search for their nearest would take minutes.
+        # Points beyond the colour scale get no exact distance: their search would take minutes.
         distance = tree.query(points, distance_upper_bound=FAR * voxel, workers=-1)[0]
         dots = colours.to_rgba(distance, bytes=True)[:, :3]
         for axis, azimuth in zip(column, AZIMUTHS, strict=True):
@@ -106,7 +106,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
 
 
 def dotted(points: Float[np.ndarray, "N 3"], colours: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """A square dot a point on white, the nearest before the others; right, up and towards the eye, in pixels."""
+    """Draw points (right, up, towards the eye; in pixels) as squares on white, nearer ones in front."""
     height, width = PANEL
     image = np.full((height, width, 3), 255, np.uint8)
     points, colours = (values[np.argsort(points[:, 2])] for values in (points, colours))
@@ -114,13 +114,13 @@ def dotted(points: Float[np.ndarray, "N 3"], colours: UInt8[np.ndarray, "N 3"]) 
     across, down = np.divmod(np.arange(DOT * DOT), DOT) - np.array(DOT // 2)
     column, row = column[:, None] + across, row[:, None] + down
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    # Of a pixel that is painted more than once, the last colour stays.
+    # A pixel that is painted more than once keeps the last colour.
     image[row[inside], column[inside]] = np.broadcast_to(colours[:, None], (*inside.shape, 3))[inside]
     return image
 
 
 def recorded_metrics(run: Run) -> dict[str, dict[int, float]]:
-    """Figures of all held-out views by name, by iteration; where a resumed run wrote one twice, the last."""
+    """Metrics of all held-out views, by name and iteration; the last value where a resumed run wrote two."""
     events = EventAccumulator(str(run.folder), size_guidance={"scalars": 0})
     events.Reload()
     found = (tag for tag in events.Tags()["scalars"] if tag.startswith(_EVENTS))
@@ -128,14 +128,14 @@ def recorded_metrics(run: Run) -> dict[str, dict[int, float]]:
 
 
 def _resolution(shot: Snapshot) -> tuple[str, float]:
-    """Unit of lengths, and the voxel."""
+    """Unit of lengths and size of a voxel."""
     if np.isfinite(shot.metres_per_unit):
         return "m", VOXEL_METRES
     return "units of the rescaled world", VOXEL_SHARE * float(np.median(shot.shell_depth[shot.mask]))
 
 
 def _facade_frame(shots: Sequence[Snapshot]) -> Float[np.ndarray, "3 3"]:
-    """The facade's right, up and front, as rows: front is the mean normal of the shell, up that of the cameras."""
+    """Right, up and front of the facade, as rows: front from the shell's mean normal, up from the cameras."""
     up = upwards(shot.camera for shot in shots)
     facing = [shot.shell_normal[shot.mask[..., 0]].astype(float).mean(axis=0) @ shot.viewmat[:3, :3] for shot in shots]
     right = np.cross(up, np.mean(facing, axis=0))
@@ -155,6 +155,6 @@ def _seen_from(frame: Float[np.ndarray, "3 3"], azimuth: float) -> Float[np.ndar
 
 
 def common_views(runs: Sequence[Run]) -> list[str]:
-    """Names of the snapshots that all runs have, in order."""
+    """Sorted names of the snapshots that all runs have."""
     views = [{path.name for path in run.renders.glob("*.npz")} for run in runs]
     return sorted(set.intersection(*views)) if views else []

@@ -1,4 +1,4 @@
-"""One HTML file with everything in it: tables, images, and a slider between methods on the held-out views."""
+"""A self-contained HTML report: tables, images, and a slider between methods on the held-out views."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def write_report(
     """Write the report.
 
     Args:
-        path: the HTML file, which needs no other.
-        tables: in order.
-        figures: captions and PNG files.
-        views: for the name of each scene, the runs that its slider shows in the views they have in common.
-        failures: what went wrong, by run.
+        path: the HTML file.
+        tables: tables to show, in order.
+        figures: PNG files by caption.
+        views: runs to show in the slider of each scene, by the scene's name; views that one run lacks are left out.
+        failures: reason of each failure, by run.
     """
     parts = [f"<p>Failed: {html.escape(run)}</p><pre>{html.escape(why)}</pre>" for run, why in failures.items()]
     parts += [f'<div class="scroll">{table.html}</div>' for table in tables]

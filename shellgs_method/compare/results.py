@@ -1,4 +1,4 @@
-"""From a grid of runs to the paper's tables, figures and a report."""
+"""Finish a grid of runs, and write the paper's tables, figures and a report."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from shellgs_method.evaluation.tables import rich_table
 from shellgs_method.folders import held
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
-"""Finishes runs; returns those that failed, with the reason."""
+"""Finish runs; return those that failed, with the reason."""
 PANELS = (
-    ("shell", "supervision", "what supervises a view."),
+    ("shell", "supervision", "the shell maps of a view."),
     ("checked", "contradicted", "where photographs contradict the shell (red) and where they confirm it (green)."),
 )
-"""Of a scene's maps: their kind, the file that the panel beside them is copied to, and its caption."""
+"""Panels of a scene's maps: kind of the maps, name of the copy, caption."""
 WRITING = "Writing tables, images and report ..."
 
 
 class Comparison(NamedTuple):
-    """What came of a grid of runs."""
+    """Results of a grid of runs."""
 
     tables: Sequence[MetricsTable]
     figures: Mapping[str, Path]
-    """Captions and PNG files."""
+    """PNG files by caption."""
     failures: Mapping[Run, str]
     """Runs that failed, with the reason."""
 
 
 def compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Console) -> Comparison:
-    """Finish the runs that are not, write all results, and show the tables.
+    """Finish the unfinished runs, write all results, and print the tables.
 
     Raises:
-        SceneError: a run was made with other settings, or another comparison works here. Nothing is started then.
+        SceneError: a run has other settings, or another comparison is running here; raised before anything starts.
     """
     output.mkdir(parents=True, exist_ok=True)
     with held(output) as alone:
         if not alone:
-            raise SceneError(f"another comparison works in {output}: wait for its end, or give another --output")
+            raise SceneError(f"another comparison is running in {output}: wait for it, or give another --output")
         return _compare(runs, launch, output, console)
 
 
@@ -64,41 +64,41 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
         run.settle()
         _remove_damaged(run, console)
     unfinished = [run for run in usable if not run.finished]
-    console.print(f"{len(usable) - len(unfinished)} of {len(runs)} runs are finished already.", highlight=False)
+    console.print(f"{len(usable) - len(unfinished)} of {len(runs)} runs are already finished.", highlight=False)
     if unfinished:
         failures |= launch(unfinished)
-    for run in usable:  # what came of the launch is read too
+    for run in usable:  # the launch may have written damaged files too
         _remove_damaged(run, console)
     runs = usable
-    if not console.is_terminal:  # where a status shows nothing
+    if not console.is_terminal:  # which would not show the status
         console.print(WRITING)
     with console.status(WRITING):
         comparison = write_results(runs, output, failures)
     for table in comparison.tables:
         console.print(rich_table(table.rows, table.columns, table.title))
     for run, why in failures.items():
-        console.print(f"[red]{run.label} failed.[/red] {run.folder / 'log.txt'} has all of its output.")
+        console.print(f"[red]{run.label} failed.[/red] All of its output is in {run.folder / 'log.txt'}.")
         console.print(why, markup=False, highlight=False)
     return comparison
 
 
 def _remove_damaged(run: Run, console: Console) -> None:
-    """Remove measurements that cannot be read; they are made again."""
+    """Remove unreadable metrics and renders, so that they are made again."""
     for half in (None, *run.halves):
         if (path := run.metrics(half)).exists() and read_metrics(path) is None:
-            console.print(f"[yellow]{path} is damaged: it is measured again.", highlight=False)
+            console.print(f"[yellow]{path} is damaged: measuring it again.", highlight=False)
             path.unlink()
     for path in run.renders.glob("*.npz"):
         try:
             Snapshot.load(path)
         except SceneError as error:
-            console.print(f"[yellow]{error}: it is rendered again.", highlight=False)
+            console.print(f"[yellow]{error}: rendering it again.", highlight=False)
             path.unlink()
             run.metrics().unlink(missing_ok=True)
 
 
 def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]) -> Comparison:
-    """Write results.md, tables/, the images and report.html of what is measured so far."""
+    """Write results.md, tables/, the images and report.html from all metrics so far."""
     layouts = {run.scene: run.paths.of(run.scene) for run in runs}
     made = list(tables(runs, {scene: measure_shell(layout) for scene, layout in layouts.items()}))
     for table in made:
@@ -117,7 +117,7 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
 
 
 def _shown(runs: Sequence[Run]) -> list[Run]:
-    """The runs that images show: the first of each variant that is measured."""
+    """The runs shown in images: of each variant, the first with renders."""
     first: dict[str, Run] = {}
     for run in runs:
         if run.metrics().exists() and any(run.renders.glob("*.npz")):
@@ -126,7 +126,7 @@ def _shown(runs: Sequence[Run]) -> list[Run]:
 
 
 def _figures(scene: Path, runs: Sequence[Run], output: Path, suffix: str) -> dict[str, Path]:
-    """Draw what can be drawn of one scene's methods; captions and files."""
+    """Draw the figures of one scene's methods, as far as possible; return files by caption."""
     figures: dict[str, Path] = {}
     for kind, name, caption in PANELS:
         panel = output / f"{name}{suffix}.png"
@@ -140,8 +140,8 @@ def _figures(scene: Path, runs: Sequence[Run], output: Path, suffix: str) -> dic
         figures[f"{scene.name}: a held-out view, its normals, and their unsigned angular error; grey: no shell."] = path
         path = output / f"surfaces{suffix}.png"
         surfaces(shown, path)
-        figures[f"{scene.name}: visible points, coloured by the distance from the shell's, from three sides."] = path
+        figures[f"{scene.name}: visible points from three sides, coloured by distance from the shell's."] = path
     path = output / f"curves{suffix}.png"
     if curves(runs, path):
-        figures[f"{scene.name}: figures of all held-out views while training."] = path
+        figures[f"{scene.name}: metrics of all held-out views during training."] = path
     return figures

@@ -1,4 +1,4 @@
-"""A run of the grid: what ns-train is told, where it lies, how far it is."""
+"""A run of the grid: its commands, folder, settings and progress."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ METHODS = ("photo-gs", "mono-gs", "2dgs", "shellgs")
 ALL = (*METHODS, "shellgs-metric")
 """All registered methods."""
 PAPER = (*METHODS, "shellgs-depth", "shellgs-normal", "shellgs-depth-normal", "shellgs-without-b")
-"""All that the paper's tables compare."""
+"""All methods of the paper's tables."""
 SAVES = 10
-"""Checkpoints that a run writes, at least: what a kill can cost."""
+"""Least number of checkpoints that a run writes, which bounds what an interruption costs."""
 
 
 class DamagedRunError(SceneError):
-    """The folder of a run cannot be used, which stops no other run."""
+    """The folder of one run cannot be used; the others continue."""
 
 
 Half = Literal["A", "B"]
@@ -52,45 +52,45 @@ class Variant:
 
     @classmethod
     def parse(cls, text: str) -> Variant:
-        """What a name stands for.
+        """The variant that a name stands for.
 
         Raises:
-            SceneError: there is no such method.
+            SceneError: the method does not exist.
         """
         name, _, words = text.partition("=")
         if not re.fullmatch(r"[\w.+-]*\w[\w.+-]*", name):
-            raise SceneError(f"{name!r} is to name a folder: take letters, digits, dots and dashes")
+            raise SceneError(f"{name!r} cannot name a folder: use letters, digits, dots and dashes")
         try:
             method, *flags = shlex.split(words) or ABLATIONS.get(name, (name,))
         except ValueError as error:
-            raise SceneError(f"{words!r} is no method with its flags: {error}") from error
+            raise SceneError(f"{words!r} is not a method with its flags: {error}") from error
         if method not in all_methods:
             ours = ", ".join([*ALL, *ABLATIONS])
             raise SceneError(
-                f"there is no method {method!r}: take {ours}, another that ns-train lists, or NAME=METHOD FLAGS"
+                f"there is no method {method!r}: use {ours}, another that ns-train lists, or NAME=METHOD FLAGS"
             )
         variant = cls(name, method, tuple(flags))
         if name in {*all_methods, *ABLATIONS} and variant != cls(name, *_definition(name)):
-            raise SceneError(f"{name} is the name of a method: give {words!r} another")
+            raise SceneError(f"{name} is the name of a method: give {words!r} another name")
         return variant
 
     @property
     def config(self) -> TrainerConfig:
-        """What ns-train makes of it, where nothing but the flags is said.
+        """The config that ns-train makes of the method and its flags alone.
 
         Raises:
-            SceneError: it refuses them.
+            SceneError: ns-train refuses the flags.
         """
         return parsed((self.method, *self.flags))
 
     @property
     def ours(self) -> bool:
-        """Whether it is trained by our trainer."""
+        """Whether our trainer trains it."""
         return isinstance(all_methods[self.method], FacadeTrainerConfig)
 
     @property
     def is_ablation(self) -> bool:
-        """Whether its name is that of an ablation."""
+        """Whether it is one of our ablations."""
         return self.name in ABLATIONS
 
     @property
@@ -101,14 +101,14 @@ class Variant:
 
 
 def _definition(name: str) -> tuple[str, tuple[str, ...]]:
-    """Method and flags of a name that is not the user's own."""
+    """Method and flags of a method or ablation."""
     method, *flags = ABLATIONS.get(name, (name,))
     return method, tuple(flags)
 
 
 @dataclass(frozen=True)
 class Run:
-    """One training of one variant, and the measurements of it."""
+    """One training run of one variant, with its metrics."""
 
     scene: Path
     variant: Variant
@@ -117,31 +117,31 @@ class Run:
     output: Path
     """Folder of the comparison."""
     halves: tuple[Half, ...] = ()
-    """Halves of the facade that are measured apart, beside the whole."""
+    """Halves of the facade measured separately, besides the whole."""
     curve_points: int = 0
-    """How often all held-out views are measured during the training."""
+    """Number of evaluations on all held-out views during training."""
     paths: ScenePaths = field(default_factory=ScenePaths)
-    """Where in the scene its files are."""
+    """Paths of the scene's files."""
 
     @property
     def label(self) -> str:
-        """The run in words."""
+        """Name of the run in messages."""
         return f"{self.scene.name}/{self.variant.name}/seed-{self.seed}"
 
     @property
     def folder(self) -> Path:
-        """Where nerfstudio puts it."""
+        """Folder that nerfstudio gives the run."""
         name, method = self.variant.name, self.variant.method
         return self.output / "runs" / self.scene.name / name / method / f"seed-{self.seed}"
 
     @property
     def config(self) -> Path:
-        """The trained config."""
+        """Config of the trained run."""
         return self.folder / "config.yml"
 
     @property
     def renders(self) -> Path:
-        """Folder of what it rendered for the held-out views."""
+        """Folder of its renders of the held-out views."""
         return self.folder / "views"
 
     @property
@@ -151,20 +151,20 @@ class Run:
 
     @property
     def trained(self) -> bool:
-        """Whether its last checkpoint is there."""
+        """Whether its last checkpoint exists."""
         return (self.checkpoints / f"step-{self.iterations - 1:09d}.ckpt").exists()
 
     def metrics(self, half: Half | None = None) -> Path:
-        """The file of its metrics, of the whole facade or of a half."""
+        """File of its metrics on the whole facade or on a half."""
         return self.folder / ("eval.json" if half is None else f"eval-{half}.json")
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to do."""
+        """Whether it is trained and all its metrics are measured."""
         return self.trained and all(self.metrics(half).exists() for half in (None, *self.halves))
 
     def commands(self) -> Iterator[list[str]]:
-        """What is left to do, word by word; ask for the next when the one before is done."""
+        """The remaining commands as lists of words; advance the iterator only once the previous command is done."""
         if not self.trained:
             yield self._train()
         for half in (None, *self.halves):
@@ -181,8 +181,8 @@ class Run:
         words += ["--steps-per-eval-batch", 0, "--steps-per-eval-all-images", every if self.curve_points else 0]
         if isinstance(all_methods[variant.method].pipeline.datamanager, FullImageDatamanagerConfig):
             words += ["--pipeline.datamanager.train-cameras-sampling-seed", self.seed]
-        # Nerfstudio's own trainer counts the iterations of a resumed run anew, and splatfacto's resume loses its
-        # optimizers (https://github.com/nerfstudio-project/nerfstudio/issues/3290): these start again.
+        # Methods of nerfstudio start again: its trainer counts the iterations of a resumed run anew, and a resumed
+        # splatfacto loses its optimizers (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
         if variant.ours and any(self.checkpoints.glob("step-*.ckpt")):
             words += ["--load-dir", self.checkpoints]
         words += variant.flags
@@ -193,7 +193,7 @@ class Run:
 
     @cached_property
     def settings(self) -> dict:
-        """What the run's result depends on.
+        """All settings that the run's result depends on.
 
         Raises:
             SceneError: the flags set what the comparison sets.
@@ -220,32 +220,32 @@ class Run:
         }
 
     def check(self) -> None:
-        """Refuse a run that cannot be made, or whose folder is another's; everything is left as it is.
+        """Refuse a run that cannot be trained, or whose folder holds another run; nothing is changed.
 
         Raises:
-            SceneError: the flags cannot be, or the folder holds a run of other settings that has come to a checkpoint.
-            DamagedRunError: the settings that lie there cannot be read.
+            SceneError: the flags are invalid, or the folder holds a run with other settings and a checkpoint.
+            DamagedRunError: the settings in the folder cannot be read.
         """
         recover_folder(self.folder)
         path, settings = self._recorded, self.settings
         if self._begun:
-            before = _settings_before(path)
-            # An earlier build did not write all of them; what it did not write it did not have, or as the default.
+            before = _recorded_settings(path)
+            # An earlier version did not write all settings: those that it lacks had their defaults or did not exist.
             known = settings | default_settings(self.variant.method) | before
             changed = [key for key in settings if settings[key] != known[key]]
             if changed:
                 what = "; ".join(f"{key}: {_short(known[key])}, now {_short(settings[key])}" for key in changed[:5])
                 raise SceneError(
-                    f"{self.folder} is a run of other settings ({what}): give another --output, or remove that folder"
+                    f"{self.folder} is a run with other settings ({what}): give another --output, or remove that folder"
                 )
             return
         if not self.variant.ours:
-            _refuse_photographs_that_change(self.paths.of(self.scene), self.variant.method)
+            _refuse_changed_photographs(self.paths.of(self.scene), self.variant.method)
         if self.config.exists() and not path.exists():
             raise SceneError(f"{self.folder} is a run that `shellgs compare` did not make: give another --output")
 
     def settle(self) -> None:
-        """Write the settings into the run's folder, where a later comparison finds them.
+        """Write the settings into the run's folder, for later comparisons to check.
 
         Raises:
             SceneError: as :meth:`check`.
@@ -262,18 +262,18 @@ class Run:
 
     @property
     def _begun(self) -> bool:
-        """Whether a run that a comparison made has come to a checkpoint."""
+        """Whether a comparison trained this run up to a checkpoint."""
         return self._recorded.exists() and any(self.checkpoints.glob("step-*.ckpt"))
 
 
-def _settings_before(path: Path) -> dict:
+def _recorded_settings(path: Path) -> dict:
     try:
         before = json.loads(path.read_text())
         if isinstance(before, dict):
             return before
     except ValueError:
         pass
-    raise DamagedRunError(f"{path} is damaged, so that nobody knows what the run is of: remove {path.parent}")
+    raise DamagedRunError(f"{path} is damaged, so the settings of the run are unknown: remove {path.parent}")
 
 
 def grid(
@@ -285,24 +285,24 @@ def grid(
     curve_points: int = 0,
     paths: ScenePaths | None = None,
 ) -> list[Run]:
-    """All runs of a comparison: seed by seed, so that a first table is there early.
+    """All runs of a comparison, seed by seed, so that all methods have results early.
 
-    Where a variant holds out half of the facade, all others are measured in that half too.
+    If a variant holds out half of the facade, all others are measured on that half too.
 
     Raises:
-        SceneError: two scenes of one name, or a method that does not exist.
-        FileNotFoundError: a scene that is not there.
+        SceneError: two scenes share a name, or a method does not exist.
+        FileNotFoundError: a scene does not exist.
     """
     if not names or not seeds:
-        raise SceneError(f"there is nothing to compare: name {'methods' if seeds else 'seeds'}")
+        raise SceneError(f"there is nothing to compare: give {'methods' if seeds else 'seeds'}")
     if iterations < 1 or curve_points < 0 or min(seeds) < 0:
-        raise SceneError("a run has at least one iteration, and no seed or number of curve points below 0")
+        raise SceneError("--iterations must be at least 1, and --seeds and --curve-points at least 0")
     for scene in scenes:
         if not scene.is_dir():
             raise FileNotFoundError(f"{scene} is not a folder; `shellgs compare` takes scene folders.")
     scenes = [scene.resolve() for scene in scenes]
     if len({scene.name for scene in scenes}) < len(scenes):
-        raise SceneError("two scenes have the same folder name, which names their results: rename one")
+        raise SceneError("two scenes have the same folder name, by which results are stored: rename one")
     words = [word for name in names for word in {"paper": PAPER, "all": ALL}.get(name, (name,))]
     variants = _variants(words)
     halves: tuple[Half, ...] = tuple(half for half in HALVES if any(variant.held_out == half for variant in variants))
@@ -324,10 +324,10 @@ def grid(
 
 
 def _variants(words: Iterable[str]) -> list[Variant]:
-    """What words stand for, each once.
+    """The variants that words stand for, without duplicates.
 
     Raises:
-        SceneError: one name stands for two methods, or for one with different flags.
+        SceneError: one name stands for two methods, or for one method with different flags.
     """
     found: dict[str, Variant] = {}
     for variant in map(Variant.parse, words):
@@ -337,19 +337,19 @@ def _variants(words: Iterable[str]) -> list[Variant]:
     return list(found.values())
 
 
-def _refuse_photographs_that_change(layout: SceneLayout, method: str) -> None:
-    """Only our datamanager undistorts and resizes photographs for the cameras of facade-data."""
+def _refuse_changed_photographs(layout: SceneLayout, method: str) -> None:
+    """Refuse photographs to undistort or resize, which only our datamanager does."""
     scene = layout.data
     resized = any(CueMaps.open(scene, kind).manifest.max_image_size for kind in find_cues(scene))
     if resized or any(view.lens for view in read_views(layout)):
         raise SceneError(
-            f"{method} takes photographs as they are, and the cameras of {scene} are of undistorted or resized ones: "
-            "bring the scene to pinhole cameras at the size of its maps (colmap image_undistorter), or leave it out"
+            f"{method} does not undistort or resize photographs, as the cameras of {scene} require: convert the scene "
+            "to pinhole cameras at the size of its maps (colmap image_undistorter), or leave the method out"
         )
 
 
 def _short(value: object) -> str:
-    """A setting as a message shows it."""
+    """A setting, shortened for a message."""
     return str(value)[:12]
 
 

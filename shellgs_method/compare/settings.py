@@ -1,4 +1,4 @@
-"""What the result of a run depends on: the config that its words make, and what the scene holds."""
+"""Settings that the result of a run depends on: those of its config, and hashes of the scene's files."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.files import content_hash, fingerprint
 
-_PLACES = re.compile(
+_IRRELEVANT = re.compile(
     r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"
     r"|(load|steps_per|save_only)_\w+|(viewer|logging|machine)\..*|(pipeline\.datamanager\.(dataparser\.)?)?data"
     r"|pipeline\.datamanager\.train_cameras_sampling_seed)"
 )
-"""Settings that say where a run lies, how it is watched and how often it is saved, or that have a name of their own."""
+"""Settings of a run's place, viewer, logs and checkpoints, and those that :class:`~.runs.Run` records by itself."""
 
 
 @cache
 def parsed(words: tuple[str, ...]) -> TrainerConfig:
-    """The config that ns-train makes of its words; shared, not to be changed.
+    """The config that ns-train makes of its arguments; cached, so do not modify it.
 
     Raises:
-        SceneError: ns-train refuses them.
+        SceneError: ns-train refuses the arguments.
     """
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with redirect_stderr(said), redirect_stdout(said):
+        with redirect_stderr(output), redirect_stdout(output):
             config = tyro.cli(AnnotatedBaseConfigUnion, args=list(words))
     except SystemExit as error:
-        lines = (line.strip("│╭╮╰╯─ ") for line in said.getvalue().splitlines())
+        lines = (line.strip("│╭╮╰╯─ ") for line in output.getvalue().splitlines())
         why = " ".join(line for line in lines if line and "helptext" not in line and "error" not in line.lower()[-8:])
         raise SceneError(f"ns-train {' '.join(words)} is refused: {why or 'it asks for help'}") from error
     assert isinstance(config, TrainerConfig)
@@ -50,12 +50,12 @@ def parsed(words: tuple[str, ...]) -> TrainerConfig:
 
 
 def config_settings(config: TrainerConfig) -> dict[str, Any]:
-    """What of a config a result depends on, by the path of the setting, as JSON has it."""
-    return {path: value for path, value in _flat(config) if not _PLACES.fullmatch(path)}
+    """Settings of a config that a result depends on, by their paths, as JSON values."""
+    return {path: value for path, value in _flat(config) if not _IRRELEVANT.fullmatch(path)}
 
 
 def default_settings(method: str) -> dict[str, Any]:
-    """:func:`config_settings` of a method as it is registered."""
+    """:func:`config_settings` of a registered method."""
     return config_settings(all_methods[method])
 
 
@@ -77,7 +77,7 @@ def _flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:
-    """Hashes of what a run takes from its scene: photographs, masks, cameras, points, and what its maps are made of."""
+    """Hashes of what a run reads from its scene: photographs, masks, cameras, points and the sources of its maps."""
     dataparser = getattr(config.pipeline.datamanager, "dataparser", None)
     if not isinstance(dataparser, FacadeDataParserConfig):
         dataparser = FacadeDataParserConfig()
@@ -89,7 +89,7 @@ def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:
         "masks": fingerprint(*([view.name, _hash(view.mask)] for view in views if view.mask)),
     }
     model = config.pipeline.model
-    # What every method is measured against, checked maps included, and what this one is trained on.
+    # Maps that every method is measured against, including checked maps, and those that this one is trained on.
     kinds = {"shell", "checked", "truth", getattr(model, "cues", "none"), getattr(model, "seeds", "none")}
     for kind in find_cues(scene):
         if kind in kinds:

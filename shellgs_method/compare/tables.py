@@ -35,38 +35,38 @@ TRUTH_COLUMNS = tuple(
 
 
 SHELL = "the shell itself"
-"""Row of a scene's shell, whose metrics are those of the pixels where it is."""
+"""Name of the row of a scene's shell, measured on the pixels that it covers."""
 
 
 @dataclass(frozen=True)
 class MetricsTable:
-    """A table with what it says."""
+    """A table of metrics."""
 
     name: str
-    """Of its files."""
+    """Name of its files."""
     title: str
     columns: Sequence[Column]
     rows: Rows
     paper: Rows = field(default_factory=dict)
-    """The paper's metrics where the scene has the same role; they are of the paper's own scene."""
+    """The paper's metrics of its own scene with the same role."""
 
     @property
     def heading(self) -> str:
-        """Title, and what the rows of the paper are."""
+        """Title, with a note if there are rows of the paper."""
         return self.title + (" (rows of the paper: its own scene)" if self.paper else "")
 
     @property
     def markdown(self) -> str:
-        """With its title."""
+        """The table in Markdown, with its title."""
         return f"**{self.heading}**\n\n{markdown_table(self.rows, self.columns, self.paper)}"
 
     @property
     def html(self) -> str:
-        """With its title."""
+        """The table in HTML, with its title."""
         return f"<h3>{html.escape(self.heading)}</h3>\n{html_table(self.rows, self.columns, self.paper)}"
 
     def save(self, folder: Path) -> None:
-        """Write it as md, tex, csv and json."""
+        """Write the table as md, tex, csv and json."""
         folder.mkdir(parents=True, exist_ok=True)
         everything = {"title": self.title, "metrics": self.rows, "paper": self.paper}
         texts = {
@@ -81,9 +81,9 @@ class MetricsTable:
 
 
 def read_metrics(path: Path) -> dict[str, float] | None:
-    """Metrics of a run from the json that ns-eval, or we, wrote; without the deviations over the views.
+    """Read a run's metrics as written by ns-eval or :mod:`.measure`, without the deviations over views.
 
-    None where the file is damaged.
+    None if the file is damaged.
     """
     try:
         results = json.loads(path.read_text())["results"]
@@ -99,10 +99,10 @@ def read_metrics(path: Path) -> dict[str, float] | None:
 def tables(
     runs: Sequence[Run], shells: Mapping[Path, Mapping[str, float]] = MappingProxyType({})
 ) -> Iterator[MetricsTable]:
-    """All tables that the metrics there are make; the first scene has the paper's primary role, others its second.
+    """All tables that have metrics; the first scene has the role of the paper's primary scene, others of its second.
 
     Args:
-        runs: of all scenes.
+        runs: runs of all scenes.
         shells: metrics of each scene's shell itself, from :func:`.measure.measure_shell`.
     """
     for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):
@@ -117,7 +117,7 @@ def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) 
     found = [
         MetricsTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
         MetricsTable(
-            "regions", f"{scene}: held-out views, where training views saw them", REGION_COLUMNS, _rows(whole)
+            "regions", f"{scene}: held-out views, where training views see them", REGION_COLUMNS, _rows(whole)
         ),
         MetricsTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
         MetricsTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, {**_rows(whole), SHELL: shell}),
@@ -129,7 +129,7 @@ def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) 
         apart = [run for run in runs if run.variant.held_out == half]
         if apart:
             rows = _rows(methods, half) | _rows(apart)
-            title = f"{scene}: in half {half} of the facade alone; -without-{half.lower()}: which no cue supervised"
+            title = f"{scene}: in half {half} of the facade alone; -without-{half.lower()}: without cues there"
             found.append(MetricsTable(f"holdout-{half.lower()}", title, GEOMETRY_COLUMNS, rows))
     for table in found:
         role = table.name if not prefix else {"main": "second"}.get(table.name, "")
@@ -139,7 +139,7 @@ def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) 
 
 
 def _rows(runs: Sequence[Run], half: Half | None = None) -> dict[str, dict[str, list[float]]]:
-    """Metrics of each variant, one for each seed that has them."""
+    """Metrics of each variant, as lists over its measured seeds."""
     rows: dict[str, dict[str, list[float]]] = {}
     for run in runs:
         if run.metrics(half).exists():

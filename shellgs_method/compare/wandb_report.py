@@ -1,4 +1,4 @@
-"""A comparison as one run of Weights & Biases."""
+"""Log a comparison as one run of Weights & Biases."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from shellgs_method.trainer import wandb_refusals
 
 
 def log_in() -> None:
-    """Make sure, before hours of training, that the comparison can be logged.
+    """Log in before hours of training, so that the comparison can be logged.
 
     Raises:
-        SceneError: wandb has no key, and nobody can be asked for one.
+        SceneError: wandb has no key and cannot ask for one.
     """
     with wandb_refusals():
         import wandb  # slow to import
@@ -23,12 +23,12 @@ def log_in() -> None:
 
 
 def log_comparison(project: str, comparison: Comparison, runs: Sequence[Run]) -> None:
-    """Log each table as a ``wandb.Table`` (a row a method; mean and deviation of each figure), and the images.
+    """Log each table as a ``wandb.Table`` (one row per method; mean and deviation of each metric), and the images.
 
     Args:
-        project: of wandb.
-        comparison: what is logged.
-        runs: what it compares. Their settings become the wandb run's config, their folder names it and gets its files.
+        project: wandb project.
+        comparison: results to log.
+        runs: the compared runs. Their settings become the wandb run's config; their folder names it and gets its files.
 
     Raises:
         SceneError: wandb cannot be used.

@@ -1,7 +1,7 @@
-"""Monocular depth and normals of the views, from a network or made elsewhere, aligned to the SfM points.
+"""Monocular depth and normals of the views, predicted by a network or imported, aligned to the SfM points.
 
-The three sources are settings that ``shellgs mono`` takes; :func:`shellgs_method.cues.maps.make_maps` turns what they
-load into the scene's maps.
+The three sources are settings of ``shellgs mono``; :func:`shellgs_method.cues.maps.make_maps` turns their predictions
+into the scene's maps.
 """
 
 from shellgs_method.cues.networks import DepthAnything, MoGe2

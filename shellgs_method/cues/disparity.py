@@ -1,4 +1,4 @@
-"""Affine-invariant disparity, and the scale and shift that make it depth."""
+"""Affine-invariant disparity, and the scale and shift that turn it into depth."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from scipy.ndimage import map_coordinates
 from scipy.stats import siegelslopes
 
 Values = Literal["disparity", "inverse-depth", "depth"]
-"""What the numbers of a map mean, each up to scale; disparity and inverse depth also up to a shift."""
+"""Meaning of a map's values, each up to scale; disparity and inverse depth also up to a shift."""
 
-# A view is trusted with at least this many points in it, most of which the aligned map meets, at depths that differ.
+# A view's map is trusted if it has enough points, at different depths, and agrees with most of them once aligned.
 MIN_POINTS = 20
 INLIER = 0.1  # relative error of the depth at a point
 MIN_INLIERS = 0.6  # share of the points
 MAX_RESIDUAL = 0.05  # median relative error of the depth
-MIN_SPREAD = 0.02  # of the points' disparity, relative to its median: below, scale and shift cannot be told apart
-# Beyond this many times the depth of the farthest inlier the fit is extrapolation: sky, and what is near it.
+MIN_SPREAD = 0.02  # of the points' disparity, relative to its median: below, scale and shift are ambiguous
+# Beyond this multiple of the farthest inlier's depth the fit is extrapolation: the sky and its surroundings.
 REACH = 2.0
 
 
 @dataclass(frozen=True)
 class DisparityFit:
-    """How ``scale * disparity + shift`` meets the inverse depth of the SfM points of one view.
+    """Fit of ``scale * disparity + shift`` to the inverse depth of the SfM points of one view.
 
     Attributes:
-        points: number of points at which the map has a value.
-        scale: in inverse scene units; 0 where nothing could be fitted.
+        points: number of points where the map has a value.
+        scale: in inverse scene units; 0 if nothing could be fitted.
         shift: in inverse scene units.
-        inliers: share of the points whose depth is met within :data:`INLIER`.
-        residual: median of |Δz| / z over the points.
+        inliers: share of the points with a depth error below :data:`INLIER`.
+        residual: median depth error |Δz| / z over the points.
         spread: range of the points' disparities (5th to 95th percentile), relative to their median.
-        farthest: depth of the farthest inlier but one in a hundred, in scene units.
+        farthest: depth within which 99 % of the inliers lie, in scene units.
     """
 
     points: int
@@ -47,22 +47,22 @@ class DisparityFit:
 
     @property
     def problem(self) -> str | None:
-        """Why the view's map cannot be trusted, in words; None if it can."""
+        """Why the view's map cannot be trusted; None if it can."""
         if self.points < MIN_POINTS:
-            return f"{self.points} SfM points, {MIN_POINTS} are needed"
+            return f"{self.points} SfM points, at least {MIN_POINTS} are needed"
         if self.spread < MIN_SPREAD:
-            return f"the points' disparities spread over {self.spread:.1%} only, {MIN_SPREAD:.0%} are needed"
+            return f"the points' disparities spread over only {self.spread:.1%}, at least {MIN_SPREAD:.0%} is needed"
         if not self.scale > 0:
-            return "its disparity does not grow towards the camera"
+            return "its disparity does not increase towards the camera"
         if self.inliers < MIN_INLIERS:
-            return f"the depth of {self.inliers:.0%} of the points is met within {INLIER:.0%}, not {MIN_INLIERS:.0%}"
+            return f"{self.inliers:.0%} of the points agree within {INLIER:.0%}, at least {MIN_INLIERS:.0%} must"
         if self.residual > MAX_RESIDUAL:
-            return f"a median depth error of {self.residual:.1%}, {MAX_RESIDUAL:.0%} are allowed"
+            return f"its median depth error is {self.residual:.1%}, at most {MAX_RESIDUAL:.0%} is allowed"
         return None
 
 
 def as_disparity(values: Float[np.ndarray, "H W"], meaning: Values) -> Float32[np.ndarray, "H W"]:
-    """Disparity, larger where nearer, NaN where ``values`` are zero (none, or infinitely far) or not finite.
+    """Convert to disparity, larger where nearer; NaN where ``values`` are zero (none, or infinitely far) or not finite.
 
     Negative values are valid disparities, but neither depths nor inverse depths.
     """
@@ -74,15 +74,15 @@ def as_disparity(values: Float[np.ndarray, "H W"], meaning: Values) -> Float32[n
 def fit_disparity(
     disparity: Float32[np.ndarray, "H W"], pixels: Float64[np.ndarray, "N 2"], depth: Float64[np.ndarray, " N"]
 ) -> DisparityFit:
-    """Scale and shift that carry a view's disparity to inverse scene units.
+    """Fit the scale and shift from a view's disparity to inverse scene units.
 
-    In disparity, because there the error of a triangulated point does not depend on its distance, and networks are
-    affine-invariant there.
+    The fit is in disparity because there the error of a triangulated point does not depend on its distance, and
+    networks are affine-invariant.
 
     Args:
-        disparity: of the view; NaN where unknown.
-        pixels: positions of the SfM points; the first pixel's centre is at 0.5.
-        depth: their z-depths in scene units.
+        disparity: disparity of the view; NaN where unknown.
+        pixels: pixel positions of the SfM points; the first pixel's centre is at 0.5.
+        depth: z-depths of the points in scene units.
     """
     found = map_coordinates(disparity.astype(np.float64), pixels.T[::-1] - 0.5, order=1, mode="nearest")
     known = np.isfinite(found)
@@ -91,13 +91,13 @@ def fit_disparity(
         return DisparityFit(len(x))
     low, median, high = np.percentile(y, [5, 50, 95])
     spread = float((high - low) / median)
-    if spread < MIN_SPREAD or np.ptp(x) < 1e-6 * np.abs(x).max():  # float32 tells no more
+    if spread < MIN_SPREAD or np.ptp(x) < 1e-6 * np.abs(x).max():  # below float32's precision
         return DisparityFit(len(x), spread=spread)
     scale, shift = _robust_line(x, y)
     error = np.abs(1 / np.maximum(scale * x + shift, 1e-12) - 1 / y) * y
-    met = error < INLIER
-    farthest = float(1 / np.percentile(y[met], 1)) if met.any() else 0.0
-    return DisparityFit(len(x), scale, shift, float(met.mean()), float(np.median(error)), spread, farthest)
+    inlier = error < INLIER
+    farthest = float(1 / np.percentile(y[inlier], 1)) if inlier.any() else 0.0
+    return DisparityFit(len(x), scale, shift, float(inlier.mean()), float(np.median(error)), spread, farthest)
 
 
 def aligned_depth(disparity: Float32[np.ndarray, "H W"], fit: DisparityFit) -> Float32[np.ndarray, "H W"]:
@@ -108,10 +108,10 @@ def aligned_depth(disparity: Float32[np.ndarray, "H W"], fit: DisparityFit) -> F
 
 
 def _robust_line(x: Float64[np.ndarray, " N"], y: Float64[np.ndarray, " N"]) -> tuple[float, float]:
-    """Slope and intercept of a line through points of which up to half may be wrong."""
-    # Repeated medians (Siegel 1982) withstand 50 % of outliers, where Theil-Sen withstands 29 %, and need neither
-    # chance nor a threshold; quadratic, hence the subset. Least squares over the points within 2.5 sigma of that line
-    # (sigma from the median absolute deviation) then averages the noise of all of them.
+    """Slope and intercept of a line through points, of which up to half may be outliers."""
+    # Repeated medians (Siegel 1982) tolerate 50 % of outliers (Theil-Sen: 29 %) and need neither random samples nor a
+    # threshold; they are quadratic, hence the subset. Least squares over the points within 2.5 sigma of that line
+    # (sigma from the median absolute deviation) then averages the noise of all inliers.
     step = -(-len(x) // 1000)
     slope, intercept = np.asarray(siegelslopes(y[::step], x[::step]), dtype=np.float64)
     for _ in range(20):

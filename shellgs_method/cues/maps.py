@@ -1,4 +1,4 @@
-"""Monocular cue maps for all views of a scene."""
+"""Make the monocular cue maps of a scene."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_dispa
 from shellgs_method.cues.normals import disagreement, facing, gradient_normals
 from shellgs_method.cues.source import Predictor
 
-NO_PREDICTION = "there is no map of it"
+NO_PREDICTION = "there is no prediction for it"
 
 
 @dataclass(frozen=True)
 class MonoSummary:
-    """What :func:`make_maps` did.
+    """Summary of :func:`make_maps`.
 
     Attributes:
-        made: views whose map was made.
-        skipped: views that had been decided already, with or without a map.
-        problems: why a view has no map, by its name.
-        residual: median over the views with a map of their fit's residual.
+        made: number of maps made.
+        skipped: number of views already processed, with or without a map.
+        problems: reason why a view has no map, by the view's name.
+        residual: median residual of the fits of all views with a map.
         seconds: wall time.
     """
 
@@ -55,20 +55,20 @@ def make_maps(
 ) -> MonoSummary:
     """Predict depth and normals of the views, align them to the SfM points, and store them in ``scene/cues/mono``.
 
-    Each view's disparity is aligned on its own (:func:`fit_disparity`). A view whose fit cannot be trusted gets no
-    map and is trained by its photograph alone. ``cues/mono/fits.json`` holds the numbers behind every verdict; what
-    is there for the same predictor and points is not made again.
+    Each view's disparity is aligned separately (:func:`fit_disparity`). A view whose fit cannot be trusted gets no
+    map and is trained on its photograph alone. ``cues/mono/fits.json`` holds the numbers of every fit; existing maps
+    of the same predictor and points are kept.
 
     Args:
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
         points: the scene's SfM points.
-        predictor: makes the predictions.
-        command: makes these maps again, with ``{scene}`` for the scene's folder.
-        max_image_size: make maps for photographs resized to this longer side.
+        predictor: source of the predictions.
+        command: command that makes these maps again, with ``{scene}`` for the scene's folder.
+        max_image_size: longer side in pixels that the photographs are resized to; None for full size.
 
     Raises:
-        SceneError: imported normals have other axes than declared, or no view has a map that can be trusted.
+        SceneError: imported normals do not have the declared axes, or no view has a map that can be trusted.
     """
     start = time.monotonic()
     views = [replace(view, camera=view.camera.shrunk(max_image_size)) for view in views]
@@ -100,10 +100,10 @@ def make_maps(
 
 
 def align_view(view: View, points: SparsePoints, predictor: Predictor) -> tuple[DisparityFit | None, CueMap | None]:
-    """The fit of a view's prediction, if there is one, and its cue map, if the fit can be trusted.
+    """Fit a view's prediction to its SfM points; return the fit and, if it can be trusted, the cue map.
 
     Raises:
-        SceneError: the normals have other axes than they were declared to have.
+        SceneError: the normals do not have the declared axes.
     """
     prediction = predictor.predict(view)
     if prediction is None:
@@ -117,29 +117,29 @@ def align_view(view: View, points: SparsePoints, predictor: Predictor) -> tuple[
     mask = (depth > 0) & normal.any(axis=-1)
     cue = CueMap(np.where(mask, depth, np.float32(0)), np.where(mask[..., None], normal, np.float16(0)), mask)
     if predictor.convention and (problem := disagreement(cue, view.camera, predictor.convention)):
-        raise SceneError(f"the normals of view {view.name!r} in {predictor.name} have other axes: {problem}")
+        raise SceneError(f"the normals of view {view.name!r} in {predictor.name} have the wrong axes: {problem}")
     return fit, cue
 
 
 def _check_one_view(views: Sequence[View], points: SparsePoints, predictor: Predictor) -> None:
-    """Find one view that gets a map, so that a mistake is told before maps that are there already count as stale."""
+    """Find one view that gets a map, so that a mistake is reported before existing maps are marked stale."""
     problem = "there are no views"
     for view in views:
         fit, cue = align_view(view, points, predictor)
         if cue is not None:
             return
-        problem = f"{view.name}, for one: {fit.problem if fit else NO_PREDICTION}"
+        problem = f"for example {view.name}: {fit.problem if fit else NO_PREDICTION}"
     raise SceneError(f"no view has a monocular map that can be trusted; {problem}")
 
 
 @dataclass(frozen=True)
 class Fits:
-    """The fits of one set of maps, kept on disk as they are made.
+    """The fits of one set of maps, saved after each view.
 
     Attributes:
-        path: the file.
-        sources: what the fits were made from, as in the maps' manifest; fits of other sources do not count.
-        views: the numbers and the problem of each view's fit, by name; None for a view without prediction.
+        path: the JSON file.
+        sources: sources of the fits, as in the maps' manifest; fits of other sources are discarded.
+        views: numbers and problem of each view's fit, by name; None for a view without prediction.
     """
 
     path: Path
@@ -148,25 +148,25 @@ class Fits:
 
     @classmethod
     def open(cls, maps: CueMaps) -> Fits:
-        """The fits there are for a set of maps."""
+        """Read the existing fits of a set of maps."""
         path = maps.folder / "fits.json"
         sources = {"max_image_size": maps.manifest.max_image_size, **maps.manifest.sources}
         try:
             kept = json.loads(path.read_bytes())
             views = dict(kept["views"]) if kept["sources"] == sources else {}
             views = {name: fit for name, fit in views.items() if fit is None or is_number(fit["residual"])}
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):  # none, or damaged: all are made again
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):  # missing or damaged: all are made again
             views = {}
         return cls(path, sources, views)
 
     def add(self, name: str, fit: DisparityFit | None) -> None:
-        """Keep the fit of a view."""
+        """Add the fit of a view and save the file."""
         self.views[name] = None if fit is None else {**asdict(fit), "problem": fit.problem}
         with atomic_write(self.path) as file:
             file.write((json.dumps({"sources": self.sources, "views": self.views}, indent=1) + "\n").encode())
 
     def problem(self, name: str) -> str | None:
-        """Why a view has no map, or None if it has one or was not tried yet."""
+        """Why a view has no map; None if it has one or was not processed yet."""
         fit = self.views.get(name, {})
         return NO_PREDICTION if fit is None else fit.get("problem")
 

@@ -1,4 +1,4 @@
-"""Monocular networks, loaded by their own packages."""
+"""Monocular networks, loaded with their own packages."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ ELSEWHERE = "or import maps made elsewhere with `shellgs mono SCENE from FOLDER`
 
 @dataclass(frozen=True)
 class MoGe2:
-    """MoGe-2 (MIT): depth and normals of one network, in one pass."""
+    """MoGe-2 (MIT): depth and normals from one network."""
 
     weights: str = "Ruicheng/moge-2-vits-normal"
     """Repository on the Hugging Face hub, or a folder that holds its model.pt."""
 
     @property
     def command(self) -> str:
-        """The words of the command line that choose it."""
+        """Command-line arguments that select this source."""
         return f"moge --weights {shlex.quote(self.weights)}"
 
     def load(self) -> Predictor:
-        """The network on the GPU, if there is one.
+        """Load the network, on the GPU if there is one.
 
         Raises:
             SceneError: the package or the weights are missing.
@@ -55,12 +55,12 @@ class MoGe2:
         weights = fetch_weights(self.weights, ["model.pt"])
         try:
             model = MoGeModel.from_pretrained(weights.folder / "model.pt").to(_device()).eval()
-        except Exception as error:  # whatever unpickling and building from a foreign file may raise
+        except Exception as error:  # unpickling and building a model from any file may raise anything
             raise _unusable(self.weights, "MoGe-2", error) from error
 
         def predict(view: View) -> Prediction:
             image = torch.from_numpy(load_photograph(view)[..., :3].astype(np.float32) / 255).permute(2, 0, 1)
-            # The focal length is known: only the shift of the point map is left to be found.
+            # The focal length is known, so only the shift of the point map is estimated.
             fov_x = math.degrees(2 * math.atan(view.camera.width / (2 * float(view.camera.K[0, 0]))))
             maps = model.infer(image.to(_device()), fov_x=fov_x, use_fp16=_device().type == "cuda")
             depth = maps["depth"].cpu().numpy()  # infinite outside the network's own mask
@@ -72,21 +72,21 @@ class MoGe2:
 
 @dataclass(frozen=True)
 class DepthAnything:
-    """Depth Anything V2: disparity; the normals are those of the aligned depth.
+    """Depth Anything V2: disparity; normals are computed from the aligned depth.
 
-    The weights of Small are Apache-2.0, those of Base and Large are for non-commercial use (CC-BY-NC-4.0).
+    The weights of Small are Apache-2.0; those of Base and Large are for non-commercial use only (CC-BY-NC-4.0).
     """
 
     weights: str = "depth-anything/Depth-Anything-V2-Small-hf"
-    """Repository on the Hugging Face hub, or a folder in the form of transformers."""
+    """Repository on the Hugging Face hub, or a folder in the format of transformers."""
 
     @property
     def command(self) -> str:
-        """The words of the command line that choose it."""
+        """Command-line arguments that select this source."""
         return f"depth-anything --weights {shlex.quote(self.weights)}"
 
     def load(self) -> Predictor:
-        """The network on the GPU, if there is one.
+        """Load the network, on the GPU if there is one.
 
         Raises:
             SceneError: the package or the weights are missing.
@@ -107,7 +107,7 @@ class DepthAnything:
         try:
             processor = AutoImageProcessor.from_pretrained(weights.folder)
             model = DepthAnythingForDepthEstimation.from_pretrained(weights.folder).eval()
-        except Exception as error:  # whatever reading a foreign configuration may raise
+        except Exception as error:  # reading any configuration may raise anything
             raise _unusable(self.weights, "Depth Anything", error) from error
         torch.nn.Module.to(model, _device())
         meaning = "depth" if model.config.depth_estimation_type == "metric" else "disparity"
@@ -124,7 +124,7 @@ class DepthAnything:
 
 @dataclass(frozen=True)
 class Weights:
-    """A network's files on this machine."""
+    """Local files of a network's weights."""
 
     folder: Path
     revision: str
@@ -132,10 +132,10 @@ class Weights:
 
 
 def fetch_weights(name: str, patterns: list[str]) -> Weights:
-    """A local folder of weights, or the files of a hub repository, downloaded once and kept in the hub's cache.
+    """Use a local folder of weights, or download a hub repository once into the hub's cache.
 
     Raises:
-        SceneError: there is no such folder, and the repository cannot be had.
+        SceneError: the folder does not exist and the repository cannot be downloaded.
     """
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HFValidationError
@@ -146,21 +146,21 @@ def fetch_weights(name: str, patterns: list[str]) -> Weights:
     if folder.is_dir():
         files = sorted(path for pattern in patterns for path in folder.glob(pattern))
         if not files:
-            raise SceneError(f"{folder} holds no weights: none of {', '.join(patterns)} is in it")
+            raise SceneError(f"{folder} holds no weights: it has no {', '.join(patterns)}")
         return Weights(folder, hash_of(files), _licence(folder))
     try:
         # In the hub's cache, a snapshot's folder is named by its commit.
         folder = Path(snapshot_download(name, allow_patterns=[*patterns, "README.md"]))
     except (OSError, HFValidationError) as error:
         raise SceneError(
-            f"the weights {name} cannot be had ({_first_sentence(error)}): check the name and the network, name a "
-            f"local folder with --weights, {ELSEWHERE}"
+            f"the weights {name} cannot be downloaded ({_first_sentence(error)}): check the name and the network, give "
+            f"a local folder with --weights, {ELSEWHERE}"
         ) from error
     return Weights(folder, folder.name, _licence(folder))
 
 
 def _licence(folder: Path) -> str:
-    """The licence that a model card's header states."""
+    """The licence stated in the header of the model card."""
     from huggingface_hub import ModelCard
 
     unknown = "not stated"
@@ -186,6 +186,6 @@ def _unusable(weights: str, network: str, error: Exception) -> SceneError:
 
 
 def _first_sentence(error: Exception) -> str:
-    """What an error of a library says, less its advice."""
+    """First sentence of a library's error message, without its advice."""
     lines = str(error).strip().splitlines()
     return lines[0].split(". ")[0].rstrip(".") if lines else type(error).__name__

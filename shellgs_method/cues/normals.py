@@ -1,4 +1,4 @@
-"""Axis conventions of normal maps, and how a wrong one is found out."""
+"""Axis conventions of normal maps, and a check for wrong ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CLEARLY = 10.0  # degrees by which other axes must be better to prove the declar
 
 
 def facing(normal: Float[np.ndarray, "H W 3"], camera: Camera) -> Float[np.ndarray, "H W 3"]:
-    """Unit normals, each turned towards the camera (n · ray < 0); zero where they are shorter than 1e-3 or unknown."""
+    """Normalize normals and turn them towards the camera (n · ray < 0); zero where shorter than 1e-3 or unknown."""
     normal = np.nan_to_num(normal.astype(np.float64), posinf=0.0, neginf=0.0)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     away = np.einsum("hwc,hwc->hw", normal, camera.rays().cpu().numpy()) > 0
@@ -38,20 +38,20 @@ def facing(normal: Float[np.ndarray, "H W 3"], camera: Camera) -> Float[np.ndarr
 
 
 def to_opencv(normal: Float[np.ndarray, "H W 3"], convention: Convention) -> Float[np.ndarray, "H W 3"]:
-    """Normals of a convention in the OpenCV camera frame."""
+    """Convert normals of a convention to the OpenCV camera frame."""
     return normal * np.array(_SIGNS[convention], dtype=normal.dtype)
 
 
 def gradient_normals(depth: Float[np.ndarray, "H W"], camera: Camera) -> Float[np.ndarray, "H W 3"]:
-    """Normals of the depth's own gradient; zero on the border and beside pixels without depth."""
+    """Normals from the depth's gradient; zero on the border and beside pixels without depth."""
     return normals_from_depth(torch.from_numpy(depth.astype(np.float64))[..., None], camera).numpy()
 
 
 def disagreement(cue: CueMap, camera: Camera, convention: Convention) -> str | None:
-    """What shows that normals read in ``convention`` have other axes, in words; None if they fit the view's depth.
+    """Why the normals do not have the axes of ``convention``, in words; None if they fit the view's depth.
 
-    The sign of a normal is known (it faces the camera), so that axes differ only by the flips that turning it around
-    does not undo: the three that are tried.
+    The sign of a normal is known (it faces the camera), so conventions differ only by flips up to a common sign: the
+    three that are tried.
     """
     reference = gradient_normals(cue.depth, camera)
     both = cue.mask & (np.abs(reference).sum(axis=-1) > 0)

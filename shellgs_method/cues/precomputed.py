@@ -1,4 +1,4 @@
-"""Maps that were made elsewhere, one file a view."""
+"""Import of existing maps, one file per view."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ ASPECT_TOLERANCE = 0.02  # networks round sizes to multiples of 14 or 32
 
 @dataclass(frozen=True)
 class Precomputed:
-    """Maps of the photographs in the scene's images folder, one npy, npz or 16-bit png for each.
+    """Existing maps: one npy, npz or 16-bit png for each photograph in the scene's images folder.
 
-    A map belongs to the photograph of its name: images/left/0001.jpg takes left/0001.npy, 0001.npy or 0001.jpg.npy.
+    Maps are matched by name: images/left/0001.jpg uses left/0001.npy, 0001.npy or 0001.jpg.npy.
     """
 
-    # tyro reads these types when it builds the command: they are spelled out, and Optional is for Python 3.10.
+    # tyro reads these types: they are written out, with Optional for Python 3.10.
     folder: Path
     """Folder of the maps; zero and NaN stand for no value."""
     values: Literal["disparity", "inverse-depth", "depth"] = "disparity"
-    """What the maps' numbers are, in any unit: disparity (up to a shift), inverse depth, or z-depth."""
+    """Meaning of the maps' values, in any unit: disparity (up to a shift), inverse depth, or z-depth."""
     normals: Optional[Path] = None
-    """Folder of normal maps, named alike; the same folder where an npz holds both."""
+    """Folder of normal maps with the same names; the same folder if an npz holds both."""
     convention: Literal["opencv", "opengl", "dsine", "stablenormal", "metric3d", "omnidata"] = "opencv"
-    """Axes of the normals; which of the two sides they point to does not matter."""
+    """Axes of the normals; their sign does not matter."""
 
     @property
     def command(self) -> str:
-        """The words of the command line that choose it."""
+        """Command-line arguments that select this source."""
         words = ["from", str(self.folder.absolute()), "--values", self.values]
         if self.normals is not None:
             words += ["--normals", str(self.normals.absolute()), "--convention", self.convention]
         return shlex.join(words)
 
     def load(self) -> Predictor:
-        """The maps, found by name when they are asked for.
+        """Index the maps, which are read when they are needed.
 
         Raises:
             SceneError: a folder is missing or holds no map.
@@ -67,8 +67,8 @@ class Precomputed:
             normal = normals.read(view, channels=3) if normals else None
             if normal is not None:
                 normal = to_opencv(np.nan_to_num(normal, posinf=0.0, neginf=0.0), self.convention)
-                normal = _as_seen(view, normal, np.abs(normal).sum(axis=-1) > 1e-3)
-            return Prediction(_as_seen(view, disparity[..., None], np.isfinite(disparity))[..., 0], normal)
+                normal = _in_view(view, normal, np.abs(normal).sum(axis=-1) > 1e-3)
+            return Prediction(_in_view(view, disparity[..., None], np.isfinite(disparity))[..., 0], normal)
 
         files = [*maps.files, *(normals.files if normals else ())]
         revision = hash_of(files, self.values, self.convention)
@@ -78,11 +78,11 @@ class Precomputed:
 
 
 class MapFolder:
-    """The arrays in a folder's files, by the name of the view that they belong to.
+    """The arrays in a folder's files, by the name of their view.
 
     Args:
-        folder: searched with its sub-folders.
-        keys: names of the wanted array in an npz that holds several, best first.
+        folder: folder to search, with its sub-folders.
+        keys: names of the array in an npz that holds several, in order of preference.
 
     Raises:
         SceneError: the folder is missing or holds no map.
@@ -90,10 +90,10 @@ class MapFolder:
 
     def __init__(self, folder: Path, keys: tuple[str, ...]) -> None:
         if not folder.is_dir():
-            raise SceneError(f"{folder} is not a folder: name the one that holds the maps")
+            raise SceneError(f"{folder} is not a folder: give the folder of the maps")
         self.files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
         if not self.files:
-            raise SceneError(f"{folder} holds no maps: no {', '.join(SUFFIXES)} file is in it")
+            raise SceneError(f"{folder} holds no maps: it has no {', '.join(SUFFIXES)} file")
         self._keys = keys
         self._by_name: dict[str, list[Path]] = {}
         for path in self.files:
@@ -101,17 +101,17 @@ class MapFolder:
         self._taken: dict[Path, str] = {}
 
     def read(self, view: View, channels: int) -> Float[np.ndarray, "H W channels"] | None:
-        """The map of a view as it was stored, or None; colours are decoded to [-1, 1].
+        """Read the stored map of a view; None if there is none. Colours are decoded to [-1, 1].
 
         Raises:
-            SceneError: the file is damaged or holds something else, or is not the only one of the view.
+            SceneError: the file is damaged or not such a map, or the view has several.
         """
         path = self._find(view)
         if path is None:
             return None
         try:
             array = self._decode(path)
-        except Exception as error:  # each format's reader has its own kinds of error for a damaged file
+        except Exception as error:  # every format has its own errors for damaged files
             reason = " ".join(str(error).split())
             raise SceneError(
                 f"the map {path} of view {view.name!r} cannot be read ({reason}): make it again"
@@ -123,12 +123,12 @@ class MapFolder:
         if array.ndim != 3 or array.shape[-1] != channels or array.dtype.kind not in "fiu":
             wanted = "one number" if channels == 1 else "three numbers"
             raise SceneError(
-                f"the map {path} of view {view.name!r} is {array.dtype} {list(array.shape)}, not {wanted} a pixel"
+                f"the map {path} of view {view.name!r} is {array.dtype} {list(array.shape)}, not {wanted} per pixel"
             )
         return array.astype(np.float32)
 
     def _find(self, view: View) -> Path | None:
-        """The file named like the view: its path inside the scene, or the end of it, with or without its suffix."""
+        """The file named like the view: its path in the scene or the end of this path, with or without suffix."""
         parts = PurePosixPath(view.name).parts
         names = ["/".join(parts[k:]) for k in range(len(parts))]
         for name in [*names, *(PurePosixPath(name).with_suffix("").as_posix() for name in names)]:
@@ -139,8 +139,8 @@ class MapFolder:
                 other = self._taken.setdefault(paths[0], view.name)
                 if other != view.name:
                     raise SceneError(
-                        f"the map {paths[0]} is named like two views, {other!r} and {view.name!r}: keep the maps in "
-                        "the sub-folders of their images"
+                        f"the map {paths[0]} matches two views, {other!r} and {view.name!r}: put the maps into "
+                        "the same sub-folders as the images"
                     )
                 return paths[0]
         return None
@@ -151,11 +151,11 @@ class MapFolder:
                 array = np.asarray(image)
             if array.ndim == 3:
                 colours = array[..., :3].astype(np.float32)
-                return np.where(colours.any(axis=-1, keepdims=True), colours / 127.5 - 1, 0)  # black is no normal
+                return np.where(colours.any(axis=-1, keepdims=True), colours / 127.5 - 1, 0)  # black means no normal
             if array.dtype == np.uint8:
-                raise ValueError("its 8 bits are too few for depth; 16-bit png, npy or npz are enough")
+                raise ValueError("its 8 bits are too few for depth; use 16-bit png, npy or npz")
             return array
-        file = np.load(path, allow_pickle=False, mmap_mode="r")  # what a file only claims is not allocated
+        file = np.load(path, allow_pickle=False, mmap_mode="r")  # does not allocate the size that a damaged file claims
         if isinstance(file, np.ndarray):
             return file
         with file:
@@ -167,8 +167,8 @@ class MapFolder:
             return file[key]
 
 
-def _as_seen(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) -> Float[np.ndarray, "H W C"]:
-    """A map of the photograph, undistorted and resized to the view's camera; NaN where less than half is valid."""
+def _in_view(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) -> Float[np.ndarray, "H W C"]:
+    """Undistort a map of the photograph and resize it to the view's camera; NaN where less than half is valid."""
     import torch
 
     from dataparsers.photograph import undistort
@@ -177,10 +177,10 @@ def _as_seen(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) 
     calibrated = view.camera if view.lens is None else view.lens
     if abs(width / height / (int(calibrated.width) / int(calibrated.height)) - 1) > ASPECT_TOLERANCE:
         raise SceneError(
-            f"the map of view {view.name!r} is {width}x{height} pixels, which is not the shape of its photograph "
-            f"({int(calibrated.width)}x{int(calibrated.height)}): make it of the whole, upright photograph"
+            f"the map of view {view.name!r} is {width}x{height} pixels, not the aspect ratio of its photograph "
+            f"({int(calibrated.width)}x{int(calibrated.height)}): make it from the whole, upright photograph"
         )
-    # Invalid pixels carry no weight: values and weights are interpolated alike, and divided in the end.
+    # Invalid pixels have weight 0; weighted values and weights are interpolated, then divided.
     weighted = np.concatenate([np.where(valid[..., None], values, 0), valid[..., None]], axis=-1).astype(np.float32)
 
     def resized(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What monocular cues come from: a network that is run, or maps that were made elsewhere."""
+"""Sources of monocular cues: a network, or existing maps."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from shellgs_method.cues.normals import Convention
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is claimed of one view, at the size of its camera.
+    """Predicted maps of one view, at the size of its camera.
 
     Attributes:
-        disparity: larger where nearer, affine in the inverse depth; NaN where unknown.
-        normal: normals in the OpenCV camera frame, of either sign and any length, zero where unknown; None to take
+        disparity: disparity, larger where nearer, affine in the inverse depth; NaN where unknown.
+        normal: normals in the OpenCV camera frame, of either sign and any length, zero where unknown; None to use
             those of the depth's gradient.
     """
 
@@ -32,14 +32,14 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predictions for views, and what makes them.
+    """A prediction function, and where its predictions come from.
 
     Attributes:
-        name: of the network's weights or the folder of maps.
-        revision: commit of the weights on their hub, or a hash of what is on disk.
-        predict: what is claimed of a view; None where there is nothing.
-        licence: of the weights, as their model card states it; None for maps that were made elsewhere.
-        convention: the axes that the normals were declared to have, if they might have others.
+        name: name of the network's weights, or the folder of maps.
+        revision: commit of the weights on the hub, or a hash of the local files.
+        predict: function from a view to its prediction; None if there is none.
+        licence: licence of the weights, as stated in their model card; None for existing maps.
+        convention: declared axes of the normals, to be checked; None if they are known.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Predictor:
 
     @property
     def non_commercial(self) -> bool:
-        """Whether the licence forbids commercial use, as CC-BY-NC-4.0."""
+        """Whether the licence forbids commercial use, as CC-BY-NC-4.0 does."""
         return self.licence is not None and ("nc" in self.licence.split("-") or "non-commercial" in self.licence)
 
 
@@ -59,11 +59,11 @@ class Source(Protocol):
 
     @property
     def command(self) -> str:
-        """The words of the command line that choose it."""
+        """Command-line arguments that select this source."""
         ...
 
     def load(self) -> Predictor:
-        """The predictor, ready to run.
+        """Load the predictor.
 
         Raises:
             SceneError: a package, the weights or the maps are missing.
@@ -72,7 +72,7 @@ class Source(Protocol):
 
 
 def hash_of(files: Sequence[Path], *words: str) -> str:
-    """sha256 of some words and of files, their names included."""
+    """SHA-256 of words and files, including the files' names."""
     digest = hashlib.sha256("\0".join(words).encode())
     for path in files:
         digest.update(b"\0" + path.name.encode() + b"\0" + content_hash(path).encode())

@@ -1,6 +1,6 @@
-"""Colours: weakly textured plaster, glass that reflects the street, an overcast day with a little sun.
+"""Materials and light: weakly textured plaster, glass that reflects the street, an overcast day with a little sun.
 
-All colours are linear; :func:`photograph` applies the display's gamma last.
+All colours are linear; :func:`photograph` applies the display gamma last.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ _SKYLIGHT = np.array([0.66, 0.70, 0.76], dtype=np.float32)
 _GROUNDLIGHT = np.array([0.42, 0.40, 0.37], dtype=np.float32)
 
 _REFLECTANCE = 0.32
-"""Of sun-protection glazing at normal incidence; bare glass has 0.04 per surface."""
+"""Reflectance of sun-protection glazing at normal incidence; bare glass has 0.04 per surface."""
 
 
 @dataclass(frozen=True)
 class Daylight:
-    """The world as it is lit.
+    """A lit world.
 
     Attributes:
-        world: what the rays meet.
-        lattice: random numbers in [-1, 1] between which the noise of every texture interpolates.
+        world: geometry and materials.
+        lattice: random numbers in [-1, 1], interpolated to the noise of all textures.
     """
 
     world: World
@@ -43,7 +43,7 @@ class Daylight:
     def radiance(
         self, origins: Float[np.ndarray, "*N 3"], directions: Float[np.ndarray, "N 3"], bounces: int = 1
     ) -> Float[np.ndarray, "N 3"]:
-        """Light that comes back along the rays; panes reflect ``bounces`` times."""
+        """Radiance seen along the rays; panes reflect up to ``bounces`` times."""
         directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
         hits = self.world.cast(origins, directions)
         colour = np.empty_like(directions)
@@ -72,15 +72,15 @@ class Daylight:
         cosine[self.world.is_shadowed(points + 1e-3 * normal, sun)] = 0.0
         up = 0.5 + 0.5 * normal[:, 2:]
         ambient = up * _SKYLIGHT + (1 - up) * _GROUNDLIGHT
-        # Recesses see less of the sky.
+        # Recesses get less skylight.
         ambient = ambient * (1.0 - 1.4 * np.clip(points[:, 1:2], 0.0, 0.25))
         return ambient + cosine[:, None] * _SUNLIGHT
 
     def _glass(self, points: np.ndarray, normal: np.ndarray, towards: np.ndarray, bounces: int) -> np.ndarray:
-        """A room behind and the street in front of a pane, weighted by Schlick's approximation of Fresnel's law."""
+        """Mix the room behind a pane and the reflected street by Schlick's approximation of Fresnel's law."""
         x, z = points[:, 0], points[:, 2]
-        # Casements are never quite parallel, and their panes never quite flat; the geometry knows nothing of it.
-        tilt = np.stack([self._chance(2 * x / BAY, z / STOREY, k) for k in range(2)], axis=-1)
+        # Real casements are not quite parallel, nor panes quite flat; only the shading has this, not the geometry.
+        tilt = np.stack([self._random(2 * x / BAY, z / STOREY, k) for k in range(2)], axis=-1)
         bow = np.stack([self._noise(x, z, 0.5), self._noise(z, x, 0.5)], axis=-1)
         optical = normal.copy()
         optical[:, [0, 2]] += 0.012 * tilt + 0.004 * bow
@@ -94,28 +94,28 @@ class Daylight:
         )
 
     def _room(self, points: np.ndarray, towards: np.ndarray) -> np.ndarray:
-        """A dark room whose curtains and blind hang a hand behind the pane, each window's its own."""
+        """A dark room with curtains and a blind just behind the pane, different for each window."""
         bay, storey = points[:, 0] / BAY, points[:, 2] / STOREY
-        chance = partial(self._chance, bay, storey)
+        random = partial(self._random, bay, storey)
         hung = points + 0.3 * towards / np.maximum(towards[:, 1:2], 0.2)
         x, z = hung[:, 0] / BAY - np.floor(bay) - 0.5, hung[:, 2] / STOREY - np.floor(storey)
 
-        cloth = 0.24 + 0.03 * np.sin(hung[:, 0] * 55.0) + 0.1 * chance(2)
+        cloth = 0.24 + 0.03 * np.sin(hung[:, 0] * 55.0) + 0.1 * random(2)
         cloth *= 1 + 0.4 * self._noise(hung[:, 0], hung[:, 2], 0.12)
-        slats = 0.3 + 0.06 * np.sin(hung[:, 2] * 120.0) + 0.1 * chance(3)
+        slats = 0.3 + 0.06 * np.sin(hung[:, 2] * 120.0) + 0.1 * random(3)
         depth = 0.035 + 0.02 * np.sin(hung[:, 2] * 1.9)
-        drawn = (x < -0.17 + 0.12 * chance(4)) | (x > 0.17 + 0.12 * chance(5))
-        lowered = z > 0.7 + 0.2 * chance(6)
-        tint = np.array([1.0, 0.95, 0.88]) + 0.12 * np.stack([chance(7), 0 * bay, chance(8)], axis=-1)
+        drawn = (x < -0.17 + 0.12 * random(4)) | (x > 0.17 + 0.12 * random(5))
+        lowered = z > 0.7 + 0.2 * random(6)
+        tint = np.array([1.0, 0.95, 0.88]) + 0.12 * np.stack([random(7), 0 * bay, random(8)], axis=-1)
         return np.where(drawn, cloth, np.where(lowered, slats, depth))[:, None] * tint
 
-    def _chance(self, u: np.ndarray, v: np.ndarray, k: int) -> np.ndarray:
-        """The ``k``-th random number in [-1, 1] of the unit cell that (u, v) lies in."""
+    def _random(self, u: np.ndarray, v: np.ndarray, k: int) -> np.ndarray:
+        """The ``k``-th random number in [-1, 1] of the unit cell around (u, v)."""
         size = len(self.lattice)
         return self.lattice[(np.floor(u).astype(int) + 31 * k) % size, (np.floor(v).astype(int) + 17 * k) % size]
 
     def _sky(self, directions: np.ndarray) -> np.ndarray:
-        """Blue overhead, white at the horizon, with clouds on a flat ceiling."""
+        """Sky: blue overhead, white at the horizon, with clouds in a horizontal plane."""
         height = np.maximum(directions[:, 2:], 0.03)
         u, v = (directions[:, :2] / height).T
         cloud = self._noise(u, v, 1.1) + 0.5 * self._noise(u, v, 0.4)
@@ -131,7 +131,7 @@ class Daylight:
 def photograph(
     daylight: Daylight, camera: Camera, supersampling: int, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The camera's image: the mean of ``supersampling``² rays per pixel, a little sensor noise, gamma 2.2."""
+    """Render an image: the mean of ``supersampling``² rays per pixel, gamma 2.2, a little sensor noise."""
     origin, directions = rays(camera)
     rotation, focal = camera.viewmat[:3, :3].numpy(), camera.K.diagonal().numpy()[:2]
     steps = (np.arange(supersampling) + 0.5) / supersampling - 0.5
@@ -144,7 +144,7 @@ def photograph(
 
 
 def rays(camera: Camera) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "height width 3"]]:
-    """Origin and directions, in the world, of the rays through the pixels' centres; their t is z-depth."""
+    """Origin and directions, in the world, of the rays through pixel centres; t along them is z-depth."""
     directions = camera.rays().numpy() @ camera.viewmat[:3, :3].numpy()
     return camera.position.numpy().astype(np.float32), directions.astype(np.float32)
 
@@ -161,7 +161,7 @@ def _plain(*colour: float) -> Callable[[np.ndarray, Noise], np.ndarray]:
 
 
 def _plaster(points: np.ndarray, noise: Noise) -> np.ndarray:
-    """Weakly textured, but weathered: grime at the foot, streaks of rain, cracks, and scrawls as high as a hand."""
+    """Weakly textured, weathered plaster: grime at the foot, rain streaks, cracks, and graffiti at hand height."""
     along, z = points[:, 0] + points[:, 1], points[:, 2]
     grime = 0.08 * np.exp(-z / 0.35)
     streaks = 0.1 * np.maximum(noise(along, z, 1.3), 0.0) * noise(12 * along, z, 0.7)

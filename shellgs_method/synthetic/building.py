@@ -1,4 +1,4 @@
-"""The building: what its shell knows of it (the structure), and what the shell leaves out (the detail).
+"""The building: its structure, which the shell has, and its detail, which the shell leaves out.
 
 Frame of the building, in metres: x along the facade to the right as seen from the street, y into the building, z up.
 The wall is the plane y = 0, the street lies at y < 0 and the ground at z = 0.
@@ -17,18 +17,18 @@ from shellgs_method.synthetic.geometry import Material, Mesh, box, merge, parall
 BAY = 3.0
 STOREY = 3.3
 RECESS = 0.25
-"""Depth of the panes behind the wall."""
+"""Depth of the panes behind the wall's front, in metres."""
 
-_MARGIN = 0.4  # of wall beyond the first and the last bay
+_MARGIN = 0.4  # width of the wall beyond the first and the last bay
 _PARAPET = 0.9
-_DEPTH = 6.0  # of the building, behind its wall
+_DEPTH = 6.0  # of the building, behind its front
 _COLUMN = 0.25, 0.3  # half width, projection
 _SLAB = 0.14, 0.1
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A hole in the wall, between two corners in x and z."""
+    """A rectangular hole in the wall, given by its bounds in x and z."""
 
     x0: float
     x1: float
@@ -44,11 +44,11 @@ class Opening:
 
 @dataclass(frozen=True)
 class Layout:
-    """The numbers both the building and its shell are made from.
+    """Parameters of the building and its shell.
 
     Attributes:
-        bays: windows along the facade.
-        storeys: windows above each other.
+        bays: number of windows along the facade.
+        storeys: number of windows above each other.
     """
 
     bays: int
@@ -56,7 +56,7 @@ class Layout:
 
     @property
     def length(self) -> float:
-        """Distance from the first bay's edge to the last one's, in metres."""
+        """Distance between the outer edges of the first and the last bay, in metres."""
         return self.bays * BAY
 
     @property
@@ -66,7 +66,7 @@ class Layout:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Where the wall starts and stops along x."""
+        """Start and end of the wall along x."""
         return -_MARGIN, self.length + _MARGIN
 
     @property
@@ -82,7 +82,7 @@ class Layout:
 
     @property
     def columns(self) -> list[float]:
-        """Axes of the columns along x: one on every second bay's edge."""
+        """Positions of the columns along x: on every second edge between bays."""
         return [bay * BAY for bay in range(0, self.bays + 1, 2)]
 
     @property
@@ -92,12 +92,12 @@ class Layout:
 
 
 def shell(layout: Layout) -> Mesh:
-    """What a survey of the outside keeps: wall, reveals, panes, slab edges, column shafts."""
+    """The shell, as a survey of the outside has it: wall, reveals, panes, slab edges, column shafts."""
     return merge(_structure(layout))
 
 
 def building(layout: Layout) -> Mesh:
-    """The shell and everything it leaves out: frames, sills, railings, bases and capitals, cornice."""
+    """The shell and all it leaves out: frames, sills, railings, flower boxes, column bases and capitals, cornice."""
     return merge([*_structure(layout), *_detail(layout)])
 
 
@@ -118,7 +118,7 @@ def _structure(layout: Layout) -> Iterator[Mesh]:
 
 
 def _wall(layout: Layout) -> Iterator[Mesh]:
-    """The front, cut along every edge of an opening so that no vertex lies on another's edge."""
+    """The front, cut along the edges of all openings, so that there are no T-junctions."""
     openings = layout.openings
     x = np.unique([*layout.ends, *(edge for o in openings for edge in (o.x0, o.x1))])
     z = np.unique([0.0, layout.height, *(edge for o in openings for edge in (o.z0, o.z1))])
@@ -129,7 +129,7 @@ def _wall(layout: Layout) -> Iterator[Mesh]:
 
 
 def _lining(o: Opening) -> Iterator[Mesh]:
-    """Jambs, sill and lintel of an opening, and what closes it."""
+    """Jambs, sill and lintel of an opening, and its pane or door."""
     width, height = o.x1 - o.x0, o.z1 - o.z0
     inwards = (0.0, RECESS, 0.0)
     yield parallelogram((o.x0, 0, o.z0), inwards, (0, 0, height), Material.WALL)
@@ -161,7 +161,7 @@ def _detail(layout: Layout) -> Iterator[Mesh]:
 def _frame(o: Opening) -> Iterator[Mesh]:
     """Outer frame, mullion and transom."""
     bar, front, back = 0.07, RECESS - 0.07, RECESS + 0.01
-    transom = o.z0 + _chance(o, "transom").uniform(0.6, 0.8) * (o.z1 - o.z0)
+    transom = o.z0 + _rng(o, "transom").uniform(0.6, 0.8) * (o.z1 - o.z0)
     for x in (o.x0, o.centre - bar / 2, o.x1 - bar):
         yield box((x, front, o.z0), (x + bar, back, o.z1), Material.FRAME)
     for z in (o.z0, transom, o.z1 - bar):
@@ -169,23 +169,23 @@ def _frame(o: Opening) -> Iterator[Mesh]:
 
 
 def _railing(o: Opening) -> Iterator[Mesh]:
-    """A French balcony: two rails and upright bars, a hand's width before the wall."""
+    """A French balcony: two rails and upright bars, 12 cm in front of the wall."""
     y, bar = -0.12, 0.025
     for z in (o.z0 + 0.06, o.z0 + 0.9):
         yield box((o.x0 - 0.05, y, z), (o.x1 + 0.05, y + 0.04, z + 0.04), Material.RAILING)
-    for x in np.linspace(o.x0, o.x1 - bar, _chance(o, "bars").integers(8, 15)):
+    for x in np.linspace(o.x0, o.x1 - bar, _rng(o, "bars").integers(8, 15)):
         yield box((x, y, o.z0 + 0.06), (x + bar, y + bar, o.z0 + 0.9), Material.RAILING)
 
 
 def _planter(o: Opening) -> Iterator[Mesh]:
-    """A box of flowers on the railing, at some windows."""
-    chance = _chance(o, "planter")
-    if chance.random() < 0.7:
-        width, height, z = chance.uniform(0.4, 1.0), chance.uniform(0.2, 0.4), o.z0 + chance.choice([0.1, 0.7])
-        x = chance.uniform(o.x0, o.x1 - width)
+    """A flower box on the railing of most windows."""
+    rng = _rng(o, "planter")
+    if rng.random() < 0.7:
+        width, height, z = rng.uniform(0.4, 1.0), rng.uniform(0.2, 0.4), o.z0 + rng.choice([0.1, 0.7])
+        x = rng.uniform(o.x0, o.x1 - width)
         yield box((x, -0.26, z), (x + width, -0.12, z + height), Material.FLOWERS)
 
 
-def _chance(o: Opening, what: str) -> np.random.Generator:
-    """Each window's own source of chance: those that match in every pixel lead structure from motion astray."""
+def _rng(o: Opening, what: str) -> np.random.Generator:
+    """Random generator of one window: identical windows would mislead structure from motion."""
     return np.random.default_rng([round(100 * o.x0), round(100 * o.z0), *what.encode()])

@@ -1,4 +1,4 @@
-"""The three frames of the synthetic scene: the building's (metres), the photographs' (arbitrary) and the shell's."""
+"""The frames of the synthetic scene: the building's (metres), the cameras' (arbitrary unit) and the shell's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _similarity(scale: float, turn: Rotation, shift: list[float]) -> Float64[np.
 
 UNITS_PER_METRE = 0.37
 
-# SfM finds neither the scale nor the directions of the world; a survey has metres and national coordinates.
+# SfM recovers neither scale nor orientation of the world; a survey has metres and national coordinates.
 SCENE_FROM_BUILDING = _similarity(
     UNITS_PER_METRE, Rotation.from_euler("ZYX", [-37, 24, 101], degrees=True), [1.9, -0.6, 2.3]
 )
@@ -29,7 +29,7 @@ SHELL_FROM_BUILDING = _similarity(1.0, Rotation.from_euler("Z", 31, degrees=True
 
 
 def scene_camera(camera: Camera) -> Camera:
-    """A camera of the building's frame in the scene's, where depths are ``UNITS_PER_METRE`` times as long."""
+    """Convert a camera from the building's frame to the scene's, which scales depths by ``UNITS_PER_METRE``."""
     rescaled = np.diag([UNITS_PER_METRE] * 3 + [1.0])
     viewmat = rescaled @ camera.viewmat.numpy() @ np.linalg.inv(SCENE_FROM_BUILDING)
     return replace(camera, viewmat=torch.from_numpy(viewmat))

@@ -1,4 +1,4 @@
-"""Triangles with a material each, and the few solids that the building and its street are made of."""
+"""Triangle meshes with materials, and the basic solids of the building and the street."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 
 class Material(IntEnum):
-    """What a triangle is made of; the building's own materials come first, up to ``RAILING``."""
+    """Material of a triangle; the building's materials come first, up to ``RAILING``."""
 
     WALL = 0
     COLUMN = 1
@@ -46,7 +46,7 @@ class Mesh:
 
 
 def merge(meshes: Iterable[Mesh]) -> Mesh:
-    """All the meshes as one."""
+    """Merge meshes into one."""
     meshes = list(meshes)
     first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
@@ -64,14 +64,14 @@ def parallelogram(corner: Sequence[float], a: Sequence[float], b: Sequence[float
 
 def box(low: Sequence[float], high: Sequence[float], material: Material) -> Mesh:
     """The axis-aligned box between two corners."""
-    return _coated(trimesh.creation.box(bounds=[low, high]), material)
+    return _with_material(trimesh.creation.box(bounds=[low, high]), material)
 
 
 def cylinder(foot: Sequence[float], radius: float, height: float, material: Material) -> Mesh:
     """An upright cylinder on ``foot``."""
     solid = trimesh.creation.cylinder(radius=radius, height=height, sections=20)
-    return _coated(solid.apply_translation(np.add(foot, (0.0, 0.0, height / 2))), material)
+    return _with_material(solid.apply_translation(np.add(foot, (0.0, 0.0, height / 2))), material)
 
 
-def _coated(solid: trimesh.Trimesh, material: Material) -> Mesh:
+def _with_material(solid: trimesh.Trimesh, material: Material) -> Mesh:
     return Mesh(np.asarray(solid.vertices), np.asarray(solid.faces), np.full(len(solid.faces), material))

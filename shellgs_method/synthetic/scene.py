@@ -36,7 +36,7 @@ from shellgs_method.synthetic.world import World
 
 SHELL = "shell/facade.ply"
 RECORD = "facade.json"
-PREDICTIONS = "predictions"  # disparity as a monocular network might see it
+PREDICTIONS = "predictions"  # simulated disparity of a monocular network
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class FacadeConfig:
     storeys: int = 3
     """Windows above each other, 3.3 m apart."""
     points: int = 4000
-    """Number of SfM points at most."""
+    """Maximum number of SfM points."""
     supersampling: int = 3
     """Rays per pixel along each image axis."""
 
     def __post_init__(self) -> None:
-        """Refuse what no scene can be made of."""
+        """Refuse settings that no scene can be made with."""
         least = {"width": 16, "height": 16, "views": 3, "seed": 0, "bays": 1, "storeys": 1, "points": 1}
         for name, minimum in {**least, "supersampling": 1}.items():
             if getattr(self, name) < minimum:
@@ -73,9 +73,9 @@ class Facade:
     """The synthetic facade in memory, in the building's frame (metres).
 
     Attributes:
-        layout: the building's numbers.
-        daylight: building and street, lit.
-        cameras: one for each photograph, in the order of the walk.
+        layout: parameters of the building.
+        daylight: lit building and street.
+        cameras: camera of each photograph, in the order of the walk.
     """
 
     layout: Layout
@@ -84,7 +84,7 @@ class Facade:
 
     @classmethod
     def build(cls, config: FacadeConfig) -> Facade:
-        """The facade a configuration describes."""
+        """Build the facade of a configuration."""
         layout = Layout(config.bays, config.storeys)
         tree, texture, hand = _generators(config.seed, 3)
         world = World(merge([building(layout), street(layout, tree)]))
@@ -92,7 +92,7 @@ class Facade:
         return cls(layout, daylight, walk(layout.length, config.views, config.width, config.height, hand))
 
     def truth(self, camera: Camera) -> CueMap:
-        """True maps in scene units: depth and normal of everything but the sky, masked to the building."""
+        """True depth and normals in scene units, of everything but the sky; the mask is the building."""
         origin, directions = rays(camera)
         hits = self.daylight.world.cast(origin, directions)
         depth = np.where(np.isfinite(hits.t), UNITS_PER_METRE * hits.t, 0.0).astype(np.float32)
@@ -101,10 +101,10 @@ class Facade:
 
 
 def write_scene(scene: Path, config: FacadeConfig) -> None:
-    """Write the scene folder of a synthetic facade; it appears whole or not at all.
+    """Write the scene folder of a synthetic facade, whole or not at all.
 
     Raises:
-        ValueError: there is something at ``scene`` already.
+        ValueError: ``scene`` exists and is not an empty folder.
     """
     scene = Path(scene)
     if scene.exists() and not (scene.is_dir() and not any(scene.iterdir())):
@@ -120,18 +120,18 @@ def write_scene(scene: Path, config: FacadeConfig) -> None:
 
 
 def settings_of(scene: Path) -> dict[str, int]:
-    """What a synthetic scene was made with, as far as it tells.
+    """Settings that a synthetic scene was made with, as far as known.
 
     Raises:
-        SceneError: it is no such scene, or damaged.
+        SceneError: it is not a synthetic scene, or it is damaged.
     """
     try:
         if (scene / RECORD).exists():
             return dict(json.loads((scene / RECORD).read_text()))
-        cameras = json.loads((scene / "transforms.json").read_text())  # of a build that kept no record
+        cameras = json.loads((scene / "transforms.json").read_text())  # of a version without a record
         return {"width": cameras["w"], "height": cameras["h"], "views": len(cameras["frames"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SceneError(f"{scene} is no synthetic scene, or damaged: give another folder, or remove it") from error
+        raise SceneError(f"{scene} is damaged or not a synthetic scene: give another folder, or remove it") from error
 
 
 def _write(scene: Path, config: FacadeConfig) -> None:
@@ -143,7 +143,7 @@ def _write(scene: Path, config: FacadeConfig) -> None:
     (scene / "images").mkdir()
     (scene / PREDICTIONS).mkdir()
 
-    # Half as many again as wanted: not every feature is seen in three views.
+    # 50 % more than wanted: not every feature is visible in three views.
     found, per_view = [], -(-3 * config.points // (2 * config.views))
     sensor, sfm, network = _generators(config.seed + 1, 3)
     for name, camera in track(list(zip(names, facade.cameras, strict=True)), "synthetic facade", transient=True):
@@ -159,12 +159,12 @@ def _write(scene: Path, config: FacadeConfig) -> None:
 
 
 def _generators(seed: int, count: int) -> list[np.random.Generator]:
-    """Independent sources of chance, so that one more view leaves the tree as it was."""
+    """Independent random generators, so that one more view does not change the tree."""
     return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)]
 
 
 def _transforms(names: list[str], cameras: list[Camera]) -> dict:
-    """The cameras in nerfstudio's form: camera to world, OpenGL axes."""
+    """The cameras in nerfstudio's format: camera to world, OpenGL axes."""
     frames = []
     for name, camera in zip(names, map(scene_camera, cameras), strict=True):
         pose = np.linalg.inv(camera.viewmat.numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -183,11 +183,11 @@ def _write_points(path: Path, points: Points) -> None:
 
 
 def write_scan(path: Path, mesh: Mesh) -> None:
-    """Write the shell in its own georeferenced frame, which only a file in double precision can hold.
+    """Write the shell in its own georeferenced frame, in double precision, which such coordinates need.
 
     Args:
-        path: of a ply file.
-        mesh: in the building's frame.
+        path: ply file to write.
+        mesh: shell in the building's frame.
     """
     o3d = import_open3d()
     vertices = transformed(mesh.vertices, SHELL_FROM_BUILDING)
@@ -198,7 +198,7 @@ def write_scan(path: Path, mesh: Mesh) -> None:
 
 
 def _write_shell(scene: Path, mesh: Mesh) -> None:
-    """The shell, and where it stands."""
+    """Write the shell and its alignment."""
     path = scene / SHELL
     path.parent.mkdir(parents=True)
     write_scan(path, mesh)

@@ -1,4 +1,4 @@
-"""Points as structure from motion would find them: many on edges, few on plaster, some wrong ones behind the glass."""
+"""Simulated SfM points: many on edges, few on plaster, some wrong ones behind the glass."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Points:
     """Coloured points in the building's frame.
 
     Attributes:
-        positions: in metres.
-        colours: of the pixel each was found in.
-        is_mirrored: true for the mirror images, in the panes, of things elsewhere.
+        positions: positions in metres.
+        colours: colours of the pixels in which the points were found.
+        is_mirrored: True for mirror images in the panes.
     """
 
     positions: Float64[np.ndarray, "N 3"]
@@ -35,27 +35,27 @@ class Points:
     is_mirrored: Bool[np.ndarray, " N"]
 
     def __getitem__(self, chosen: np.ndarray) -> Points:
-        """The points of an index array or a mask."""
+        """Select points by an index array or a mask."""
         return Points(self.positions[chosen], self.colours[chosen], self.is_mirrored[chosen])
 
 
 def features(
     world: World, camera: Camera, image: UInt8[np.ndarray, "H W 3"], count: int, rng: np.random.Generator
 ) -> Points:
-    """What lies behind at most ``count`` pixels of one view, drawn in proportion to the image's gradient."""
+    """Points at up to ``count`` pixels of one view, drawn in proportion to the image's gradient."""
     origin, directions = rays(camera)
     hits = world.cast(origin, directions)
     glass = hits.material == Material.GLASS
     gradient = gaussian_gradient_magnitude(image.mean(axis=-1), 1.0)
     weight = np.maximum(gradient - 1.0, 0.0) * np.where(glass, _FEATURES_ON_GLASS, np.isfinite(hits.t))
-    # An exponential race draws without replacement in proportion to the weights.
+    # Exponential races draw without replacement in proportion to the weights.
     candidates = np.flatnonzero(weight)
-    winners = candidates[np.argsort(rng.exponential(1 / weight.flat[candidates]))[:count]]
-    pixels = np.unravel_index(winners, weight.shape)
+    drawn = candidates[np.argsort(rng.exponential(1 / weight.flat[candidates]))[:count]]
+    pixels = np.unravel_index(drawn, weight.shape)
 
     directions, t, normal, mirrored = directions[pixels], hits.t[pixels], hits.normal[pixels], glass[pixels]
     surface = origin + t[:, None] * directions
-    # A pane shows things as far behind it, along the ray, as they stand before it.
+    # A pane shows things as far behind it, along the ray, as they are in front of it.
     reflected = directions - 2 * np.sum(directions * normal, axis=-1, keepdims=True) * normal
     beyond = world.cast(surface + 1e-3 * normal, reflected).t
     positions = surface + np.where(mirrored, beyond, 0.0)[:, None] * directions
@@ -66,20 +66,20 @@ def features(
 def triangulate(
     world: World, cameras: Sequence[Camera], views: Sequence[Points], count: int, rng: np.random.Generator
 ) -> Points:
-    """At most ``count`` of the views' features: those that three cameras see, with noise that grows with distance."""
+    """At most ``count`` features, each visible in three views or more, with noise proportional to the distance."""
     points = Points(*(np.concatenate([getattr(view, f) for view in views]) for f in Points.__annotations__))
-    seen = np.stack([_is_seen(world, camera, points) for camera in cameras])
+    visible = np.stack([_is_visible(world, camera, points) for camera in cameras])
     centres = np.stack([camera.position.numpy() for camera in cameras])
     distance = np.linalg.norm(points.positions - centres[:, None], axis=-1)
-    nearest = np.where(seen, distance, np.inf).min(axis=0)
-    kept = np.flatnonzero(seen.sum(axis=0) >= _MIN_VIEWS)
+    nearest = np.where(visible, distance, np.inf).min(axis=0)
+    kept = np.flatnonzero(visible.sum(axis=0) >= _MIN_VIEWS)
     kept = rng.permutation(kept)[:count]
     noise = rng.normal(0.0, NOISE, (len(kept), 3)) * nearest[kept, None]
     points = points[kept]
     return Points(points.positions + noise, points.colours, points.is_mirrored)
 
 
-def _is_seen(world: World, camera: Camera, points: Points) -> np.ndarray:
+def _is_visible(world: World, camera: Camera, points: Points) -> np.ndarray:
     """Whether points project into the image, unoccluded, or, for mirror images, into a pane."""
     viewmat, K = camera.viewmat.numpy(), camera.K.numpy()
     in_camera = points.positions @ viewmat[:3, :3].T + viewmat[:3, 3]

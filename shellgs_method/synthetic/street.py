@@ -1,4 +1,4 @@
-"""What stands around the building: ground, a pole and a tree before it, houses and cars for its glass to reflect."""
+"""The street: ground, a pole and a tree in front of the building, houses and cars for its glass to reflect."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from shellgs_method.synthetic.building import Layout
 from shellgs_method.synthetic.geometry import Material, Mesh, box, cylinder, merge, parallelogram
 
 KERB = -4.5
-"""Where along y the pavement ends."""
+"""Position of the pavement's edge along y, in metres."""
 HOUSE = 6.5
-"""Width of a house of the rows across the street and behind the building."""
+"""Width of the houses across the street and behind the building, in metres."""
 CAR = 6.0
-"""Distance between two parked cars."""
+"""Spacing of parked cars, in metres."""
 
 
 def street(layout: Layout, rng: np.random.Generator) -> Mesh:
-    """Everything that is not the building, in the building's frame."""
+    """Everything except the building, in the building's frame."""
     return merge(_street(layout, rng))
 
 
@@ -40,9 +40,9 @@ def _street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
 
 
 def _crown(centre: np.ndarray, rng: np.random.Generator, leaves: int = 700, size: float = 0.12) -> Mesh:
-    """Loose leaves, one triangle each, thicker towards the outside of an ellipsoid."""
+    """Loose leaves, one triangle each, denser towards the surface of an ellipsoid."""
     outwards = rng.normal(size=(leaves, 1, 3))
     outwards /= np.linalg.norm(outwards, axis=-1, keepdims=True)
-    place = centre + outwards * [0.7, 0.65, 0.9] * rng.uniform(0.25, 1.0, (leaves, 1, 1)) ** 0.5
-    vertices = (place + rng.uniform(-size, size, (leaves, 3, 3))).reshape(-1, 3)
+    centres = centre + outwards * [0.7, 0.65, 0.9] * rng.uniform(0.25, 1.0, (leaves, 1, 1)) ** 0.5
+    vertices = (centres + rng.uniform(-size, size, (leaves, 3, 3))).reshape(-1, 3)
     return Mesh(vertices, np.arange(3 * leaves).reshape(-1, 3), np.full(leaves, Material.LEAF))

@@ -1,4 +1,4 @@
-"""Ray casting into triangles with materials."""
+"""Ray casting of meshes with materials."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from shellgs_method.synthetic.geometry import Mesh
 
 @dataclass(frozen=True)
 class Hits:
-    """What a bundle of rays meets first.
+    """First hits of rays.
 
     Attributes:
-        t: multiple of the ray's direction at which it hits; inf where it hits nothing.
-        normal: unit normal facing the ray's origin; 0 where it hits nothing.
-        material: the triangle's material; 255 where it hits nothing.
+        t: distance to the hit in multiples of the ray's direction; inf without a hit.
+        normal: unit normal facing the ray's origin; 0 without a hit.
+        material: material of the triangle; 255 without a hit.
     """
 
     t: Float[np.ndarray, " *N"]
@@ -40,14 +40,14 @@ class World:
         answer = self._scene.cast_rays(self._rays(origins, directions))
         normal = answer["primitive_normals"].numpy()
         away = np.sum(normal * directions, axis=-1, keepdims=True) > 0
-        # Open3D's index of a miss is the largest integer, which becomes the table's last entry.
+        # Open3D marks a miss by the largest integer; clamping selects the table's last entry.
         triangle = np.minimum(answer["primitive_ids"].numpy(), len(self._material) - 1)
         return Hits(answer["t_hit"].numpy(), np.where(away, -normal, normal), self._material[triangle])
 
     def is_shadowed(
         self, points: Float[np.ndarray, "*N 3"], towards: Float[np.ndarray, " 3"]
     ) -> Bool[np.ndarray, " *N"]:
-        """Whether anything stands between the points and a light infinitely far away."""
+        """Whether anything is between the points and a light at infinity."""
         return self._scene.test_occlusions(self._rays(points, np.broadcast_to(towards, points.shape))).numpy()
 
     def _rays(self, origins: np.ndarray, directions: np.ndarray):
