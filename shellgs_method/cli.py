@@ -435,8 +435,7 @@ def splats(
 
 
 def sim(
-    configs: Annotated[tuple[Path, ...], tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.Positional],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
     up: Optional[UpAxis] = None,
 ) -> None:
@@ -445,8 +444,7 @@ def sim(
     With several runs, whose shells are in the same national coordinates, they stand in one world.
 
     Args:
-        configs: The runs' config.yml.
-        out: The folder.
+        paths: The runs' config.yml, and last the folder.
         settings: Settings.
         up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
     """
@@ -455,6 +453,7 @@ def sim(
     def tell(sentence: str) -> None:
         console.print(sentence, highlight=False)
 
+    *configs, out = paths or (Path(),)  # one list: of two, the first takes all paths that an option follows
     figures, _ = simulate(configs, out, settings, tell, up)
     for sentence in figures["summary"]:
         tell(sentence)
