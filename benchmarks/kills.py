@@ -5,7 +5,8 @@ comparison goes on from its last checkpoint; the others simply begin again.
 
 Each command is left in peace twice. Files that come out the same then, byte for byte (checkpoints number for number),
 must do so after a kill. The others are named; of them meshes are compared in any order of their triangles, JSON but for
-the last digits, and what differs even so between two commands left in peace is not compared.
+the last digits, and what differs even so between two commands left in peace is not compared. All of them work in
+a folder of the same name, one after another: some results say where they were made.
 """
 
 from __future__ import annotations
@@ -204,17 +205,23 @@ class Peace:
         return set(self.unsteady) - set(self.loose)
 
 
+def work_in(folder: Path, before: Path) -> Path:
+    """A copy to work in, beside a folder."""
+    return Path(shutil.copytree(before, folder.with_name("work"), symlinks=True))
+
+
 def leave(command: str, before: Path, after: Path) -> Peace:
     """Give a command twice, and let it end."""
     seconds, again = [], after.with_name(f"{after.name}-again")
     for folder in (after, again):
-        shutil.copytree(before, folder, symlinks=True)
+        work = work_in(folder, before)
         log, since = after.with_name(f"{command}.log"), time.perf_counter()
-        process = start(command, folder, log)
+        process = start(command, work, log)
         process.join()
         seconds.append(time.perf_counter() - since)
         if process.exitcode != 0:
             raise SystemExit(f"{command} fails when left in peace: see {log}")
+        work.rename(folder)
     unsteady = set(differences(command, again, after))
     loose = unsteady - set(differences(command, again, after, unsteady))
     shutil.rmtree(again)
@@ -222,31 +229,32 @@ def leave(command: str, before: Path, after: Path) -> Peace:
 
 
 def kill(command: str, peace: Peace, tally: Tally, moment: float, trial: Path, say: Callable) -> None:
-    """Start a command on a copy, kill it, give it again, and count."""
-    shutil.copytree(peace.before, trial, symlinks=True)
-    log = trial.with_suffix(".log")
-    process = start(command, trial, log)
+    """Start a command on a copy, kill it, give it again, and count; the copy is kept where anything went wrong."""
+    work, log = work_in(trial, peace.before), trial.with_suffix(".log")
+    process = start(command, work, log)
     process.join(moment * peace.seconds)
     if process.is_alive():
         process.kill()
     process.join()
     if process.exitcode == 0:  # it was faster than we
-        shutil.rmtree(trial)
+        shutil.rmtree(work)
         return
     tally.kills += 1
-    again = start(command, trial, log)
+    again = start(command, work, log)
     again.join()
     tally.finished += again.exitcode == 0
-    compared = set(differences(command, trial, peace.after, peace.loose))
+    compared = set(differences(command, work, peace.after, peace.loose))
     wrong = sorted(compared - peace.not_compared)
     tally.same += not wrong
-    litter = {name for name in files(trial) - files(peace.after) if not is_record(name)}
+    litter = {name for name in files(work) - files(peace.after) if not is_record(name)}
     tally.litter += bool(litter)
     for what, names in (("differs", wrong), ("is left over", sorted(litter))):
         if names:
             say(f"{command}, killed after {moment:.0%}: {', '.join(names[:4])} {what} ({log})")
-    if not wrong and not litter and again.exitcode == 0:
-        shutil.rmtree(trial)
+    if wrong or litter or again.exitcode != 0:
+        work.rename(trial)
+    else:
+        shutil.rmtree(work)
 
 
 def is_record(name: str) -> bool:
