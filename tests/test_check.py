@@ -268,5 +268,6 @@ def test_surfaces_are_measured_on_the_shell_and_before_it():
     figures = reference_errors(Rendering(wall, wall, torch.ones(size), normal), camera, batch, 1.0)
     assert figures["truth_f_score_5cm_on_shell"] == pytest.approx(1)
     assert figures["truth_f_score_5cm_before_shell"] == 0
+    assert list(figures)[-2:] == ["truth_f_score_5cm_on_shell", "truth_f_score_5cm_before_shell"]  # in every process
     assert 0.4 < figures["truth_f_score_5cm"] < 0.6
     assert not [name for name in figures if name.startswith("f_score") and name.endswith("shell")]
