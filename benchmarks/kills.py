@@ -5,7 +5,8 @@ comparison resumes from its last checkpoint; the other commands start over.
 
 Each command first runs undisturbed twice. Files that are then identical, byte for byte (checkpoints number for number),
 must be so after a kill. The others are listed; among them meshes are compared in any order of their triangles and JSON
-up to the last digits, and what still differs between two undisturbed runs is not compared.
+up to the last digits, and what still differs between two undisturbed runs is not compared. All runs work in a
+folder of the same name, one after another, since some results contain its path.
 """
 
 from __future__ import annotations
@@ -204,17 +205,23 @@ class Undisturbed:
         return set(self.unsteady) - set(self.loose)
 
 
+def work_in(folder: Path, before: Path) -> Path:
+    """A copy to work in, beside a folder."""
+    return Path(shutil.copytree(before, folder.with_name("work"), symlinks=True))
+
+
 def undisturbed(command: str, before: Path, after: Path) -> Undisturbed:
     """Run a command to its end, twice."""
     seconds, again = [], after.with_name(f"{after.name}-again")
     for folder in (after, again):
-        shutil.copytree(before, folder, symlinks=True)
+        work = work_in(folder, before)
         log, since = after.with_name(f"{command}.log"), time.perf_counter()
-        process = start(command, folder, log)
+        process = start(command, work, log)
         process.join()
         seconds.append(time.perf_counter() - since)
         if process.exitcode != 0:
             raise SystemExit(f"{command} fails undisturbed: see {log}")
+        work.rename(folder)
     unsteady = set(differences(command, again, after))
     loose = unsteady - set(differences(command, again, after, unsteady))
     shutil.rmtree(again)
@@ -222,31 +229,32 @@ def undisturbed(command: str, before: Path, after: Path) -> Undisturbed:
 
 
 def kill(command: str, reference: Undisturbed, tally: Tally, moment: float, trial: Path, say: Callable) -> None:
-    """Start a command on a copy, kill it, run it again, and count."""
-    shutil.copytree(reference.before, trial, symlinks=True)
-    log = trial.with_suffix(".log")
-    process = start(command, trial, log)
+    """Start a command on a copy, kill it, run it again, and count; keep the copy if anything went wrong."""
+    work, log = work_in(trial, reference.before), trial.with_suffix(".log")
+    process = start(command, work, log)
     process.join(moment * reference.seconds)
     if process.is_alive():
         process.kill()
     process.join()
     if process.exitcode == 0:  # it was faster than we
-        shutil.rmtree(trial)
+        shutil.rmtree(work)
         return
     tally.kills += 1
-    again = start(command, trial, log)
+    again = start(command, work, log)
     again.join()
     tally.finished += again.exitcode == 0
-    compared = set(differences(command, trial, reference.after, reference.loose))
+    compared = set(differences(command, work, reference.after, reference.loose))
     wrong = sorted(compared - reference.not_compared)
     tally.same += not wrong
-    litter = {name for name in files(trial) - files(reference.after) if not is_record(name)}
+    litter = {name for name in files(work) - files(reference.after) if not is_record(name)}
     tally.litter += bool(litter)
     for what, names in (("differs", wrong), ("is left over", sorted(litter))):
         if names:
             say(f"{command}, killed after {moment:.0%}: {', '.join(names[:4])} {what} ({log})")
-    if not wrong and not litter and again.exitcode == 0:
-        shutil.rmtree(trial)
+    if wrong or litter or again.exitcode != 0:
+        work.rename(trial)
+    else:
+        shutil.rmtree(work)
 
 
 def is_record(name: str) -> bool:

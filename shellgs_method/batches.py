@@ -47,11 +47,10 @@ def reference_errors(
         errors = geometry_errors(rendering, camera, reference, metres_per_unit)
         metrics |= {prefix + name: value for name, value in errors.items()}
     if truth := found.get(REFERENCES["truth"]):
-        parts = regions(batch, metres_per_unit, rendering.depth.device)
-        for name in parts.keys() & {"on_shell", "before_shell"}:
-            reference = truth._replace(mask=truth.mask & parts[name])
-            errors = geometry_errors(rendering, camera, reference, metres_per_unit)
-            metrics |= {f"truth_{key}_{name}": errors[key] for key in errors.keys() & {"f_score_5cm"}}
+        for name, part in regions(batch, metres_per_unit, rendering.depth.device).items():
+            if name in ("on_shell", "before_shell"):  # not by a set, whose order is another in each process
+                errors = geometry_errors(rendering, camera, truth._replace(mask=truth.mask & part), metres_per_unit)
+                metrics |= {f"truth_{key}_{name}": errors[key] for key in errors.keys() & {"f_score_5cm"}}
     return metrics
 
 

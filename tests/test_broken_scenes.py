@@ -17,7 +17,7 @@ import laspy
 import numpy as np
 import pytest
 from PIL import Image
-from test_capture import picture, write_video
+from test_capture import photograph, write_video
 from test_facade_dataparser import parse, write_colmap
 from test_shell_clouds import scan
 
@@ -293,7 +293,7 @@ def test_a_photograph_that_is_none_is_refused_by_name(scene, spoil, words):
 def test_a_photograph_with_a_huge_header_is_refused_by_capture(tmp_path, shellgs):
     (tmp_path / "photographs").mkdir()
     for k in range(3):
-        picture(seed=k).save(tmp_path / "photographs" / f"{k}.png")
+        photograph(seed=k).save(tmp_path / "photographs" / f"{k}.png")
     with_header(tmp_path / "photographs" / "1.png", 64_000, 48_000)
     assert "1.png cannot be read" in shellgs("capture", tmp_path / "photographs", tmp_path / "scene")
     assert not (tmp_path / "scene" / "images").exists()
@@ -301,7 +301,7 @@ def test_a_photograph_with_a_huge_header_is_refused_by_capture(tmp_path, shellgs
 
 @pytest.mark.parametrize("kept", [0.3, 0.02])
 def test_a_damaged_video_is_not_told_to_be_converted_alone(tmp_path, shellgs, kept):
-    write_video(tmp_path / "walk.mp4", [picture(seed=k) for k in range(9)])
+    write_video(tmp_path / "walk.mp4", [photograph(seed=k) for k in range(9)])
     data = (tmp_path / "walk.mp4").read_bytes()
     (tmp_path / "walk.mp4").write_bytes(data[: int(kept * len(data))])
     message = shellgs("capture", tmp_path / "walk.mp4", tmp_path / "scene")

@@ -76,6 +76,11 @@ def test_a_voxel_is_a_pixel_on_the_surface_by_default():
     assert 3.5 / 80 < mesh.metadata["voxel"] < 4.8 / 80
 
 
+def test_the_same_views_fuse_to_the_same_mesh_to_the_last_bit(sphere):
+    again = fuse((view_of_sphere(camera_at(angle)) for angle in np.linspace(-0.6, 0.6, 7)), ROOM, 0.05)
+    assert again.export(file_type="ply") == sphere.export(file_type="ply")
+
+
 def test_views_that_see_nothing_of_the_box_are_refused():
     empty = view_of_sphere(camera_at(0.0))._replace(depth=torch.zeros(64, 96, 1))
     with pytest.raises(SceneError, match="no view renders an opaque surface"):

@@ -9,6 +9,7 @@ import importlib
 import inspect
 import re
 from pathlib import Path
+from typing import Any
 
 import gsplat
 import pytest
@@ -50,7 +51,7 @@ PRIVATE = [
     ("module", "path", "parameters"), [each[1:] for each in PRIVATE], ids=[each[2] for each in PRIVATE]
 )
 def test_a_private_function_is_there_with_its_parameters(module: str, path: str, parameters: str):
-    found = importlib.import_module(module)
+    found: Any = importlib.import_module(module)
     for name in path.split("."):
         found = getattr(found, name)
     given = list(inspect.signature(found).parameters)

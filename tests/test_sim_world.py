@@ -315,7 +315,7 @@ SMALL = SimSettings(faces=4000)
 
 def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, capsys):
     out = tmp_path / "facade sim"
-    cli.sim((config,), out, SMALL)
+    cli.sim((config, out), SMALL)
     said = capsys.readouterr().out
     assert "convex parts" in said
     assert "8 spheres and boxes thrown" in said
@@ -335,6 +335,14 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, cap
     page = (out / "report.html").read_text()
     assert page.count("<img") >= 6
     assert "nan" not in page
+
+
+@pytest.mark.parametrize("words", ["run.yml out --parts 8", "--parts 8 run.yml out", "run.yml other.yml out --up z"])
+def test_options_stand_before_the_runs_or_after_the_folder(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["shellgs", "sim", *words.split()])
+    with pytest.raises(SystemExit, match=r"^shellgs: run\.yml does not exist"):
+        cli.main()
 
 
 def joined_file(out: Path) -> tuple[np.ndarray, np.ndarray]:

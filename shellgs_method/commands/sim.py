@@ -14,8 +14,7 @@ _SIM = SimSettings()
 
 
 def sim(
-    configs: Annotated[tuple[Path, ...], tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.Positional],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
     up: Optional[UpAxis] = None,
 ) -> None:
@@ -24,8 +23,7 @@ def sim(
     Several runs share one world; their shells must be in the same national coordinates.
 
     Args:
-        configs: config.yml of each run.
-        out: Output folder.
+        paths: config.yml of each run, then the output folder.
         settings: Settings.
         up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
     """
@@ -34,6 +32,7 @@ def sim(
     def report(sentence: str) -> None:
         console.print(sentence, highlight=False)
 
+    *configs, out = paths or (Path(),)  # one list: of two, the first takes all paths that an option follows
     metrics, _ = simulate(configs, out, settings, report, up)
     for sentence in metrics["summary"]:
         report(sentence)

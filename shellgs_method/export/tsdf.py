@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from dataparsers.camera import Camera
@@ -152,7 +152,22 @@ def _extract(grid, views: int) -> trimesh.Trimesh:
         return trimesh.Trimesh()
     colours = np.round(255 * surface.vertex.colors.numpy()).clip(0, 255).astype(np.uint8)
     vertices, faces = surface.vertex.positions.numpy().astype(np.float64), surface.triangle.indices.numpy()
+    vertices, faces, colours = _in_order(vertices, faces, colours)
     return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+
+
+def _in_order(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], colours: UInt8[np.ndarray, "V 3"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same surface, sorted by place.
+
+    Open3D's threads hand it out in another order each time, and what is made of it, thinned say, depends on the order.
+    """
+    order = np.lexsort((*colours.T, *vertices.T))
+    faces = np.argsort(order)[faces]
+    first = faces.argmin(1, keepdims=True)
+    faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, 1)
+    return vertices[order], faces[np.lexsort(faces.T)], colours[order]
 
 
 def _without_specks(mesh: trimesh.Trimesh, area: float) -> Bool[np.ndarray, " F"]:
