@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, UInt8
@@ -92,9 +92,9 @@ def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndar
         rays = cv2.fisheye.undistortPoints(pixels[:, None], K, np.array([k1, k2, k3, k4]))
     else:
         precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-        rays = cv2.undistortPointsIter(
-            pixels[:, None], K, np.array([k1, k2, p1, p2, k3]), np.eye(3), np.eye(3), precise
-        )
+        iterate: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # of OpenCV 4, of OpenCV 5
+        coefficients = np.array([k1, k2, p1, p2, k3])
+        rays = iterate(pixels[:, None], K, coefficients, R=np.eye(3), P=np.eye(3), criteria=precise)
     undistorted = view.camera.K.cpu().double().numpy()
     return rays[:, 0] @ undistorted[:2, :2].T + undistorted[:2, 2]
 

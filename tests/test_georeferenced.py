@@ -52,7 +52,8 @@ def national(request, scene: Path) -> Path:
         views = read_views(FacadeDataParserConfig(data=scene))
         write_colmap(scene, views, list(range(1, len(views) + 1)))
         points = [
-            f"{k} {' '.join(map(repr, np.add(NATIONAL, [k % 3, k % 5, k % 7])))} 9 9 9 0.1 1 0" for k in range(1, 40)
+            f"{k} {' '.join(map(repr, np.add(NATIONAL, [k % 3, k % 5, k % 7]).tolist()))} 9 9 9 0.1 1 0"
+            for k in range(1, 40)
         ]
         (scene / "sparse" / "0" / "points3D.txt").write_text("\n".join(points))
     return scene

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,7 +43,8 @@ def rays_through(model: str, coefficients: dict[str, float]) -> np.ndarray:
     if model == "OPENCV":
         parameters = np.array([coefficients.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-10)
-        ideal = cv2.undistortPointsIter(pixels, K, parameters, np.eye(3), np.eye(3), criteria)
+        iterate: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # of OpenCV 4, of OpenCV 5
+        ideal = iterate(pixels, K, parameters, R=np.eye(3), P=np.eye(3), criteria=criteria)
     else:
         parameters = np.array([coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
         ideal = cv2.fisheye.undistortPoints(pixels, K, parameters)

@@ -58,8 +58,9 @@ def test_the_users_number_of_threads_is_left_alone(machine, monkeypatch):
 
 
 def test_the_load_of_this_machine_can_be_read():
+    """In seconds of work, not of time: beside other processes this one may hardly get a core."""
     start = Load.now()
-    while (later := Load.now()).passed - start.passed < 0.2:
+    while (later := Load.now()).own - start.own < 0.1:
         sum(range(10_000))
-    assert later.own > start.own
-    assert later.cores_since(start) > 0.1
+    assert later.passed > start.passed
+    assert later.cores_since(start) > 0
