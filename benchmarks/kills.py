@@ -297,6 +297,8 @@ def main(config: Kills, folder: Path, console: Console) -> Sequence[Tally]:
 def preload() -> None:
     """Start the processes of commands with all imports, on one thread, without a compiler."""
     os.environ |= {"OMP_NUM_THREADS": "1", "SHELLGS_COMPILE": "0"}
+    if hasattr(os, "sched_setaffinity"):  # COLMAP asks for no variable, but starts as many threads as it has cores
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     multiprocessing.get_context("forkserver").set_forkserver_preload(
         ["method_configs", "nerfstudio.scripts.train", "shellgs_method.cli", "shellgs_method.compare.results"]
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import av
@@ -16,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import load_mask, load_photograph
-from shellgs_method.capture import CaptureConfig, capture
+from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.frames import extract_frames, sharpest
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import add_mask, add_photograph, find_masks, find_photographs, group_by_lens
@@ -277,6 +279,15 @@ def test_a_product_is_kept_until_it_is_made_with_another_key(tmp_path):
         pass
     assert not Work(tmp_path).has("model", "old")
     assert list((tmp_path / "model").iterdir()) == []
+
+
+def test_counting_rows_leaves_no_files_beside_the_database(tmp_path):
+    database = tmp_path / "database.db"
+    with closing(sqlite3.connect(database)) as connection:
+        connection.executescript("PRAGMA journal_mode = WAL; CREATE TABLE cameras (id); INSERT INTO cameras VALUES (1)")
+    assert stages._rows(database, "cameras") == 1
+    stages._tidy(database)
+    assert list(tmp_path.iterdir()) == [database]
 
 
 def test_a_growing_product_is_kept_only_for_the_same_key(tmp_path):

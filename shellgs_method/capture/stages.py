@@ -7,7 +7,7 @@ import json
 import os
 import sqlite3
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -166,6 +166,7 @@ class _Capture:
             masks=str(self.work.folder / "masks") if self.masks else None,
             sift=_SIFT[self.config.quality],
         )
+        _tidy(database)
         return database
 
     def _model(self, database: Path) -> None:
@@ -263,3 +264,10 @@ def _rows(database: Path, table: str) -> int:
             return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
     except sqlite3.Error:  # does not exist yet, or is busy
         return 0
+
+
+def _tidy(database: Path) -> None:
+    """Let SQLite remove the files that it made beside a database when :func:`_rows`, which may not, came last."""
+    writing = f"{database.absolute().as_uri()}?mode=rw"
+    with suppress(sqlite3.Error), closing(sqlite3.connect(writing, uri=True)) as connection:
+        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
