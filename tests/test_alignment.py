@@ -463,7 +463,7 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     positions = read_positions(tmp_path / "geo.txt", views)
     assert [view.name for view in positions.views] == ["images/0.png", "images/2.png"]
     np.testing.assert_array_equal(positions.shell, [[410000.125, 5413000.25, 251], [410001, 5413000, 251]])
-    assert positions.strangers == ["lost.jpg"]
+    assert positions.unknown == ["lost.jpg"]
 
 
 @pytest.mark.parametrize(

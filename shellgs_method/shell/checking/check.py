@@ -31,7 +31,7 @@ from shellgs_method.shell.checking.contradiction import (
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared."""
-WITNESSES = 6
+NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 VERSION = 2
 """Version of the maps: maps of another version are made again."""
@@ -92,9 +92,11 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     ]
     missing = [view for view in views if not maps.current(view.name, view.camera)]
     if missing:
-        known = _Known.of([view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}")
+        training = _TrainingViews.of(
+            [view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}"
+        )
         for view in track(missing, description="comparing the photographs"):
-            maps.write(view.name, known.compare(view, _read(shell, view)), view.camera)
+            maps.write(view.name, training.compare(view, _read(shell, view)), view.camera)
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
     records = [(shell.record(view.name), maps.record(view.name)) for view in views]
@@ -106,14 +108,14 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
 
 
 @dataclass(frozen=True)
-class _Known:
+class _TrainingViews:
     """The training views and their sweeps."""
 
     views: dict[str, ShellView]
     sweeps: dict[str, Sweep]
 
     @classmethod
-    def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _Known:
+    def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
         """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
         shell_views = {view.name: _shell_view(view, _read(shell, view)) for view in views}
         sweeps = {}
@@ -136,8 +138,8 @@ class _Known:
         else:
             seen = _shell_view(view, cue)
             found = sweep(seen, list(self.views.values()))
-        witnesses = self._witnesses(seen)
-        others, found_there = [self.views[name] for name in witnesses], [self.sweeps[name] for name in witnesses]
+        names = self._neighbours(seen)
+        others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
         score = agreed_score(seen, found, others, found_there)
         size, hit = cue.depth.shape, cue.depth > 0
         occluded = _resized(score, size).numpy() > CONTRADICTED
@@ -146,14 +148,14 @@ class _Known:
         depth = np.where(occluded, nearer, np.where(confirmed, cue.depth, 0)) * hit
         return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), occluded & hit)
 
-    def _witnesses(self, seen: ShellView) -> list[str]:
+    def _neighbours(self, seen: ShellView) -> list[str]:
         """Names of the nearest training views on either side that look in about the same direction."""
         if not (seen.depth > 0).any():
             return []
         reach = 0.9 * float(seen.depth[seen.depth > 0].median())
         names = [name for name, other in self.views.items() if other is not seen]
         found = sides(seen.camera, [self.views[name].camera for name in names])
-        near = [sorted(each for each in side if each[0] < reach)[:WITNESSES] for side in found]
+        near = [sorted(each for each in side if each[0] < reach)[:NEIGHBOURS] for side in found]
         return [names[index] for side in near for _, index in side]
 
 

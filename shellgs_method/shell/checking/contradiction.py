@@ -28,7 +28,7 @@ away to a third of its depth."""
 MOVES = 5.5
 """Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and much more needs
 finer steps of depth than the offsets have."""
-A_SIDE = 4
+PER_SIDE = 4
 """Neighbours on either side of a view: what is occluded on one side is visible from the other."""
 CONTRADICTED = 0.14
 """Score above which a pixel is contradicted. With 0.08 more are found, and renders of what is in front of the shell
@@ -70,12 +70,12 @@ class Sweep(NamedTuple):
     """Relative excess of the inverse depth over the shell's, interpolated between the tried :data:`OFFSETS`."""
 
 
-def neighbours(view: Camera, beside: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
+def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
     """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES`.
 
     Args:
         view: the view's camera.
-        beside: cameras to choose from, by :func:`sides`.
+        others: cameras to choose from, by :func:`sides`.
         depth: typical depth of the shell in the view.
         offset: one of :data:`OFFSETS`.
 
@@ -87,9 +87,9 @@ def neighbours(view: Camera, beside: Sides, depth: float, offset: float) -> list
         sorted(
             (max(baseline / wanted, wanted / baseline), index) for baseline, index in side if baseline > 1e-6 * depth
         )
-        for side in beside
+        for side in others
     ]
-    return [(index, side) for side in (0, 1) for _, index in found[side][:A_SIDE]]
+    return [(index, side) for side in (0, 1) for _, index in found[side][:PER_SIDE]]
 
 
 def sides(view: Camera, others: Sequence[Camera]) -> Sides:
@@ -110,15 +110,15 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
     pixels, near = _Pixels(view), sides(view.camera, [other.camera for other in others])
     depth = float(pixels.surface.median())
     roles: dict[int, list[tuple[int, int]]] = {}
-    for rung, offset in enumerate(OFFSETS):
+    for step, offset in enumerate(OFFSETS):
         for index, side in neighbours(view.camera, near, depth, offset):
-            roles.setdefault(index, []).append((rung, side))
+            roles.setdefault(index, []).append((step, side))
     sums = torch.zeros(len(OFFSETS), 2, 3, *view.depth.shape)
     for index, asked in roles.items():
-        beside = _Beside(pixels, others[index])
-        for rung, side in asked:
-            nearer = beside.disagreement(beside.look(pixels.surface / (1 + OFFSETS[rung])))
-            sums[rung, side] += beside.visible * torch.stack([beside.visible, beside.on_shell, nearer])
+        neighbour = _Neighbour(pixels, others[index])
+        for step, side in asked:
+            nearer = neighbour.disagreement(neighbour.look(pixels.surface / (1 + OFFSETS[step])))
+            sums[step, side] += neighbour.visible * torch.stack([neighbour.visible, neighbour.on_shell, nearer])
     weight, on_shell, nearer = sums.unbind(dim=2)
     on_shell, nearer = ((each / weight).nan_to_num(1.0).amin(dim=1) for each in (on_shell, nearer))
     scores = _smooth(pixels, on_shell - nearer)
@@ -138,23 +138,23 @@ def agreed_score(
     Args:
         view: the view.
         found: its sweep.
-        others: its neighbours, at most :data:`A_SIDE` and a few more on either side.
+        others: its nearest neighbours on either side.
         found_there: their sweeps.
     """
     pixels = _Pixels(view)
     shell, nearer, trust, support = [], [], [], []
     for other, sweep_there in zip(others, found_there, strict=True):
-        beside = _Beside(pixels, other)
-        before = beside.look(pixels.surface / (1 + found.offset.float()))
-        hidden = (beside.visible == 0) | ~before.inside
+        neighbour = _Neighbour(pixels, other)
+        look = neighbour.look(pixels.surface / (1 + found.offset.float()))
+        hidden = (neighbour.visible == 0) | ~look.inside
         probability = torch.sigmoid((sweep_there.score.float() - 0.4 * CONTRADICTED) / 0.02)
-        of_shell = _sampled(probability, beside.shell.grid)
-        of_nearer = _sampled(probability, before.grid)
-        offset = _sampled(other.depth, before.grid, "nearest") / before.z - 1
-        found_offset = _sampled(sweep_there.offset.float(), before.grid, "nearest")
+        of_shell = _sampled(probability, neighbour.shell.grid)
+        of_nearer = _sampled(probability, look.grid)
+        offset = _sampled(other.depth, look.grid, "nearest") / look.z - 1
+        found_offset = _sampled(sweep_there.offset.float(), look.grid, "nearest")
         alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
-        shell.append(beside.on_shell.masked_fill(hidden, torch.nan))
-        nearer.append(beside.disagreement(before).masked_fill(hidden, torch.nan))
+        shell.append(neighbour.on_shell.masked_fill(hidden, torch.nan))
+        nearer.append(neighbour.disagreement(look).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
         support.append((of_nearer * torch.where(alike, 1.0, 0.4)).masked_fill(hidden, torch.nan))
     if len(shell) < 2:
@@ -186,7 +186,7 @@ class _Pixels:
         self.surface = view.depth.where(hit, view.depth[hit].median() if hit.any() else view.depth.new_tensor(1.0))
 
 
-class _Beside:
+class _Neighbour:
     """A neighbour of a view; the epipolar lines of the view's pixels in it are computed once."""
 
     def __init__(self, pixels: _Pixels, other: ShellView) -> None:

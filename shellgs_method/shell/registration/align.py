@@ -76,8 +76,8 @@ def place_by_positions(path: Path, views: Sequence[View], shell: str, metres_per
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
     history = [_residuals_in_words(cameras, "camera positions")]
-    if surveyed.strangers:
-        history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.strangers)}.")
+    if surveyed.unknown:
+        history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.unknown)}.")
     if play > _MAX_PLAY:
         history.append(f"The rotation about the cameras' path is uncertain by about {play:.1f}°: use --refine.")
     return Placement(alignment, history, cameras)

@@ -38,12 +38,12 @@ class SurveyedPositions:
     Attributes:
         views: photographs of the scene that have a position.
         shell: camera position of each, in the shell's own frame.
-        strangers: names in the file that are not photographs of the scene.
+        unknown: names in the file that are not photographs of the scene.
     """
 
     views: Sequence[View]
     shell: Float64[np.ndarray, "N 3"]
-    strangers: Sequence[str]
+    unknown: Sequence[str]
 
 
 def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
@@ -54,7 +54,7 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
         SceneError: the file is in degrees, or a line cannot be read or contradicts another.
     """
     found: dict[str, tuple[View, list[float]]] = {}
-    strangers: list[str] = []
+    unknown: list[str] = []
     for number, (where, words) in enumerate(read_lines(path, "camera positions")):
         is_position = len(words) >= 4 and are_numbers(words[1:4])
         if number == 0 and not is_position:
@@ -65,13 +65,13 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
             raise SceneError(f"{where}: expected the image, then X Y Z in the shell's coordinates")
         view = view_named(words[0], views, where)
         if view is None:
-            strangers.append(words[0])
+            unknown.append(words[0])
         elif view.name in found:
             raise SceneError(f"{where}: {words[0]} has a position already")
         else:
             found[view.name] = view, [float(word) for word in words[1:4]]
     shell = np.array([position for _, position in found.values()]).reshape(-1, 3)
-    return SurveyedPositions([view for view, _ in found.values()], shell, strangers)
+    return SurveyedPositions([view for view, _ in found.values()], shell, unknown)
 
 
 def align_positions(
@@ -86,7 +86,7 @@ def align_positions(
     """
     views = surveyed.views
     if len(views) < 3:
-        known = f" ({', '.join(surveyed.strangers[:3])} … are not in the scene)" if surveyed.strangers else ""
+        known = f" ({', '.join(surveyed.unknown[:3])} … are not in the scene)" if surveyed.unknown else ""
         raise SceneError(f"{len(views)} photographs of the scene have a position{known}: at least 3 are needed")
     everyone = np.ones(len(views), bool)
     scene = positions(view.camera for view in views)
