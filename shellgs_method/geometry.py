@@ -52,7 +52,7 @@ class Geometry:
     """Differentiable maps of one rendered view, in the camera frame."""
 
     depth: Float[Tensor, "H W 1"]
-    """Forward z-depth, positive and finite everywhere; the view's maximum where nothing was rendered."""
+    """Forward z-depth, finite and positive unless the view is empty; its maximum where nothing was rendered."""
     normal: Float[Tensor, "H W 3"]
     """Composited normals, of length at most 1."""
     alpha: Float[Tensor, "H W 1"]
