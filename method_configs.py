@@ -1,4 +1,4 @@
-"""The registry: every method is a point of primitive x cues, as a config."""
+"""Method registry: a nerfstudio config for each method, a choice of primitive and cues."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpec
     return MethodSpecification(config=config, description=description)
 
 
-# Beside terms of geometry the picture comes more slowly, and its gradients are smaller while there is time to densify:
-# with this threshold the methods with cues end with about as many Gaussians as photo-gs, whose is 0.0002.
+# With geometric terms the image converges more slowly, and its gradients are smaller during densification. With this
+# threshold the methods with cues end with about as many Gaussians as photo-gs, whose threshold is 0.0002.
 THRESHOLD_WITH_CUES = 0.00014
 
-THRESHOLD_METRIC = 0.0004  # its seeds resolve the wall already
+THRESHOLD_METRIC = 0.0004  # the seeds already resolve the wall
 
 shellgs = _method(
     "shellgs",
@@ -60,7 +60,7 @@ shellgs = _method(
 )
 shellgs_metric = _method(
     "shellgs-metric",
-    "3D Gaussians that begin on an aligned facade shell and stay within its tolerance: the method to use",
+    "3D Gaussians initialised on an aligned facade shell and kept within its tolerance: the recommended method",
     FacadeModelConfig(
         cues="shell",
         shell_counts="uncontradicted",
@@ -71,16 +71,16 @@ shellgs_metric = _method(
 )
 mono_gs = _method(
     "mono-gs",
-    "3D Gaussians supervised by depth and normals that networks see in the photographs",
+    "3D Gaussians supervised by depth and normals that networks predict from the photographs",
     FacadeModelConfig(cues="mono", densify_grad_thresh=THRESHOLD_WITH_CUES),
 )
 photo_gs = _method(
     "photo-gs",
-    "3D Gaussians from the photographs alone, the baseline of shellgs",
+    "3D Gaussians from the photographs alone, the baseline",
     FacadeModelConfig(cues="none"),
 )
 two_dgs = _method(
     "2dgs",
-    "The discs of 2D Gaussian Splatting from the photographs alone",
+    "2D Gaussian Splatting discs from the photographs alone",
     FacadeModelConfig(primitive="2d", cull_alpha_thresh=0.05, extra=ExtraLossConfig(normal_consistency=0.05)),
 )

@@ -1,4 +1,4 @@
-"""Ablations by name: each is a registered method and the flags that change it, the words after ``ns-train``."""
+"""Ablations by name: a registered method and the flags that modify it, as arguments of ``ns-train``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _DISCS = ("--pipeline.model.primitive", "2d", "--pipeline.model.cull-alpha-thres
 _METRIC = ("--pipeline.model.extra.point-to-plane", "1")
 
 ABLATIONS: dict[str, tuple[str, ...]] = {
-    # The paper's: which terms (table of the ablation), and what the baseline has beside them.
+    # The paper's ablations: terms left out (its ablation table), and extras of the baseline.
     "shellgs-depth": ("shellgs", *_off("normal", "smoothness")),
     "shellgs-normal": ("shellgs", *_off("depth", "smoothness")),
     "shellgs-depth-normal": ("shellgs", *_off("smoothness")),
@@ -20,7 +20,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "shellgs-flat": ("shellgs", *_FLATTENED),
     "mono-gs-flat": ("mono-gs", *_FLATTENED),
     "photo-gs-flat": ("photo-gs", *_FLATTENED),
-    # Beyond the paper, one at a time, and the two that do most for geometry together.
+    # Beyond the paper, one at a time, and the two most effective for geometry together.
     "shellgs-2d": ("shellgs", *_DISCS),
     "shellgs-plane": ("shellgs", "--pipeline.model.depth", "plane"),
     "shellgs-normals-of-depth": ("shellgs", "--pipeline.model.extra.depth-normal", "0.1"),
@@ -28,7 +28,7 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "shellgs-2d-point-to-plane": ("shellgs", *_DISCS, *_METRIC),
     "shellgs-occlusion-gate": ("shellgs", "--pipeline.model.extra.occlusion-gate", "0.5"),
     "shellgs-mcmc": ("shellgs", "--pipeline.model.densification", "mcmc"),
-    # Supervised in half of the facade's bands, measured in the other half.
+    # Supervised in half of the facade's bands, evaluated in the other half.
     "shellgs-without-a": ("shellgs", "--pipeline.datamanager.holdout", "A"),
     "shellgs-without-b": ("shellgs", "--pipeline.datamanager.holdout", "B"),
     "photo-gs-without-a": ("photo-gs", "--pipeline.datamanager.holdout", "A"),

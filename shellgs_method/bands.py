@@ -1,7 +1,7 @@
-"""Vertical bands of a facade, alternating A and B, so that what is supervised and what is measured are apart.
+"""Vertical bands of a facade, alternately A and B, that separate supervised from evaluated surface.
 
-A band belongs to the wall, not to the image: it is cut by planes that stand in the scene, across the facade, so that
-it is the same piece of wall in every view.
+Bands are cut by planes fixed in the scene, perpendicular to the facade, so that each is the same piece of wall in every
+view.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 
 MAX_VIEWS = 32
-"""Views, evenly spaced among those given, that the facade's direction is taken from."""
+"""Maximum number of views, evenly spaced, used to find the facade's direction."""
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Every other vertical band of a facade: band k reaches from k to k + 1 widths along the axis, A are the even ones.
+    """Every other vertical band of a facade: band k extends from k to k + 1 widths along the axis; even k are A.
 
     Attributes:
         axis: unit vector in the scene, horizontal along the facade.
-        width: of a band, in scene units.
+        width: width of a band, in scene units.
         name: which of the two halves.
     """
 
@@ -44,36 +44,36 @@ class Bands:
         return replace(self, name="B" if self.name == "A" else "A")
 
     def index(self, depth: Float[Tensor, "H W"], camera: Camera) -> Int[Tensor, "H W"]:
-        """Number k of the band that each pixel's surface lies in.
+        """Index k of the band of each pixel's surface.
 
         Args:
-            depth: the shell's z-depth, in scene units.
-            camera: of the view, in the scene's frame.
+            depth: z-depth of the shell, in scene units.
+            camera: camera of the view, in the scene's frame.
         """
-        direction = camera.viewmat[:3, :3] @ self.axis.to(camera.viewmat)  # the axis as the camera sees it
+        direction = camera.viewmat[:3, :3] @ self.axis.to(camera.viewmat)  # the axis in the camera frame
         along = depth * (camera.rays() @ direction) + camera.position @ self.axis.to(camera.viewmat)
         return (along / self.width).floor().long()
 
     def mask(self, shell: CueMap, camera: Camera) -> Bool[np.ndarray, "H W"]:
-        """Pixels whose surface lies in this half; none of those beside the shell, which are in no band."""
+        """Pixels whose surface lies in this half; pixels without shell are in no band."""
         odd = self.index(torch.from_numpy(shell.depth), camera).numpy() % 2 == 1
         return shell.mask & (odd == (self.name == "B"))
 
 
 def facade_bands(maps: CueMaps, views: Sequence[View], width: float, name: Literal["A", "B"]) -> Bands:
-    """Bands across the facade that a shell's maps show, the same for the same maps and views.
+    """Find the bands of the facade in a shell's maps; deterministic for the same maps and views.
 
-    The facade's normal is the dominant horizontal direction of the shell's normals, up is the mean of the cameras'. A
-    camera path that looks up at the facade tilts this up within the plane of the two, which does not turn the axis.
+    The facade's normal is the dominant horizontal direction of the shell's normals; up is the mean of the cameras'. If
+    all cameras look up at the facade, up tilts within the plane of the two, which does not change the axis.
 
     Args:
-        maps: of the shell.
-        views: the training views, with cameras of the maps' size.
-        width: of a band in metres, or in scene units where the maps do not know metres.
+        maps: shell maps.
+        views: training views, with cameras of the maps' size.
+        width: width of a band in metres, or in scene units if the maps' metres are unknown.
         name: which half.
 
     Raises:
-        SceneError: no view has a map, or the shell in the maps has no upright wall.
+        SceneError: If no view has a map, or the shell in the maps has no upright wall.
     """
     up = torch.from_numpy(upwards(view.camera for view in views))
     upright = torch.eye(3).double() - torch.outer(up, up)
@@ -87,10 +87,10 @@ def facade_bands(maps: CueMaps, views: Sequence[View], width: float, name: Liter
     strengths, directions = torch.linalg.eigh(scatter)
     if strengths[-1] <= 0:
         raise SceneError(
-            f"the shell maps of {maps.scene} show no upright wall that bands could be cut across: "
+            f"the shell maps of {maps.scene} show no upright wall to cut into bands: "
             "run `shellgs cast SCENE`, or train without a holdout"
         )
     wall = directions[:, -1]
-    wall = wall if wall @ facing >= 0 else -wall  # towards the cameras: eigenvectors have no sign of their own
+    wall = wall if wall @ facing >= 0 else -wall  # towards the cameras: the sign of an eigenvector is arbitrary
     axis = torch.linalg.cross(up, wall)
     return Bands(axis / axis.norm(), width / (maps.manifest.metres_per_unit or 1.0), name)

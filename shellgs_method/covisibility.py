@@ -1,4 +1,4 @@
-"""Which pixels of a held-out view the training has seen: in the others there is nothing right to be measured."""
+"""Pixels of a held-out view that the training views cover; elsewhere no method can be right."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from torch import Tensor
 from dataparsers.camera import Camera
 
 MAX_SIZE = 320
-"""Longer side in pixels at which visibility is worked out."""
+"""Longer side in pixels at which visibility is computed."""
 MIN_VIEWS = 2
-"""Training views that must see a pixel: one alone does not tell how far away it is."""
+"""Minimum number of training views that see a pixel: one alone does not determine its depth."""
 BEHIND = 0.02
-"""Share of its depth that a point may lie behind a training view's shell without being hidden by it."""
+"""Relative depth by which a point may lie behind a training view's shell without being hidden by it."""
 
 
 @dataclass(frozen=True)
 class SeenBy:
-    """What training views see of the scene.
+    """Cameras and shell depths of the training views.
 
     Attributes:
-        cameras: of the training views.
-        depths: z-depth of the shell in each of them, 0 where there is none; of the camera's size or thinned.
+        cameras: cameras of the training views.
+        depths: z-depth of the shell in each view, 0 where there is none; at the camera's size or thinned.
         points: SfM points in the cameras' world.
     """
 
@@ -35,13 +35,13 @@ class SeenBy:
     points: Float[Tensor, "N 3"]
 
     def mask(self, camera: Camera, depth: Float[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
-        """Pixels of a view that at least two training views have in their image, not hidden by the shell.
+        """Pixels of a view that lie in at least two training images, not hidden by the shell.
 
-        This is the co-visibility of Gao et al. 2022, from geometry instead of optical flow. A pixel's place is that of
-        the shell or, where there is none, as far away as the nearest SfM point in the image.
+        This is the co-visibility of Gao et al. 2022, from geometry instead of optical flow. A pixel has the depth of
+        the shell or, without shell, of the SfM point nearest in the image.
 
         Args:
-            camera: of the view.
+            camera: camera of the view.
             depth: z-depth of the shell, 0 where there is none.
         """
         step = camera.thinning(MAX_SIZE)
@@ -54,7 +54,7 @@ class SeenBy:
         return seen[: camera.height, : camera.width, None]
 
     def _depth_of_points(self, camera: Camera, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
-        """Depth of the SfM point that is nearest in the image; as far as the sky where none is in it."""
+        """Depth of the SfM point nearest in the image; that of the sky, 1e6, if the image has none."""
         pixels, z = _project(camera, self.points)
         inside = _inside(camera, pixels, z)
         if not inside.any():
@@ -77,7 +77,7 @@ def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "*sh
 def _project(
     camera: Camera, world: Float[Tensor, "*shape 3"]
 ) -> tuple[Float[Tensor, "*shape 2"], Float[Tensor, "*shape"]]:
-    """Pixels and z-depths."""
+    """Pixel coordinates and z-depths of points."""
     points = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     z = points[..., 2]
     return (points @ camera.K.T)[..., :2] / z.clamp_min(1e-9)[..., None], z

@@ -1,6 +1,6 @@
-"""Densification as Markov chain Monte Carlo (Kheradmand et al. 2024) in plain torch, on any device.
+"""MCMC densification (3DGS as Markov chain Monte Carlo, Kheradmand et al. 2024) in plain torch, on any device.
 
-gsplat's ``MCMCStrategy`` calls CUDA kernels for the relocation and for the covariances of the noise.
+gsplat's ``MCMCStrategy`` needs CUDA kernels for the relocation and for the covariances of the noise.
 """
 
 from __future__ import annotations
@@ -18,45 +18,45 @@ from torch.optim import Optimizer
 from shellgs_method.rasterizer import quats_to_rotations
 
 MAX_COPIES = 51
-"""Most Gaussians that one is divided into at a time, as in the authors' code: more would change nothing visible."""
+"""Maximum number of Gaussians that one is divided into, as in the authors' code: more would make no visible change."""
 
 
 @dataclass(frozen=True)
 class MCMCConfig:
-    """Densification as Markov chain Monte Carlo, with its authors' numbers."""
+    """MCMC densification, with the authors' defaults."""
 
     cap_max: int = 1_000_000
-    """Most Gaussians; SfM points beyond it are left out."""
+    """Maximum number of Gaussians; further SfM points are ignored."""
     noise: float = 5e5
-    """Size of the noise on the centres."""
+    """Scale of the noise on the centres."""
     opacity: float = 0.01
-    """Weight of the mean opacity, which makes Gaussians that are not needed fade."""
+    """Weight of the mean opacity, which makes unneeded Gaussians fade."""
     scale: float = 0.01
     """Weight of the mean scale."""
 
 
 @dataclass
 class MCMCStrategy(Strategy):
-    """Gaussians too faint to see are moved to where others are, some are added up to a cap, and all are shaken.
+    """Relocate faint Gaussians onto others, add Gaussians up to a cap, and add noise to all centres.
 
-    The numbers are the authors'. Neither moving nor adding changes the image: a Gaussian is divided into copies in
-    its place that together are what it was.
+    The defaults are the authors'. Neither relocation nor addition changes the image: a Gaussian is divided into copies
+    at its centre that together look as it did.
     """
 
     cap_max: int
-    """Most Gaussians."""
+    """Maximum number of Gaussians."""
     refine_start_iter: int
     refine_stop_iter: int
     refine_every: int
     noise: float = 5e5
-    """Size of the noise on the centres, as a multiple of their learning rate and covariance."""
+    """Scale of the noise on the centres, as a multiple of their learning rate and covariance."""
     min_opacity: float = 0.005
-    """A Gaussian of this opacity or less is moved."""
+    """Gaussians of this opacity or less are relocated."""
     growth: float = 0.05
-    """Share of Gaussians that are added at a time."""
+    """Share of Gaussians added at each refinement."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """Nothing is carried from step to step."""
+        """Return an empty state: nothing is kept between steps."""
         del scene_scale
         return {}
 
@@ -70,20 +70,20 @@ class MCMCStrategy(Strategy):
         info: dict[str, Any],
         packed: bool = False,
     ) -> None:
-        """Move, add and shake, after the optimizers' step."""
+        """Relocate, add Gaussians and add noise, after the optimizers' step."""
         del state, info, packed
         in_window = self.refine_start_iter < step < self.refine_stop_iter
         if in_window and step % self.refine_every == 0:
-            self._move(params, optimizers)
+            self._relocate(params, optimizers)
             self._add(params, optimizers)
         means = params["means"]
-        shake = self.noise * optimizers["means"].param_groups[0]["lr"]
-        # Opaque Gaussians stay where they are: the factor falls from 1 to 0 around an opacity of 0.005.
+        noise = self.noise * optimizers["means"].param_groups[0]["lr"]
+        # Opaque Gaussians get no noise: the factor falls from 1 to 0 around an opacity of 0.005.
         faint = torch.sigmoid(100 * (0.005 - params["opacities"].sigmoid()))
         axes = quats_to_rotations(params["quats"]) * params["scales"].exp()[:, None]
-        means += shake * faint * (axes @ (axes.mT @ torch.randn_like(means)[..., None])).squeeze(-1)
+        means += noise * faint * (axes @ (axes.mT @ torch.randn_like(means)[..., None])).squeeze(-1)
 
-    def _move(self, params: nn.ParameterDict, optimizers: dict[str, Optimizer]) -> None:
+    def _relocate(self, params: nn.ParameterDict, optimizers: dict[str, Optimizer]) -> None:
         opacities = params["opacities"].sigmoid().flatten()
         dead = (opacities <= self.min_opacity).nonzero().squeeze(1)
         if 0 < len(dead) < len(opacities):
@@ -111,7 +111,7 @@ class MCMCStrategy(Strategy):
         sources: Int[Tensor, "M"],
         places: Int[Tensor, "M"],
     ) -> None:
-        """Turn each source into itself and its copies, which are written over the Gaussians at ``places``."""
+        """Divide each source into itself and its copies, which replace the Gaussians at ``places``."""
         copies = torch.bincount(sources)[sources] + 1
         opacities = params["opacities"][sources].sigmoid()
         opacity, shrink = relocated(opacities.flatten(), copies.clamp_max(MAX_COPIES))
@@ -122,12 +122,12 @@ class MCMCStrategy(Strategy):
         for name, parameter in params.items():
             parameter[places] = parameter[sources]
             for moment in optimizers[name].state[parameter].values():
-                if moment.dim() > 0:  # not the count of steps
+                if moment.dim() > 0:  # not the step count
                     moment[touched] = 0
 
 
 def relocated(opacities: Float[Tensor, "M"], copies: Int[Tensor, "M"]) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:
-    """Opacity of each of N copies that are in one place what one Gaussian was, and the factor of their scales.
+    """Opacity and scale factor of N copies that in one place together look like one Gaussian.
 
     o' = 1 - (1 - o)^(1/N), and s'/s = o / Σ_{i=1..N} Σ_{k<i} C(i-1, k) (-1)^k o'^(k+1) / √(k+1) (Kheradmand et al.
     2024, eq. 9). Summed over i first, the binomials are C(N, k+1).

@@ -1,7 +1,7 @@
-"""What Gaussians say of the surface: the channels they carry, and the depth and normals these composite to.
+"""Depth and normals of Gaussians: the channels to composite, and the maps made of them.
 
-A disc of 2D Gaussian Splatting is a Gaussian whose third axis has no length: everything here but the depth of its ray
-intersection is the same for both primitives.
+A disc of 2D Gaussian Splatting is a Gaussian whose third axis has no length: all but the depth of its ray intersection
+is the same for both primitives.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from dataparsers.camera import Camera
 from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer import quats_to_rotations
-from shellgs_method.rasterizer.projection import to_camera, turn
+from shellgs_method.rasterizer.projection import rotate, to_camera
 
 Primitive = Literal["3d", "2d"]
 DepthKind = Literal["expected", "median", "plane"]
 
 DISC_LOG_THICKNESS = -20.0
-"""Logarithm of a disc's third scale: nothing, yet finite in an exported file, and splits stay in the plane."""
+"""Logarithm of a disc's third scale: negligible, so that splits stay in the plane, yet finite in an exported file."""
 
 GRAZING = 0.01
-"""Least cosine of normal and ray at which a plane depth is taken: a plane seen edge-on is met nowhere near."""
+"""Smallest cosine of normal and ray for a plane depth: the ray meets a plane seen edge-on far away or not at all."""
 
 
 class DepthMoments(NamedTuple):
-    """Composited powers of the centres' depths."""
+    """Composited moments of the centres' depths."""
 
     origin: Float[Tensor, ""]
-    """Depth they are about, a constant, so that little is lost in float32."""
+    """Constant depth that the moments are about, for accuracy in float32."""
     first: Float[Tensor, "H W 1"]
     """Σ w (z - origin)."""
     second: Float[Tensor, "H W 1"]
     """Σ w (z - origin)²."""
 
     def about(self, depth: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "H W 1"]:
-        """Σ w (z - depth)²: how far all that is rendered in a pixel is from a depth, which their mean may well have."""
+        """Σ w (z - depth)², positive if splats of a pixel are off the depth even if their mean is not."""
         d = depth - self.origin
         return self.second - 2 * d * self.first + d.square() * alpha
 
@@ -52,29 +52,29 @@ class Geometry:
     """Differentiable maps of one rendered view, in the camera frame."""
 
     depth: Float[Tensor, "H W 1"]
-    """Forward z-depth, positive and finite everywhere; the farthest of the view where nothing was rendered."""
+    """Forward z-depth, finite and positive unless the view is empty; its maximum where nothing was rendered."""
     normal: Float[Tensor, "H W 3"]
-    """Normals as composited, of length 1 at most."""
+    """Composited normals, of length at most 1."""
     alpha: Float[Tensor, "H W 1"]
     """Accumulated opacity."""
     camera: Camera
     distortion: Float[Tensor, "H W 1"] | None = None
-    """Spread of the splats along each ray, of discs only."""
+    """Spread of the splats along each ray; discs only."""
     moments: DepthMoments | None = None
-    """Of the centres' depths, where they were asked for."""
+    """Moments of the centres' depths, if requested."""
 
     @cached_property
     def depth_normal(self) -> Float[Tensor, "H W 3"]:
-        """Unit normals of the depth, zero on the image's border."""
+        """Unit normals of the depth, zero on the image border."""
         return normals_from_depth(self.depth, self.camera)
 
 
 def geometry_channels(
     gaussians: Mapping[str, Tensor], camera: Camera, depth: DepthKind
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"]]:
-    """Of each Gaussian, in the camera frame: its normal, and what its depth is made of.
+    """Normal and depth channel of each Gaussian, in the camera frame.
 
-    The normal is the shortest axis, facing the camera. The other is n·m, which is negative, for plane depth (m the
+    The normal n is the shortest axis, facing the camera. The depth channel is n·m, negative, for plane depth (m is the
     centre), else the forward depth of the centre.
     """
     splats = (gaussians[name] for name in ("means", "quats", "scales"))
@@ -83,7 +83,7 @@ def geometry_channels(
 
 
 def squared_depths(depths: Float[Tensor, "N 1"]) -> tuple[Float[Tensor, "N 1"], Float[Tensor, ""]]:
-    """The channel that :class:`DepthMoments` are made of besides the centres' depths, and its origin, their median."""
+    """Squared depths about their median, the second channel of :class:`DepthMoments`, and this origin."""
     origin = depths.detach().median()
     return (depths - origin).square(), origin
 
@@ -96,7 +96,7 @@ def _normals_and_depths(
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"], Float[Tensor, "N 1"]]:
     """Normals, n·m, and depths of the centres."""
     centres = torch.stack(to_camera(means, viewmat), dim=-1)[0]
-    axes = torch.stack(turn(quats_to_rotations(quats), viewmat), dim=-2)[0]
+    axes = torch.stack(rotate(quats_to_rotations(quats), viewmat), dim=-2)[0]
     x, y, z = scales.detach().unbind(-1)
     first, second = (x <= y) & (x <= z), y <= z
     shortest = torch.where(first[:, None], axes[..., 0], torch.where(second[:, None], axes[..., 1], axes[..., 2]))
@@ -114,17 +114,17 @@ def rendered_geometry(
 ) -> Geometry:
     """Depth and normals of a view from the composite of :func:`geometry_channels`.
 
-    * ``expected``: mean depth of the Gaussians' centres; of discs, alpha / Σ w/z of the ray's intersections.
-    * ``median``: discs only, the intersection where half of the light has been stopped; where it never is, expected.
+    * ``expected``: mean depth of the Gaussians' centres; for discs, alpha / Σ w/z of the ray's intersections.
+    * ``median``: discs only, the intersection where the transmittance falls to 1/2; expected where it does not.
     * ``plane``: Σ w n·m / (Σ w n · ray), the ray's intersection with the composited plane (PGSR, Chen et al. 2024).
 
     Args:
-        composited: normals and the depth channel; with ``origin`` also that of :func:`squared_depths`.
+        composited: normals and depth channel; with ``origin`` also the channel of :func:`squared_depths`.
         alpha: accumulated opacity.
-        info: what the rasterizer returned beside them.
-        camera: of the view.
-        depth: which depth; the channel must have been made for it.
-        origin: of the squared depths.
+        info: third output of the rasterizer.
+        camera: camera of the view.
+        depth: kind of depth, as given to :func:`geometry_channels`.
+        origin: origin of the squared depths.
     """
     normal, channel = composited[..., :3], composited[..., 3:4]
     solid = alpha.clamp_min(1e-6)

@@ -1,4 +1,4 @@
-"""Points of the shell as Gaussians to begin with, as densely as the photographs resolve them."""
+"""Initial points on the shell, as dense as the photographs resolve."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from shellgs_method.reference import Reference
 from shellgs_method.voxels import cell_means, voxel_cells
 
 GRAZING = 0.2
-"""Least cosine of the shell's normal and the ray at which a pixel is a sample: below it, colours and depth smear."""
+"""Smallest cosine of the shell's normal and the ray of a sampled pixel: below it, colours and depth smear."""
 MAX_SAMPLES = 8_000_000
-"""Pixels of all views that seeds are made from."""
+"""Maximum number of pixels of all views that seeds are made from."""
 
 
 class SeededView(NamedTuple):
-    """What seeds are made from: one training view."""
+    """A training view to make seeds from."""
 
     camera: Camera
     image: Float[Tensor, "H W 3"]
     """Colours in [0, 1]."""
     shell: Reference
-    """In units and axes of the camera's world, or what photographs show before it; its mask is where seeds may be."""
+    """Shell in units of the camera's world, or what photographs show in front of it; the mask is where seeds may be."""
 
 
 class Seeds(NamedTuple):
@@ -41,14 +41,14 @@ class Seeds(NamedTuple):
     colours: Float[ndarray, "N 3"]
     """Median over the views that show the point, in [0, 1]."""
     spacing: Float[ndarray, " N"]
-    """Distance to the next seeds, in the units of the points."""
+    """Distance to neighbouring seeds, in the units of the points."""
 
 
 class _Samples(NamedTuple):
     points: Float[ndarray, "S 3"]
     normals: Float[ndarray, "S 3"]
     colours: Float[ndarray, "S 3"]
-    footprint: Float[ndarray, " S"]  # of a pixel on the shell, seen from the front
+    footprint: Float[ndarray, " S"]  # size of a pixel on the shell, as if seen from the front
     view: Int[ndarray, " S"]
 
     def select(self, kept: Bool[ndarray, " S"]) -> _Samples:
@@ -56,19 +56,19 @@ class _Samples(NamedTuple):
 
 
 def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, most: int) -> Seeds:
-    """Seeds about ``spacing`` pixels apart in the view that is closest to them.
+    """Make seeds about ``spacing`` pixels apart in the view closest to them.
 
-    The pixels of all views are lifted to the shell and thinned to one point in a voxel, whose side is a power of two
-    times the smallest there is: what a view shows from near is thinned finely first, and then what others add.
+    The pixels of all views are lifted to the shell and thinned to one point per voxel. Voxel sides are the smallest one
+    times powers of two: surface seen from close up is thinned first, finely, then what farther views add.
 
     Args:
-        views: of the training.
-        num_pixels: of all views together.
-        spacing: in pixels.
-        most: number of seeds beyond which they are spread more widely.
+        views: training views.
+        num_pixels: number of pixels of all views together.
+        spacing: distance between seeds in pixels.
+        most: maximum number of seeds; the spacing is increased to stay below it.
 
     Returns:
-        The seeds; none where no view has a pixel on the shell that is neither masked nor grazing.
+        Seeds; none if no view has a pixel on the shell that is neither masked nor grazing.
     """
     stride = max(1, int(np.ceil((num_pixels / MAX_SAMPLES) ** 0.5)))
     lifted = [_lift(view, index, stride) for index, view in enumerate(views)]
@@ -83,13 +83,13 @@ def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, mo
     distance, nearest = map(np.asarray, KDTree(points).query(samples.points, workers=-1))
     near = distance < apart[nearest]
     by_view, pairs = np.unique(nearest[near] * (samples.view.max() + 1) + samples.view[near], return_inverse=True)
-    shown = by_view // (samples.view.max() + 1)  # the seed of each pair of a seed and a view
+    shown = by_view // (samples.view.max() + 1)  # the seed of each (seed, view) pair
     colours, known = _medians(cell_means(samples.colours[near], pairs), shown, len(points))
     return Seeds(points[known], normals[known], colours[known], apart[known])
 
 
 def _lift(view: SeededView, index: int, stride: int) -> _Samples:
-    """Every ``stride``-th pixel of a view in both directions, on the shell."""
+    """Lift every ``stride``-th pixel of a view, in both directions, to the shell."""
     depth, normal, mask = (each[::stride, ::stride] for each in view.shell)
     rays, image = view.camera.rays()[::stride, ::stride], view.image[::stride, ::stride]
     facing = -(normal * torch.nn.functional.normalize(rays, dim=-1)).sum(dim=-1)
@@ -105,7 +105,7 @@ def _lift(view: SeededView, index: int, stride: int) -> _Samples:
 def _thinned(
     samples: _Samples, spacing: float
 ) -> tuple[Float[ndarray, "N 3"], Float[ndarray, "N 3"], Float[ndarray, " N"]]:
-    """Points, unit normals, and the side of the voxel that each was thinned by."""
+    """Thinned points, their unit normals, and the voxel side of each."""
     wanted = spacing * samples.footprint
     finest = np.percentile(wanted, 1)
     levels = np.floor(np.log2(wanted / finest)).clip(0).astype(int)
@@ -124,7 +124,7 @@ def _thinned(
 def _medians(
     values: Float[ndarray, "S 3"], groups: Int[ndarray, " S"], num_groups: int
 ) -> tuple[Float[ndarray, "G 3"], Bool[ndarray, " G"]]:
-    """Median of each group's values, channel by channel, and which groups have any."""
+    """Median of each group's values per channel, and which groups have values."""
     counts = np.bincount(groups, minlength=num_groups)
     middle = (np.cumsum(counts) - counts + (counts - 1) // 2).clip(0, len(values) - 1)
     medians = [channel[np.lexsort((channel, groups))][middle] for channel in values.T]

@@ -1,4 +1,4 @@
-"""The geometric terms of the objective, weighted for the iteration. A term of no weight is not computed."""
+"""Geometric loss terms, weighted for the iteration. Terms of weight 0 are not computed."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.reference import Reference
 
 TOLERANCES = (0.05, 0.15)
-"""Least and largest tolerance in metres: with less, pictures of Herz-Jesu lost more than its surface gained."""
+"""Smallest and largest tolerance in metres: with less, images of Herz-Jesu lost more than its surface gained."""
 
 
 @dataclass
 class GeometryLossConfig:
-    """Weights of D, N and C from the first iteration to the last (paper, section 3.4); initial 0 leaves a term out."""
+    """Weights of D, N and C over the iterations (paper, section 3.4); initial 0 switches a term off."""
 
     depth: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.5, 0.1))
     """Weight α(t) of the inverse-depth NCC."""
@@ -41,19 +41,19 @@ class GeometryLossConfig:
     smoothness: ExponentialDecay = field(default_factory=lambda: ExponentialDecay(0.1, 0.1))
     """Weight γ(t) of normal smoothness."""
     ncc: Literal["local", "vid2sim"] = "local"
-    """local: the paper's equation; vid2sim: the form of the released baseline."""
+    """local: the paper's equation; vid2sim: as in the baseline's released code."""
     ncc_window: int = 9
-    """Side of the patches of the local NCC in pixels."""
+    """Patch side of the local NCC in pixels."""
     ncc_eps: float = 1e-3
-    """Contrast of a patch, relative to its depth, below which the local NCC takes it for flat."""
+    """Contrast of a patch, relative to its depth, below which the local NCC treats it as flat."""
 
 
 @dataclass(frozen=True)
 class ExtraLossConfig:
-    """Terms beyond the paper's objective, each off at 0. Lengths are scene units where metres are unknown."""
+    """Terms beyond the paper's objective, each off at 0. Lengths are in scene units if metres are unknown."""
 
     normal_consistency: float = 0.0
-    """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (there 0.05)."""
+    """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05)."""
     normal_consistency_from: int = 7000
     """First iteration of that term."""
     distortion: float = 0.0
@@ -61,26 +61,26 @@ class ExtraLossConfig:
     distortion_from: int = 3000
     """First iteration of that term."""
     depth_normal: float = 0.0
-    """Weight of the normal loss on normals of the rendered depth, which moves Gaussians where N turns them."""
+    """Weight of the normal loss on normals of the rendered depth, which moves Gaussians; N only rotates them."""
     point_to_plane: float = 0.0
-    """Weight of the distance from the cue's tangent plane, in metres, under a logarithm."""
+    """Weight of the logarithm of the distance from the cue's tangent plane, in metres."""
     empty_space: float = 0.0
-    """Weight of the same loss on all that a pixel shows, where ``point_to_plane`` takes the mean: what lies before and
-    behind the shell may have the right mean."""
+    """Weight of the same loss on all splats of a pixel instead of their mean depth, which may be right with splats in
+    front of and behind the shell."""
     empty_space_from: int = 0
     """First iteration of that term."""
     tolerance: Optional[float] = None
-    """Distance from the plane that costs nothing, in metres. If not set: how far the shell may be off by the metrics of
-    its alignment, from 5 to 15 cm; 5 cm where it was not validated."""
+    """Distance from the plane without cost, in metres. If not set: the shell's error by the metrics of its alignment,
+    clamped to 5 to 15 cm; 5 cm if it was not validated."""
     occlusion_gate: float = 0.0
-    """Metres that a pixel's rendered depth may be in front of the cue before it is taken for an occluder's."""
+    """Distance in metres in front of the cue beyond which a pixel's rendered depth counts as an occluder's."""
     occlusion_gate_from: int = 3000
-    """First iteration of all cue terms with a gate; by then the photographs have put occluders in their place."""
+    """First iteration of all cue terms if there is a gate; by then the photographs have shaped the occluders."""
     flattening: float = 0.0
     """Weight of the mean smallest scale of visible Gaussians, in units of the rescaled world (Vid2Sim: 100)."""
 
-    def tolerance_beside(self, shell_error: float | None) -> float:
-        """The tolerance for a shell that may be off by so many metres, None where unknown."""
+    def tolerance_for(self, shell_error: float | None) -> float:
+        """Tolerance for a shell with an error in metres, None if unknown."""
         if self.tolerance is not None:
             return self.tolerance
         low, high = TOLERANCES
@@ -88,7 +88,7 @@ class ExtraLossConfig:
 
 
 class CueLosses:
-    """:func:`cue_losses` for many renderings of one view; what depends on its maps alone is computed once."""
+    """:func:`cue_losses` for many renders of one view; what depends on its maps alone is computed once."""
 
     def __init__(
         self,
@@ -103,7 +103,7 @@ class CueLosses:
         self._from_plane: PointToPlaneLoss | None = None
 
     def __call__(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
-        """The weighted terms of one rendering, at the share ``progress`` of the run."""
+        """Weighted terms of one render, at ``progress`` in [0, 1] of the run."""
         paper, extra = self.paper, self.extra
         if extra.occlusion_gate > 0:
             return self._gated(geometry, progress)
@@ -124,14 +124,14 @@ class CueLosses:
         return {name: weight * term() for name, (weight, term) in terms.items() if weight > 0}
 
     def _gated(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
-        """The terms where nothing that is rendered stands before the cue."""
+        """Weighted terms over the pixels without an occluder in front of the cue."""
         gate = self.extra.occlusion_gate
         if progress < self.extra.occlusion_gate_from / PAPER_ITERATIONS:
             return {}
         near = self.metres * (self.cue.depth - geometry.depth.detach()) < gate
-        open_to_all = replace(self.extra, occlusion_gate=0.0)
-        seen = self.cue._replace(mask=self.cue.mask & near)
-        return CueLosses(seen, self.paper, open_to_all, self.metres, self.shell_error)(geometry, progress)
+        without_gate = replace(self.extra, occlusion_gate=0.0)
+        unoccluded = self.cue._replace(mask=self.cue.mask & near)
+        return CueLosses(unoccluded, self.paper, without_gate, self.metres, self.shell_error)(geometry, progress)
 
     @cached_property
     def _ncc(self) -> Callable[[Tensor], Tensor]:
@@ -156,7 +156,7 @@ class CueLosses:
     def _point_to_plane(self, geometry: Geometry) -> PointToPlaneLoss:
         if self._from_plane is None:
             depth, normal, mask = self.cue
-            rays, tolerance = geometry.camera.rays(), self.extra.tolerance_beside(self.shell_error)
+            rays, tolerance = geometry.camera.rays(), self.extra.tolerance_for(self.shell_error)
             self._from_plane = PointToPlaneLoss(depth, normal, rays, mask, self.metres, tolerance)
         return self._from_plane
 
@@ -169,9 +169,9 @@ def cue_losses(
     progress: float,
     metres_per_unit: float | None,
 ) -> dict[str, Tensor]:
-    """Terms that compare the rendered geometry with a cue's maps, at the share ``progress`` of the run.
+    """Weighted terms that compare rendered geometry with a cue's maps, at ``progress`` in [0, 1] of the run.
 
-    Where metres are unknown, ``extra``'s lengths are in units of nerfstudio's rescaled world.
+    If metres are unknown, ``extra``'s lengths are in units of nerfstudio's rescaled world.
     """
     return CueLosses(cue, paper, extra, metres_per_unit)(geometry, progress)
 
@@ -179,9 +179,9 @@ def cue_losses(
 def self_losses(
     geometry: Geometry, extra: ExtraLossConfig, progress: float, kept: Bool[Tensor, "H W 1"] | None = None
 ) -> dict[str, Tensor]:
-    """Terms of the rendered geometry that need no cue, those of 2DGS, at the share ``progress`` of the run.
+    """Weighted terms of 2DGS on the rendered geometry, without a cue, at ``progress`` in [0, 1] of the run.
 
-    They are means over the pixels that the user's mask keeps.
+    They are means over the pixels kept by the user's mask.
     """
     iteration = progress * PAPER_ITERATIONS
     losses = {}

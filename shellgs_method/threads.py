@@ -1,8 +1,8 @@
-"""As many threads for torch as there are cores that nothing else uses.
+"""Set the number of torch threads to the number of free cores.
 
 A lone process is fastest with all cores, and with threads that spin while they wait for each other, as OpenMP's do by
-default. Of processes side by side, threads that spin keep the cores from each other: each process is then fastest with
-the threads that have a core of their own. Which is the case is seen from the load, again and again.
+default. Spinning threads of parallel processes block each other's cores: each process is then fastest with one thread
+per core of its own. The number is therefore updated regularly from the machine's load.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import psutil
 import torch
 
 LOOK_EVERY = 2.0
-"""Seconds between two looks at the load."""
+"""Seconds between two measurements of the load."""
 ENOUGH = 0.6
-"""Share of a core that must be free to be worth a thread."""
+"""Share of a core that must be free for another thread."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """Seconds that have passed, that the machine's cores idled, and that this process worked, since some moment."""
+    """Seconds passed, idle seconds of the machine's cores, and CPU seconds of this process, since a fixed moment."""
 
     passed: float
     idle: float
@@ -30,17 +30,17 @@ class Load:
 
     @classmethod
     def now(cls) -> Load:
-        """Measure."""
+        """Measure the load now."""
         machine, own = psutil.cpu_times(), psutil.Process().cpu_times()
         return cls(time.monotonic(), machine.idle + getattr(machine, "iowait", 0.0), own.user + own.system)
 
     def cores_since(self, earlier: Load) -> float:
-        """Cores that this process has, or could have without taking them from others."""
+        """Number of cores that this process used or that were idle."""
         return (self.idle - earlier.idle + self.own - earlier.own) / (self.passed - earlier.passed)
 
 
 class ThreadsByLoad:
-    """Sets torch's number of threads by the load of the machine, if ``OMP_NUM_THREADS`` does not."""
+    """Set torch's number of threads by the machine's load, unless ``OMP_NUM_THREADS`` is set."""
 
     def __init__(self) -> None:
         self._most = torch.get_num_threads()
@@ -48,7 +48,7 @@ class ThreadsByLoad:
         self._load = Load.now()
 
     def follow(self) -> None:
-        """Look at the load if the last look is some time ago; to be called by the thread that works."""
+        """Update the number of threads if :data:`LOOK_EVERY` has passed; to be called by the working thread."""
         if self._fixed or time.monotonic() - self._load.passed < LOOK_EVERY:
             return
         load = Load.now()

@@ -1,4 +1,4 @@
-"""Rasterization from its formulas: every splat at every pixel, in plain autograd. Shares no code with the package."""
+"""Reference rasterization: every splat at every pixel, in plain autograd. Shares no code with the package."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor
 
 @dataclass
 class DenseImage:
-    """What the formulas give, and where rounding could have decided otherwise.
+    """A render, and where rounding could have changed a decision.
 
     Attributes:
         composited: [H, W, C].
         alpha: [H, W, 1].
         means2d: [N, 2], kept in the graph.
-        margin: [H, W], the least relative distance of any decision at a pixel from its threshold.
+        margin: [H, W], smallest relative distance of any decision at a pixel from its threshold.
     """
 
     composited: Tensor
@@ -83,7 +83,7 @@ def dense_rasterize(means, quats, scales, opacities, features, viewmat, K, width
 
 @dataclass
 class DenseDiscs(DenseImage):
-    """The picture of discs, and its maps [H, W, 1]."""
+    """The render of discs, and its maps [H, W, 1]."""
 
     inverse_depth: Tensor
     median_depth: Tensor
@@ -106,7 +106,7 @@ def dense_rasterize_discs(means, quats, scales, opacities, features, viewmat, K,
     composited = torch.zeros(height, width, features.shape[1], dtype=means.dtype)
     zeros = torch.zeros(height, width, dtype=means.dtype)
     alpha_sum, inverse_depth, median, distortion, transmittance = zeros, zeros, zeros, zeros, zeros + 1
-    met: list[tuple[Tensor, Tensor]] = []
+    composited_before: list[tuple[Tensor, Tensor]] = []
     stopped = torch.zeros(height, width, dtype=torch.bool)
     margin = torch.full((height, width), torch.inf, dtype=means.dtype)
     for i in order:
@@ -142,9 +142,9 @@ def dense_rasterize_discs(means, quats, scales, opacities, features, viewmat, K,
         inverse_depth = inverse_depth + weight / z_hit
         median = torch.where(counted & (transmittance > 0.5) & (behind <= 0.5), z_hit, median)
         mapped = 100 / (100 - 0.2) * (1 - 0.2 / z_hit)
-        for weight_before, mapped_before in met:
+        for weight_before, mapped_before in composited_before:
             distortion = distortion + weight * weight_before * (mapped - mapped_before) ** 2
-        met.append((weight, mapped))
+        composited_before.append((weight, mapped))
         transmittance = torch.where(counted, behind, transmittance)
     maps = (each[..., None] for each in (inverse_depth, median, distortion))
     return DenseDiscs(composited, alpha_sum[..., None], means2d, margin, *maps)

@@ -1,6 +1,6 @@
-"""gsplat's kernels on the CPU: its own plain-torch projections and binning, and compositing as its .cu files have it.
+"""gsplat's kernels on the CPU: its own projections and binning in plain torch, and compositing as in its .cu files.
 
-What a kernel leaves uninitialised is NaN here.
+Memory that a kernel leaves uninitialised is NaN here.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def rasterize_to_pixels_2dgs(
     means2d, ray_transforms, colors, opacities, normals, densify, width, height, tile_size, offsets, splats
 ):
     n = colors.shape[-1]
-    assert n & (n - 1) == 0, "gsplat would fill up the features with memory as it is"
+    assert n & (n - 1) == 0, "gsplat would pad the features with uninitialised memory"
     assert densify.shape == means2d.shape
     splatted = (x.flatten(0, 1) for x in (means2d, ray_transforms, colors, opacities, normals))
     means2d, ray_transforms, colors, opacities, normals = splatted

@@ -1,4 +1,4 @@
-"""Splats and cameras at random, the same every time."""
+"""Random splats and cameras, the same in every run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NAMES = ("means", "quats", "scales", "opacities", "features")
 
 
 def make_camera(width: int, height: int, dtype: torch.dtype = torch.float64) -> Camera:
-    """A camera that looks along z, a little askew, from near the origin."""
+    """A camera near the origin that looks roughly along z."""
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = torch.linalg.qr(torch.eye(3).double() + 0.1 * torch.arange(9.0).double().view(3, 3).sin())[0]
     viewmat[:3, :3] *= viewmat[:3, :3].diagonal().sign()
@@ -23,7 +23,7 @@ def make_camera(width: int, height: int, dtype: torch.dtype = torch.float64) -> 
 
 
 def make_splats(n: int, n_features: int, seed: int) -> list[Tensor]:
-    """Splats of every sort: in front and behind, off screen, sub-pixel to screen-filling, faint and opaque."""
+    """Splats of every kind: in front and behind, off screen, sub-pixel to screen-filling, faint and opaque."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -39,7 +39,7 @@ def make_splats(n: int, n_features: int, seed: int) -> list[Tensor]:
 
 
 def orbit(camera: Camera, n: int) -> list[Camera]:
-    """Cameras one beside the other, each turned a little further about its y axis, with ever longer lenses."""
+    """Cameras side by side, each turned a little further about its y axis, with a longer focal length."""
     cameras = []
     for i in range(n):
         angle = torch.tensor(0.15 * i, dtype=camera.viewmat.dtype)
@@ -52,7 +52,7 @@ def orbit(camera: Camera, n: int) -> list[Camera]:
 
 
 def make_discs(n: int, n_features: int, seed: int) -> list[Tensor]:
-    """Discs turned to z by up to 37 degrees, none of which reaches from before the camera to behind it."""
+    """Discs tilted by up to 37 degrees from z, none of which reaches from in front of the camera to behind it."""
     means, quats, scales, opacities, features = make_splats(n, n_features, seed)
     means[:, 2] = 3 + means[:, 2].abs()
     means[: n // 8, 2] *= -1

@@ -1,4 +1,4 @@
-"""Bands of a facade: the same wall in every view, and training and evaluation on different ones."""
+"""Bands of a facade: the same wall in every view, and different ones for training and evaluation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, UNITS_PER_METRE
 
 pytestmark = pytest.mark.usefixtures("eager")
 
-WIDTH = 2 * UNITS_PER_METRE  # of a band, in scene units
+WIDTH = 2 * UNITS_PER_METRE  # width of a band, in scene units
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def shell_of(scene, view: View) -> CueMap:
 
 
 def world_points(view: View, depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Surface points in the scene, in float64, by the inverse of the projection."""
+    """Surface points in the scene, in float64, by inverse projection."""
     v, u = np.nonzero(mask)
     pixels = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], axis=-1) * depth[mask][:, None].astype(np.float64)
     in_camera = pixels @ np.linalg.inv(view.camera.K.numpy()).T
@@ -47,8 +47,8 @@ def world_points(view: View, depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return in_camera @ pose[:3, :3].T + pose[:3, 3]
 
 
-def test_bands_run_up_the_wall(bands):
-    """Their axis is the facade's horizontal, which the world's own axes are far from."""
+def test_bands_run_vertically_up_the_wall(bands):
+    """Their axis is the facade's horizontal, far from any axis of the world."""
     along_the_facade = SCENE_FROM_BUILDING[:3, 0] / UNITS_PER_METRE
     assert abs(bands.axis.numpy() @ along_the_facade) == pytest.approx(1, abs=1e-3)
     assert bands.width == pytest.approx(WIDTH)
@@ -62,7 +62,7 @@ def test_bands_do_not_depend_on_the_order_of_the_calls_or_on_a_sign(pristine_sce
         assert (again.mask(shell, view.camera) == bands.mask(shell, view.camera)).all()
 
 
-def test_the_halves_share_no_pixel_and_leave_out_none_of_the_shell(pristine_scene, views, bands):
+def test_the_halves_are_disjoint_and_cover_the_shell(pristine_scene, views, bands):
     for view in views:
         shell = shell_of(pristine_scene, view)
         a, b = bands.mask(shell, view.camera), bands.others.mask(shell, view.camera)
@@ -71,7 +71,7 @@ def test_the_halves_share_no_pixel_and_leave_out_none_of_the_shell(pristine_scen
 
 
 def test_a_band_is_the_same_wall_in_two_views(pristine_scene, views, bands):
-    """A pixel's surface point, seen again in another view, lies in the same half there."""
+    """A pixel's surface point lies in the same half in another view."""
     first, second = views[4], views[5]
     shell, other = shell_of(pristine_scene, first), shell_of(pristine_scene, second)
     points = world_points(first, shell.depth, shell.mask)
@@ -81,7 +81,7 @@ def test_a_band_is_the_same_wall_in_two_views(pristine_scene, views, bands):
     inside = (u > 0) & (u < 47) & (v > 0) & (v < 31)
     u, v, z, labels = u[inside], v[inside], in_camera[inside, 2], labels[inside]
     there = bands.mask(other, second.camera)
-    # Pixels are some 30 cm wide here: those beside a band's edge may show both.
+    # Pixels are about 30 cm wide here: those at a band's edge may show both halves.
     clear = np.stack([there[v, u] == there[v, u + step] for step in (-1, 1)]).all(0)
     same = clear & other.mask[v, u] & (np.abs(other.depth[v, u] / z - 1) < 0.02)
     assert same.sum() > 200
@@ -90,7 +90,7 @@ def test_a_band_is_the_same_wall_in_two_views(pristine_scene, views, bands):
 
 
 @pytest.mark.parametrize("holdout", ["A", "B"])
-def test_what_is_supervised_and_what_is_measured_share_no_wall(pristine_scene, views, bands, tmp_path, holdout):
+def test_supervised_and_evaluated_wall_are_disjoint(pristine_scene, views, bands, tmp_path, holdout):
     def hold_out(config):
         config.pipeline.datamanager.holdout = holdout
 
@@ -110,14 +110,14 @@ def test_what_is_supervised_and_what_is_measured_share_no_wall(pristine_scene, v
                 assert (depth[mask] > 0).all()
                 coordinates.append(world_points(by_name[view.name], depth, mask) @ bands.axis.numpy())
         halves.append(np.concatenate(coordinates) % (2 * WIDTH) // WIDTH)  # 0 in A, 1 in B
-    supervised, measured = halves
+    supervised, evaluated = halves
     assert len(supervised) > 1000
-    assert len(measured) > 200
+    assert len(evaluated) > 200
     assert (supervised == (holdout == "A")).all()
-    assert (measured == (holdout == "B")).all()
+    assert (evaluated == (holdout == "B")).all()
 
 
-def test_a_holdout_trains_and_is_measured(pristine_scene, tmp_path):
+def test_a_run_with_a_holdout_trains_and_is_evaluated(pristine_scene, tmp_path):
     def hold_out(config):
         config.pipeline.datamanager.holdout = "B"
 
@@ -129,7 +129,7 @@ def test_a_holdout_trains_and_is_measured(pristine_scene, tmp_path):
     assert model_of(half).step == 2
 
 
-def test_the_photographs_are_learnt_everywhere(pristine_scene, tmp_path):
+def test_a_holdout_does_not_mask_the_photographs(pristine_scene, tmp_path):
     def hold_out(config):
         config.pipeline.datamanager.holdout = "B"
 
@@ -137,7 +137,7 @@ def test_the_photographs_are_learnt_everywhere(pristine_scene, tmp_path):
     assert all("mask" not in batch for batch in data_of(trainer).cached_train)
 
 
-def test_a_holdout_without_shell_maps_ends_with_one_sentence(scene, tmp_path):
+def test_a_holdout_without_shell_maps_is_an_error(scene, tmp_path):
     def hold_out(config):
         config.pipeline.datamanager.holdout = "B"
 

@@ -1,4 +1,4 @@
-"""What two training cameras see of a wall, counted by hand."""
+"""Pixels of a wall visible in two training cameras, computed by hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NO_POINTS = torch.zeros(0, 3)
 
 
 def camera(x: float) -> Camera:
-    """Looking along z at walls that are parallel to the picture."""
+    """A camera that looks along z at walls parallel to the image plane."""
     viewmat = torch.eye(4)
     viewmat[0, 3] = -x
     return Camera(viewmat, K, WIDTH, HEIGHT)
@@ -23,8 +23,8 @@ def wall(depth: float) -> torch.Tensor:
     return torch.full((HEIGHT, WIDTH), depth)
 
 
-def test_a_pixel_counts_where_two_views_have_it_in_their_picture():
-    """At depth 10 a step of 5 aside is one of 20 pixels."""
+def test_a_pixel_is_seen_if_two_training_images_contain_it():
+    """At depth 10 a sideways step of 5 is 20 pixels."""
     seen = SeenBy([camera(5), camera(-5)], [wall(10.0)] * 2, NO_POINTS).mask(camera(0), wall(10.0)[..., None])
     expected = torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool)
     expected[:, 20:60] = True
@@ -33,7 +33,7 @@ def test_a_pixel_counts_where_two_views_have_it_in_their_picture():
     assert not one.mask(camera(0), wall(10.0)[..., None]).any()
 
 
-def test_what_is_hidden_by_the_shell_in_a_training_view_is_not_seen():
+def test_pixels_hidden_by_the_shell_in_a_training_view_are_not_seen():
     hidden = wall(10.0)
     hidden[:30] = 4.0
     seen = SeenBy([camera(0), camera(0)], [hidden, wall(10.0)], NO_POINTS).mask(camera(0), wall(10.0)[..., None])
@@ -41,8 +41,8 @@ def test_what_is_hidden_by_the_shell_in_a_training_view_is_not_seen():
     assert seen[30:].all()
 
 
-def test_a_pixel_off_the_shell_is_as_far_away_as_the_nearest_sfm_point():
-    """The left is at depth 5, where 5 aside are 40 pixels; the right at 100, where they are 2."""
+def test_a_pixel_off_the_shell_has_the_depth_of_the_nearest_sfm_point():
+    """The left is at depth 5, where a sideways step of 5 is 40 pixels; the right at 100, where it is 2."""
     points = torch.tensor([[-2.5, 0.0, 5.0], [50.0, 0.0, 100.0]])
     nothing = torch.zeros(HEIGHT, WIDTH, 1)
     seen = SeenBy([camera(5), camera(5)], [nothing[..., 0]] * 2, points).mask(camera(0), nothing)
@@ -50,12 +50,12 @@ def test_a_pixel_off_the_shell_is_as_far_away_as_the_nearest_sfm_point():
     assert seen[:, 45:].all()
 
 
-def test_a_sky_without_points_is_seen_by_all_who_look_there():
+def test_sky_without_points_is_seen_by_all_views_that_look_there():
     nothing = torch.zeros(HEIGHT, WIDTH, 1)
     assert SeenBy([camera(5), camera(-5)], [nothing[..., 0]] * 2, NO_POINTS).mask(camera(0), nothing).all()
 
 
-def test_large_pictures_are_worked_out_on_a_thinned_grid():
+def test_visibility_of_large_images_is_computed_on_a_thinned_grid():
     large = Camera(torch.eye(4), torch.tensor([[500.0, 0, 500], [0, 500, 375], [0, 0, 1]]), 1001, 751)
     aside = Camera(camera(5).viewmat, large.K, 1001, 751)
     depth = torch.full((751, 1001, 1), 10.0)

@@ -1,4 +1,4 @@
-"""MCMC densification against its equation in float64, and the laws that make it leave the picture as it is."""
+"""MCMC densification against its equation in float64, and that it preserves the image."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_relocation_equals_equation_9(opacity, copies):
 
 
 @pytest.mark.parametrize(("opacity", "copies"), CASES)
-def test_copies_in_one_place_are_as_opaque_in_the_middle_and_in_sum(opacity, copies):
+def test_copies_in_one_place_keep_the_opacity_at_the_centre_and_in_sum(opacity, copies):
     new, factor = one(opacity, copies)
     assert 1 - (1 - new) ** copies == pytest.approx(opacity)
     together, _ = quad(lambda x: 1 - (1 - new * math.exp(-0.5 * (x / factor) ** 2)) ** copies, -40, 40, points=[0])
@@ -61,7 +61,7 @@ def gaussians(n: int, opacity: float = 0.6) -> nn.ParameterDict:
 
 
 def stepped(params: nn.ParameterDict, lr: float = 0.0) -> dict[str, torch.optim.Optimizer]:
-    """Optimizers that have moments."""
+    """Optimizers after one step, with moments."""
     optimizers: dict[str, torch.optim.Optimizer] = {
         name: torch.optim.Adam([parameter], lr=lr) for name, parameter in params.items()
     }
@@ -110,7 +110,7 @@ def test_divided_gaussians_start_without_momentum():
     assert 0 < int(still[:100].sum()) <= 5
 
 
-def test_a_faint_gaussian_is_moved_onto_one_that_is_seen():
+def test_faint_gaussians_are_relocated_onto_visible_ones():
     params = gaussians(100)
     with torch.no_grad():
         params["opacities"][:10] = -10.0
@@ -122,8 +122,8 @@ def test_a_faint_gaussian_is_moved_onto_one_that_is_seen():
     assert params["opacities"].sigmoid().min() > 0.1
 
 
-def test_dividing_hardly_changes_the_picture(eager):
-    """Exactly, where a splat is alone, in 1D; that of the screen is 2D and splats overlap."""
+def test_dividing_hardly_changes_the_image(eager):
+    """It is exact for a lone splat in 1D; the screen is 2D and splats overlap."""
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), 40, 40)
 
     def opacity_of(params: nn.ParameterDict) -> torch.Tensor:
@@ -138,7 +138,7 @@ def test_dividing_hardly_changes_the_picture(eager):
     assert (opacity_of(params) - before).abs().mean() < 0.02
 
 
-def test_noise_has_a_gaussians_own_shape_and_spares_opaque_ones():
+def test_noise_has_the_shape_of_its_gaussian_and_spares_opaque_ones():
     n = 20_000
     params = gaussians(n, opacity=0.001)
     rotation = Rotation.from_rotvec([0.3, -0.5, 0.8])
@@ -153,7 +153,7 @@ def test_noise_has_a_gaussians_own_shape_and_spares_opaque_ones():
     step(strategy(), params, optimizers, at=100)  # outside the window: noise alone
     moved = params["means"].detach() - before
     axes = torch.from_numpy(rotation.as_matrix()).float()
-    # Noise is the covariance, squares of the scales, times white noise; 5e5 · 1e-5 · 1 / (1 + exp(100 (0.001 - 0.005)))
+    # Noise is the covariance (squared scales) times white noise; 5e5 · 1e-5 · 1 / (1 + exp(100 (0.001 - 0.005)))
     size = 5 / (1 + math.exp(-0.4))
     expected = size * torch.tensor([0.25, 0.04, 0.01])
     torch.testing.assert_close((moved[1:] @ axes).std(dim=0), expected, rtol=0.03, atol=0)

@@ -46,7 +46,7 @@ EVERYWHERE = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
 
 @pytest.fixture(autouse=True)
 def no_lpips(monkeypatch):
-    """No test may go to the network for weights."""
+    """Keep tests from downloading weights."""
     image.lpips_network.cache_clear()
     monkeypatch.setattr(image, "_reachable", lambda url: False)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: "nowhere")
@@ -62,7 +62,7 @@ def plane(normal: tuple[float, float, float], distance: float = 6.0) -> tuple[to
     return depth, n.expand(HEIGHT, WIDTH, 3)
 
 
-def seen(normal: tuple[float, float, float] = (0.3, -0.2, -1.0)) -> tuple[Rendering, torch.Tensor, Reference]:
+def perfect(normal: tuple[float, float, float] = (0.3, -0.2, -1.0)) -> tuple[Rendering, torch.Tensor, Reference]:
     """A perfect rendering of a slanted wall, its photograph, and its reference."""
     depth, normals = plane(normal)
     photograph = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -74,7 +74,7 @@ def seen(normal: tuple[float, float, float] = (0.3, -0.2, -1.0)) -> tuple[Render
 
 
 @pytest.mark.parametrize("normal", [(0, 0, -1), (0.5, 0, -1), (-0.3, 0.6, -1), (0.9, -0.8, -1)])
-def test_normals_of_a_slanted_plane_are_the_planes(normal):
+def test_normals_of_a_slanted_plane_are_exact(normal):
     depth, expected = plane(normal)
     normals = normals_from_depth(depth, CAMERA)
     torch.testing.assert_close(normals[1:-1, 1:-1], expected[1:-1, 1:-1])
@@ -86,8 +86,8 @@ def test_normals_of_any_depth_face_the_camera():
     assert (towards < 0).all()
 
 
-def test_normals_of_a_smooth_surface_are_those_of_kornia():
-    """Whose gradient is Sobel's, from pixels a column apart too, and whose pixels have their centres at integers."""
+def test_normals_of_a_smooth_surface_match_kornia():
+    """Kornia uses Sobel gradients, which include neighbouring columns, and has pixel centres at integers."""
     rays = CAMERA.rays().double()
     depth = (6 + 0.5 * torch.sin(2 * rays[..., :1]) + 0.3 * rays[..., 1:2].square()).double()
     K = CAMERA.K.double().clone()
@@ -130,7 +130,7 @@ def test_angular_error_of_a_known_rotation_is_unsigned(degrees, sign):
     torch.testing.assert_close(error, torch.full((3, 4, 1), degrees), atol=1e-5, rtol=1e-5)
 
 
-def test_missing_normal_counts_as_ninety_degrees():
+def test_a_missing_normal_counts_as_ninety_degrees():
     target = torch.tensor([0.0, 0.0, -1.0]).repeat(1, 4, 1)
     normal = target.clone()
     normal[0, 0] = 0
@@ -151,19 +151,19 @@ def test_random_normals_are_at_the_chance_level_of_57_degrees():
 # depth
 
 
-def test_depth_error_is_what_the_median_ratio_leaves():
+def test_depth_error_is_measured_after_median_scaling():
     depth = torch.tensor([1.0, 2.0, 3.0, 0.0, 5.0])[None, :, None]
     target = torch.tensor([2.0, 4.0, 9.0, 7.0, 0.0])[None, :, None]
     # Ratios 2, 2, 3; the last two pixels lack a depth, so the error is |2-2|, |4-4|, |6-9|.
     assert depth_mae(depth, target, torch.ones(1, 5, 1, dtype=torch.bool)) == pytest.approx(1.0)
 
 
-def test_depth_error_ignores_the_scale_of_the_rendering():
+def test_depth_error_ignores_the_scale_of_the_render():
     depth, _ = plane((0.3, 0, -1))
     assert depth_mae(0.37 * depth, depth, EVERYWHERE) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_depth_error_of_nothing_is_none():
+def test_depth_error_is_none_if_nothing_was_rendered():
     depth, _ = plane((0, 0, -1))
     assert depth_mae(torch.zeros_like(depth), depth, EVERYWHERE) is None
 
@@ -171,7 +171,7 @@ def test_depth_error_of_nothing_is_none():
 # surfaces
 
 
-def test_surface_of_two_parallel_walls_three_centimetres_apart():
+def test_surface_distance_of_parallel_walls_three_centimetres_apart():
     grid = np.stack(np.meshgrid(np.arange(0.01, 1, 0.02), np.arange(0.01, 1, 0.02)), axis=-1).reshape(-1, 2)
     wall = np.c_[grid, np.full(len(grid), 2.005)]
     surface = compare_surfaces(wall + np.array([0, 0, 0.03]), wall, voxel=0.02)
@@ -199,7 +199,7 @@ def test_surface_distances_equal_brute_force():
     assert surface.completeness == pytest.approx(distances.min(axis=0).mean())
 
 
-def test_voxel_means_are_those_of_a_dictionary_of_cells():
+def test_voxel_means_match_a_dictionary_of_cells():
     points = np.random.default_rng(0).normal(size=(500, 3))
     cells: dict[tuple, list] = {}
     for point in points:
@@ -208,7 +208,7 @@ def test_voxel_means_are_those_of_a_dictionary_of_cells():
     assert np.allclose(sorted(voxel_means(points, 0.5).tolist()), expected)
 
 
-def test_voxel_means_stand_a_depth_beyond_any_grid():
+def test_voxel_means_work_for_points_beyond_any_grid():
     points = np.array([[0, 0, 1], [0.001, 0, 1], [1e9, -1e9, 1e9]])
     assert len(voxel_means(points, 0.02)) == 2
 
@@ -224,18 +224,18 @@ def test_back_projected_points_project_to_their_pixels():
 # images
 
 
-def test_psnr_of_a_constant_error_is_its_closed_form():
+def test_psnr_of_a_constant_error_matches_its_closed_form():
     target = torch.full((HEIGHT, WIDTH, 3), 0.5)
     # MSE 0.01
     assert image_errors(target + 0.1, target)["psnr"] == pytest.approx(20.0, abs=1e-3)
 
 
-def test_figures_of_an_exact_picture_are_finite():
+def test_metrics_of_an_exact_image_are_finite():
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
     assert image_errors(target, target) == {"psnr": 100.0, "ssim": pytest.approx(1.0)}
 
 
-def test_pictures_are_measured_in_regions_as_if_there_were_nothing_else():
+def test_metrics_of_a_region_ignore_the_rest_of_the_image():
     random = torch.Generator().manual_seed(0)
     target, noise = torch.rand(2, HEIGHT, WIDTH, 3, generator=random)
     rgb = (target + 0.2 * noise - 0.1).clamp(0, 1)
@@ -249,13 +249,13 @@ def test_pictures_are_measured_in_regions_as_if_there_were_nothing_else():
     assert metrics.keys() == {"psnr", "ssim", "psnr_left", "ssim_left"}
 
 
-def test_ssim_equals_the_formula_on_constant_pictures():
+def test_ssim_of_constant_images_equals_the_formula():
     # No variance, so the luminance term alone: (2·0.5·0.6 + c1) / (0.25 + 0.36 + c1).
     a, b = torch.full((HEIGHT, WIDTH, 3), 0.5), torch.full((HEIGHT, WIDTH, 3), 0.6)
     assert image_errors(a, b)["ssim"] == pytest.approx((0.6 + 1e-4) / (0.61 + 1e-4), abs=1e-4)
 
 
-def test_lpips_without_weights_is_left_out_and_said_once(caplog, monkeypatch):
+def test_lpips_without_weights_is_left_out_and_warned_of_once(caplog, monkeypatch):
     asked = []
     monkeypatch.setattr(image, "_reachable", asked.append)
     target = torch.rand(HEIGHT, WIDTH, 3)
@@ -266,14 +266,14 @@ def test_lpips_without_weights_is_left_out_and_said_once(caplog, monkeypatch):
     assert [record.message.startswith("LPIPS is not available") for record in caplog.records] == [True]
 
 
-def test_lpips_with_a_damaged_file_of_weights_is_left_out(tmp_path, monkeypatch, caplog):
+def test_lpips_with_damaged_weights_is_left_out(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth").write_bytes(b"cut short")
     assert "cannot be loaded" in str(image.lpips_network())
 
 
-def test_lpips_with_weights_is_zero_for_the_same_picture_and_positive_for_another(tmp_path, monkeypatch):
+def test_lpips_is_zero_for_equal_images_and_positive_for_different_ones(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     (tmp_path / "checkpoints").mkdir()
     torch.manual_seed(0)
@@ -288,7 +288,7 @@ def test_lpips_with_weights_is_zero_for_the_same_picture_and_positive_for_anothe
 
 
 def test_a_perfect_rendering_has_perfect_geometry():
-    rendering, photograph, reference = seen()
+    rendering, photograph, reference = perfect()
     metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=2.0)
     for key in ("depth_mae_m", "normal_deg", "depth_normal_deg", "accuracy_m", "completeness_m", "chamfer_m"):
         assert metrics[key] == pytest.approx(0.0, abs=1e-5), key
@@ -297,7 +297,7 @@ def test_a_perfect_rendering_has_perfect_geometry():
 
 
 def test_lengths_are_in_metres():
-    # A frontal wall at 6 units rendered at 6.1, half a metre a unit: each point lies 5 cm too far in z, along its ray.
+    # A frontal wall at 6 units rendered at 6.1, half a metre per unit: each point is 5 cm too far in z, along its ray.
     depth, normals = plane((0, 0, -1))
     photograph = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64)
     rendering = Rendering(photograph, depth + 0.1, torch.ones_like(depth), normals)
@@ -307,14 +307,14 @@ def test_lengths_are_in_metres():
     assert (metrics["f_score_5cm"], metrics["f_score_10cm"]) == (0.0, 1.0)
 
 
-def test_lengths_without_a_known_metre_do_not_pretend_to_be_metres():
-    metrics = evaluate_view(*seen()[:2], CAMERA, seen()[2])
+def test_lengths_are_in_scene_units_if_metres_are_unknown():
+    metrics = evaluate_view(*perfect()[:2], CAMERA, perfect()[2])
     assert {"depth_mae_units", "accuracy_units", "completeness_units", "chamfer_units"} <= metrics.keys()
     assert not any(key.endswith(("_m", "cm")) for key in metrics)
 
 
-def test_a_hole_costs_normals_and_completeness_but_is_no_depth_error():
-    rendering, photograph, reference = seen()
+def test_a_hole_worsens_normals_and_completeness_but_not_depth_error():
+    rendering, photograph, reference = perfect()
     alpha = rendering.alpha.clone()
     alpha[:, : WIDTH // 2] = 0.2
     metrics = evaluate_view(rendering._replace(alpha=alpha), photograph, CAMERA, reference, metres_per_unit=1.0)
@@ -324,8 +324,8 @@ def test_a_hole_costs_normals_and_completeness_but_is_no_depth_error():
     assert metrics["completeness_m"] > 0.1 > metrics["accuracy_m"]
 
 
-def test_a_view_where_nothing_was_rendered_scores_zero_and_has_no_nan():
-    rendering, photograph, reference = seen()
+def test_an_empty_render_scores_zero_without_nan():
+    rendering, photograph, reference = perfect()
     empty = Rendering(
         rendering.rgb, *(torch.zeros_like(t) for t in (rendering.depth, rendering.alpha, reference.normal))
     )
@@ -336,8 +336,8 @@ def test_a_view_where_nothing_was_rendered_scores_zero_and_has_no_nan():
     assert all(math.isfinite(value) for value in metrics.values())
 
 
-def test_what_lies_outside_the_mask_does_not_count():
-    rendering, photograph, reference = seen()
+def test_geometry_outside_the_mask_is_ignored():
+    rendering, photograph, reference = perfect()
     mask = EVERYWHERE.clone()
     mask[:, :10] = False
     wrong = rendering.depth.clone()
@@ -348,21 +348,21 @@ def test_what_lies_outside_the_mask_does_not_count():
 
 
 @pytest.mark.parametrize("supported", [False, True], ids=["empty mask", "with a mask"])
-def test_a_view_without_support_has_image_figures_only(supported):
-    rendering, photograph, reference = seen()
+def test_a_view_without_a_reference_has_image_metrics_only(supported):
+    rendering, photograph, reference = perfect()
     reference = reference._replace(mask=EVERYWHERE & supported)
     metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
     assert ("depth_mae_m" in metrics) == supported
     assert evaluate_view(rendering, photograph, CAMERA).keys() == {"psnr", "ssim"}
 
 
-def test_figures_are_plain_floats():
-    rendering, photograph, reference = seen()
+def test_metrics_are_plain_floats():
+    rendering, photograph, reference = perfect()
     metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
 
 
-def test_means_are_over_the_views_that_have_a_figure():
+def test_means_are_over_the_views_that_have_the_metric():
     views = [{"psnr": 20.0, "chamfer_m": 0.1}, {"psnr": 30.0}, {"psnr": 25.0, "chamfer_m": 0.3}]
     assert mean_over_views(views) == {"psnr": 25.0, "chamfer_m": pytest.approx(0.2), "chamfer_m_views": 2.0}
 
@@ -378,8 +378,8 @@ COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("chamfer_m", "CD (m)", min
 ROWS = {"shellgs": {"psnr": 24.96, "chamfer_m": 0.052}, "photo-gs": {"psnr": 25.04}}
 
 
-def test_markdown_table_sets_the_best_in_bold_and_dashes_what_is_missing():
-    # 24.96 and 25.04 both read 25.0 and are equally good.
+def test_markdown_table_has_the_best_in_bold_and_dashes_for_missing_metrics():
+    # 24.96 and 25.04 are both shown as 25.0 and are equally good.
     assert markdown_table(ROWS, COLUMNS) == (
         "| Method | PSNR ↑ | CD (m) ↓ |\n"
         "| --- | ---: | ---: |\n"
@@ -397,21 +397,21 @@ def test_terminal_table_has_the_same_cells():
     ]
 
 
-def test_strip_is_written_whole_and_grey_outside_the_mask(tmp_path):
-    rendering, _, reference = seen()
+def test_strip_is_written_in_one_file_and_grey_outside_the_mask(tmp_path):
+    rendering, _, reference = perfect()
     mask = torch.zeros_like(EVERYWHERE)
     error = angular_error(reference.normal, reference.normal)
     panel = Panel("shellgs", rendering.rgb, reference.normal, error, mask)
     save_strip(tmp_path / "new folder" / "strip.png", [panel, panel._replace(title="photo-gs")])
     assert [path.name for path in (tmp_path / "new folder").iterdir()] == ["strip.png"]
-    picture = np.asarray(Image.open(tmp_path / "new folder" / "strip.png").convert("RGB"))
-    grey = (picture == GREY).all(axis=-1)
-    # Two of three rows of the panels, which fill most of the picture.
+    strip = np.asarray(Image.open(tmp_path / "new folder" / "strip.png").convert("RGB"))
+    grey = (strip == GREY).all(axis=-1)
+    # Two of three rows of panels, which fill most of the image.
     assert grey.mean() > 0.2
 
 
-def test_error_picture_is_black_where_exact_yellow_where_nothing_is_rendered_and_grey_off_the_reference():
-    rendering, _, reference = seen()
+def test_error_image_is_black_if_exact_yellow_if_not_rendered_and_grey_without_reference():
+    rendering, _, reference = perfect()
     alpha, mask = rendering.alpha.clone(), EVERYWHERE.clone()
     alpha[:10], mask[-10:] = 0.2, False
     error = geometry_images(rendering._replace(alpha=alpha), reference._replace(mask=mask))["normal_error"]
@@ -419,20 +419,20 @@ def test_error_picture_is_black_where_exact_yellow_where_nothing_is_rendered_and
     assert rows == [[[252, 255, 164]], [[0, 0, 4]], [[GREY] * 3]]  # both ends of inferno, and grey
 
 
-def test_depth_and_normal_pictures_put_a_perfect_rendering_beside_the_same():
-    rendering, _, reference = seen()
-    pictures = geometry_images(rendering, reference)
+def test_depth_and_normal_images_of_a_perfect_render_have_equal_halves():
+    rendering, _, reference = perfect()
+    images = geometry_images(rendering, reference)
     for name in ("depth", "normal"):
-        assert pictures[name].shape == (HEIGHT, 2 * WIDTH, 3)
-        assert torch.equal(pictures[name][:, :WIDTH], pictures[name][:, WIDTH:])
+        assert images[name].shape == (HEIGHT, 2 * WIDTH, 3)
+        assert torch.equal(images[name][:, :WIDTH], images[name][:, WIDTH:])
 
 
-def test_pictures_stay_in_range_for_normals_that_half_precision_made_longer_than_one():
-    rendering, _, reference = seen((0, 0, -1))
-    pictures = geometry_images(rendering, reference._replace(normal=1.001 * reference.normal))
-    assert all(picture.min() >= 0 and picture.max() <= 1 for picture in pictures.values())
+def test_images_stay_in_range_if_half_precision_makes_normals_longer_than_one():
+    rendering, _, reference = perfect((0, 0, -1))
+    images = geometry_images(rendering, reference._replace(normal=1.001 * reference.normal))
+    assert all(each.min() >= 0 and each.max() <= 1 for each in images.values())
 
 
-def test_a_view_without_reference_has_pictures_of_what_was_rendered_alone():
-    shapes = {name: tuple(picture.shape) for name, picture in geometry_images(seen()[0]).items()}
+def test_without_a_reference_images_show_the_render_alone():
+    shapes = {name: tuple(each.shape) for name, each in geometry_images(perfect()[0]).items()}
     assert shapes == {"depth": (HEIGHT, WIDTH, 3), "normal": (HEIGHT, WIDTH, 3)}

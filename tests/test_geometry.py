@@ -1,4 +1,4 @@
-"""Depth and normals of Gaussians and discs that lie on a wall, whose depth is known in closed form."""
+"""Depth and normals of Gaussians and discs on a wall, against its closed form."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 15], [0, 0, 1
 
 
 def wall(yaw: float) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-    """Flat Gaussians side by side on a wall 5 ahead that is turned by ``yaw``, and the wall's normal."""
+    """Flat Gaussians side by side on a wall at depth 5, turned by ``yaw``, and the wall's normal."""
     x, y = torch.meshgrid(torch.linspace(-6, 6, 41), torch.linspace(-3, 3, 21), indexing="ij")
     on_wall = torch.stack([x.flatten(), y.flatten(), torch.zeros(x.numel())], dim=-1)
-    turn = Rotation.from_euler("y", yaw)
+    rotation_y = Rotation.from_euler("y", yaw)
     w, z = math.cos(yaw / 2), math.sin(yaw / 2)
-    rotation = torch.from_numpy(turn.as_matrix()).float()
+    rotation = torch.from_numpy(rotation_y.as_matrix()).float()
     gaussians = {
         "means": on_wall @ rotation.T + torch.tensor([0.0, 0.0, 5.0]),
         "quats": torch.tensor([w, 0.0, z, 0.0]).repeat(len(on_wall), 1),
@@ -49,8 +49,8 @@ def render(
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_moments_are_of_each_splats_own_distance(eager, primitive):
-    """Against the splats' weights, which features that are one for one splat each composite to."""
+def test_moments_are_those_of_the_splats_own_depths(eager, primitive):
+    """The splats' weights are composited as one-hot features."""
     random = torch.Generator().manual_seed(0)
     gaussians = {
         "means": torch.randn(6, 3, generator=random) * torch.tensor([1.0, 1.0, 2.0]) + torch.tensor([0.0, 0.0, 9.0]),
@@ -70,7 +70,7 @@ def test_moments_are_of_each_splats_own_distance(eager, primitive):
 
 
 def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:
-    """Distance from the wall's depth, as a share of it, where the wall is opaque."""
+    """Relative error of the wall's depth where it is opaque."""
     exact = 5 * normal[2] / (geometry.camera.rays() @ normal)[..., None]
     return ((geometry.depth - exact) / exact).abs()[geometry.alpha > 0.9]
 
@@ -79,18 +79,18 @@ def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("primitive", "depth"), [("2d", "expected"), ("2d", "median"), ("2d", "plane"), ("3d", "plane")]
 )
-def test_depths_that_meet_the_ray_are_those_of_the_wall(eager, primitive, depth, yaw):
+def test_depths_of_ray_intersections_are_those_of_the_wall(eager, primitive, depth, yaw):
     gaussians, normal = wall(yaw)
     assert error(render(gaussians, primitive, depth), normal).max() < 1e-4
 
 
-def test_the_depth_of_centres_is_off_where_a_wall_recedes(eager):
+def test_the_depth_of_centres_is_wrong_on_a_receding_wall(eager):
     gaussians, normal = wall(0.9)
     assert error(render(gaussians, "3d", "expected"), normal).max() > 0.01
 
 
 @pytest.mark.parametrize("primitive", ["2d", "3d"])
-def test_normals_of_a_wall_and_of_its_depth_are_its_own(eager, primitive):
+def test_normals_and_depth_normals_of_a_wall_are_right(eager, primitive):
     gaussians, normal = wall(0.9)
     geometry = render(gaussians, primitive, "plane")
     opaque = (geometry.alpha > 0.9)[..., 0]
@@ -99,18 +99,18 @@ def test_normals_of_a_wall_and_of_its_depth_are_its_own(eager, primitive):
     inner[1:-1, 1:-1] = opaque[1:-1, 1:-1] & opaque[1:-1, 2:] & opaque[1:-1, :-2]
     known = geometry.depth_normal[inner & (geometry.depth_normal != 0).any(-1)]
     assert len(known) > 300
-    assert ((known @ normal) > 0.999).float().mean() > 0.95  # but for those with a neighbour off the wall
+    assert ((known @ normal) > 0.999).float().mean() > 0.95  # except those with a neighbour off the wall
 
 
 @pytest.mark.parametrize(("depth", "moves"), [("plane", True), ("expected", False)])
-def test_plane_depth_depends_on_where_gaussians_are_turned(depth, moves):
-    """It couples depth and normals; the depth of centres does not see a Gaussian turn."""
+def test_only_plane_depth_depends_on_the_rotation_of_gaussians(depth, moves):
+    """Plane depth couples depth and normals; the depth of centres is independent of rotation."""
     gaussians, _ = wall(0.5)
     gaussians["quats"].requires_grad_()
     assert geometry_channels(gaussians, CAMERA, depth)[1].requires_grad == moves
 
 
-def test_a_faint_disc_has_an_expected_depth_where_it_has_no_median(eager):
+def test_a_faint_disc_without_median_depth_has_its_expected_depth(eager):
     gaussians, _ = wall(0.0)
     one = {name: value[430:431] for name, value in gaussians.items()}  # the middle one
     geometry = render(one, "2d", "median", opacity=0.3)
@@ -119,7 +119,7 @@ def test_a_faint_disc_has_an_expected_depth_where_it_has_no_median(eager):
     torch.testing.assert_close(geometry.depth[seen], torch.full_like(geometry.depth[seen], 5.0))
 
 
-def test_depth_is_positive_and_finite_where_planes_are_seen_edge_on(eager):
+def test_depth_is_positive_and_finite_for_planes_seen_edge_on(eager):
     gaussians, _ = wall(math.pi / 2 - 1e-3)
     geometry = render(gaussians, "3d", "plane")
     assert geometry.depth.isfinite().all()

@@ -1,4 +1,4 @@
-"""The losses against loops over pixels in float64, and against the laws they are meant to obey."""
+"""The losses against loops over pixels in float64, and their invariances."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def yawed(degrees: float) -> torch.Tensor:
 
 
 def ncc_by_patches(x, y, mask, window=9, min_valid=0.5, eps=1e-4) -> float:
-    """Patch by patch, with NumPy's correlation coefficient."""
+    """NCC loss patch by patch, with NumPy's correlation coefficient."""
     x, y, mask = (t[..., 0].numpy() for t in (x, y, mask))
     half, losses = window // 2, []
     for row, column in np.argwhere(mask):
@@ -79,13 +79,13 @@ def ncc_by_patches(x, y, mask, window=9, min_valid=0.5, eps=1e-4) -> float:
 
 
 @pytest.mark.parametrize("window", [3, 7, 9])
-def test_ncc_equals_correlation_patch_by_patch(random, window):
+def test_ncc_equals_numpys_correlation_of_each_patch(random, window):
     x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) * 0.1 + 0.1
     mask = some_mask(random)
     torch.testing.assert_close(ncc_loss(x, y, mask, window).item(), ncc_by_patches(x, y, mask, window))
 
 
-def test_ncc_in_float32_equals_float64_where_a_patch_varies_by_a_thousandth(random):
+def test_ncc_is_accurate_in_float32_for_patches_that_vary_by_a_thousandth(random):
     # 1/8 with a deviation of 1/8000: E[x²] - E[x]² in float32 would be wrong by a tenth.
     x, y = 0.125 + 0.000125 * torch.randn(2, HEIGHT, WIDTH, 1, generator=random)
     mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
@@ -94,13 +94,13 @@ def test_ncc_in_float32_equals_float64_where_a_patch_varies_by_a_thousandth(rand
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1.1, 0.0), (1.0, 0.05), (3.0, -0.1)])
-def test_ncc_ignores_scale_and_offset_of_the_rendering(random, scale, offset):
+def test_ncc_ignores_scale_and_offset_of_the_render(random, scale, offset):
     x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) + 0.5
     mask = some_mask(random)
     torch.testing.assert_close(ncc_loss(scale * x + offset, y, mask), ncc_loss(x, y, mask))
 
 
-def test_ncc_is_blind_to_how_far_a_plane_tilts_but_not_to_which_way():
+def test_ncc_depends_on_the_direction_of_a_planes_tilt_not_on_its_amount():
     mask = torch.ones(64, 96, 1, dtype=torch.bool)
     shell = 1 / yawed(30)
     assert ncc_loss(1 / yawed(55), shell, mask).item() == pytest.approx(0.0, abs=1e-9)
@@ -112,7 +112,7 @@ def test_ncc_is_blind_to_how_far_a_plane_tilts_but_not_to_which_way():
     assert ncc_loss(pitched, shell, inner, min_valid=1.0).item() == pytest.approx(1.0, abs=1e-9)
 
 
-def test_ncc_leaves_out_the_patches_of_a_frontal_wall():
+def test_ncc_ignores_the_patches_of_a_frontal_wall():
     rendered, shell = (1 / yawed(30)).requires_grad_(), 1 / yawed(0)
     loss = ncc_loss(rendered, shell, torch.ones(64, 96, 1, dtype=torch.bool))
     (gradient,) = torch.autograd.grad(loss, rendered)
@@ -120,7 +120,7 @@ def test_ncc_leaves_out_the_patches_of_a_frontal_wall():
     assert not gradient.any()
 
 
-def test_ncc_of_a_flat_rendering_is_one_with_a_finite_gradient():
+def test_ncc_loss_of_a_flat_render_is_one_with_a_finite_gradient():
     rendered = torch.full((64, 96, 1), 0.1, requires_grad=True)
     loss = ncc_loss(rendered, (1 / yawed(30)).float(), torch.ones(64, 96, 1, dtype=torch.bool))
     (gradient,) = torch.autograd.grad(loss, rendered)
@@ -129,14 +129,14 @@ def test_ncc_of_a_flat_rendering_is_one_with_a_finite_gradient():
     assert gradient.any()
 
 
-def test_ncc_does_not_see_what_the_mask_leaves_out(random):
+def test_ncc_ignores_pixels_outside_the_mask(random):
     x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random) + 0.5
     mask = some_mask(random)
     loss = ncc_loss(x, y, mask)
     assert ncc_loss(x.where(mask, torch.inf), y.where(mask, torch.nan), mask) == loss
 
 
-def test_ncc_gradient(random):
+def test_the_gradient_of_the_ncc_loss_matches_finite_differences(random):
     x, y = torch.rand(2, 5, 6, 1, generator=random, dtype=torch.float64) + 0.5
     mask = torch.rand(5, 6, 1, generator=random) < 0.8
     assert gradcheck(lambda x: ncc_loss(x, y, mask, window=3), x.requires_grad_())
@@ -182,7 +182,7 @@ def test_normal_loss_of_a_missing_normal_has_a_finite_gradient():
     assert gradient.isfinite().all()
 
 
-def test_normal_loss_gradient(random):
+def test_the_gradient_of_the_normal_loss_matches_finite_differences(random):
     normal, target, mask = some_normals(random), some_normals(random), some_mask(random)
     assert gradcheck(lambda normal: normal_loss(normal, target, mask), normal.requires_grad_())
 
@@ -206,8 +206,8 @@ def test_smoothness_equals_a_loop_over_pixels(random):
     assert smoothness_loss(normal, depth, mask).item() == pytest.approx((w * a).sum() / w.sum(), abs=1e-12)
 
 
-def test_smoothness_ignores_pairs_that_straddle_the_mask():
-    # Two walls at a right angle; the column between them is not supported.
+def test_smoothness_ignores_pairs_across_the_edge_of_the_mask():
+    # Two walls at a right angle; the column between them is not in the mask.
     normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
     normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
     mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
@@ -217,7 +217,7 @@ def test_smoothness_ignores_pairs_that_straddle_the_mask():
     assert smoothness_loss(normal, depth, mask) == 0
 
 
-def test_smoothness_does_not_take_missing_depth_for_an_edge(random):
+def test_smoothness_sees_no_edge_at_missing_depth(random):
     normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
     mask[:, :5] = False
     depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
@@ -225,8 +225,8 @@ def test_smoothness_does_not_take_missing_depth_for_an_edge(random):
     torch.testing.assert_close(missing, smoothness_loss(normal, depth, mask))
 
 
-def test_smoothness_costs_nothing_at_the_strongest_edge():
-    # The fold of the normals lies on the only step of the depth, where w = 0.
+def test_smoothness_is_free_at_the_strongest_depth_edge():
+    # The normals change at the only step of the depth, where w = 0.
     normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
     normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
     depth = torch.full((HEIGHT, WIDTH, 1), 5.0)
@@ -243,7 +243,7 @@ def test_smoothness_does_not_depend_on_the_unit_of_length(random):
     torch.testing.assert_close(smoothness_loss(normal, 100 * depth, mask), smoothness_loss(normal, depth, mask))
 
 
-def test_smoothness_gradient(random):
+def test_the_gradient_of_smoothness_matches_finite_differences(random):
     normal, mask = torch.randn(5, 6, 3, generator=random, dtype=torch.float64), torch.ones(5, 6, 1, dtype=torch.bool)
     depth = 5 + torch.rand(5, 6, 1, generator=random, dtype=torch.float64)
     assert gradcheck(lambda normal: smoothness_loss(normal, depth, mask), normal.requires_grad_())
@@ -272,7 +272,7 @@ def test_photometric_loss_is_l1_and_one_minus_ssim(random):
     assert photometric_loss(a, b).item() == pytest.approx(0.8 * l1 + 0.2 * (1 - ssim), abs=1e-9)
 
 
-def test_ssim_and_its_gradient_are_those_of_kornia(random):
+def test_ssim_and_its_gradient_match_kornia(random):
     a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
     slope = torch.randn(HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
     ours = ssim(a.requires_grad_(), SsimTarget.of(b))
@@ -282,7 +282,7 @@ def test_ssim_and_its_gradient_are_those_of_kornia(random):
     torch.testing.assert_close(*gradients)
 
 
-def test_photometric_loss_averages_over_kept_pixels_only(random):
+def test_photometric_loss_averages_over_the_mask_only(random):
     a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
     mask = some_mask(random)
     kept, shown = mask[..., 0].numpy(), a.where(mask, b).numpy()
@@ -290,7 +290,7 @@ def test_photometric_loss_averages_over_kept_pixels_only(random):
     assert photometric_loss(a, b, mask).item() == pytest.approx(0.8 * l1 + 0.2 * (1 - ssim), abs=1e-9)
 
 
-def test_photometric_loss_sends_no_gradient_to_pixels_left_out(random):
+def test_photometric_loss_has_no_gradient_outside_the_mask(random):
     a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random)
     mask = some_mask(random)
     (gradient,) = torch.autograd.grad(photometric_loss(a.requires_grad_(), b, mask), a)
@@ -298,14 +298,11 @@ def test_photometric_loss_sends_no_gradient_to_pixels_left_out(random):
     assert gradient[mask[..., 0]].any()
 
 
-# all of them
-
-
-# Beyond the paper
+# beyond the paper
 
 
 def slanted_wall(depth: float, yaw: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Depth, normals and rays of a wall that the optical axis meets at ``depth``, turned by ``yaw``."""
+    """Depth, normals and rays of a wall at ``depth`` along the optical axis, turned by ``yaw``."""
     K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
     rays = Camera(torch.eye(4, dtype=torch.float64), K, WIDTH, HEIGHT).rays()
     normal = torch.tensor([math.sin(yaw), 0.0, -math.cos(yaw)], dtype=torch.float64)
@@ -315,7 +312,7 @@ def slanted_wall(depth: float, yaw: float) -> tuple[torch.Tensor, torch.Tensor, 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.2])
 def test_point_to_plane_is_the_distance_of_two_parallel_walls(yaw):
-    """Whatever the angle they are seen at: 0.3 units apart along the axis are 0.3 cos(yaw) apart."""
+    """At any viewing angle: walls 0.3 units apart along the axis are 0.3 cos(yaw) apart."""
     target, normal, rays = slanted_wall(8.0, yaw)
     loss = point_to_plane_loss(
         slanted_wall(8.3, yaw)[0],
@@ -329,7 +326,7 @@ def test_point_to_plane_is_the_distance_of_two_parallel_walls(yaw):
     assert float(loss) == pytest.approx(math.log(1 + 0.6 * math.cos(yaw) - 0.05))
 
 
-def test_point_to_plane_costs_nothing_within_the_tolerance_and_pulls_less_the_farther_away():
+def test_the_point_to_plane_gradient_is_zero_within_the_tolerance_and_falls_with_distance():
     target, normal, rays = slanted_wall(8.0, 0.5)
     distances = torch.tensor([0.04, 0.5, 5.0], dtype=torch.float64, requires_grad=True)
     mask = torch.ones_like(target).bool()
@@ -342,18 +339,18 @@ def test_point_to_plane_costs_nothing_within_the_tolerance_and_pulls_less_the_fa
     assert middle > 3 * far > 0
 
 
-def test_the_distance_of_all_that_a_pixel_shows_is_no_less_for_the_right_mean():
-    """Half of the light 0.3 before the wall and half 0.3 behind: the mean depth is the wall's."""
+def test_the_loss_of_all_splats_is_positive_even_if_their_mean_depth_is_right():
+    """Half of the weight lies 0.3 in front of the wall and half 0.3 behind: the mean depth is the wall's."""
     target, normal, rays = slanted_wall(8.0, 0.5)
     loss = PointToPlaneLoss(target, normal, rays, torch.ones_like(target).bool(), metres_per_unit=2.0, tolerance=0.05)
     offset, alpha = 0.3 / (rays * normal).sum(-1, keepdim=True).abs(), torch.ones_like(target)
     assert float(loss(target)) == 0
     assert float(loss.of_all(offset.square(), alpha)) == pytest.approx(math.log(1 + 0.6 - 0.05))
-    # Half of it on the wall, the rest through it: as half of it a metre behind.
+    # Half of the weight on the wall, the rest passing through: as if that were a metre behind.
     assert float(loss.of_all(0 * target, alpha / 2)) == pytest.approx(math.log(1 + 0.5**0.5 - 0.05))
 
 
-def test_the_gradient_of_the_distance_of_all_is_right_and_finite_on_the_wall(random):
+def test_the_gradient_of_the_loss_of_all_splats_is_right_and_finite_on_the_wall(random):
     target, normal, rays = slanted_wall(8.0, 0.5)
     loss = PointToPlaneLoss(target, normal, rays, some_mask(random), tolerance=0.05)
     squares, alpha = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
@@ -362,7 +359,7 @@ def test_the_gradient_of_the_distance_of_all_is_right_and_finite_on_the_wall(ran
     assert torch.autograd.grad(loss.of_all(zero, torch.ones_like(target)), zero)[0].isfinite().all()
 
 
-def test_agreement_equals_its_formula_pixel_by_pixel(random):
+def test_normal_consistency_equals_its_formula_pixel_by_pixel(random):
     normal, depth_normal = some_normals(random), some_normals(random)
     alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
     expected = np.mean(
@@ -371,14 +368,14 @@ def test_agreement_equals_its_formula_pixel_by_pixel(random):
     assert float(normal_consistency_loss(normal, depth_normal, alpha)) == pytest.approx(expected)
 
 
-def test_agreement_does_not_make_splats_fade(random):
+def test_normal_consistency_has_no_gradient_to_alpha(random):
     alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64).requires_grad_()
     normal = some_normals(random).requires_grad_()
     loss = normal_consistency_loss(normal, some_normals(random), alpha)
     assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
 
 
-def test_flattening_shrinks_the_thinnest_axis_of_visible_gaussians_alone():
+def test_flattening_shrinks_only_the_thinnest_axis_of_visible_gaussians():
     scales = torch.tensor([[1.0, 2.0, 3.0], [6.0, 4.0, 5.0], [0.1, 0.1, 0.2]], requires_grad=True)
     loss = flattening_loss(scales, torch.tensor([True, True, False]))
     assert loss.item() == 2.5
@@ -387,7 +384,7 @@ def test_flattening_shrinks_the_thinnest_axis_of_visible_gaussians_alone():
 
 
 def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[str, tuple]:
-    """Each loss that is compiled, for a view of some size, and a rendering."""
+    """Every compiled loss of a view of the given size, and a rendered map for it."""
     mask = torch.rand(height, width, 1, generator=random) < 0.9
     x, y = 0.125 + 0.001 * torch.randn(2, height, width, 1, generator=random)
     a, b, normal, target = torch.rand(4, height, width, 3, generator=random) - 0.5
@@ -403,7 +400,7 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
     }
 
 
-def test_compiled_losses_are_the_plain_ones_at_every_size_of_image(compiler):
+def test_compiled_losses_match_plain_torch_at_all_image_sizes(compiler):
     fusion._compiled.cache_clear()
     for size in [(30, 40), (37, 61), (52, 33)]:
         losses = losses_of_a_view(*size, torch.Generator().manual_seed(1))
@@ -436,7 +433,7 @@ def test_compiled_losses_are_the_plain_ones_at_every_size_of_image(compiler):
     ids=["ncc", "vid2sim ncc", "normal", "smoothness", "photometric"],
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_empty_mask_gives_a_zero_that_can_be_back_propagated(random, loss, channels, dtype):
+def test_an_empty_mask_gives_a_differentiable_zero(random, loss, channels, dtype):
     rendered, target = torch.rand(2, HEIGHT, WIDTH, channels, generator=random, dtype=dtype)
     value = loss(rendered.requires_grad_(), target, torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool))
     (gradient,) = torch.autograd.grad(value, rendered)
@@ -452,16 +449,16 @@ def test_depth_weight_falls_from_a_half_to_a_tenth():
 
 
 @pytest.mark.parametrize("value", [0.0, 0.1])
-def test_equal_ends_are_a_constant_weight(value):
+def test_equal_initial_and_final_weights_are_constant(value):
     weight = ExponentialDecay(value, value)
     assert [weight(t) for t in (0, 0.3, 1)] == pytest.approx([value] * 3)
 
 
-def test_a_weight_that_begins_at_0_leaves_its_term_out_to_the_end():
+def test_a_weight_that_starts_at_0_stays_0():
     assert [ExponentialDecay(0.0, 0.1)(t) for t in (0, 0.5, 1)] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("ends", [(0.5, -0.1), (float("nan"), 0.1), (0.1, float("inf")), (0.5, 0.0)])
-def test_weights_that_are_none_and_a_decay_to_0_are_refused(ends):
+def test_negative_or_infinite_weights_and_decay_to_0_are_errors(ends):
     with pytest.raises(ValueError, match="a loss weight"):
         ExponentialDecay(*ends)

@@ -301,8 +301,8 @@ def test_point_to_plane_is_in_metres(untrained):
 
 @pytest.mark.parametrize(("error", "expected"), [(None, 0.05), (0.003, 0.05), (0.08, 0.08), (0.5, 0.15)])
 def test_the_tolerance_is_what_the_alignment_may_be_off(error, expected):
-    assert ExtraLossConfig().tolerance_beside(error) == expected
-    assert ExtraLossConfig(tolerance=0.3).tolerance_beside(error) == 0.3
+    assert ExtraLossConfig().tolerance_for(error) == expected
+    assert ExtraLossConfig(tolerance=0.3).tolerance_for(error) == 0.3
 
 
 def test_empty_space_needs_depths_of_centres(pristine_scene, tmp_path):

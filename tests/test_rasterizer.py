@@ -1,4 +1,4 @@
-"""The rasterizer against the formulas, the laws of a picture, and gsplat's densification."""
+"""The rasterizer against a reference, its invariances, and gsplat's densification."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def differentiate(splats: list[Tensor], composited: Tensor, alpha: Tensor, count
 
 
 def compare(dtype: torch.dtype, n: int, width: int, height: int, n_features: int, seed: int, margin: float) -> tuple:
-    """Largest error of the values, relative error of each gradient, and the share of pixels left out.
+    """Largest error of the values, relative error of each gradient, and share of pixels left out.
 
-    Left out is where a decision (alpha below 1/255, transmittance below 1e-4) is closer to its threshold than rounding.
+    A pixel is left out if alpha or transmittance is within ``margin`` of a threshold (1/255 or 1e-4).
     """
     splats = [splat.requires_grad_() for splat in make_splats(n, n_features, seed)]
     camera = make_camera(width, height)
@@ -63,7 +63,7 @@ def render(n: int, width: int, height: int, dtype: torch.dtype = torch.float32) 
     ("n", "width", "height", "n_features", "seed"),
     [(90, 37, 29, 3, 0), (60, 8, 8, 1, 1), (120, 61, 45, 8, 2), (40, 3, 50, 3, 3), (1, 20, 20, 3, 13)],
 )
-def test_values_and_gradients_are_those_of_the_formulas_in_float64(n, width, height, n_features, seed):
+def test_values_and_gradients_match_the_reference_in_float64(n, width, height, n_features, seed):
     error, relative, left_out = compare(torch.float64, n, width, height, n_features, seed, margin=1e-10)
     assert error < 1e-9
     assert max(relative.values()) < 1e-8, relative
@@ -71,7 +71,7 @@ def test_values_and_gradients_are_those_of_the_formulas_in_float64(n, width, hei
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_values_and_gradients_are_those_of_the_formulas_in_float32(compiled, request):
+def test_values_and_gradients_match_the_reference_in_float32(compiled, request):
     fusion._compiled.cache_clear()
     if compiled:
         request.getfixturevalue("compiler")
@@ -83,7 +83,7 @@ def test_values_and_gradients_are_those_of_the_formulas_in_float32(compiled, req
     assert not fusion._failed
 
 
-def test_compiled_kernels_serve_every_number_of_splats_and_size_of_image(compiler):
+def test_kernels_are_compiled_once_for_all_numbers_of_splats_and_image_sizes(compiler):
     render(20, 40, 30).sum().backward()  # compiles
     with torch._dynamo.config.patch(error_on_recompile=True), warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -92,7 +92,7 @@ def test_compiled_kernels_serve_every_number_of_splats_and_size_of_image(compile
     assert not fusion._failed
 
 
-def test_a_failure_to_compile_is_said_once_and_the_picture_is_made_all_the_same(monkeypatch, caplog):
+def test_without_a_compiler_rendering_works_and_warns_once(monkeypatch, caplog):
     def fail(*_) -> None:
         raise RuntimeError("no C++ compiler\nmuch detail")
 
@@ -108,7 +108,7 @@ def test_a_failure_to_compile_is_said_once_and_the_picture_is_made_all_the_same(
 
 
 def test_a_stack_of_splats_stops_before_the_transmittance_reaches_the_minimum():
-    # One pixel, four splats on it, each of alpha 0.9: transmittance 1, 0.1, 0.01, 0.001; the fourth would bring 1e-4.
+    # Four splats of alpha 0.9 on one pixel: transmittance 1, 0.1, 0.01, 0.001; the fourth would make it 1e-4.
     n = 4
     means = torch.tensor([[0.0, 0.0, 1.0 + i] for i in range(n)], dtype=torch.float64)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(n, 4)
@@ -130,7 +130,7 @@ def test_an_opaque_splat_leaves_a_thousandth_of_the_light():
 
 
 @pytest.mark.parametrize("n", [0, 1, 5])
-def test_nothing_visible_gives_an_empty_picture_and_gradients_of_zero(n):
+def test_without_visible_splats_image_and_gradients_are_zero(n):
     camera = make_camera(20, 13)
     splats = make_splats(n, 3, seed=0)
     splats[0][:, 2] = -5.0
@@ -147,7 +147,7 @@ def test_nothing_visible_gives_an_empty_picture_and_gradients_of_zero(n):
         assert not splat.grad.any()
 
 
-def test_a_splat_at_the_cameras_centre_or_fainter_than_a_grey_level_leaves_finite_gradients():
+def test_gradients_are_finite_with_splats_at_the_camera_centre_or_fainter_than_a_grey_level():
     camera = make_camera(20, 13)
     splats = make_splats(40, 3, seed=4)
     splats[0][0] = camera.position
@@ -159,7 +159,7 @@ def test_a_splat_at_the_cameras_centre_or_fainter_than_a_grey_level_leaves_finit
     assert not splats[3].grad[1:4].any()
 
 
-def test_alpha_is_what_a_feature_of_one_composites_to():
+def test_alpha_is_the_composite_of_a_feature_of_one():
     *splats, features = make_splats(100, 1, seed=5)
     composited, alpha, _ = rasterize(*splats, features=torch.ones_like(features), camera=make_camera(33, 21))
     torch.testing.assert_close(composited, alpha)
@@ -174,7 +174,7 @@ def test_the_order_of_the_splats_does_not_matter(primitive):
     torch.testing.assert_close(actual, expected)
 
 
-def test_a_batch_of_cameras_gives_the_pictures_of_each():
+def test_a_batch_of_cameras_gives_the_render_of_each():
     splats = [splat.requires_grad_() for splat in make_splats(80, 3, seed=14)]
     cameras = orbit(make_camera(29, 22), 3)
     composited, alpha, info = rasterize(*splats, camera=cameras)
@@ -183,12 +183,12 @@ def test_a_batch_of_cameras_gives_the_pictures_of_each():
     singles = [rasterize(*splats, camera=camera) for camera in cameras]
     slope = torch.linspace(-1, 1, 29 * 3, dtype=torch.float64).view(29, 3)
     batched = torch.autograd.grad((slope * composited).sum() + alpha.sum(), [*splats, info["means2d"]])
-    by_one = [torch.autograd.grad((slope * c).sum() + a.sum(), [*splats, i["means2d"]]) for c, a, i in singles]
+    by_view = [torch.autograd.grad((slope * c).sum() + a.sum(), [*splats, i["means2d"]]) for c, a, i in singles]
     torch.testing.assert_close(composited, torch.stack([single[0] for single in singles]))
     torch.testing.assert_close(alpha, torch.stack([single[1] for single in singles]))
-    for actual, *expected in zip(batched[:-1], *(each[:-1] for each in by_one), strict=True):
+    for actual, *expected in zip(batched[:-1], *(each[:-1] for each in by_view), strict=True):
         torch.testing.assert_close(actual, torch.stack(expected).sum(0))
-    torch.testing.assert_close(batched[-1], torch.cat([each[-1] for each in by_one]))
+    torch.testing.assert_close(batched[-1], torch.cat([each[-1] for each in by_view]))
     assert torch.equal(info["radii"], torch.cat([single[2]["radii"] for single in singles]))
 
 
@@ -199,7 +199,7 @@ def test_a_batch_needs_cameras_of_one_size(widths):
 
 
 @pytest.mark.parametrize("batches", [(1, 1), (7, 3), compositing.GPU_BATCHES])
-def test_how_tiles_are_batched_changes_neither_picture_nor_gradients(batches, monkeypatch):
+def test_batching_of_tiles_changes_neither_render_nor_gradients(batches, monkeypatch):
     def differentiated() -> list[Tensor]:
         splats = [splat.requires_grad_() for splat in make_splats(200, 3, seed=14)]
         composited, alpha, _ = rasterize(*splats, camera=make_camera(53, 38))
@@ -210,8 +210,8 @@ def test_how_tiles_are_batched_changes_neither_picture_nor_gradients(batches, mo
     torch.testing.assert_close(differentiated(), expected)
 
 
-def test_a_few_deep_tiles_are_not_packed_again_after_each_chunk(monkeypatch):
-    """On real scenes a handful of tiles have hundreds of chunks more than the others."""
+def test_a_few_deep_tiles_are_not_repacked_after_each_chunk(monkeypatch):
+    """In real scenes a few tiles have hundreds of chunks more than the others."""
     plans, plan = [], compositing._plan
     monkeypatch.setattr(compositing, "_plan", lambda *args: plans.append(plan(*args)) or plans[-1])
     shallow, n_deep = make_splats(200, 3, seed=14), 400
@@ -225,9 +225,11 @@ def test_a_few_deep_tiles_are_not_packed_again_after_each_chunk(monkeypatch):
     assert len(plans) <= 4
 
 
-def test_cropping_is_shifting_the_principal_point():
+def test_cropping_equals_shifting_the_principal_point():
     *splats, features = make_splats(100, 3, seed=7)
-    splats[0] *= 0.2  # all within the field of view, or the clamped slopes of the projection would follow the crop
+    splats[0] *= (
+        0.2  # all within the field of view, where the crop does not affect the clamped slopes of the projection
+    )
     splats[0][:, 2] += 3
     camera = make_camera(50, 40)
     shift = torch.tensor([[0.0, 0.0, 11.0], [0.0, 0.0, 6.0], [0.0, 0.0, 0.0]])
@@ -254,7 +256,7 @@ def test_a_rigid_motion_of_world_and_camera_changes_nothing(primitive):
     torch.testing.assert_close(actual, expected)
 
 
-def test_radii_are_positive_exactly_where_a_splat_shows():
+def test_radii_are_positive_for_visible_splats_and_few_others():
     *splats, features = make_splats(60, 1, seed=9)
     camera = make_camera(33, 21)
     *_, info = rasterize(*splats, features=features, camera=camera)
@@ -262,10 +264,10 @@ def test_radii_are_positive_exactly_where_a_splat_shows():
     shows = torch.tensor([bool(rasterize(*splat, camera=camera)[1].any()) for splat in alone])
     seen = info["radii"][0] > 0
     assert seen[shows].all()
-    assert int((seen & ~shows).sum()) <= 3  # the ellipse's box touches the picture, the ellipse no pixel's centre
+    assert int((seen & ~shows).sum()) <= 3  # the ellipse's box touches the image, the ellipse no pixel centre
 
 
-def test_the_pictures_gradient_by_the_camera_is_that_of_the_formulas():
+def test_the_gradient_of_the_camera_pose_matches_the_reference():
     splats, camera = make_splats(60, 3, seed=10), make_camera(24, 17)
 
     def sparse(pose: Tensor) -> Tensor:
@@ -275,15 +277,15 @@ def test_the_pictures_gradient_by_the_camera_is_that_of_the_formulas():
         return dense_rasterize(*splats, viewmat=pose, K=camera.K, width=camera.width, height=camera.height).composited
 
     gradients = []
-    for picture in (sparse, dense):
+    for renderer in (sparse, dense):
         pose = camera.viewmat.clone().requires_grad_()
-        (picture(pose) * torch.linspace(-1, 1, 24, dtype=torch.float64)[:, None]).sum().backward()
+        (renderer(pose) * torch.linspace(-1, 1, 24, dtype=torch.float64)[:, None]).sum().backward()
         assert pose.grad is not None
         gradients.append(pose.grad[:3])
     torch.testing.assert_close(*gradients)
 
 
-def test_gsplats_default_strategy_densifies_unchanged():
+def test_gsplats_default_strategy_works_with_the_rasterizer():
     means, quats, scales, opacities, features = (splat.float() for splat in make_splats(80, 3, seed=11))
     params = torch.nn.ParameterDict(
         {"means": means, "quats": quats, "scales": scales.log(), "opacities": opacities.logit(), "features": features}
@@ -306,7 +308,7 @@ def test_gsplats_default_strategy_densifies_unchanged():
     sizes, losses = [], []
     for step in range(20):
         if step == 10:
-            strategy.grow_grad2d = float("inf")  # from here it can only prune
+            strategy.grow_grad2d = float("inf")  # from now on it can only prune
         opacities = params["opacities"].sigmoid()
         composited, _, info = rasterize(
             params["means"], params["quats"], params["scales"].exp(), opacities, params["features"], camera
@@ -326,7 +328,7 @@ def test_gsplats_default_strategy_densifies_unchanged():
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_the_gradient_to_densify_by_is_that_of_the_first_features_alone(primitive):
+def test_the_densification_gradient_is_that_of_the_first_features_alone(primitive):
     splats = [splat.requires_grad_() for splat in make_splats(90, 5, seed=0)]
     camera = make_camera(37, 29)
     slope = torch.randn(29, 37, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -339,12 +341,12 @@ def test_the_gradient_to_densify_by_is_that_of_the_first_features_alone(primitiv
         return list(torch.autograd.grad(output, [*splats, info["means2d"]]))
 
     *of_splats, to_densify = gradients(slope, n_densifying=3)
-    torch.testing.assert_close(of_splats, gradients(slope, None)[:-1])  # all that moves a splat stays
+    torch.testing.assert_close(of_splats, gradients(slope, None)[:-1])  # the splats' gradients are unchanged
     torch.testing.assert_close(to_densify, gradients(of_first, None)[-1])
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_the_gradient_to_densify_by_is_the_same_where_it_is_compiled(compiler, primitive):
+def test_the_densification_gradient_is_the_same_when_compiled(compiler, primitive):
     fusion._compiled.cache_clear()
     for n in (100, 250):
         splats = [nn.Parameter(splat.float()) for splat in make_splats(n, 5, seed=0)]

@@ -1,4 +1,4 @@
-"""The rasterizer on a CUDA device, each backend against the formulas in float64."""
+"""The rasterizer on a CUDA device, each backend against the reference in float64."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def errors(expected: list[Tensor], actual: list[Tensor], counted: Tensor, wrt: l
     """Largest errors of the maps, and relative errors of the gradients of a random linear function of them."""
     generator = torch.Generator().manual_seed(5)
     slopes = [torch.randn(x.shape, generator=generator, dtype=x.dtype) * counted[..., None] for x in expected]
-    by_formulas = torch.autograd.grad(expected, wrt, slopes)
+    references = torch.autograd.grad(expected, wrt, slopes)
     gradients = torch.autograd.grad(actual, own, [slope.to(x) for x, slope in zip(actual, slopes, strict=True)])
     found = {
         f"map {i}": float((x - y.cpu())[counted].abs().max())
         for i, (x, y) in enumerate(zip(expected, actual, strict=True))
     }
-    for name, x, y in zip([*NAMES, "means2d"], by_formulas, gradients, strict=True):
-        found[f"gradient by {name}"] = float((x - y.cpu().view_as(x)).norm() / x.norm())
+    for name, x, y in zip([*NAMES, "means2d"], references, gradients, strict=True):
+        found[f"gradient of {name}"] = float((x - y.cpu().view_as(x)).norm() / x.norm())
     print(found)
     return found
 
@@ -48,7 +48,7 @@ def errors(expected: list[Tensor], actual: list[Tensor], counted: Tensor, wrt: l
     [("torch", torch.float64, 1e-6), ("torch", torch.float32, 2e-3), ("gsplat", torch.float32, 5e-3)],
 )
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_pictures_and_gradients_are_those_of_the_formulas(primitive, backend, dtype, tolerance, request):
+def test_renders_and_gradients_match_the_reference(primitive, backend, dtype, tolerance, request):
     if backend == "gsplat":
         request.getfixturevalue("_kernels")
     make, dense = {"3d": (make_splats, dense_rasterize), "2d": (make_discs, dense_rasterize_discs)}[primitive]
@@ -69,14 +69,14 @@ def test_pictures_and_gradients_are_those_of_the_formulas(primitive, backend, dt
 
 @pytest.mark.usefixtures("_kernels")
 @pytest.mark.parametrize(("primitive", "make"), [("3d", make_splats), ("2d", make_discs)])
-def test_a_batch_of_cameras_on_gsplat_is_that_of_torch(primitive, make):
+def test_gsplat_and_torch_render_a_batch_of_cameras_alike(primitive, make):
     splats = [splat.float().cuda() for splat in make(120, 3, seed=2)]
     cameras = orbit(CAMERA, 3)
     (expected, _, _), (actual, _, info) = (
         rasterize(*splats, camera=cameras, primitive=primitive, backend=backend) for backend in ("torch", "gsplat")
     )
     assert info["means2d"].shape == (3, 120, 2)
-    assert float(((actual - expected).abs() > 1e-3).double().mean()) < 0.01  # where a threshold is near
+    assert float(((actual - expected).abs() > 1e-3).double().mean()) < 0.01  # near a threshold
 
 
 @pytest.mark.usefixtures("_kernels")
@@ -88,7 +88,7 @@ def test_auto_is_gsplat_in_float32_and_torch_in_float64():
 
 @pytest.mark.usefixtures("_kernels")
 @pytest.mark.parametrize("n", [0, 5])
-def test_nothing_visible_gives_an_empty_picture_and_gradients_of_zero(n):
+def test_without_visible_splats_image_and_gradients_are_zero(n):
     splats = [splat.float().cuda() for splat in make_splats(n, 3, seed=0)]
     splats[0][:, 2] = -5.0
     splats = [splat.requires_grad_() for splat in splats]

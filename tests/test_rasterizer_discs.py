@@ -1,4 +1,4 @@
-"""2D discs against the formulas of 2DGS, and geometry in closed form."""
+"""2D discs against a reference of 2DGS, and geometry in closed form."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
 
 def pinhole(width: int, height: int, focal: float) -> Camera:
-    """A camera at the origin that looks along z, with the principal point at the image's centre."""
+    """A camera at the origin that looks along z, with its principal point at the image centre."""
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return Camera(torch.eye(4, dtype=torch.float64), K, width, height)
 
 
 def near_discs(n: int, n_features: int, seed: int) -> list[Tensor]:
-    """Discs around the camera, many across the near plane and behind, some edge-on to the last digit or nearly."""
+    """Discs around the camera, many across the near plane and behind it, some exactly or nearly edge-on."""
     means, quats, scales, opacities, features = make_splats(n, n_features, seed)
     means[:] = (means - torch.tensor([0.0, 0.0, 2.9])) * 0.4
     scales[:, :2] = scales[:, :2].clamp(max=1.0) * 3
     return [means, quats, scales, opacities, features]
 
 
-def maps_of(picture: DenseDiscs | dict) -> list[Tensor]:
-    return [picture[name] if isinstance(picture, dict) else getattr(picture, name) for name in MAPS]
+def maps_of(render: DenseDiscs | dict) -> list[Tensor]:
+    return [render[name] if isinstance(render, dict) else getattr(render, name) for name in MAPS]
 
 
 def differentiate(splats: list[Tensor], channels: Tensor, counted: Tensor, means2d: Tensor) -> dict:
@@ -50,9 +50,9 @@ def differentiate(splats: list[Tensor], channels: Tensor, counted: Tensor, means
 
 
 def compare(splats: list[Tensor], camera: Camera, dtype: torch.dtype, margin: float) -> tuple[float, dict, float]:
-    """Largest error of the values, relative error of each gradient, and the share of pixels left out.
+    """Largest error of the values, relative error of each gradient, and share of pixels left out.
 
-    Left out is where a decision is closer to its threshold than rounding.
+    A pixel is left out if a decision is within ``margin`` of its threshold.
     """
     splats = [splat.requires_grad_() for splat in splats]
     view = dict(viewmat=camera.viewmat, K=camera.K, width=camera.width, height=camera.height)
@@ -82,7 +82,7 @@ def compare(splats: list[Tensor], camera: Camera, dtype: torch.dtype, margin: fl
         (near_discs, 60, 8, 50, 1, 4),
     ],
 )
-def test_values_and_gradients_are_those_of_the_formulas_in_float64(make, n, width, height, n_features, seed):
+def test_values_and_gradients_match_the_reference_in_float64(make, n, width, height, n_features, seed):
     error, relative, left_out = compare(
         make(n, n_features, seed), make_camera(width, height), torch.float64, margin=1e-10
     )
@@ -92,7 +92,7 @@ def test_values_and_gradients_are_those_of_the_formulas_in_float64(make, n, widt
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_values_and_gradients_are_those_of_the_formulas_in_float32(compiled, request):
+def test_values_and_gradients_match_the_reference_in_float32(compiled, request):
     fusion._compiled.cache_clear()
     if compiled:
         request.getfixturevalue("compiler")
@@ -125,7 +125,7 @@ def test_the_depth_of_a_slanted_disc_is_that_of_its_plane(scale):
     assert info["distortion"].abs().max() < 1e-12
 
 
-def test_the_distortion_of_two_surfaces_is_the_product_of_their_weights_and_squared_distance():
+def test_the_distortion_of_two_surfaces_is_the_product_of_weights_and_squared_distance():
     # Alphas 0.6 and 0.5, so weights 0.6 and 0.4 · 0.5 = 0.2, at z = 1 and 4: m = 100 / 99.8 (1 - 0.2 / z).
     means = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 4.0]], dtype=torch.float64)
     opacities = torch.tensor([0.6, 0.5], dtype=torch.float64)
@@ -139,7 +139,7 @@ def test_the_distortion_of_two_surfaces_is_the_product_of_their_weights_and_squa
     assert info["distortion"].item() == pytest.approx(0.6 * 0.2 * (near - far) ** 2)
 
 
-def test_a_disc_edge_on_leaves_no_trace_and_finite_gradients():
+def test_an_edge_on_disc_is_invisible_and_has_zero_gradients():
     camera = pinhole(9, 9, 9.0)
     quat = torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=torch.float64)  # the normal turned from z to -y
     splat = [torch.tensor([[0.0, 0.0, 2.0]]).double(), quat, torch.ones(1, 3).double(), torch.ones(1).double() * 0.9]
@@ -150,8 +150,8 @@ def test_a_disc_edge_on_leaves_no_trace_and_finite_gradients():
     assert all(each.grad is not None and not each.grad.any() for each in splat)
 
 
-def test_a_disc_too_small_to_see_is_as_wide_as_a_pixel():
-    # At a pixel's centre, alpha is the opacity; at the next, exp(-rho / 2) = exp(-1) of it.
+def test_a_sub_pixel_disc_is_as_wide_as_a_pixel():
+    # Alpha at the disc's pixel is the opacity; at the next pixel, exp(-rho / 2) = exp(-1) of it.
     tiny = torch.full((1, 3), 1e-9, dtype=torch.float64)
     opacity, feature = torch.tensor([0.8], dtype=torch.float64), torch.ones(1, 1).double()
     centre = torch.tensor([[0.0, 0.0, 3.0]], dtype=torch.float64)
@@ -168,7 +168,7 @@ def test_the_third_scale_does_not_matter():
     assert torch.equal(rasterize(means, quats, fat, *rest, camera=camera, primitive="2d")[0], expected)
 
 
-def test_radii_are_positive_wherever_a_disc_shows():
+def test_radii_are_positive_for_visible_discs():
     splats, camera = near_discs(60, 1, seed=9), make_camera(33, 21)
     *_, info = rasterize(*splats, camera=camera, primitive="2d")
     alone = [[splat[i : i + 1] for splat in splats] for i in range(60)]
@@ -181,8 +181,8 @@ def test_a_batch_of_cameras_gives_the_maps_and_gradients_of_each():
     splats = [splat.requires_grad_() for splat in make_splats(60, 2, seed=14)]
     cameras = orbit(make_camera(29, 22), 2)
 
-    def loss(picture: tuple[Tensor, Tensor, dict]) -> Tensor:
-        composited, alpha, info = picture
+    def loss(render: tuple[Tensor, Tensor, dict]) -> Tensor:
+        composited, alpha, info = render
         channels = torch.cat([composited, alpha, *maps_of(info)], dim=-1)
         return (channels * torch.linspace(-1, 1, channels.shape[-1]).double()).sum()
 
@@ -191,13 +191,13 @@ def test_a_batch_of_cameras_gives_the_maps_and_gradients_of_each():
     for name in MAPS:
         torch.testing.assert_close(batch[2][name], torch.stack([info[name] for *_, info in singles]))
     actual = torch.autograd.grad(loss(batch), splats)
-    by_one = [torch.autograd.grad(loss(single), splats) for single in singles]
-    for gradient, *expected in zip(actual, *by_one, strict=True):
+    by_view = [torch.autograd.grad(loss(single), splats) for single in singles]
+    for gradient, *expected in zip(actual, *by_view, strict=True):
         torch.testing.assert_close(gradient, torch.stack(expected).sum(0))
 
 
 @pytest.mark.parametrize("make", [make_splats, near_discs])
-def test_cropping_is_shifting_the_principal_point(make):
+def test_cropping_equals_shifting_the_principal_point(make):
     splats, camera = make(100, 3, seed=7), make_camera(50, 40)
     shift = torch.tensor([[0.0, 0.0, 11.0], [0.0, 0.0, 6.0], [0.0, 0.0, 0.0]])
     crop = replace(camera, K=camera.K - shift, width=30, height=27)
@@ -207,7 +207,7 @@ def test_cropping_is_shifting_the_principal_point(make):
     torch.testing.assert_close(torch.cat([composited, alpha, *maps_of(info)], dim=-1), whole[6:33, 11:41])
 
 
-def test_gsplats_default_strategy_densifies_discs_by_their_own_gradient():
+def test_gsplats_default_strategy_densifies_discs_by_gradient_2dgs():
     means, quats, scales, opacities, features = (splat.float() for splat in make_splats(80, 3, seed=11))
     params = torch.nn.ParameterDict(
         {"means": means, "quats": quats, "scales": scales.log(), "opacities": opacities.logit(), "features": features}

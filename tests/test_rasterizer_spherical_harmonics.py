@@ -42,20 +42,20 @@ def test_the_first_harmonics_have_the_values_that_3dgs_files_rely_on():
     torch.testing.assert_close(actual, torch.tensor(expected, dtype=torch.float64))
 
 
-def test_coefficients_beyond_the_degree_are_left_out():
+def test_coefficients_beyond_the_degree_are_ignored():
     coefficients = torch.randn(50, 16, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     expected = spherical_harmonics(1, DIRECTIONS, coefficients[:, :4])
     torch.testing.assert_close(spherical_harmonics(1, DIRECTIONS, coefficients), expected)
 
 
-def test_gradients_are_those_of_finite_differences():
+def test_gradients_match_finite_differences():
     coefficients = torch.randn(4, 16, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     inputs = DIRECTIONS[:4].clone().requires_grad_(), coefficients.requires_grad_()
     assert torch.autograd.gradcheck(lambda d, c: spherical_harmonics(3, d, c), inputs)
 
 
-def test_compiled_harmonics_of_each_degree_are_the_plain_ones(compiler):
-    """Degrees follow each other in training; none may make those after it fall back to plain torch."""
+def test_compiled_harmonics_of_each_degree_match_plain_torch(compiler):
+    """The degree grows during training; no degree may make later ones fall back to plain torch."""
     fusion._compiled.cache_clear()
     directions = DIRECTIONS.float()
     coefficients = torch.randn(50, 16, 3, requires_grad=True)
@@ -69,6 +69,6 @@ def test_compiled_harmonics_of_each_degree_are_the_plain_ones(compiler):
     assert fusion._compiled.cache_info().currsize == 1
 
 
-def test_too_few_coefficients_are_refused():
+def test_too_few_coefficients_are_an_error():
     with pytest.raises(ValueError, match="degree 3 needs 16 coefficients, not 4"):
         spherical_harmonics(3, DIRECTIONS, torch.zeros(50, 4, 3))

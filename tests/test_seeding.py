@@ -1,4 +1,4 @@
-"""Seeds on a wall whose place, colour and resolution are known."""
+"""Seeds on a wall of known position, colour and resolution."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shellgs_method.seeding import SeededView, shell_seeds
 
 FOCAL, WIDTH, HEIGHT = 60.0, 80, 60
 NORMAL = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
-"""Of the wall through (0, 0, 10), in the world."""
+"""Normal of the wall through (0, 0, 10), in the world."""
 
 
 def camera(position: tuple[float, float, float]) -> Camera:
@@ -30,7 +30,7 @@ def camera(position: tuple[float, float, float]) -> Camera:
 
 
 def view(position=(0.0, 0.0, 0.0), colour: float = 0.5, normal=NORMAL) -> SeededView:
-    """The wall in one colour, where it is before the camera."""
+    """A view of the wall in one colour; pixels where it is behind the camera are masked."""
     here = camera(position)
     distance = (torch.tensor([0.0, 0.0, 10.0], dtype=torch.float64) - here.position) @ normal
     depth = (distance / (here.rays() @ normal))[..., None]
@@ -43,7 +43,7 @@ def seeds_of(views: list[SeededView], spacing: float = 4.0, most: int = 100_000)
     return shell_seeds(views, len(views) * WIDTH * HEIGHT, spacing, most)
 
 
-def test_seeds_lie_on_the_wall_and_face_as_it_does():
+def test_seeds_lie_on_the_wall_and_have_its_normal():
     seeds = seeds_of([view(), view((2.0, 0.0, 1.0))])
     assert len(seeds.points) > 50
     np.testing.assert_allclose((seeds.points - [0, 0, 10]) @ NORMAL.numpy(), 0, atol=1e-9)
@@ -53,7 +53,7 @@ def test_seeds_lie_on_the_wall_and_face_as_it_does():
 def test_seeds_are_a_few_pixels_apart_in_the_closest_view():
     frontal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
     seeds = seeds_of([view(normal=frontal), view((0.0, 0.0, 6.0), normal=frontal)], spacing=4.0)
-    near = (abs(seeds.points[:, :2]) < [2, 1.5]).all(axis=1)  # what the second view shows, from 4 instead of 10
+    near = (abs(seeds.points[:, :2]) < [2, 1.5]).all(axis=1)  # visible in the second view, from 4 instead of 10
     neighbours = KDTree(seeds.points).query(seeds.points, k=2)[0][:, 1] * FOCAL
     assert 2 < np.median(neighbours[near] / 4) < 6
     assert 2 < np.median(neighbours[~near] / 10) < 6
@@ -61,13 +61,13 @@ def test_seeds_are_a_few_pixels_apart_in_the_closest_view():
 
 
 def test_a_seed_has_the_median_colour_of_the_views():
-    """A passer-by in one of three photographs does not colour the wall."""
+    """A passer-by in one of three photographs does not change the wall's colour."""
     seeds = seeds_of([view(colour=0.3), view((0.1, 0.0, 0.0), colour=0.3), view((-0.1, 0.0, 0.0), colour=1.0)])
     central = np.linalg.norm(seeds.points - [0, 0, 10], axis=1) < 3
     np.testing.assert_allclose(seeds.colours[central], 0.3, atol=1e-6)
 
 
-def test_there_are_no_seeds_where_the_mask_or_the_angle_says_no():
+def test_masked_and_grazing_pixels_give_no_seeds():
     masked = view()
     masked.shell.mask[:, : WIDTH // 2] = False
     assert (camera((0, 0, 0)).K.numpy() @ seeds_of([masked]).points.T)[0].min() > 0
@@ -78,16 +78,14 @@ def test_there_are_no_seeds_where_the_mask_or_the_angle_says_no():
     assert len(seeds_of([edge_on]).points) == 0
 
 
-def test_seeds_are_spread_more_widely_where_there_would_be_too_many():
+def test_seeds_are_spread_more_widely_if_there_are_too_many():
     few = seeds_of([view()], most=40)
     assert 15 < len(few.points) <= 40
     assert np.ptp(few.points, axis=0)[0] > 0.8 * np.ptp(seeds_of([view()]).points, axis=0)[0]
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_a_run_begins_with_flat_gaussians_on_the_shell_beside_the_sfm_points(
-    eager, pristine_scene, tmp_path, primitive
-):
+def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(eager, pristine_scene, tmp_path, primitive):
     def choose(config):
         config.pipeline.model.primitive = primitive
 
@@ -113,7 +111,7 @@ def test_without_shell_maps_in_any_training_view_there_are_no_seeds():
         assert [len(each) for each in seeds_of(views)] == [0, 0, 0, 0]
 
 
-def test_seeds_without_shell_maps_are_refused_in_one_sentence(scene, tmp_path):
+def test_a_method_with_seeds_is_an_error_without_shell_maps(scene, tmp_path):
     shutil.rmtree(scene / "cues" / "shell")
     with pytest.raises(SystemExit, match="run `shellgs cast SCENE` first"):
         trainer_of(scene, tmp_path, "shellgs_metric")

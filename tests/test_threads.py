@@ -1,4 +1,4 @@
-"""The number of threads against loads of a machine of four cores."""
+"""The number of threads for given loads of a machine with four cores."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shellgs_method.threads import Load, ThreadsByLoad
 
 @pytest.fixture
 def machine(monkeypatch):
-    """A process with four threads on a machine whose load the test decides."""
+    """A process with four threads on a machine whose load the test sets."""
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     before, measured = torch.get_num_threads(), [Load(0.0, 0.0, 0.0)]
     monkeypatch.setattr(Load, "now", classmethod(lambda cls: measured[-1]))
@@ -24,12 +24,12 @@ def machine(monkeypatch):
 @pytest.mark.parametrize(
     ("idle", "own", "expected"),
     [
-        (0.0, 4.0, 4),  # alone, at work on all cores
-        (3.0, 1.0, 4),  # alone, while one core had something to do
-        (0.0, 2.0, 2),  # beside another like it: each has half of the cores
-        (1.5, 1.0, 2),  # something else takes one and a half
-        (0.7, 2.95, 4),  # something else takes a third of a core
-        (0.0, 0.4, 1),  # hardly anything is left
+        (0.0, 4.0, 4),  # alone, working on all cores
+        (3.0, 1.0, 4),  # alone, working on one core
+        (0.0, 2.0, 2),  # beside a process like it: each has half of the cores
+        (1.5, 1.0, 2),  # other processes take one and a half cores
+        (0.7, 2.95, 4),  # other processes take a third of a core
+        (0.0, 0.4, 1),  # other processes take nearly all
     ],
 )
 def test_torch_gets_a_thread_for_each_core_that_nothing_else_uses(machine, idle, own, expected):
@@ -46,10 +46,10 @@ def test_cores_that_come_free_are_used_again(machine):
         machine.append(load)
         process.follow()
         counts.append(torch.get_num_threads())
-    assert counts == [1, 4, 4]  # the last look came too soon to tell
+    assert counts == [1, 4, 4]  # the last update came too soon
 
 
-def test_the_users_number_of_threads_is_left_alone(machine, monkeypatch):
+def test_the_users_number_of_threads_is_kept(machine, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     process = ThreadsByLoad()
     machine.append(Load(10.0, 0.0, 1.0))

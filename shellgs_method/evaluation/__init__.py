@@ -1,6 +1,6 @@
-"""What is measured on held-out views: appearance, and geometry where a reference supports it.
+"""Metrics of held-out views: appearance, and geometry where there is a reference.
 
-:func:`geometry_errors` says what each metric means. The parts it is made of take plain tensors and can be used alone.
+:func:`geometry_errors` documents each geometric metric. All functions take plain tensors and can be used on their own.
 """
 
 from shellgs_method.evaluation.colours import colours_to_normals, normal_colours, normals_to_colours

@@ -1,4 +1,4 @@
-"""Colours for maps that are not images."""
+"""Colour maps for depth, normals and errors."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from matplotlib import colormaps
 from torch import Tensor
 
-GREY = 153  # where there is nothing to show
+GREY = 153  # grey level of pixels without a value
 MAX_ERROR = 45.0
-"""Angle in degrees from which errors have the last colour of the scale."""
+"""Angle in degrees at which the error scale saturates."""
 
 
 def normals_to_colours(normal: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 3"]:
-    """Camera-frame normals as the usual normal-map colours in [0, 1]; no normal (zero) is mid-grey.
+    """Convert camera-frame normals to the usual normal-map colours in [0, 1]; a missing normal (zero) is mid-grey.
 
-    The axes are turned to OpenGL's first, so that a wall seen from the front is bluish.
+    The axes are converted to OpenGL's first, so that a frontal wall is bluish.
     """
     return 0.5 + normal * normal.new_tensor([0.5, -0.5, -0.5])
 
@@ -29,7 +29,7 @@ def colours_to_normals(colours: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*sh
 def normal_colours(
     normal: Shaped[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The colours of :func:`normals_to_colours` in 8 bits, grey outside the mask."""
+    """Colours of :func:`normals_to_colours` in 8 bits, grey outside the mask."""
     colours = normals_to_colours(torch.from_numpy(normal.astype(np.float32))).clamp(0, 1).numpy()
     colours = np.rint(255 * colours).astype(np.uint8)
     if mask is not None:
@@ -40,14 +40,14 @@ def normal_colours(
 def error_colours(
     error: Shaped[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"], max_error: float = MAX_ERROR
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Angles in degrees, black where exact and yellow from a limit on, in 8 bits; grey outside the mask."""
+    """Colours of angles in degrees in 8 bits: black at 0, yellow from ``max_error``, grey outside the mask."""
     return _scale_colours("inferno", error.astype(float) / max_error, mask)
 
 
 def depth_colours(
     depth: Shaped[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"], near: float, far: float
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Depths from near (dark) to far (light) in 8 bits; grey outside the mask."""
+    """Colours of depths in 8 bits: dark at ``near``, light at ``far``, grey outside the mask."""
     return _scale_colours("viridis", (depth.astype(float) - near) / max(far - near, 1e-6), mask)
 
 

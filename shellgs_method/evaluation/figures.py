@@ -1,4 +1,4 @@
-"""Qualitative strips: methods side by side, their normals and the error of these below."""
+"""Qualitative comparison: methods side by side, with their normals and normal errors below."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from shellgs_method.evaluation.colours import MAX_ERROR, error_colours, normal_c
 
 
 class Panel(NamedTuple):
-    """What one method, or the reference, shows of a view."""
+    """A view as rendered by one method, or as in the reference."""
 
     title: str
     rgb: Float[Tensor, "H W 3"]
     normal: Float[Tensor, "H W 3"]
     error: Float[Tensor, "H W 1"]
-    """Unsigned angle to the reference's normals in degrees, as from :func:`angular_error`."""
+    """Unsigned angle to the reference's normals in degrees, from :func:`angular_error`."""
     mask: Bool[Tensor, "H W 1"]
-    """True where the reference has a normal; grey elsewhere."""
+    """True where the reference has a normal; other pixels are grey."""
 
 
 def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR, panel_inches: float = 2.5) -> None:
-    """Write a PNG of one column a panel: image, normals, angular error with one colour bar for all, up to a limit."""
+    """Write a PNG with one column per panel: image, normals, and angular error with a common colour bar."""
     height, width = panels[0].rgb.shape[:2]
     size = (panel_inches * len(panels) + 0.8, panel_inches * 3 * height / width + 0.3)
     figure = Figure(figsize=size, layout="constrained")
@@ -49,7 +49,7 @@ def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR
 
 
 def save_figure(path: Path, figure: Figure, dpi: float | None = None) -> None:
-    """Write a PNG, at the figure's own resolution if none is given."""
+    """Write a figure as PNG, by default at the figure's own resolution."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         figure.savefig(file, format="png", dpi=dpi or "figure")

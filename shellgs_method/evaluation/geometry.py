@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 class NormalErrors(NamedTuple):
-    """Unsigned angles between two maps of normals over a mask."""
+    """Statistics of the unsigned angles between two normal maps over a mask."""
 
     mean: float
     """Mean angle in degrees."""
@@ -23,10 +23,10 @@ class NormalErrors(NamedTuple):
 def depth_mae(
     depth: Float[Tensor, "H W 1"], target: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]
 ) -> float | None:
-    """Mean absolute error of the depth after the view's median scale, in the units of the maps (the paper's D-MAE).
+    """Mean absolute depth error after median scaling of the view, in the units of the maps (the paper's D-MAE).
 
-    The scale is the median over pixels of target / depth, and pixels where one of the two is missing do not count;
-    None if no pixel is left.
+    The scale is the median over pixels of target / depth. Pixels where one of the two is missing are ignored; None if
+    no pixel is left.
     """
     valid = mask & (depth > 0) & (target > 0)
     if not valid.any():
@@ -36,18 +36,18 @@ def depth_mae(
 
 
 def angular_error(normal: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 1"]:
-    """Unsigned angle between normals of any length, in degrees; 90, the worst there is, where one of them is zero."""
+    """Unsigned angle between normals of any length, in degrees; 90, the maximum, where one of them is zero."""
     normal, target = normal.double(), target.double()
     sine = torch.linalg.cross(normal, target).norm(dim=-1, keepdim=True)
     cosine = (normal * target).sum(dim=-1, keepdim=True).abs()
-    # The arc cosine alone would lose all angles below 0.02° in float32, and those near zero in any precision.
+    # The arc cosine alone would lose angles below 0.02° in float32, and those near zero in any precision.
     return torch.rad2deg(torch.atan2(sine, cosine)).where((sine > 0) | (cosine > 0), 90.0).float()
 
 
 def normal_errors(
     normal: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"]
 ) -> NormalErrors:
-    """Summary of :func:`angular_error` over a mask that is not empty; a missing normal counts as 90°."""
+    """Statistics of :func:`angular_error` over a mask that is not empty; a missing normal counts as 90°."""
     angle = angular_error(normal, target)[mask]
     return NormalErrors(*(metric.item() for metric in (angle.mean(), share(angle < 10), share(angle < 20))))
 

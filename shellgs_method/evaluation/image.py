@@ -1,4 +1,4 @@
-"""Appearance: PSNR, SSIM, LPIPS."""
+"""Appearance metrics: PSNR, SSIM, LPIPS."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torchmetrics import Metric
 
 SMALLEST_LPIPS_IMAGE = 31
-"""Side in pixels below which AlexNet's strides leave nothing of an image."""
+"""Smallest side in pixels that AlexNet's strides can process."""
 
 logger = logging.getLogger(__name__)
 
@@ -32,13 +32,13 @@ def image_errors(
     regions: Mapping[str, Bool[Tensor, "H W 1"]] | None = None,
     kept: Bool[Tensor, "H W 1"] | None = None,
 ) -> dict[str, float]:
-    """PSNR in dB (at most 100, so that an exact image can be averaged), SSIM, and LPIPS where it can be had.
+    """PSNR in dB (at most 100, so that an exact image can be averaged), SSIM, and LPIPS if available.
 
-    Colours are in [0, 1]. SSIM is that of the loss, of a Gaussian window of 11 pixels and sigma 1.5; LPIPS has the
+    Colours are in [0, 1]. SSIM is as in the loss, with a Gaussian window of 11 pixels and sigma 1.5; LPIPS uses the
     AlexNet backbone. PSNR and SSIM of each region that is not empty are ``psnr_…`` and ``ssim_…`` with its name.
 
-    Pixels that are not kept count nowhere: they are taken to be exact, so that no window sees a difference there, and
-    left out of all means. LPIPS, whose mean is over all pixels, is divided by the share that is kept.
+    Pixels outside ``kept`` are ignored: they are set to the target, so that no window differs there, and excluded from
+    all means. LPIPS, whose mean is over all pixels, is divided by the share of kept pixels.
     """
     kept = torch.ones_like(target[..., :1], dtype=torch.bool) if kept is None else kept
     if not kept.any():
@@ -61,9 +61,9 @@ def image_errors(
 
 @cache
 def lpips_network() -> Metric | str:
-    """LPIPS' network, or why there is none: its backbone's weights are downloaded unless torch.hub has them cached.
+    """Return the LPIPS network, or why there is none; the backbone is downloaded unless torch.hub has it cached.
 
-    Tried once a process, so that a machine without network pays for it once and is told once.
+    Tried once per process, so that a machine without network waits once and warns once.
     """
     url, cached = lpips_weights()
     if not os.path.exists(cached) and not _reachable(url):
@@ -73,20 +73,20 @@ def lpips_network() -> Metric | str:
             from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
             return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True)
-        except Exception as error:  # a cut download, a damaged file, a full disk: the run goes on without LPIPS
+        except Exception as error:  # incomplete download, damaged file, full disk: continue without LPIPS
             obstacle = f"the weights of AlexNet cannot be loaded from {cached}: {error}"
     logger.warning("LPIPS is not available: %s.", obstacle)
     return obstacle
 
 
 def lpips_weights() -> tuple[str, str]:
-    """Where the weights of LPIPS' backbone are downloaded from, and the file they are looked for in first."""
+    """URL of the weights of the LPIPS backbone, and the file that is tried first."""
     url = torchvision.models.AlexNet_Weights.DEFAULT.url
     return url, os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
 
 
 def _reachable(url: str, seconds: float = 5.0) -> bool:
-    """Whether a server answers in time. A name server can take minutes, so a thread is asked and not waited for."""
+    """Whether a server answers in time; asked in a thread, as a name server can take minutes."""
     answered = threading.Event()
 
     def ask() -> None:

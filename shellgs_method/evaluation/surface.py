@@ -1,4 +1,4 @@
-"""The visible surface as a point cloud: accuracy, completeness, Chamfer distance, F-score."""
+"""Metrics of the visible surface as a point cloud: accuracy, completeness, Chamfer distance, F-score."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from shellgs_method.voxels import voxel_means
 
 @dataclass(frozen=True)
 class SurfaceComparison:
-    """Distances between a reconstructed point cloud and a reference, from each point to the other's nearest.
+    """Nearest-neighbour distances between a reconstructed point cloud and a reference, in both directions.
 
     The F-score is that of Tanks and Temples (Knapitsch et al. 2017), the Chamfer distance the paper's: the mean of
-    accuracy and completeness, not squared. Both clouds must have points for the mean distances to exist.
+    accuracy and completeness, not squared. Mean distances require points in both clouds.
     """
 
     to_reference: Float[ndarray, " N"]
-    """From each reconstructed point."""
+    """Distance of each reconstructed point."""
     to_reconstruction: Float[ndarray, " M"]
-    """From each point of the reference."""
+    """Distance of each reference point."""
 
     @property
     def accuracy(self) -> float:
@@ -50,7 +50,7 @@ class SurfaceComparison:
         return float((self.to_reconstruction < threshold).mean()) if len(self.to_reconstruction) else 0.0
 
     def f_score(self, threshold: float) -> float:
-        """Harmonic mean of precision and recall; zero where both are."""
+        """Harmonic mean of precision and recall; zero if both are zero."""
         precision, recall = self.precision(threshold), self.recall(threshold)
         return 2 * precision * recall / max(precision + recall, 1e-12)
 
@@ -58,21 +58,21 @@ class SurfaceComparison:
 def compare_surfaces(
     points: Float[ndarray, "N 3"], reference: Float[ndarray, "M 3"], voxel: float
 ) -> SurfaceComparison:
-    """Compare two point clouds after both are thinned to one point a voxel.
+    """Compare two point clouds after thinning both to one point per voxel.
 
-    The density of the samples alone moves the Chamfer distance threefold: metrics can be compared only at the same
-    voxel, and are stated with it.
+    Sample density alone can change the Chamfer distance by a factor of three: compare metrics only at the same voxel
+    size, and state it.
     """
     points, reference = voxel_means(points, voxel), voxel_means(reference, voxel)
     return SurfaceComparison(_nearest(points, reference), _nearest(reference, points))
 
 
 def back_project(depth: Float[Tensor, "H W 1"], camera: Camera, mask: Bool[Tensor, "H W 1"]) -> Float[ndarray, "N 3"]:
-    """Points of the masked pixels in the camera frame, in float64."""
+    """Back-project the masked pixels to points in the camera frame, in float64."""
     return (depth.double() * camera.rays().to(depth.device).double())[mask[..., 0]].cpu().numpy()
 
 
 def _nearest(points: Float[ndarray, "N 3"], others: Float[ndarray, "M 3"]) -> Float[ndarray, " N"]:
-    """Distance of each point to the nearest of the others, infinite where there are none."""
-    # For points far from a wall this is ten times as fast as scipy's default, which fits the cells to the wall.
+    """Distance of each point to the nearest of the others, infinite if there are none."""
+    # For points far from a wall, ten times faster than scipy's default, which fits the cells to the wall.
     return KDTree(others, leafsize=40, balanced_tree=False, compact_nodes=False).query(points, workers=-1)[0]

@@ -1,4 +1,4 @@
-"""Tables of metrics, methods down and metrics across: Markdown, LaTeX, HTML, CSV, and for the terminal."""
+"""Tables of metrics, a row per method and a column per metric, in Markdown, LaTeX, HTML, CSV and for the terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 Rows = Mapping[str, Mapping[str, float | Sequence[float]]]
-"""Metrics by name, by method; a metric is one number, or one for each seed: then mean ± sample deviation is shown."""
+"""Metrics of each method by name: one number, or one per seed, shown as mean ± sample standard deviation."""
 
 _LATEX = str.maketrans(
     {character: rf"\{character}" for character in "&%$#_{}"}
@@ -24,18 +24,18 @@ _LATEX = str.maketrans(
 
 @dataclass(frozen=True)
 class Column:
-    """A metric as a table shows it."""
+    """A metric in a table."""
 
     key: str
     """Name of the metric, as in :func:`evaluate_view`."""
     title: str
     best: Callable[..., float]
-    """``min`` or ``max``: which value is the best of a column."""
+    """``min`` or ``max``: selects the best value of the column."""
     format: str = ".3f"
 
     @property
     def heading(self) -> str:
-        """Title with the arrow that says where better is."""
+        """Title with an arrow towards better values."""
         return f"{self.title} {'↑' if self.best is max else '↓'}"
 
 
@@ -62,7 +62,7 @@ REGION_COLUMNS = (
     Column("truth_f_score_5cm_on_shell", "F5 to the truth, on the shell", max),
     Column("truth_f_score_5cm_before_shell", "F5 to the truth, before it", max),
 )
-"""Images and surfaces by their parts; pixels that no training view has seen are left out."""
+"""Metrics by image region; pixels not covered by the training views are excluded."""
 
 SURFACE_COLUMNS = (
     Column("accuracy_m", "Acc. (m)", min),
@@ -76,12 +76,12 @@ SURFACE_COLUMNS = (
 
 
 def markdown_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
-    """A Markdown table with the best of each column in bold; a metric that a method lacks is a dash.
+    """Markdown table with the best value of each column in bold and a dash for missing metrics.
 
     Args:
         rows: metrics of the methods.
-        columns: metrics that are shown.
-        quoted: metrics measured elsewhere, say a paper's; below the others, never bold.
+        columns: metrics to show.
+        quoted: metrics from elsewhere, such as a paper; below the others, never bold.
     """
     lines = [["Method", *(column.heading for column in columns)], ["---", *("---:" for _ in columns)]]
     for method, cells in _cells(rows, columns, quoted):
@@ -90,7 +90,7 @@ def markdown_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = 
 
 
 def latex_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
-    """The same as a tabular of booktabs."""
+    """The table of :func:`markdown_table` as a LaTeX tabular with booktabs."""
     head = ["Method", *(column.heading for column in columns)]
     lines = [rf"\begin{{tabular}}{{l{'c' * len(columns)}}}", r"\toprule", _latex_line(head), r"\midrule"]
     for method, cells in _cells(rows, columns, quoted):
@@ -100,7 +100,7 @@ def latex_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = Non
 
 
 def html_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None) -> str:
-    """The same as an HTML table."""
+    """The table of :func:`markdown_table` in HTML."""
     lines = ["<tr><th>Method" + "".join(f"<th>{html.escape(column.heading)}" for column in columns)]
     for method, cells in _cells(rows, columns, quoted):
         texts = "".join(f"<td><b>{text}</b>" if best else f"<td>{text}" for text, best in cells)
@@ -109,7 +109,7 @@ def html_table(rows: Rows, columns: Sequence[Column], quoted: Rows | None = None
 
 
 def csv_table(rows: Rows, columns: Sequence[Column]) -> str:
-    """All digits, for programs: the head and the lines of :func:`plain_table`."""
+    """The table of :func:`plain_table` as CSV, with all digits."""
     text = io.StringIO()
     head, lines = plain_table(rows, columns)
     csv.writer(text, lineterminator="\n").writerows([head, *lines])
@@ -117,7 +117,7 @@ def csv_table(rows: Rows, columns: Sequence[Column]) -> str:
 
 
 def plain_table(rows: Rows, columns: Sequence[Column]) -> tuple[list[str], list[list[str | float | None]]]:
-    """Head and lines: mean and sample deviation of each column's metric (None: there is none), number of seeds."""
+    """Header and rows: mean and sample standard deviation of each metric (None if missing), number of seeds."""
     head = ["method", *(key for column in columns for key in (column.key, f"{column.key}_std")), "seeds"]
     lines: list[list[str | float | None]] = []
     for method, metrics in rows.items():
@@ -128,7 +128,7 @@ def plain_table(rows: Rows, columns: Sequence[Column]) -> tuple[list[str], list[
 
 
 def rich_table(rows: Rows, columns: Sequence[Column], title: str | None = None) -> Table:
-    """The same as :func:`markdown_table` for a terminal."""
+    """The table of :func:`markdown_table` for the terminal."""
     table = Table(title=title)
     table.add_column("Method", no_wrap=True)
     for column in columns:
@@ -141,7 +141,7 @@ def rich_table(rows: Rows, columns: Sequence[Column], title: str | None = None) 
 def _cells(
     rows: Rows, columns: Sequence[Column], quoted: Rows | None = None
 ) -> Iterator[tuple[str, list[tuple[str, bool]]]]:
-    """Each method with its cells' texts and whether they are the column's best; what reads the same is equally good."""
+    """Each method with the text of its cells and whether they are the column's best; equal texts are equally good."""
     best = {}
     for column in columns:
         means = [_mean(metrics[column.key]) for metrics in rows.values() if column.key in metrics]

@@ -1,4 +1,4 @@
-"""Everything that is measured on one held-out view, and the average over views."""
+"""Metrics of one held-out view, and their average over views."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from shellgs_method.evaluation.surface import back_project, compare_surfaces
 from shellgs_method.reference import Reference
 
 VOXEL_METRES = 0.02
-"""Voxel of both point clouds; 0.4 of the smallest threshold."""
+"""Voxel size of both point clouds; 0.4 of the smallest threshold."""
 THRESHOLDS_METRES = {"5cm": 0.05, "10cm": 0.10, "20cm": 0.20}
-"""Thresholds of the F-score."""
+"""Distance thresholds of the F-score."""
 VOXEL_SHARE = 1 / 500
-"""Voxel as a share of the reference's median depth where metres are unknown: 2 cm for a wall 10 m away."""
+"""Voxel size as a share of the reference's median depth if metres are unknown: 2 cm for a wall 10 m away."""
 OPAQUE = 0.5
-"""Opacity from which a pixel counts as rendered: a ray that never becomes half opaque has no median depth."""
+"""Minimum opacity of a rendered pixel: a ray that never becomes half opaque has no median depth."""
 
 
 class Rendering(NamedTuple):
-    """Maps that a method rendered for a view."""
+    """Rendered maps of a view."""
 
     rgb: Float[Tensor, "H W 3"]
     """Colours in [0, 1]."""
     depth: Float[Tensor, "H W 1"]
-    """Forward z-depth in scene units, 0 where there is none."""
+    """Forward z-depth in scene units, 0 where missing."""
     alpha: Float[Tensor, "H W 1"]
     """Accumulated opacity."""
     normal: Float[Tensor, "H W 3"] | None = None
-    """Composited normals in the camera frame, of any length; None for a method that has none."""
+    """Composited normals in the camera frame, of any length; None for a method without normals."""
 
 
 def evaluate_view(
@@ -47,7 +47,7 @@ def evaluate_view(
     reference: Reference | None = None,
     metres_per_unit: float | None = None,
 ) -> dict[str, float]:
-    """All metrics of a view by name: those of :func:`image_errors`, and with a reference those of the geometry."""
+    """All metrics of a view by name: those of :func:`image_errors`, and with a reference :func:`geometry_errors`."""
     metrics = image_errors(rendering.rgb, image)
     if reference is not None:
         metrics |= geometry_errors(rendering, camera, reference, metres_per_unit)
@@ -59,20 +59,20 @@ def geometry_errors(
 ) -> dict[str, float]:
     """Geometric metrics of a view: shares in [0, 1], angles in degrees, lengths in metres (``_m``).
 
-    Empty where the reference supports no pixel, else:
+    Empty if the reference's mask is empty, else:
 
     * ``supported``: share of the image in the mask; ``rendered``: share of the mask at least half opaque, with depth.
-    * ``depth_mae_m``: after the view's median scale, over rendered pixels.
+    * ``depth_mae_m``: after median scaling of the view, over rendered pixels.
     * ``normal_deg``, ``normal_below_10deg``, ``normal_below_20deg``: composited normals, over the whole mask;
-      ``depth_normal_deg`` and so on: normals of the rendered depth, over the mask less the image's border. Where
-      nothing was rendered the angle counts as 90°: a hole is no way to a better metric.
+      ``depth_normal_deg`` and so on: normals of the rendered depth, over the mask without the image border. Where
+      nothing was rendered the angle counts as 90°, so that holes do not improve the metric.
     * ``accuracy_m``, ``completeness_m``, ``chamfer_m``, ``precision_5cm``, ``recall_5cm``, ``f_score_5cm`` (10cm,
-      20cm): raw depth of rendered pixels against the mask's, both thinned to 2 cm voxels; ``surface_points`` and
-      ``reference_points`` are what is left of the two.
+      20cm): unscaled depth of rendered pixels against the mask's, both thinned to 2 cm voxels; ``surface_points`` and
+      ``reference_points`` are the numbers of points after thinning.
 
-    Where nothing of the mask was rendered, depth error and distances do not exist and are absent, and the F-scores
-    are 0. Where ``metres_per_unit`` is unknown, lengths are in scene units and their names end in ``_units``, the
-    voxel is 1/500 of the reference's median depth, and there is no F-score. No metric is ever NaN.
+    If nothing in the mask was rendered, depth error and distances are absent, and the F-scores are 0. If
+    ``metres_per_unit`` is unknown, lengths are in scene units with names ending in ``_units``, the voxel is 1/500 of
+    the reference's median depth, and there is no F-score. No metric is ever NaN.
     """
     mask = reference.mask & (reference.depth > 0)
     if not mask.any():
@@ -93,8 +93,8 @@ def geometry_errors(
 def mean_over_views(metrics: Sequence[Mapping[str, float]], deviation: bool = False) -> dict[str, float]:
     """Mean of each metric over the views that have it.
 
-    A metric that some views lack gets its number of views beside it (``_views``), and with ``deviation`` every metric
-    its standard deviation over the views (``_std``).
+    For a metric missing in some views, the number of views is added (``_views``); with ``deviation``, also each
+    metric's standard deviation over the views (``_std``).
     """
     means: dict[str, float] = {}
     for key in dict.fromkeys(key for view in metrics for key in view):
@@ -121,7 +121,7 @@ def _normal_metrics(name: str, normal: Tensor, target: Tensor, mask: Tensor) -> 
 def _length_metrics(
     depth: Tensor, target: Tensor, mask: Tensor, camera: Camera, metres_per_unit: float | None
 ) -> dict[str, float]:
-    """Depth error and point clouds; a rendered depth of zero is none."""
+    """Depth error and metrics of the point clouds; a rendered depth of zero is missing."""
     if metres_per_unit is None:
         unit, scale, voxel, thresholds = "units", 1.0, VOXEL_SHARE * target[mask].median().item(), {}
     else:

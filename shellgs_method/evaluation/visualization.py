@@ -1,4 +1,4 @@
-"""Pictures of a view's geometry, to watch a training with."""
+"""Images of a view's geometry, to monitor training."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from shellgs_method.reference import Reference
 
 
 def geometry_images(rendering: Rendering, reference: Reference | None = None) -> dict[str, Float[Tensor, "H _ 3"]]:
-    """What was rendered as images in [0, 1], by name.
+    """Rendered geometry as images in [0, 1], by name.
 
-    * ``depth``, ``normal``: with a reference, that on the left, in the same colours; grey where there is none.
-    * ``normal_error``: with a reference, the angle between the two as :func:`geometry_errors` counts it, from black
-      (0°) to yellow (45° and more, or nothing rendered).
+    * ``depth``, ``normal``: the rendered map, with a reference to its left in the same colours; grey where missing.
+    * ``normal_error``: with a reference only, the angle of :func:`geometry_errors` between the two, from black (0°) to
+      yellow (45° and more, or nothing rendered).
 
     Args:
-        rendering: maps of a method that has normals.
-        reference: maps that they are compared with.
+        rendering: rendered maps, with normals.
+        reference: maps to compare with.
     """
     assert rendering.normal is not None
     opaque = (rendering.depth > 0) & (rendering.alpha >= OPAQUE)

@@ -1,9 +1,9 @@
-"""The terms of the objective: plain differentiable functions of [H, W, C] maps in the camera frame.
+"""Terms of the training loss: differentiable functions of [H, W, C] maps in the camera frame.
 
 L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C normal smoothness; the others are off in the
-paper's setting. Masks are true where a pixel counts; an empty one gives a zero that can be back-propagated.
+paper's setting. Masks are true where a pixel counts; an empty mask gives a differentiable zero.
 
-A class ``…Loss`` is its function ``…_loss`` for many renderings of one view: what depends on the view alone is computed
+A class ``…Loss`` is the function ``…_loss`` for many renders of one view: what depends on the view alone is computed
 once. On a CPU both run as fused loops, see :mod:`shellgs_method.fusion`.
 """
 

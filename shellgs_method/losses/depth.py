@@ -1,4 +1,4 @@
-"""D: agreement of the rendered inverse depth with a cue's, patch by patch."""
+"""D: patch-wise correlation of rendered and cue inverse depth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shellgs_method.losses.windows import shifted, window_sums
 
 
 class NccLoss:
-    """:func:`ncc_loss` for many renderings of one view."""
+    """:func:`ncc_loss` for many renders of one view."""
 
     def __init__(
         self,
@@ -30,7 +30,7 @@ class NccLoss:
         self._valid = F.pad(mask.to(y), self._around)
         n = window_sums(self._valid, ones)
         per_pixel = 1 / n.clamp_min(0.5)
-        # Outside of the mask stands a value to centre patches on that is near those inside.
+        # Fill pixels outside the mask with values close to those inside, for patches centred there.
         self._target = F.pad(y.where(mask, window_sums(F.pad(y, self._around), ones) * per_pixel), self._around)
         mean, _, variance, _ = _moments(self._target, self._target, self._valid, per_pixel, window)
         floor = (eps * mean).square()
@@ -38,18 +38,18 @@ class NccLoss:
         self._patches, self._share = (per_pixel, variance, floor, used.to(y)), 1 / used.sum().clamp_min(1).to(y)
 
     def __call__(self, inverse_depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
-        """The loss of one rendering."""
+        """Loss of one render."""
         return self._share * _Ncc.apply(inverse_depth[..., 0], self)
 
     def correlate(self, x: Float[Tensor, "H W"]) -> list[Tensor]:
-        """An inverse depth filled up, the sum of the patches' losses, and what :meth:`gradient` needs besides."""
+        """Padded inverse depth, sum of the patches' losses, and the other arguments of :meth:`gradient`."""
         x = F.pad(x, self._around).where(self._valid > 0, self._target)
         return [x, *run_fused(_correlate, x, self._target, self._valid, *self._patches, self._window, varying=2)]
 
-    def gradient(self, x: Float[Tensor, "H+2r W+2r"], *by_patch: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Gradient of the sum by the inverse depth."""
-        padded = [F.pad(each, self._around) for each in by_patch]
-        return run_fused(_by_inverse_depth, x, self._target, self._valid, *padded, self._window, varying=2)
+    def gradient(self, x: Float[Tensor, "H+2r W+2r"], *gradient_terms: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+        """Gradient of the sum w.r.t. the inverse depth."""
+        padded = [F.pad(each, self._around) for each in gradient_terms]
+        return run_fused(_gradient, x, self._target, self._valid, *padded, self._window, varying=2)
 
 
 def ncc_loss(
@@ -60,22 +60,22 @@ def ncc_loss(
     min_valid: float = 0.5,
     eps: float = 1e-3,
 ) -> Float[Tensor, ""]:
-    """Mean of 1 - NCC over the patches centred on supported pixels, in [0, 2].
+    """Mean of 1 - NCC over the patches centred on pixels in the mask, in [0, 2].
 
-    Means and variances are those of a patch's valid pixels. The loss does not change when the rendered inverse depth
-    is scaled or shifted, and a plane's inverse depth is linear in the pixel: it sees which way a plane tilts, not how
-    far. A patch is left out where too few of its pixels are valid and where the target has no structure to correlate
-    (a frontal plane).
+    Means and variances are over a patch's valid pixels. The loss is invariant to scale and shift of the rendered
+    inverse depth, and a plane's inverse depth is linear in the pixel: the loss depends on the direction of a plane's
+    tilt, not on its amount. A patch is ignored if too few of its pixels are valid or if the target has no structure to
+    correlate (a frontal plane).
 
     Args:
         inverse_depth: rendered 1/z, finite wherever the mask is true.
         target: the cue's 1/z.
         mask: true where the target is valid.
         window: side of a patch in pixels, odd.
-        min_valid: share of a patch's pixels that must be valid.
-        eps: smallest standard deviation of a patch, relative to the target's mean in it; 0.001 is 1 cm at 10 m, what
-            shells and alignments are good for. Below it the target counts as flat, and a flatter rendering is treated
-            as if it had this much contrast, which bounds the gradient.
+        min_valid: minimum share of valid pixels in a patch.
+        eps: smallest standard deviation of a patch, relative to the target's mean in it; 0.001 is 1 cm at 10 m, the
+            accuracy of shells and alignments. Below it the target counts as flat, and a flatter render is treated
+            as if it had this contrast, which bounds the gradient.
     """
     return NccLoss(target, mask, window, min_valid, eps)(inverse_depth)
 
@@ -83,9 +83,9 @@ def ncc_loss(
 class _Ncc(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, view):
-        filled, loss, *by_patch = view.correlate(x.detach())
+        filled, loss, *gradient_terms = view.correlate(x.detach())
         ctx.view = view
-        ctx.save_for_backward(filled, *by_patch)
+        ctx.save_for_backward(filled, *gradient_terms)
         return loss
 
     @staticmethod
@@ -104,22 +104,22 @@ def _correlate(
     weights: Float[Tensor, "H W"],
     window: Float[Tensor, "1 1 w"],
 ) -> tuple[Tensor, ...]:
-    """The sum of the patches' losses; and by patch a, a E[y], b and b E[x] of the gradient.
+    """Sum of the patches' losses; and a, a E[y], b and b E[x] of each patch, the terms of the gradient.
 
-    That is the sum of a (y - E[y]) + b (x - E[x]) over the patches a pixel is in.
+    The gradient at a pixel is the sum of a (y - E[y]) + b (x - E[x]) over the patches that contain it.
 
     Args:
         x: rendered inverse depth.
-        y: target.
+        y: target inverse depth.
         valid: 1 where a pixel counts, else 0.
-        per_pixel: one over the number of pixels that count, by patch, like what follows.
-        variance_y: of the target.
+        per_pixel: one over the number of valid pixels, per patch, like the following.
+        variance_y: variance of the target.
         floor: smallest variance that counts as contrast.
-        weights: 1, or 0 of a patch that is left out.
-        window: of the width of a patch.
+        weights: 1, or 0 for a patch that is ignored.
+        window: tensor as wide as a patch.
     """
     mean_x, mean_y, variance_x, covariance = _moments(x, y, valid, per_pixel, window.shape[2])
-    # Clamped rather than floor added: a perfect match is exactly 1 and scale does not matter above the floor.
+    # Clamp rather than add the floor: a perfect match is exactly 1, and scale does not matter above the floor.
     product = torch.where(weights > 0, torch.maximum(variance_x, floor) * variance_y, 1.0)
     ncc = covariance / product.sqrt()
     a = -weights * per_pixel / product.sqrt()
@@ -134,10 +134,10 @@ def _moments(
     per_pixel: Float[Tensor, "H W"],
     size: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Means of x and y, variance of x, and covariance, of the valid pixels of each patch.
+    """Means of x and y, variance of x, and covariance, over the valid pixels of each patch.
 
-    E[x²] - E[x]² of nearly equal values loses all digits in float32. So a row of a patch is summed about the value in
-    its middle, and the rows about that in the middle of the patch: what is summed is small.
+    E[x²] - E[x]² of nearly equal values loses all digits in float32. To keep the summands small, each row of a patch is
+    summed relative to its central value, and the rows relative to the central value of the patch.
     """
     half = size // 2
     x0, y0 = (shifted(each, size, dim=1)[half] for each in (x, y))
@@ -159,7 +159,7 @@ def _moments(
     return x0 + mean_x, y0 + mean_y, sum_xx * per_pixel - mean_x * mean_x, covariance
 
 
-def _by_inverse_depth(
+def _gradient(
     x: Float[Tensor, "H+2r W+2r"],
     y: Float[Tensor, "H+2r W+2r"],
     valid: Float[Tensor, "H+2r W+2r"],
@@ -169,7 +169,7 @@ def _by_inverse_depth(
     b_mean_x: Float[Tensor, "H+2r W+2r"],
     window: Float[Tensor, "1 1 w"],
 ) -> Float[Tensor, "H W"]:
-    """The gradient from what :func:`_correlate` returns."""
+    """Gradient from the outputs of :func:`_correlate`."""
     size = window.shape[2]
     x, y, valid = (shifted(shifted(each, size, 0)[size // 2], size, 1)[size // 2] for each in (x, y, valid))
     a, a_mean_y, b, b_mean_x = (window_sums(each, [1.0] * size) for each in (a, a_mean_y, b, b_mean_x))
@@ -179,15 +179,15 @@ def _by_inverse_depth(
 def vid2sim_ncc_loss(
     inverse_depth: Float[Tensor, "H W 1"], target: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]
 ) -> Float[Tensor, ""]:
-    """The patch NCC that Vid2Sim released, kept for comparison; :func:`ncc_loss` is what it is meant to be.
+    """Patch NCC as in Vid2Sim's released code, for comparison; :func:`ncc_loss` is the intended formula.
 
-    Patches of 3 x 3 pixels are centred by one mean over all patches of the image, unsupported pixels take part as
+    Patches of 3 x 3 pixels are centred by one mean over all patches of the image, pixels outside the mask count as
     zeros, eps is absolute, and the average is over all pixels. A view with an empty mask gives zero.
     """
     maps = torch.stack([inverse_depth[..., 0].where(mask[..., 0], 0.0), target[..., 0].where(mask[..., 0], 0.0)])
     patches = unfold(maps[:, None], kernel_size=3, padding=1)  # [2, 9, H*W]
     patches = patches - patches.mean(dim=(1, 2), keepdim=True)
-    # The clamp only keeps the root differentiable at zero: it is far below the eps of 1e-5.
+    # The clamp only makes the root differentiable at zero: it is far below the eps of 1e-5.
     deviation_x, deviation_y = patches.square().mean(dim=1).clamp_min(1e-24).sqrt()
     ncc = (patches[0] * patches[1]).mean(dim=0) / (deviation_x * deviation_y + 1e-5)
     return (1 - ncc).mean() * mask.any()

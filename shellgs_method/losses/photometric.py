@@ -1,4 +1,4 @@
-"""R: how far the rendered picture is from the photograph."""
+"""R: difference between rendered image and photograph."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shellgs_method.losses.ssim import SsimTarget, ssim
 
 
 class PhotometricLoss:
-    """:func:`photometric_loss` for many renderings of one view."""
+    """:func:`photometric_loss` for many renders of one view."""
 
     def __init__(
         self, target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"] | None = None, ssim_weight: float = 0.2
@@ -26,7 +26,7 @@ class PhotometricLoss:
         return made
 
     def __call__(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """The loss of one rendering."""
+        """Loss of one render."""
         if self.mask is not None:
             rgb = rgb.where(self.mask, self.target)
         l1, dissimilarity = (rgb - self.target).abs(), 1 - ssim(rgb, self._ssim_target)
@@ -40,15 +40,15 @@ def photometric_loss(
     mask: Bool[Tensor, "H W 1"] | None = None,
     ssim_weight: float = 0.2,
 ) -> Float[Tensor, ""]:
-    """(1 - w) L1 + w (1 - SSIM), averaged over the pixels that are kept (Kerbl et al. 2023, eq. 7).
+    """(1 - w) L1 + w (1 - SSIM), averaged over the masked pixels (Kerbl et al. 2023, eq. 7).
 
-    SSIM's windows reach over the mask's edge: what is rendered there is replaced by the photograph, so that no gradient
-    comes from a pixel that is not kept.
+    SSIM's windows extend beyond the mask; there the render is replaced by the photograph, so that pixels outside the
+    mask get no gradient.
 
     Args:
         rgb: rendered colours in [0, 1].
-        target: the photograph, in [0, 1].
-        mask: true where a pixel is kept; all of them by default.
-        ssim_weight: share w of the structural term.
+        target: photograph, in [0, 1].
+        mask: true where a pixel counts; all pixels by default.
+        ssim_weight: weight w of the structural term.
     """
     return PhotometricLoss(target, mask, ssim_weight)(rgb)

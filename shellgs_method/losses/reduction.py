@@ -1,4 +1,4 @@
-"""The one average behind every loss."""
+"""Weighted averages for the losses."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 def weighted_mean(values: Float[Tensor, "*shape"], weights: Tensor) -> Float[Tensor, ""]:
-    """Average of ``values`` under non-negative ``weights`` (or a boolean mask) that broadcast to their shape.
+    """Average of ``values`` with non-negative ``weights`` (or a boolean mask) that broadcast to their shape.
 
-    A value of no weight has no part in the result, whatever it is. Where all weights are zero the result is a zero
-    that still belongs to the graph of ``values``, so that a view without support can be trained like any other.
+    Values of weight zero are ignored, even if not finite. If all weights are zero, the result is a zero in the graph of
+    ``values``, so that a view with an empty mask can be trained like any other.
     """
     weights = weights.to(values.dtype).expand_as(values)
     total = weights.sum()
@@ -18,5 +18,5 @@ def weighted_mean(values: Float[Tensor, "*shape"], weights: Tensor) -> Float[Ten
 
 
 def mean_weights(mask: Bool[Tensor, "*shape"], like: Tensor) -> Float[Tensor, "*shape"]:
-    """Weights of sum 1 that make a mean over a mask of a sum; all 0 where it is empty. In the dtype of ``like``."""
+    """Weights that sum to 1 over a mask, or are all 0 if it is empty, in the dtype of ``like``."""
     return mask.to(like) / mask.sum().clamp_min(1)

@@ -1,4 +1,4 @@
-"""Weights that change over a run."""
+"""Loss weights that change during training."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import math
 from dataclasses import dataclass
 
 PAPER_ITERATIONS = 30_000
-"""The run for which the iteration numbers of configs are stated; a shorter run shrinks them in proportion."""
+"""Run length that the iteration numbers of configs refer to; for other lengths they are scaled in proportion."""
 
 
 @dataclass(frozen=True)
 class ExponentialDecay:
-    """A loss weight that goes from ``initial`` to ``final`` at a constant rate; a constant where the two are equal.
+    """Loss weight that changes exponentially from ``initial`` to ``final``; constant if the two are equal.
 
-    The paper's depth weight is ``ExponentialDecay(0.5, 0.1)``: 0.5 · (0.1 / 0.5)^(t/T). From 0 it stays 0, whatever
-    ``final`` is; to 0 it cannot go.
+    The paper's depth weight is ``ExponentialDecay(0.5, 0.1)``: 0.5 · (0.1 / 0.5)^(t/T). If ``initial`` is 0, the weight
+    stays 0; a positive weight cannot decay to 0.
     """
 
     initial: float
@@ -24,7 +24,7 @@ class ExponentialDecay:
 
     def __post_init__(self) -> None:
         if not all(0 <= weight < math.inf for weight in (self.initial, self.final)):
-            raise ValueError(f"a loss weight is a number from 0, not {self.initial} to {self.final}")
+            raise ValueError(f"a loss weight must be finite and at least 0, not {self.initial} to {self.final}")
         if self.initial > 0 and self.final == 0:
             raise ValueError(
                 f"a loss weight of {self.initial} cannot decay to 0 at a constant rate: give a small final weight, or "
@@ -32,7 +32,7 @@ class ExponentialDecay:
             )
 
     def __call__(self, progress: float) -> float:
-        """Weight at the share ``progress`` = t/T of the run, held at its ends outside [0, 1]."""
+        """Weight at ``progress`` = t/T of the run, clamped to [0, 1]."""
         if self.initial == 0:
             return 0.0
         progress = min(max(progress, 0.0), 1.0)

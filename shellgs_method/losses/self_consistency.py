@@ -1,4 +1,4 @@
-"""Terms that need no cue: the rendered geometry against itself, and the shape of the Gaussians."""
+"""Terms without a cue: consistency of the rendered geometry, and the shape of the Gaussians."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ def normal_consistency_loss(
 ) -> Float[Tensor, ""]:
     """Mean of 1 - <N, A n>: composited normals against those of the rendered depth (Huang et al. 2024, eq. 14).
 
-    Their opacity A only weights: no gradient goes through it. N is taken as composited, so that splats behind one
-    another gain by agreeing.
+    Alpha A is only a weight, without gradient. N is not normalised, so that splats behind one another lower the loss by
+    having the same normal.
 
     Args:
         normal: N, composited and not normalised.
         depth_normal: n, unit normals of the rendered depth, zero where there are none.
-        alpha: A.
-        mask: pixels that count; all if not given.
+        alpha: accumulated opacity A.
+        mask: pixels that count; all by default.
     """
     terms = 1 - (normal * depth_normal * alpha.detach()).sum(dim=-1, keepdim=True)
     return terms.mean() if mask is None else weighted_mean(terms, mask)
 
 
 def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> Float[Tensor, ""]:
-    """Mean of the smallest standard deviation of the visible Gaussians, in the units of the scales."""
+    """Mean of the visible Gaussians' smallest standard deviations, in the units of the scales."""
     return weighted_mean(scales.amin(dim=-1), visible)

@@ -1,4 +1,4 @@
-"""C: rendered normals should be smooth where the cue's depth is."""
+"""C: smoothness of the rendered normals where the cue's depth is smooth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shellgs_method.losses.normal import unit
 
 
 class SmoothnessLoss:
-    """:func:`smoothness_loss` for many renderings of one view."""
+    """:func:`smoothness_loss` for many renders of one view."""
 
     def __init__(self, target_depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]):
         smoothness = _smoothness(target_depth, mask)
@@ -21,7 +21,7 @@ class SmoothnessLoss:
         self._weights = (smoothness / total.where(total > 0, 1.0))[1:, 1:]
 
     def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """The loss of one rendering."""
+        """Loss of one render."""
         return run_fused(_roughness, normal, self._weights, varying=2)
 
 
@@ -31,7 +31,7 @@ def smoothness_loss(
     """Edge-aware smoothness of the rendered normals, Σ w a / Σ w (Vid2Sim's geometry consistency).
 
     ``a`` is the mean of 1 - cos between a pixel's normal and those to its left and above; ``w`` falls from 1 at the
-    smoothest supported pixel to 0 at the steepest one.
+    smoothest pixel in the mask to 0 at the steepest.
 
     Args:
         normal: rendered normals of any length, as composited.
@@ -50,10 +50,10 @@ def _roughness(normal: Float[Tensor, "H W 3"], weights: Float[Tensor, "H-1 W-1 1
 
 @torch.no_grad()
 def _smoothness(depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]) -> Float[Tensor, "H W 1"]:
-    """1 - minmax(|∇Z| / Z) where all the 3 x 3 pixels of the Sobel window are supported, else 0.
+    """1 - minmax(|∇Z| / Z) where all 3 x 3 pixels of the Sobel window are in the mask, else 0.
 
-    Only there is the gradient known, and only there are both neighbours supported too: pairs of normals that straddle
-    the mask's edge drop out by the same rule.
+    Only there is the gradient known. Both neighbours are in the mask there too, so that this also excludes pairs of
+    normals across the mask's edge.
     """
     unsupported = pad((~mask).to(depth.dtype)[None, ..., 0], (1, 1, 1, 1), value=1.0)
     inside = max_pool2d(unsupported, kernel_size=3, stride=1)[0, ..., None] == 0
@@ -61,5 +61,5 @@ def _smoothness(depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]) -> F
     steepness = gradient.norm(dim=0)[..., None] / depth.where(inside, 1.0)
     low = steepness.where(inside, torch.inf).amin()
     high = steepness.where(inside, -torch.inf).amax()
-    # Gradients that differ by 1e-5 of the depth per pixel differ by rounding: they are not stretched to [0, 1].
+    # Differences below 1e-5 of the depth per pixel are rounding errors: do not stretch them to [0, 1].
     return (1 - (steepness - low) / (high - low).clamp_min(1e-5)).where(inside, 0.0)

@@ -1,4 +1,4 @@
-"""Structural similarity, with what depends on the photograph alone computed once."""
+"""Structural similarity, with the photograph's moments computed once."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ TAPS = [tap / sum(_GAUSSIAN) for tap in _GAUSSIAN]
 C1, C2 = 0.01**2, 0.03**2
 
 
-# In here, the channels lie side by side in a row, see windows.py.
+# Images are [height, width * channels] here, see windows.py.
 
 
 @dataclass(frozen=True)
 class SsimTarget:
-    """A photograph, with its moments.
+    """A photograph with its moments.
 
     Attributes:
-        padded: by its reflection.
-        mean: in the windows.
-        variance: in the windows.
+        padded: photograph padded by reflection.
+        mean: mean of each window.
+        variance: variance of each window.
     """
 
     padded: Float[Tensor, "H+10 X+30"]
@@ -40,7 +40,7 @@ class SsimTarget:
 
     @property
     def photograph(self) -> Float[Tensor, "H W 3"]:
-        """The photograph, without its reflection; a view of ``padded``."""
+        """The photograph without the padding; a view of ``padded``."""
         return self.padded.unflatten(1, (-1, 3))[RADIUS:-RADIUS, RADIUS:-RADIUS]
 
     @classmethod
@@ -54,8 +54,8 @@ class SsimTarget:
 def ssim(rgb: Float[Tensor, "H W 3"], target: SsimTarget) -> Float[Tensor, "H W 3"]:
     """SSIM (Wang et al. 2004) of each pixel's Gaussian window, 11 x 11 of sigma 1.5, of colours in [0, 1].
 
-    It is ``kornia.metrics.ssim``, whose windows at the border see the image reflected; that one computes the moments of
-    the photograph in each call, and its convolutions are many times slower in training on a CPU.
+    Equals ``kornia.metrics.ssim``, with reflected borders; that one recomputes the photograph's moments in each call,
+    and its convolutions are many times slower in training on a CPU.
     """
     return _Ssim.apply(_reflected(rgb), target.padded, target.mean, target.variance).view_as(rgb)
 
@@ -63,17 +63,17 @@ def ssim(rgb: Float[Tensor, "H W 3"], target: SsimTarget) -> Float[Tensor, "H W 
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, y, mean, variance):
-        similarity, *by_moments = run_fused(_similarity, x, y, mean, variance, varying=2)
-        ctx.save_for_backward(x, y, *by_moments)
+        similarity, *grad_moments = run_fused(_similarity, x, y, mean, variance, varying=2)
+        ctx.save_for_backward(x, y, *grad_moments)
         return similarity
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradient):
-        x, y, *by_moments = ctx.saved_tensors
+        x, y, *grad_moments = ctx.saved_tensors
         around = (6 * RADIUS, 6 * RADIUS, 2 * RADIUS, 2 * RADIUS)
-        by_moments = [F.pad(gradient * each, around) for each in by_moments]
-        return run_fused(_by_colours, x, y, *by_moments, varying=2), None, None, None
+        grad_moments = [F.pad(gradient * each, around) for each in grad_moments]
+        return run_fused(_gradient, x, y, *grad_moments, varying=2), None, None, None
 
 
 def _similarity(
@@ -82,30 +82,32 @@ def _similarity(
     mean_y: Float[Tensor, "H X"],
     variance_y: Float[Tensor, "H X"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """SSIM, and its derivatives by the windows' means of x, x² and x y."""
+    """SSIM, and its derivatives w.r.t. the windows' means of x, x² and x y."""
     mean_x, mean_xx, mean_xy = _blur(x), _blur(x * x), _blur(x * y)
     cross, squares = 2 * mean_x * mean_y + C1, mean_x * mean_x + mean_y * mean_y + C1
     covariance = 2 * (mean_xy - mean_x * mean_y) + C2
     variances = mean_xx - mean_x * mean_x + variance_y + C2
     similarity = cross * covariance / (squares * variances)
-    by_xx, by_xy = -similarity / variances, 2 * cross / (squares * variances)
-    by_x = 2 * (mean_y * covariance / variances - mean_x * similarity) / squares - mean_y * by_xy - 2 * mean_x * by_xx
-    return similarity, by_x, by_xx, by_xy
+    grad_xx, grad_xy = -similarity / variances, 2 * cross / (squares * variances)
+    grad_x = (
+        2 * (mean_y * covariance / variances - mean_x * similarity) / squares - mean_y * grad_xy - 2 * mean_x * grad_xx
+    )
+    return similarity, grad_x, grad_xx, grad_xy
 
 
-def _by_colours(
+def _gradient(
     x: Float[Tensor, "H+10 X+30"],
     y: Float[Tensor, "H+10 X+30"],
-    by_x: Float[Tensor, "H+20 X+60"],
-    by_xx: Float[Tensor, "H+20 X+60"],
-    by_xy: Float[Tensor, "H+20 X+60"],
+    grad_x: Float[Tensor, "H+20 X+60"],
+    grad_xx: Float[Tensor, "H+20 X+60"],
+    grad_xy: Float[Tensor, "H+20 X+60"],
 ) -> Float[Tensor, "H+10 X+30"]:
-    """Gradient by the padded image from those by the windows' means: the windows are symmetric, so blurred again."""
-    return _blur(by_x) + 2 * x * _blur(by_xx) + y * _blur(by_xy)
+    """Gradient w.r.t. the padded image from those w.r.t. the windows' means, blurred by the same, symmetric window."""
+    return _blur(grad_x) + 2 * x * _blur(grad_xx) + y * _blur(grad_xy)
 
 
 def _blur(image: Float[Tensor, "H+10 X+30"]) -> Float[Tensor, "H X"]:
-    """Gaussian means of windows inside the image: one loop where it is compiled, else kornia's convolutions."""
+    """Gaussian means of the windows inside the image: one loop if compiled, else kornia's convolutions."""
     if torch.compiler.is_compiling():
         return window_sums(image, TAPS, channels=3)
     taps = image.new_tensor([TAPS])

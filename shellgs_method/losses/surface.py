@@ -1,4 +1,4 @@
-"""Distance of the rendered surface from the shell, in metres."""
+"""Metric distance of the rendered surface from the shell."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from shellgs_method.losses.normal import unit
 from shellgs_method.losses.reduction import mean_weights
 
 BEHIND = 1.0
-"""Metres beyond the shell at which light counts that nothing has stopped."""
+"""Distance behind the shell in metres at which the remaining transmittance is assumed to end."""
 
 
 class PointToPlaneLoss:
-    """:func:`point_to_plane_loss` for many renderings of one view."""
+    """:func:`point_to_plane_loss` for many renders of one view."""
 
     def __init__(
         self,
@@ -31,13 +31,13 @@ class PointToPlaneLoss:
         self._tolerance = target_depth.new_full((1, 1, 1), tolerance)
 
     def __call__(self, depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
-        """The loss of one rendering."""
+        """Loss of one render."""
         return run_fused(_beyond, depth, self._target, self._slope, self._weights, self._tolerance, varying=2)
 
     def of_all(self, squares: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
-        """The loss of the root mean square distance of all that a pixel shows, in place of that of its mean depth.
+        """Loss of the root mean square distance of all splats of a pixel, instead of that of its mean depth.
 
-        What is left of the light counts as if it ended a metre (:data:`BEHIND`) beyond the shell.
+        The remaining transmittance counts as if it ended a metre (:data:`BEHIND`) behind the shell.
 
         Args:
             squares: Σ w (z - target)², not divided by alpha.
@@ -57,9 +57,9 @@ def point_to_plane_loss(
 ) -> Float[Tensor, ""]:
     """Mean of log(1 + max(0, d - tolerance)), d the distance in metres to the shell's tangent plane at the pixel.
 
-    Metric where the NCC is blind: to scale, to offset and to how far a plane tilts. Measured along the shell's normal,
-    a wall seen at a grazing angle counts no more than one seen from the front; the logarithm keeps what stands before
-    the shell from pulling hardest.
+    Unlike the NCC, it depends on scale, offset and the amount of a plane's tilt. As the distance is along the shell's
+    normal, a wall at a grazing angle counts no more than a frontal one; the logarithm keeps objects in front of the
+    shell from dominating the gradient.
 
     Args:
         depth: rendered z-depth.
@@ -67,8 +67,8 @@ def point_to_plane_loss(
         target_normal: the cue's normals.
         rays: ray through each pixel, z = 1.
         mask: true where the target is valid.
-        metres_per_unit: of the depths.
-        tolerance: metres that the shell's alignment may be off, which cost nothing.
+        metres_per_unit: metres per unit of the depths.
+        tolerance: distance in metres without cost, for errors of the shell's alignment.
     """
     return PointToPlaneLoss(target_depth, target_normal, rays, mask, metres_per_unit, tolerance)(depth)
 

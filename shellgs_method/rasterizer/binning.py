@@ -1,4 +1,4 @@
-"""Which splats touch which tiles of the image."""
+"""Assign splats to the tiles of the image that they touch."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from shellgs_method.fusion import run_fused
 
 TILE = 8  # pixels along the side of a tile
 
-# An ellipse on the screen is x, y of its centre; A, B, C of A dx² + 2 B dx dy + C dy² <= 1; half its width and height.
+# The 7 values of an ellipse: x, y of its centre; A, B, C of A dx² + 2 B dx dy + C dy² <= 1; half its width and height.
 
 
 @dataclass(frozen=True)
 class Bins:
-    """Every (splat, tile) pair that may share a pixel, an *entry*.
+    """All (splat, tile) pairs that may share a pixel, called entries.
 
-    The last tile and the last entry do not exist: they are what fills a batch up.
+    The last tile and the last entry are padding.
 
     Attributes:
-        width: of the image in pixels.
-        height: of the image in pixels.
-        splats: splat of each entry, tile after tile, front to back; the last is the number of splats.
+        width: image width in pixels.
+        height: image height in pixels.
+        splats: splat of each entry, tile by tile, front to back; the last is the number of splats.
         starts: first entry of each tile.
-        counts: entries of each tile.
+        counts: number of entries of each tile.
     """
 
     width: int
@@ -39,36 +39,36 @@ class Bins:
 
     @property
     def rows(self) -> int:
-        """Of tiles."""
+        """Number of rows of tiles."""
         return -(-self.height // TILE)
 
     @property
     def columns(self) -> int:
-        """Of tiles."""
+        """Number of columns of tiles."""
         return -(-self.width // TILE)
 
 
 def touches(ellipses: Float[Tensor, "*batch 7"], size: Float[Tensor, "1 2"]) -> Bool[Tensor, "*batch"]:
-    """Whether the ellipses' boxes touch an image of a width and height."""
+    """Whether the bounding boxes of ellipses touch an image of the given width and height."""
     centres, reach = ellipses[..., :2], ellipses[..., 5:]
     return ((centres + reach > 0) & (centres - reach < size)).all(dim=-1)
 
 
 @torch.no_grad()
 def bin_splats(outlines: Float[Tensor, "N O 7"], width: int, height: int) -> Bins:
-    """Assign splats, ordered front to back, to the tiles whose pixels' centres their outlines span.
+    """Assign splats, sorted front to back, to the tiles with a pixel centre inside their outlines.
 
-    Of a splat with several outlines, it is the tiles between the leftmost and rightmost of them in each row.
+    A splat with several outlines gets all tiles between the leftmost and the rightmost of them in each row.
 
     Args:
         outlines: O ellipses of each splat, which together cover it.
-        width: of the image.
-        height: of the image.
+        width: image width in pixels.
+        height: image height in pixels.
     """
     size = outlines.new_tensor([[width, height]])
     splat, row = _count_up(*run_fused(_rows, outlines, size))
     strip, tile = _count_up(*run_fused(_columns, outlines, splat, row, size))
-    # The entries follow the splats, front to back, and a stable sort keeps that order within a tile.
+    # The entries are front to back, and a stable sort keeps that order within a tile.
     strip = strip.index_select(0, stable_order(tile))
     splats = F.pad(splat.index_select(0, strip), (0, 1), value=len(outlines))
     n_tiles = -(-width // TILE) * -(-height // TILE)
@@ -77,15 +77,15 @@ def bin_splats(outlines: Float[Tensor, "N O 7"], width: int, height: int) -> Bin
 
 
 def stable_order(keys: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """The order that sorts integers from 0, equal ones as they stand."""
+    """Indices that sort non-negative integers, stably."""
     if keys.device.type == "cpu" and len(keys) < 1 << 15:
-        # From that length on torch sorts by radix. Below it, numpy does so 16 bits at a time, in a tenth of the time.
+        # torch uses radix sort only from this length; below it, numpy's, 16 bits at a time, takes a tenth of the time.
         return torch.from_numpy(np.lexsort(keys.numpy()[:, None].view(np.uint16).T))
     return keys.sort(stable=True).indices
 
 
 def _rows(outlines: Float[Tensor, "N O 7"], size: Float[Tensor, "1 2"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"]]:
-    """First row of tiles of each splat, and the number of rows."""
+    """First row of tiles of each splat, and number of rows."""
     v, reach = outlines[..., 1], outlines[..., 6]
     return _tiles_between((v - reach).amin(-1), (v + reach).amax(-1), size[:, 1])
 
@@ -93,7 +93,7 @@ def _rows(outlines: Float[Tensor, "N O 7"], size: Float[Tensor, "1 2"]) -> tuple
 def _columns(
     outlines: Float[Tensor, "N O 7"], splat: Int[Tensor, "M"], row: Int[Tensor, "M"], size: Float[Tensor, "1 2"]
 ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
-    """First tile of a splat in a row of tiles, and the number of tiles.
+    """First tile of each splat in a row of tiles, and number of tiles.
 
     At height y above its centre, the ellipse A x² + 2 B x y + C y² = 1 spans
     x = -B/A y ± sqrt((1 - y² / reach_y²) / A), and it is widest where y = ∓B/C reach_x.
@@ -120,7 +120,7 @@ def _columns(
 def _tiles_between(
     low: Float[Tensor, "n"], high: Float[Tensor, "n"], n_pixels: Float[Tensor, "1"]
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
-    """First tile and number of tiles with a pixel's centre between two coordinates, along one side of the image."""
+    """First tile and number of tiles with a pixel centre between two coordinates, along one side of the image."""
     first = torch.minimum((low - 0.5).ceil().clamp_min(0), n_pixels).int()
     last = torch.minimum((high - 0.5).floor().clamp_min(-1), n_pixels - 1).int()
     n_tiles = torch.where(last >= first, last // TILE - first // TILE + 1, 0)
@@ -128,7 +128,7 @@ def _tiles_between(
 
 
 def _count_up(first: Int[Tensor, "n"], times: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
-    """Each position 0, 1, … so many times, and for each of these times a number, counted up from the first."""
+    """Repeat each index ``times`` times, and number the repetitions from ``first``."""
     item = torch.repeat_interleave(times)
     start = first - (times.cumsum(0, dtype=torch.int32) - times)
     return item, torch.arange(len(item), dtype=torch.int32, device=item.device) + start.index_select(0, item)

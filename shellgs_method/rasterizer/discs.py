@@ -1,4 +1,4 @@
-"""Discs of 2D Gaussian Splatting (Huang et al. 2024) to the screen: exactly, in perspective."""
+"""Project the discs of 2D Gaussian Splatting (Huang et al. 2024) to the screen, exactly in perspective."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from shellgs_method.rasterizer.projection import (
     cutoffs,
     halvings,
     quats_to_rotations,
+    rotate,
     stack_cameras,
     to_camera,
-    turn,
 )
 
-EDGE_ON = 1e-6  # cosine of normal and ray below which rounding decides which side of a disc shows: none does
-MAPPING_NEAR, MAPPING_FAR = 0.2, 100.0  # of the depths in the distortion, as in 2DGS
+EDGE_ON = 1e-6  # cosine of normal and ray below which rounding decides which side of a disc shows; it is culled
+MAPPING_NEAR, MAPPING_FAR = 0.2, 100.0  # depth range of the distortion, as in 2DGS
 
 
 def project_discs(
@@ -36,15 +36,15 @@ def project_discs(
     cameras: Sequence[Camera],
     with_probe: bool = False,
 ) -> Projection:
-    """Project discs with the half-axes s_u t_u and s_v t_v, the first two; differentiable in the means2d and shapes.
+    """Project discs with half-axes s_u t_u and s_v t_v, a splat's first two; means2d and shapes are differentiable.
 
-    A ray z r (r_z = 1) meets the plane through m with the normal n = t_u × t_v at the depth z = n·m / n·r, where
-    u = t_v·(m × r) / (s_u n·r) and v = -t_u·(m × r) / (s_v n·r). With r = m / m_z + e at a pixel whose distance from
-    the projected centre is e, the constant terms of the cross products vanish, and what is left are the shapes of
+    A ray z r (r_z = 1) meets the plane through m with normal n = t_u × t_v at depth z = n·m / n·r, where
+    u = t_v·(m × r) / (s_u n·r) and v = -t_u·(m × r) / (s_v n·r). With r = m / m_z + e at a pixel at offset e from
+    the projected centre, the constant terms of the cross products vanish, which leaves the shapes of
     :mod:`~shellgs_method.rasterizer.disc_kernels`.
 
-    The centres in the camera are taken from ``means2d`` and their depths, so that the gradient by ``means2d`` is all
-    that a shift of the disc parallel to the screen does: hence two kernels, with ``means2d`` between them.
+    The centres in the camera frame are computed from ``means2d`` and depths, so that the gradient w.r.t. ``means2d``
+    is the full effect of moving the disc parallel to the screen: hence two kernels, with ``means2d`` between them.
     """
     views = stack_cameras(cameras)
     means2d, depths, in_front = run_fused(_project_centres, means, *views)
@@ -64,7 +64,7 @@ def _project_centres(
     intrinsics: Float[Tensor, "B 4 1"],
     size: Float[Tensor, "1 2"],
 ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
-    """The means2d, their depths, and whether they are in front of the near plane; if not, the depth is 1."""
+    """Means2d, depths, and whether the depth is beyond the near plane; if not, it is set to 1."""
     del size
     fx, fy, cx, cy = intrinsics.unbind(1)
     x, y, z = to_camera(means, viewmats)
@@ -85,7 +85,7 @@ def _project(
 ) -> tuple[Tensor, ...]:
     fx, fy, cx, cy = intrinsics.unbind(1)
     rays = torch.stack([(means2d[..., 0] - cx) / fx, (means2d[..., 1] - cy) / fy, torch.ones_like(z)], dim=-1)
-    axes = torch.stack(turn(quats_to_rotations(quats), viewmats), dim=-2)
+    axes = torch.stack(rotate(quats_to_rotations(quats), viewmats), dim=-2)
     tangents_u, tangents_v, normals = axes.unbind(-1)
 
     facing = (normals * rays).sum(-1)
@@ -113,11 +113,11 @@ def _project(
 def disc_maps(
     alpha: Float[Tensor, "*batch 1"], maps: Float[Tensor, "*batch 3"]
 ) -> dict[str, Float[Tensor, "*batch 1"]]:
-    """What a disc render tells of geometry, from what is composited of each disc: 1/z, 1/z², and the median's z.
+    """Geometry maps of a disc render, from its composited 1/z and 1/z² and its median z.
 
     Distortion is the L2 form of 2DGS, sum over i and j < i of w_i w_j (m_i - m_j)², with depths mapped to
-    m = far / (far - near) (1 - near / z). It is the variance A Σ w m² - (Σ w m)², A = Σ w, in which the constant of
-    the mapping drops out: left out, it does not drown the rest in rounding.
+    m = far / (far - near) (1 - near / z). It equals A Σ w m² - (Σ w m)², A = Σ w, in which the constant of the mapping
+    cancels; leaving it out avoids rounding errors.
     """
     inverse_depth, square, median_depth = maps.split(1, dim=-1)
     mapping = MAPPING_FAR * MAPPING_NEAR / (MAPPING_FAR - MAPPING_NEAR)
@@ -134,10 +134,10 @@ def _outlines(
     intrinsics: Float[Tensor, "B 4 1"],
     size: Float[Tensor, "1 2"],
 ) -> tuple[Float[Tensor, "B N 7"], Float[Tensor, "B N 3"]]:
-    """Ellipses around discs of so many half-axes, and the covariances of the discs as if seen from afar.
+    """Ellipses around discs of a radius in half-axes, and the covariances of the discs as if seen from afar.
 
-    The ellipse is exact, but for a tenth of a pixel in quadrature, where the whole disc is well in front of the camera.
-    Of another, it is the one around its box in the camera, cut off at the near plane and at the image's borders.
+    Where the whole disc is well in front of the camera, the ellipse is exact, plus a tenth of a pixel in quadrature.
+    Else it surrounds the projected box of the disc, clipped at the near plane and at the image border.
     """
     fx, fy, cx, cy = intrinsics.unbind(1)
     # A disc's point (u, v) is at (across, down)·(u, v) / (z + along·(u, v)) from the projected centre.

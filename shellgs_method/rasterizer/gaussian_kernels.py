@@ -1,6 +1,6 @@
-"""Compositing of screen-space Gaussians.
+"""Kernels for screen-space Gaussians.
 
-Their shape is a, b, c, n: at a pixel (dx, dy) from the centre, z = a dx² + b dx dy + c dy² + n.
+The shape of a Gaussian is a, b, c, n: at a pixel (dx, dy) from its centre, z = a dx² + b dx dy + c dy² + n.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from shellgs_method.rasterizer.kernels import Kernels, attenuate, look_up, walk_back_groups
+from shellgs_method.rasterizer.kernels import Kernels, attenuate, backward_step_groups, look_up
 
 _NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, math.inf)
 _FEATURES = slice(len(_NULL_SHAPE), None)
@@ -43,7 +43,7 @@ def _backward(
     behinds: list[Float[Tensor, "G P V"]],
     gradients: list[Float[Tensor, "G P V"]],
     others: list[Float[Tensor, "G P V"]],
-    by_params: Float[Tensor, "G L V K"],
+    grad_params: Float[Tensor, "G L V K"],
     table: Float[Tensor, "N K"],
     splats: Int[Tensor, "G L V"],
     centres: Float[Tensor, "G 2 V"],
@@ -53,21 +53,24 @@ def _backward(
 ) -> None:
     params = look_up(table, splats, centres)
     chunk = params[:, :, None].unbind(3)
-    met = []
+    recomputed = []
     for splat in chunk:
         z = _exponent(splat, x, y)
         alpha, weight, transmittance = attenuate(z, transmittance, stop)
-        met.append((z, alpha, weight))
+        recomputed.append((z, alpha, weight))
 
-    befores, by_z = list(behinds), []
-    for splat, (z, alpha, weight) in zip(reversed(chunk), reversed(met), strict=True):
+    befores, grad_z = list(behinds), []
+    for splat, (z, alpha, weight) in zip(reversed(chunk), reversed(recomputed), strict=True):
         groups = [gradients, others] if others else [gradients]
-        by_z.append(walk_back_groups(befores, z, alpha, weight, groups, splat[:, _FEATURES].unbind(1)))
+        grad_z.append(backward_step_groups(befores, z, alpha, weight, groups, splat[:, _FEATURES].unbind(1)))
     for behind, before in zip(behinds, befores, strict=True):
         behind.copy_(before)
 
-    # u, v, a, b, c and n take the moments of the gradient by z about the splat's centre, shifted there from the tile's.
-    q, w = torch.stack([of_all for of_all, _ in by_z[::-1]]), torch.stack([weight for *_, weight in met])  # [L G P V]
+    # u, v, a, b, c and n get moments of the gradient of z about the splat's centre, shifted there from the tile's.
+    q, w = (
+        torch.stack([of_all for of_all, _ in grad_z[::-1]]),
+        torch.stack([weight for *_, weight in recomputed]),
+    )  # [L G P V]
     qx, qy = q * x, q * y
     q, sx, sy, sxx, sxy, syy = (moment.sum(2) for moment in (q, qx, qy, qx * x, qx * y, qy * y))
     u, v, a, b, c = params[:, :5].permute(1, 2, 0, 3)
@@ -76,11 +79,11 @@ def _backward(
     shape = [-2 * a * mx - b * my, -b * mx - 2 * c * my, mxx, mxy, myy, q]
     columns = [*shape, *((w * gradient).sum(2) for gradient in [*gradients, *others])]
     if others:
-        q = torch.stack([of_first for _, of_first in by_z[::-1]])
+        q = torch.stack([of_first for _, of_first in grad_z[::-1]])
         sq = q.sum(2)
         mx, my = (q * x).sum(2) - u * sq, (q * y).sum(2) - v * sq
         columns += [-2 * a * mx - b * my, -b * mx - 2 * c * my]
-    by_params.copy_(torch.stack(columns).permute(2, 1, 3, 0))
+    grad_params.copy_(torch.stack(columns).permute(2, 1, 3, 0))
 
 
 def _exponent(splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]) -> Tensor:

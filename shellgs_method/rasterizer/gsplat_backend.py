@@ -1,6 +1,6 @@
-"""Rasterization on the CUDA kernels of the installed gsplat, 1.4 or 1.5, for 3D Gaussians and for the discs of 2DGS.
+"""Rasterization of 3D Gaussians and 2DGS discs with the CUDA kernels of the installed gsplat, 1.4 or 1.5.
 
-gsplat imports everywhere; whether its kernels load shows when they are first asked for, which may compile them.
+gsplat can be imported everywhere; its kernels are loaded, and if need be compiled, on first use.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ logger = logging.getLogger(__name__)
 
 Backend = Literal["auto", "torch", "gsplat"]
 
-TILE = 16  # pixels along the side of a tile; gsplat tests no other
+TILE = 16  # pixels along the side of a tile; gsplat tests no other size
 
 
 def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
-    """Whether to rasterize on gsplat's kernels; where a CUDA device has to do without, a log line says why, once.
+    """Whether to rasterize with gsplat's kernels; if they cannot run on a CUDA device, log the reason once.
 
     Raises:
-        ValueError: gsplat is asked for by name and cannot run.
+        ValueError: If ``backend`` is ``gsplat`` and it cannot run.
     """
     if backend == "torch":
         return False
@@ -65,17 +65,17 @@ def rasterize_3d(
     cameras: Sequence[Camera],
     n_densifying: int | None = None,
 ) -> Renders:
-    """Rasterize Gaussians on cameras of one size; float32 on a CUDA device, like all tensors here.
+    """Rasterize Gaussians for cameras of one size; all tensors are float32 on a CUDA device.
 
-    The render is that of the torch backend, except that gsplat culls a splat beside the image that reaches into it
-    with no more than its alpha beyond three standard deviations, which is below 0.012.
+    The render equals that of the torch backend, except that gsplat culls splats beside the image that reach into it
+    only beyond three standard deviations, where alpha is below 0.012.
     """
     viewmats, Ks, width, height = _stack(cameras)
     radii, means2d, depths, conics, _ = fully_fused_projection(
         means, None, quats, scales, viewmats, Ks, width, height, eps2d=LOW_PASS, near_plane=NEAR_PLANE, packed=False
     )
-    # gsplat's radii are of three standard deviations. A splat goes into the tiles where its alpha counts: farther out,
-    # or the render would break off at their borders; or, of a faint splat, not so far, which saves time.
+    # gsplat's radii are three standard deviations. Bin a splat to all tiles where its alpha counts: farther out, to
+    # avoid visible tile borders; less far for a faint splat, to save time.
     reach = (cutoffs(opacities).sqrt() / 3).view(-1, *[1] * (radii.dim() - 2))
     bins = _bin(means2d, radii * reach, depths, width, height)
     probe, groups = _probed(means2d, features, n_densifying)
@@ -101,19 +101,19 @@ def rasterize_2d(
 ) -> Renders:
     """Rasterize the discs of 2DGS (Huang et al. 2024).
 
-    gsplat blends the depths of the centres, not of the intersections (its issues #477 and #863). Of an intersection,
-    though, 1/z = q · ray with a constant q of the disc, see :class:`_Discs`: composited, the vectors q give the sum of
-    weight over z exactly, and their products q qᵀ that of weight over z².
+    gsplat blends the depths of the centres, not of the intersections (its issues #477 and #863). At an intersection,
+    1/z = q · ray with a constant q of the disc, see :class:`_Discs`: compositing the vectors q gives the exact sum of
+    weight over z, and compositing q qᵀ that of weight over z².
 
-    The render is that of the torch backend, except that gsplat culls by the boxes of three standard deviations, and
-    that its maps have the depth of the centre for all of a disc that is as good as edge-on.
+    The render equals that of the torch backend, except that gsplat culls by boxes of three standard deviations, and
+    that all of a nearly edge-on disc has the depth of its centre in the maps.
     """
     discs = _project_discs(means, quats, scales, opacities, cameras)
     probe, groups = _probed(discs.means2d, features, n_densifying)
     renders = []
     for means2d, group in groups:
         moved = replace(discs, means2d=means2d, ray_transforms=_centred(discs.ray_transforms, means2d))
-        # One camera at a time: gsplat 1.4 writes the normals of a batch over those of its first (its issue #425).
+        # One camera at a time: gsplat 1.4 writes all normals of a batch into those of its first (its issue #425).
         views = [_composite_discs(moved, i, opacities, group, camera) for i, camera in enumerate(cameras)]
         renders.append([torch.cat(view) for view in zip(*views, strict=True)])
     composited = torch.cat([render[0] for render in renders], dim=-1)
@@ -127,9 +127,9 @@ RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
 def _probed(
     means2d: Float[Tensor, "B N 2"], features: Float[Tensor, "N C"], n_densifying: int | None
 ) -> tuple[Float[Tensor, "B N 2"], list[tuple[Float[Tensor, "B N 2"], Float[Tensor, "N c"]]]]:
-    """The means2d whose gradient is to drive densification, and groups of features, each with means2d to composite at.
+    """Means2d whose gradient drives densification, and groups of features with the means2d they are composited at.
 
-    The kernels tell the gradients of features apart only if they are composited apart; alpha belongs to the last group.
+    The kernels separate the gradients of features only if these are composited separately; alpha is the last group's.
     """
     if n_densifying is None:
         return means2d, [(means2d, features)]
@@ -139,7 +139,7 @@ def _probed(
 
 
 def _centred(ray_transforms: Float[Tensor, "B N 3 3"], means2d: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N 3 3"]:
-    """The ray transforms of discs with their centres, the last column, taken from the means2d and their depths."""
+    """Ray transforms of discs with the centres, the last column, recomputed from means2d and depths."""
     depths = ray_transforms[..., 2:, 2]
     centres = torch.cat([means2d * depths, depths], dim=-1)
     return torch.cat([ray_transforms[..., :2], centres[..., None]], dim=-1)
@@ -152,10 +152,10 @@ class _Discs:
     Attributes:
         means2d: projected centres in pixels.
         ray_transforms: K [s_u t_u | s_v t_v | centre] in the camera frame; equation 8 of 2DGS.
-        inverse_planes: q = normal / (normal · centre), which has q · ray = 1/z where a ray meets the plane;
-            of a steep disc as if it faced the camera.
-        radii: as gsplat has them, 0 of a culled disc.
-        tile_radii: of the squares around the means2d outside of which alpha does not count.
+        inverse_planes: q = normal / (normal · centre), so that q · ray = 1/z where a ray meets the plane;
+            a steep disc is treated as facing the camera.
+        radii: gsplat's radii, 0 for a culled disc.
+        tile_radii: half sides of the boxes around the means2d outside of which alpha does not count.
     """
 
     means2d: Float[Tensor, "B N 2"]
@@ -175,13 +175,13 @@ def _project_discs(
     viewmats, Ks, width, height = _stack(cameras)
     splats = fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane=NEAR_PLANE)
     radii, _, _, ray_transforms, normals = splats  # pyright: ignore[reportAssignmentType]
-    # Of a culled disc gsplat leaves memory as it was; none of it may reach a gradient, as 0 times NaN.
+    # gsplat leaves the memory of culled discs uninitialised; none of it may reach a gradient, as 0 times NaN.
     visible = radii.view(*normals.shape[:2], -1).amin(-1) > 0
     normals = torch.where(visible[..., None], normals, normals.new_tensor([0.0, 0.0, -1.0]))
     ray_transforms = torch.where(visible[..., None, None], ray_transforms, torch.eye(3).to(means))
 
-    # The centres go through means2d, which so have the whole gradient by a shift on the screen. gsplat has centres of
-    # boxes there, unlike the torch backend, and in 1.4 their gradient lacks the mixed terms of a tilted disc.
+    # The centres are computed from means2d, so that these get the full gradient of a shift on the screen. gsplat's own
+    # are centres of boxes, unlike the torch backend's, and in 1.4 their gradient lacks the mixed terms of tilted discs.
     depths = ray_transforms[..., 2:, 2]
     means2d = ray_transforms[..., :2, 2] / depths
     ray_transforms = _centred(ray_transforms, means2d)
@@ -189,8 +189,8 @@ def _project_discs(
     centres = ray_transforms[..., 2] @ torch.linalg.inv(Ks).mT
     planes = (normals * centres).sum(-1, keepdim=True)
     shows = visible & (planes[..., 0].detach().abs() > EDGE_ON * centres.detach().norm(dim=-1))
-    # The low-pass shows a steep disc even where the ray meets its plane behind the camera; the depth of the centre is
-    # right there, and for want of another has to do where a ray meets the plane in front.
+    # The low-pass shows a steep disc even where the ray meets its plane behind the camera. The centre's depth is right
+    # there; with one q per disc, it must also serve where a ray meets the plane in front.
     cutoff = cutoffs(opacities)
     slopes = (normals[..., :2] / torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], dim=-1)[:, None]).norm(dim=-1)
     steep = planes[..., 0].abs() <= slopes * (cutoff / 2).sqrt() * depths[..., 0]
@@ -209,10 +209,10 @@ def _reach_of_discs(
     cutoff: Float[Tensor, "N"],
     image_size: int,
 ) -> Float[Tensor, "B N 2"]:
-    """Half the sides of boxes around the means2d in which a disc, and its low-pass, lie up to a cutoff.
+    """Half the sides of boxes around the means2d that contain a disc, and its low-pass, up to a cutoff.
 
-    The points (u, v) of a disc with u² + v² = cutoff lie on the screen on an ellipse, and its box follows from the dual
-    conic T diag(cutoff, cutoff, -1) Tᵀ (2DGS, section 4.2), here with the origin of the pixels in the projected centre.
+    The points (u, v) of a disc with u² + v² = cutoff project to an ellipse, whose box follows from the dual conic
+    T diag(cutoff, cutoff, -1) Tᵀ (2DGS, section 4.2), here in pixels relative to the projected centre.
     """
     w = ray_transforms[..., 2:, :]
     rows = ray_transforms[..., :2, :] - means2d[..., None] * w
@@ -220,7 +220,7 @@ def _reach_of_discs(
     against = (signs * w * w).sum(-1)
     middle = (signs * rows * w).sum(-1) / against
     half = (middle.square() - (signs * rows * rows).sum(-1) / against).clamp_min(0).sqrt()
-    # A disc that reaches behind the camera has no ellipse: it may be anywhere in the image.
+    # A disc that reaches behind the camera has no ellipse and may be anywhere in the image.
     on_plane = torch.where(against < 0, middle.abs() + half, means2d.abs() + image_size)
     return torch.maximum(on_plane, (cutoff / 2).sqrt()[:, None])
 
@@ -228,13 +228,13 @@ def _reach_of_discs(
 def _composite_discs(
     discs: _Discs, i: int, opacities: Float[Tensor, "N"], features: Float[Tensor, "N C"], camera: Camera
 ) -> tuple[Float[Tensor, "1 height width C"], Float[Tensor, "1 height width 1"], Float[Tensor, "1 height width 3"]]:
-    """Features, alpha, and the maps of a render, as camera ``i`` sees them."""
+    """Features, alpha, and the maps of camera ``i``."""
     one = slice(i, i + 1)
     means2d, inverse_planes = discs.means2d[one], discs.inverse_planes[one]
     bins = _bin(means2d, discs.tile_radii[one], discs.ray_transforms[one, :, 2, 2], camera.width, camera.height)
     rows, columns = torch.triu_indices(3, 3, device=means2d.device)
-    # Filled up with zeros to a power of two; gsplat would fill up with memory as it is. The kernel takes the last
-    # feature of the disc at the median for its depth: numbered, the discs tell which one it is.
+    # Pad with zeros to a power of two: gsplat would pad with uninitialised memory. The kernel returns the last feature
+    # of the median disc as its depth: the disc's index here, to look it up.
     n_features = features.shape[-1]
     size = 1 << (n_features + len(rows)).bit_length()
     products = inverse_planes[..., rows] * inverse_planes[..., columns]
@@ -265,21 +265,21 @@ def _bin(
     width: int,
     height: int,
 ) -> tuple[Int[Tensor, "B rows columns"], Int[Tensor, "entries"]]:
-    """Which splats touch which tiles, front to back: where each tile begins in the list, and the list."""
+    """Bin splats to tiles, front to back: offset of each tile in the list of splats, and the list."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     _, tiles, splats = isect_tiles(means2d, radii.ceil().int(), depths, TILE, columns, rows)
     return isect_offset_encode(tiles, len(means2d), columns, rows), splats
 
 
 def _stack(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"], int, int]:
-    """The viewmats and Ks, and the width and height that all share."""
+    """Viewmats, Ks, and the common width and height."""
     viewmats = torch.stack([camera.viewmat for camera in cameras])
     return viewmats, torch.stack([camera.K for camera in cameras]), cameras[0].width, cameras[0].height
 
 
 @functools.cache
 def _kernels_fault() -> str | None:
-    """Why gsplat's kernels do not load, None if they do; asked for the first time it may compile them, in minutes."""
+    """Why gsplat's kernels do not load, None if they do; the first call may compile them, which takes minutes."""
     try:
         kernels = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # of nvcc, of the C++ compiler, of a library for another CUDA or torch, …

@@ -1,16 +1,16 @@
-"""The arithmetic of compositing that all primitives share: one chunk of splats over many tiles at once.
+"""Compositing arithmetic shared by all primitives: one chunk of splats over many tiles at once.
 
 Shapes: G groups of V tiles side by side in the innermost dimension, so that a vector unit works on V tiles and every
 pixel of a tile meets the same splat; P pixels of a tile; L splats of a chunk, front to back.
 
-A splat's parameters, a row of K in the table of all splats, are u, v, those of its shape, and its features, the last of
-which is 1 and composites to alpha. The exponent z of a splat at a pixel is how many times alpha has halved below its
-limit: alpha = ALPHA_MAX 2^-max(z, 0).
+A splat is a row of K parameters in the table of all splats: u, v, its shape, and its features, the last of which is 1
+and composites to alpha. The exponent z of a splat at a pixel is how many times alpha has halved below its maximum:
+alpha = ALPHA_MAX 2^-max(z, 0).
 
-What the kernels need besides: the splats of the chunk as rows of the table [G L V], the tiles' centres [G 2 V], x and y
-of a tile's pixels from its centre [1 P 1], and ``stop`` [G 1 V], which is
-TRANSMITTANCE_MIN in a tensor whose dimensions are groups and lanes, but not pixels. As a number it would let inductor
-merge the loops over pixels and lanes wherever nothing else tells them apart, and not fuse these statements with others.
+The kernels also take the table rows of the chunk's splats [G L V], the tiles' centres [G 2 V], x and y of a tile's
+pixels relative to its centre [1 P 1], and ``stop`` [G 1 V]: TRANSMITTANCE_MIN as a tensor over groups and lanes, not
+pixels. Given a number, inductor would merge the loops over pixels and lanes in statements where nothing else separates
+them, and not fuse these statements with others.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from torch import Tensor
 
 from shellgs_method.rasterizer.projection import ALPHA_MAX, ALPHA_MIN
 
-TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would bring it there
+TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would reach it
 Z_MAX = math.log2(ALPHA_MAX / ALPHA_MIN)
 
 
 @dataclass(frozen=True)
 class Kernels:
-    """What compositing needs to know of a primitive.
+    """Kernels of a primitive and the sizes of their arguments.
 
     Attributes:
         null_shape: parameters before the features of a splat whose alpha is 0 everywhere.
-        n_maps: totals behind those of the features, of what the primitive itself has at a pixel.
-        forward: from the transmittance before a chunk (0 once the pixel has stopped) [G P V], a list of totals [G P V],
-            to which it adds those of the chunk, and the rest as above: the transmittance behind the chunk, and its
-            maximum over each tile's pixels [G V].
-        backward: walks a chunk back to front. From the transmittance before it, a list of ``behind`` [G P V] (see
-            :func:`walk_back`), which it brings to before the chunk, the list of the totals' gradients, the gradients of
-            the parameters [G L V K], which it fills, summed over a tile's pixels, and the rest as above. The totals'
-            gradients are in two lists, each with a ``behind`` of its own: where the second is not empty, the first
-            ``n_probed`` parameters have columns once more at the end, for their gradients by the first list alone.
-        n_probed: number of the parameters, from u and v, that follow from where the splat is on the screen.
+        n_maps: number of totals after those of the features, for the primitive's own maps.
+        forward: takes the transmittance before a chunk (0 once the pixel has stopped) [G P V], a list of totals
+            [G P V], to which it adds the chunk, and the arguments above. Returns the transmittance behind the chunk,
+            and its maximum over each tile's pixels [G V].
+        backward: goes through a chunk back to front. Takes the transmittance before it, a list of ``behind`` [G P V]
+            (see :func:`backward_step`), which it updates to before the chunk, the totals' gradients in two lists, each
+            with its own ``behind``, the parameters' gradients [G L V K], which it fills, summed over a tile's pixels,
+            and the arguments above. If the second list is not empty, the gradients of the first ``n_probed`` parameters
+            due to the first list alone are appended as columns.
+        n_probed: number of parameters, from u and v on, that depend on the splat's screen position.
     """
 
     null_shape: tuple[float, ...]
@@ -63,7 +63,7 @@ class Kernels:
 def look_up(
     table: Float[Tensor, "N K"], splats: Int[Tensor, "G L V"], centres: Float[Tensor, "G 2 V"]
 ) -> Float[Tensor, "G K L V"]:
-    """Parameters of splats, with u and v from the tiles' centres."""
+    """Parameters of splats, with u and v relative to the tiles' centres."""
     u, v, *rest = (table[splats, i] for i in range(table.shape[1]))
     return torch.stack([u - centres[:, :1], v - centres[:, 1:], *rest], dim=1)
 
@@ -71,7 +71,7 @@ def look_up(
 def attenuate(
     z: Float[Tensor, "G P V"], transmittance: Float[Tensor, "G P V"], stop: Float[Tensor, "G 1 V"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Alpha (0 where it does not count), the weight, and the transmittance behind a splat."""
+    """Alpha (0 where it does not count), weight, and transmittance behind a splat."""
     alpha = torch.where(z <= Z_MAX, ALPHA_MAX * _halve(torch.relu(z)), 0.0)
     after = transmittance - alpha * transmittance
     counts = after > stop
@@ -79,7 +79,7 @@ def attenuate(
     return alpha, alpha * transmittance, torch.where(counts, after, 0.0)
 
 
-def walk_back(
+def backward_step(
     behind: Float[Tensor, "G P V"],
     z: Float[Tensor, "G P V"],
     alpha: Float[Tensor, "G P V"],
@@ -87,20 +87,21 @@ def walk_back(
     gradients: Sequence[Tensor],
     values: Sequence[Tensor],
 ) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G P V"]]:
-    """Step to before a splat: the new ``behind``, and the gradient of the loss by z.
+    """One splat of the backward pass: ``behind`` before the splat, and the gradient of the loss w.r.t. z.
 
-    With g_i = the gradient of the loss by the weight w_i = alpha_i T_i, the sum over the channels of the total's
-    gradient times the splat's value, ``behind`` is the sum of g_j w_j of the splats behind, over their transmittance.
-    It needs no division: behind += alpha_i (g_i - behind), and the loss has the gradient T_i (g_i - behind) by alpha_i.
+    Let g_i be the gradient of the loss w.r.t. the weight w_i = alpha_i T_i: the sum over the channels of the total's
+    gradient times the splat's value. ``behind`` is the sum of g_j w_j over the splats behind, divided by their
+    transmittance. Its update needs no division, behind += alpha_i (g_i - behind), and the gradient of the loss w.r.t.
+    alpha_i is T_i (g_i - behind).
     """
     excess = -behind
     for gradient, value in zip(gradients, values, strict=True):
         excess = excess + gradient * value
-    # d alpha / dz = -ln 2 alpha, and 0 where alpha is at its limit
+    # d alpha / dz = -ln 2 alpha, and 0 where alpha is at its maximum
     return behind + alpha * excess, torch.where(z > 0, (-math.log(2)) * weight * excess, 0.0)
 
 
-def walk_back_groups(
+def backward_step_groups(
     behinds: list[Float[Tensor, "G P V"]],
     z: Float[Tensor, "G P V"],
     alpha: Float[Tensor, "G P V"],
@@ -108,20 +109,20 @@ def walk_back_groups(
     groups: Sequence[Sequence[Tensor]],
     values: Sequence[Tensor],
 ) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G P V"]]:
-    """:func:`walk_back` for groups of totals apart, in place in the list: gradients by z of all and of the first."""
-    by_z, done = [], 0
+    """:func:`backward_step` per group of totals, updating ``behinds``: gradients w.r.t. z of all and of the first."""
+    grad_z, done = [], 0
     for i, gradients in enumerate(groups):
         of_group = values[done : done + len(gradients)]
-        behinds[i], gradient = walk_back(behinds[i], z, alpha, weight, gradients, of_group)
-        by_z.append(gradient)
+        behinds[i], gradient = backward_step(behinds[i], z, alpha, weight, gradients, of_group)
+        grad_z.append(gradient)
         done += len(gradients)
-    return functools.reduce(torch.add, by_z), by_z[0]
+    return functools.reduce(torch.add, grad_z), grad_z[0]
 
 
 def _halve(z: Tensor) -> Tensor:
-    """2^-z for z from 0 to 8: if compiled in float32 to 3e-6, by the minimax polynomial of 2^(-z/8), squared thrice.
+    """2^-z for z from 0 to 8; compiled in float32 to 3e-6, by the minimax polynomial of 2^(-z/8), squared three times.
 
-    It is what vectorises best; a call of the library's exp2 doubles the time of the kernels.
+    The polynomial vectorises best; calls of the library's exp2 double the kernels' run time.
     """
     if not torch.compiler.is_compiling() or z.dtype != torch.float32:
         return torch.exp2(-z)

@@ -1,4 +1,4 @@
-"""3D Gaussians to screen-space Gaussians: the EWA approximation, with the conventions of gsplat."""
+"""Project 3D Gaussians to the screen by the EWA approximation, with the conventions of gsplat."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shellgs_method.rasterizer.binning import touches
 
 NEAR_PLANE = 0.01
 LOW_PASS = 0.3  # variance in px² added to every splat
-ALPHA_MIN = 1 / 255  # less does not count
+ALPHA_MIN = 1 / 255  # smaller alphas do not count
 ALPHA_MAX = 0.999
 
 
@@ -28,13 +28,13 @@ class Projection:
 
     Attributes:
         means2d: centres in pixels.
-        shapes: what the kernels of the primitive know of a splat besides its centre and features.
+        shapes: shape parameters of the primitive's kernels.
         depths: z of the centres in the camera frame.
         outlines: O ellipses (see :mod:`~.binning`) that together cover the pixels where alpha reaches 1/255.
         covars2d: covariances (xx, xy, yy) in px², low-pass included.
-        visible: in front of the near plane, and an outline touches the image.
-        probe: if asked for, a leaf of the values of ``means2d`` that leads to ``probed`` alone.
-        probed: the centres and shapes (as far as these follow from the centres) as they follow from the probe.
+        visible: whether beyond the near plane with an outline that touches the image.
+        probe: if requested, a leaf with the values of ``means2d`` on which ``probed`` alone depends.
+        probed: centres, and the shape parameters that depend on them, computed from the probe.
     """
 
     means2d: Float[Tensor, "B N 2"]
@@ -47,9 +47,9 @@ class Projection:
     probed: Float[Tensor, "B N 2+k"] | None = None
 
     def views(self) -> Iterator[View]:
-        """What each camera sees of them."""
+        """Iterate over the cameras."""
         parts = (self.means2d, self.shapes, self.depths, self.outlines, self.visible)
-        # unbind, whose gradient is a stack, where indexing would fill a whole batch for each view.
+        # The gradient of unbind is a stack; that of indexing would fill a whole batch for each view.
         probed = [None] * len(self.means2d) if self.probed is None else self.probed.unbind(0)
         return (View(*view) for view in zip(*(part.unbind(0) for part in parts), probed, strict=True))
 
@@ -73,10 +73,10 @@ def project_gaussians(
     cameras: Sequence[Camera],
     with_probe: bool = False,
 ) -> Projection:
-    """Project Gaussians (EWA splatting, Zwicker et al. 2001); differentiable in the means2d and shapes.
+    """Project Gaussians (EWA splatting, Zwicker et al. 2001); means2d and shapes are differentiable.
 
-    Their shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`; none follows from
-    where the centre is on the screen.
+    The shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`; none depends on the
+    screen position of the centre.
     """
     projected = run_fused(_project, means, quats, scales, opacities, *stack_cameras(cameras))
     probe = projected[0].detach().requires_grad_() if with_probe else None
@@ -100,11 +100,11 @@ def _project(
     x, y = x / z, y / z
     means2d = torch.stack([fx * x + cx, fy * y + cy], dim=-1)
 
-    # Off screen the linearised projection runs wild: its slope is held within 15 % of the image beyond the borders.
+    # Far off screen the linearised projection diverges: clamp its slope to 15 % of the image beyond the borders.
     width, height = size.unbind(-1)
     x = torch.minimum(torch.maximum(x, -(cx + 0.15 * width) / fx), (1.15 * width - cx) / fx)
     y = torch.minimum(torch.maximum(y, -(cy + 0.15 * height) / fy), (1.15 * height - cy) / fy)
-    axes = turn(quats_to_rotations(quats) * scales[:, None, :], viewmats)  # columns: the Gaussian's half-axes
+    axes = rotate(quats_to_rotations(quats) * scales[:, None, :], viewmats)  # columns: the Gaussian's half-axes
     across = (fx / z)[..., None] * (axes[0] - x[..., None] * axes[2])
     down = (fy / z)[..., None] * (axes[1] - y[..., None] * axes[2])
 
@@ -127,7 +127,7 @@ def _project(
 def stack_cameras(
     cameras: Sequence[Camera],
 ) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 4 1"], Float[Tensor, "1 2"]]:
-    """Viewmats, fx, fy, cx, cy, and the width and height that all share; as tensors, or each size would be compiled."""
+    """Viewmats, intrinsics, and the common size, as a tensor so that kernels are not recompiled for each size."""
     Ks = torch.stack([camera.K for camera in cameras])
     intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], dim=1)[..., None]
     size = Ks.new_tensor([[cameras[0].width, cameras[0].height]])
@@ -135,14 +135,14 @@ def stack_cameras(
 
 
 def to_camera(points: Float[Tensor, "N 3"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N"]]:
-    """Coordinates of points of the world in the frames of cameras."""
-    return [row + viewmats[:, i, 3, None] for i, row in enumerate(turn(points, viewmats))]
+    """Transform points from the world to the camera frames."""
+    return [row + viewmats[:, i, 3, None] for i, row in enumerate(rotate(points, viewmats))]
 
 
-def turn(vectors: Float[Tensor, "N 3 *each"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N *each"]]:
-    """Coordinates of vectors (or rows of matrices) of the world in the frames of cameras.
+def rotate(vectors: Float[Tensor, "N 3 *each"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N *each"]]:
+    """Rotate vectors (or the columns of matrices) from the world to the camera frames.
 
-    A sum of three products, unlike a matrix product, fuses with what is before and behind.
+    Unlike a matrix product, a sum of three products fuses with the operations around it.
     """
     shape = (-1, *[1] * (vectors.dim() - 1))
     R = [[viewmats[:, i, j].view(shape) for j in range(3)] for i in range(3)]
@@ -150,14 +150,14 @@ def turn(vectors: Float[Tensor, "N 3 *each"], viewmats: Float[Tensor, "B 4 4"]) 
 
 
 def halvings(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """How many times alpha has halved below its limit at a splat's centre."""
-    # What is so faint is culled; it must not put a division by 0 into the gradients.
+    """How many times alpha has halved below its maximum at a splat's centre."""
+    # Fainter splats are culled; they must not put a division by 0 into the gradients.
     return (ALPHA_MAX / opacities.clamp_min(ALPHA_MIN / 2)).log2()
 
 
 def cutoffs(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-    """Squared Mahalanobis distance up to which alpha may reach 1/255; 0 for a splat too faint to count."""
-    # The slack outweighs rounding, so that binning never loses a pixel that the kernel would count.
+    """Squared Mahalanobis distance within which alpha may reach 1/255; 0 for a splat too faint to count."""
+    # The slack exceeds rounding errors, so that binning never loses a pixel that the kernel would count.
     return (2 * (opacities.detach() / ALPHA_MIN).log() + 1e-3).clamp_min(0)
 
 

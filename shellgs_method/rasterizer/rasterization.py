@@ -1,4 +1,4 @@
-"""Rasterization of splats with any features, differentiable, with the semantics of gsplat's classic mode."""
+"""Differentiable rasterization of splats with arbitrary features, with the semantics of gsplat's classic mode."""
 
 from __future__ import annotations
 
@@ -35,42 +35,42 @@ def rasterize(
     backend: gsplat_backend.Backend = "auto",
     n_densifying: int | None = None,
 ) -> tuple[Float[Tensor, "*B height width C"], Float[Tensor, "*B height width 1"], dict[str, Any]]:
-    """Composite the features of 3D Gaussians or 2D discs front to back, by the depth of their centres.
+    """Composite the features of 3D Gaussians or 2D discs front to back, sorted by the depth of their centres.
 
-    Gaussians go through the EWA approximation. Discs, spanned by the first two axes of a splat, are met by each
-    pixel's ray where it goes through their planes, and are at least as wide as a pixel by the low-pass of 2DGS.
+    Gaussians are projected by the EWA approximation. Discs, spanned by the first two axes of a splat, are intersected
+    with each pixel's ray; the low-pass of 2DGS keeps them at least as wide as a pixel.
 
-    A splat's alpha is at most 0.999, and does not count below 1/255; a pixel stops before the splat that would bring
-    its transmittance to 1e-4 or less.
+    Alpha is at most 0.999, and ignored below 1/255; a pixel stops before the splat that would bring its transmittance
+    to 1e-4 or less.
 
     Args:
         means: centres in the world.
         quats: rotations (w, x, y, z) of any norm.
         scales: standard deviations along the rotated axes, in scene units, positive.
-        opacities: in (0, 1).
+        opacities: opacities in (0, 1).
         features: any channels, all composited in one pass.
-        camera: one, or B of one size; its tensors are brought to the dtype and device of the means.
+        camera: one camera, or B of one size; moved to the dtype and device of the means.
         primitive: "3d" for Gaussians, "2d" for discs.
         backend: ``torch`` runs everywhere; ``gsplat`` takes float32 tensors on a CUDA device where its kernels load;
             ``auto`` is gsplat where it runs.
         n_densifying: if given, the gradient of ``info["means2d"]``, by which gsplat's strategies densify, is that of
-            the first so many features alone. All others act as ever, but drive no densification.
+            the first ``n_densifying`` features alone; all other gradients are unchanged.
 
     Returns:
-        The sums of weight times feature (not divided by alpha, no background), the sums of the weights, and what
-        gsplat's densification strategies need: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained,
-        ``radii``, …. The renders of a sequence of cameras are stacked.
+        Sums of weight times feature (not divided by alpha, no background), sums of the weights, and the ``info`` of
+        gsplat's densification strategies: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained, ``radii``,
+        …. The renders of a sequence of cameras are stacked.
 
-        Of discs there are also, differentiable, ``[*B, H, W, 1]``: ``inverse_depth``, the sum of weight over z of
-        the ray's intersection, so that alpha / inverse_depth is the expected depth (the mean is taken of 1/z, which is
-        affine on the screen, as every backend can composite it exactly); ``median_depth``, the z of the splat at which
-        the transmittance falls to 1/2 or less, 0 where it does not, with a gradient to that splat alone;
-        ``distortion``, see :func:`~.discs.disc_maps`. Their ``gradient_2dgs`` is ``means2d``: gsplat's is the gradient
-        by the screen position of a centre at fixed depth and axes, as it acts through the intersection; this one has
-        what acts through the low-pass added.
+        For discs, ``info`` also has differentiable maps ``[*B, H, W, 1]``: ``inverse_depth``, the sum of weight over z
+        of the ray's intersection, so that alpha / inverse_depth is the expected depth (1/z is averaged because it is
+        affine on the screen: every backend can composite it exactly); ``median_depth``, the z of the splat at which
+        the transmittance falls to 1/2 or less, 0 where it does not, with a gradient to that splat alone; and
+        ``distortion``, see :func:`~.discs.disc_maps`. ``gradient_2dgs`` is ``means2d``: gsplat's is the gradient w.r.t.
+        the screen position of a centre at fixed depth and axes, through the intersection alone; here that through the
+        low-pass is added.
 
     Raises:
-        ValueError: if the cameras differ in size, or there are none; if gsplat is asked for and cannot run.
+        ValueError: If there are no cameras, they differ in size, or ``backend`` is ``gsplat`` and it cannot run.
     """
     cameras = [camera] if isinstance(camera, Camera) else list(camera)
     sizes = {(each.width, each.height) for each in cameras}
@@ -107,7 +107,7 @@ def _rasterize(
     cameras: Sequence[Camera],
     n_densifying: int | None,
 ) -> Renders:
-    """Rasterize in torch the primitive of a projection and kernels."""
+    """Rasterize in torch the primitive given by ``project`` and ``kernels``."""
     projection = project(means, quats, scales, opacities, cameras, with_probe=n_densifying is not None)
     views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
     composited, alpha, maps = torch.stack(views).split([features.shape[1], 1, kernels.n_maps], dim=-1)
@@ -125,10 +125,10 @@ _RASTERIZE = {
 def _render(
     view: View, kernels: Kernels, features: Float[Tensor, "N C"], camera: Camera, n_densifying: int
 ) -> Float[Tensor, "height width C+1+maps"]:
-    """Features, alpha and the primitive's maps as one camera sees them."""
+    """Features, alpha and the primitive's maps of one camera."""
     visible = view.visible.nonzero().squeeze(1)
     depths = view.depths.index_select(0, visible)
-    # The bits of positive numbers are integers of the same order, which are sorted several times as fast.
+    # The bits of positive floats are integers of the same order, which sort several times faster.
     depths = depths.view(torch.int32 if depths.dtype == torch.float32 else torch.int64)
     order = visible.index_select(0, stable_order(depths))
     bins = bin_splats(view.outlines.index_select(0, order), camera.width, camera.height)
@@ -136,14 +136,14 @@ def _render(
 
 
 def _three_sigmas(outlines: Tensor, covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Tensor:
-    """Radii as gsplat 1.4 has them, of three standard deviations."""
+    """Radii of gsplat 1.4: three standard deviations."""
     xx, xy, yy = covars2d.unbind(-1)
     variance = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
     return torch.where(visible, (3 * variance.sqrt()).ceil(), 0).int()
 
 
 def _boxes(outlines: Float[Tensor, "B N O 7"], covars2d: Tensor, visible: Bool[Tensor, "B N"]) -> Tensor:
-    """Radii in x and y as gsplat has them from 1.5, up to where alpha counts."""
+    """Radii of gsplat from 1.5: in x and y, up to where alpha counts."""
     return torch.where(visible[..., None], outlines[..., 5:].amax(-2).ceil(), 0).int()
 
 

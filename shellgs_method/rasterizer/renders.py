@@ -1,4 +1,4 @@
-"""What every backend makes of splats."""
+"""Output of every rasterization backend."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Renders:
-    """Splats as B cameras of one size see them.
+    """Renders of splats for B cameras of one size.
 
     Attributes:
         composited: sums of weight times feature.
         alpha: sums of the weights.
-        maps: of discs, the sums of weight over z and over z², and the median depth; of Gaussians none.
-        means2d: projected centres in pixels, through which all gradient by them goes; where some features are to drive
-            densification, a leaf that gets the gradient of these alone.
-        radii: in pixels, as the installed gsplat has them: one, or from 1.5 one each along x and y; 0 where invisible.
+        maps: for discs, sums of weight over z and over z², and the median depth; none for Gaussians.
+        means2d: projected centres in pixels, in the graph; if only some features drive densification, a leaf that gets
+            the gradient of these alone.
+        radii: radii in pixels, as in the installed gsplat: one, or from 1.5 two, along x and y; 0 where invisible.
     """
 
     composited: Float[Tensor, "B height width C"]

@@ -15,20 +15,20 @@ from shellgs_method.fusion import run_fused
 def spherical_harmonics(
     degree: int, directions: Float[Tensor, "N 3"], *coefficients: Float[Tensor, "N k 3"]
 ) -> Float[Tensor, "N 3"]:
-    """Sum of the harmonics up to ``degree``, as it is: 3DGS adds 0.5 to it and clamps at 0 to get a colour.
+    """Sum of the harmonics up to ``degree``; 3DGS adds 0.5 and clamps at 0 to get a colour.
 
     Args:
-        degree: highest degree that counts; coefficients of higher degrees are left out.
-        directions: from the camera to the splats, of any length.
-        coefficients: of Y(l, m) at index l² + l + m, in one tensor or, one after the other, in several.
+        degree: highest degree that counts; coefficients of higher degrees are ignored.
+        directions: directions from the camera to the splats, of any length.
+        coefficients: that of Y(l, m) at index l² + l + m, in one tensor or concatenated from several.
 
     Raises:
-        ValueError: if there are fewer coefficients than the degree needs.
+        ValueError: If there are fewer coefficients than the degree needs.
     """
     n_harmonics = (degree + 1) ** 2
     if (n_given := sum(part.shape[1] for part in coefficients)) < n_harmonics:
         raise ValueError(f"SH degree {degree} needs {n_harmonics} coefficients, not {n_given}.")
-    # All are summed, times 1 or 0: a kernel for each degree would be four to compile.
+    # Sum all, times 1 or 0: one kernel per degree would mean four to compile.
     counts = (torch.arange(n_given, device=directions.device) < n_harmonics).to(directions)[None]
     return run_fused(_sum, directions, list(coefficients), counts)
 
@@ -48,8 +48,8 @@ def _sum(
 def _harmonics(degree: int, directions: Float[Tensor, "N 3"]) -> list[Float[Tensor, "N"]]:
     """Real harmonics of unit directions, Condon-Shortley phase included.
 
-    The recurrences are those of Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013: of the associated Legendre
-    functions without their factor sin(theta)^m, and of sin(theta)^m times the sine and cosine of m phi.
+    Recurrences from Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013: of the associated Legendre functions
+    without their factor sin(theta)^m, and of sin(theta)^m times the sine and cosine of m phi.
     """
     x, y, z = directions.unbind(-1)
     harmonics = [torch.empty(0)] * (degree + 1) ** 2
