@@ -81,11 +81,11 @@ def text(content: str | bytes) -> Callable[[Path], object]:
 
 
 BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "empty": (text(""), "transforms.json is damaged: it is no json"),
-    "cut": (lambda scene: text((scene / "transforms.json").read_bytes()[:200])(scene), "is no json"),
-    "binary": (text(b"\xff\xfe\x00\x01"), "is no json"),
-    "deep": (text("[" * 100_000), "is no json"),
-    "a list": (text("[]"), "it holds list where an object is wanted"),
+    "empty": (text(""), "transforms.json is damaged: it is not json"),
+    "cut": (lambda scene: text((scene / "transforms.json").read_bytes()[:200])(scene), "is not json"),
+    "binary": (text(b"\xff\xfe\x00\x01"), "is not json"),
+    "deep": (text("[" * 100_000), "is not json"),
+    "a list": (text("[]"), "it holds list where an object is expected"),
     "no frames": (lambda scene: remove(scene, "frames"), "has no list of frames"),
     "frames of words": (lambda scene: change(scene, None, frames=["a"]), "frame 1: there is no file_path"),
     "no photographs": (lambda scene: change(scene, None, frames=[]), "holds no photographs"),
@@ -94,22 +94,22 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a negative focal length": (lambda scene: change(scene, None, fl_y=-300.0), "must be positive"),
     "a focal length of nan": (lambda scene: change(scene, None, fl_x=float("nan")), "'nan' as its fl_x"),
     "a focal length of words": (lambda scene: change(scene, None, fl_x="wide"), "'wide' as its fl_x"),
-    "a list as focal length": (lambda scene: change(scene, None, fl_x=[1]), "as its fl_x, which is no number"),
-    "an endless focal length": (lambda scene: change(scene, None, fl_x=10**400), "as its fl_x, which is no number"),
+    "a list as focal length": (lambda scene: change(scene, None, fl_x=[1]), "fl_x, which is not a finite number"),
+    "an endless focal length": (lambda scene: change(scene, None, fl_x=10**400), "fl_x, which is not a finite number"),
     "an infinite centre": (lambda scene: change(scene, None, cx=float("inf")), "'inf' as its cx"),
-    "no width": (lambda scene: change(scene, None, w=0), "is of 0x32 pixels"),
-    "half a pixel": (lambda scene: change(scene, None, h=31.5), "is of 48x31.5 pixels"),
-    "a huge picture": (lambda scene: change(scene, None, w=64_000, h=48_000), "is of 64000x48000 pixels, more than"),
+    "no width": (lambda scene: change(scene, None, w=0), "has 0x32 pixels"),
+    "half a pixel": (lambda scene: change(scene, None, h=31.5), "has 48x31.5 pixels"),
+    "a huge picture": (lambda scene: change(scene, None, w=64_000, h=48_000), "has 64000x48000 pixels, more than"),
     "an unknown model": (lambda scene: change(scene, None, camera_model="SPHERE"), "is SPHERE, but only perspective"),
     "a model of numbers": (lambda scene: change(scene, None, camera_model=4), "is 4, but only perspective"),
     "distortion of words": (lambda scene: change(scene, None, k1="strong"), "'strong' as its k1"),
     "five coefficients": (lambda scene: change(scene, None, distortion_params=[0] * 5), "distortion_params are k1"),
     "a pose of nan": (lambda scene: pose(scene, 3, lambda m: m.fill(np.nan)), "frame_00004.png has NaN"),
-    "a pose that mirrors": (lambda scene: pose(scene, 3, lambda m: np.negative(m[:3, 0], m[:3, 0])), "no rotation"),
+    "a pose that mirrors": (lambda scene: pose(scene, 3, lambda m: np.negative(m[:3, 0], m[:3, 0])), "not a rotation"),
     "a pose that scales": (lambda scene: pose(scene, 3, lambda m: np.multiply(m[:3, :3], 2, m[:3, :3])), "it scales"),
-    "a pose of zeros": (lambda scene: pose(scene, 3, lambda m: m.fill(0)), "frame_00004.png has a pose that is no"),
-    "half a pose": (lambda scene: change(scene, 3, transform_matrix=[[1, 0, 0, 0]]), "no matrix of 4x4 numbers"),
-    "a pose of words": (lambda scene: change(scene, 3, transform_matrix="here"), "no matrix of 4x4 numbers"),
+    "a pose of zeros": (lambda scene: pose(scene, 3, lambda m: m.fill(0)), "frame_00004.png has a pose that is not"),
+    "half a pose": (lambda scene: change(scene, 3, transform_matrix=[[1, 0, 0, 0]]), "not a 4x4 matrix of numbers"),
+    "a pose of words": (lambda scene: change(scene, 3, transform_matrix="here"), "not a 4x4 matrix of numbers"),
     "one photograph twice": (
         lambda scene: change(scene, 3, file_path="images/frame_00005.png"),
         "two cameras for the photograph images/frame_00005.png",
@@ -122,8 +122,8 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no photograph": (lambda scene: change(scene, 3, file_path="images/x.png"), "1 of 10 images"),
     "a mask out of the scene": (lambda scene: change(scene, 3, mask_path="../m.png"), "is not inside the scene"),
     "no mask": (lambda scene: change(scene, 3, mask_path="m.png"), "1 masks of"),
-    "a transform of words": (lambda scene: change(scene, None, applied_transform="up"), "its applied_transform is no"),
-    "a list of numbers": (lambda scene: change(scene, None, train_filenames=[1]), "something else than names"),
+    "a transform of words": (lambda scene: change(scene, None, applied_transform="up"), "its applied_transform is not"),
+    "a list of numbers": (lambda scene: change(scene, None, train_filenames=[1]), "something other than names"),
     "no orientation": (lambda scene: change(scene, None, orientation_override="left"), "as its orientation_override"),
 }
 
@@ -149,7 +149,7 @@ BAD_CLOUDS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda scene: (scene / "sparse_pc.ply").write_bytes(
             CUT_PLY.replace(b"ascii", b"binary_little_endian").replace(b"vertex 9", b"vertex 4000000000")
         ),
-        "claims 48000000",
+        "claims at least 48000000",
     ),
 }
 
@@ -238,7 +238,7 @@ def test_a_broken_colmap_model_is_refused_in_a_sentence(scene, shellgs, fault):
     [
         ({"eval_interval": 0}, lambda scene: None, "eval_interval must be at least 2, not 0"),
         ({"eval_interval": 1}, lambda scene: None, "eval_interval must be at least 2, not 1"),
-        ({"max_image_size": 0}, lambda scene: None, "at least 1, not 0"),
+        ({"max_image_size": 0}, lambda scene: None, "at least 1 pixel, not 0"),
         ({}, lambda scene: change(scene, None, train_filenames=["images/x.png"]), "lists images/x.png, which has no"),
         ({}, lambda scene: change(scene, None, test_filenames=["images/frame_00001.png"]), "lists no photographs"),
     ],

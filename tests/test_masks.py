@@ -59,7 +59,7 @@ def test_a_photograph_without_a_mask_is_kept_whole(scene):
 
 def test_masks_of_no_photograph_are_refused(scene):
     paint(scene / "masks" / "elsewhere.png", left=12)
-    with pytest.raises(SceneError, match=r"no photograph has a mask in .*masks/frame_00001.png.png; name them so"):
+    with pytest.raises(SceneError, match=r"no photograph has a mask in .*masks/frame_00001.png.png; rename the masks"):
         read_views(FacadeDataParserConfig(data=scene))
     with pytest.raises(FileNotFoundError, match="painted is not a folder of masks"):
         read_views(FacadeDataParserConfig(data=scene, masks_path=Path("painted")))
