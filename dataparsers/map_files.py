@@ -85,7 +85,7 @@ class MapRecord:
         if K.shape != (3, 3) or viewmat.shape != (4, 4) or not np.isfinite([K.sum(), viewmat.sum()]).all():
             raise ValueError("its camera lacks 3x3 intrinsics or a 4x4 pose of finite numbers")
         if not is_number(self.supported) or not (self.mean_depth is None or is_number(self.mean_depth)):
-            raise TypeError("its share of supported pixels or its mean depth is not a number")
+            raise TypeError("its share of supported pixels or its mean depth is not a finite number")
 
     @classmethod
     def of(cls, image: str, cue: CueMap, camera: Camera, sources: dict[str, str]) -> MapRecord:
