@@ -28,7 +28,7 @@ class Camera:
     height: int
 
     def to(self, *args, **kwargs) -> Camera:
-        """The same camera with its tensors on another device or of another dtype, as :meth:`torch.Tensor.to`."""
+        """Move or cast the tensors, as :meth:`torch.Tensor.to`."""
         return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
 
     @property
@@ -37,7 +37,7 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def shrunk(self, max_image_size: int | None) -> Camera:
-        """The camera of the same photograph resized so that its longer side is at most ``max_image_size`` pixels."""
+        """Camera of the photograph resized to at most ``max_image_size`` pixels along its longer side."""
         longest = max(self.width, self.height)
         if max_image_size is None or longest <= max_image_size:
             return self
@@ -46,14 +46,14 @@ class Camera:
         return self.resized(width, height)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The camera of the same photograph resized to so many pixels."""
+        """Camera of the photograph resized to ``width`` x ``height`` pixels."""
         if (width, height) == (self.width, self.height):
             return self
         stretch = self.K.new_tensor([width / self.width, height / self.height, 1.0])
         return Camera(self.viewmat, stretch[:, None] * self.K, width, height)
 
     def thinning(self, max_image_size: int) -> int:
-        """The step from pixel to pixel that leaves at most ``max_image_size`` along the longer side."""
+        """Pixel stride that leaves at most ``max_image_size`` pixels along the longer side."""
         return -(-max(self.width, self.height) // max_image_size)
 
     def rays(self) -> Float[Tensor, "height width 3"]:
@@ -65,21 +65,21 @@ class Camera:
 
 
 def positions(cameras: Iterable[Camera]) -> Float64[np.ndarray, "V 3"]:
-    """Where the cameras stand, in the world."""
+    """Camera centres in the world."""
     return np.array([camera.position.detach().cpu().double().numpy() for camera in cameras]).reshape(-1, 3)
 
 
 def project(
     camera: Camera, points: Float64[np.ndarray, "N 3"]
 ) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, " N"]]:
-    """Pixels and z-depths of points in the camera's world."""
+    """Project points of the world to pixels and z-depths."""
     viewmat, K = (each.detach().cpu().double().numpy() for each in (camera.viewmat, camera.K))
-    seen = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depth = seen[:, 2]
-    return (seen / np.where(np.abs(depth) > 1e-9, depth, 1e-9)[:, None] @ K.T)[:, :2], depth
+    in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = in_camera[:, 2]
+    return (in_camera / np.where(np.abs(depth) > 1e-9, depth, 1e-9)[:, None] @ K.T)[:, :2], depth
 
 
 def upwards(cameras: Iterable[Camera]) -> Float64[np.ndarray, " 3"]:
-    """Unit vector up in the world, as the cameras are held; tilted where they look up or down."""
+    """Mean up direction of the cameras in the world, a unit vector; tilted where they look up or down."""
     up = -np.mean([camera.viewmat[1, :3].detach().cpu().double().numpy() for camera in cameras], axis=0)
     return up / np.linalg.norm(up)

@@ -1,4 +1,4 @@
-"""A COLMAP model on disk, binary or text: cameras, images, points. Nothing that a damaged file claims is believed."""
+"""Read COLMAP models, binary or text: cameras, images and points. What a file claims is checked against its size."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from dataparsers.errors import SceneError
 from dataparsers.shots import UNDISTORT, Recording, Shot, in_order, shot
 
 FOLDERS = ("colmap/sparse/0", "sparse/0", "colmap/sparse", "sparse")
-# From COLMAP's axes, whose -y is up, to nerfstudio's.
+# From COLMAP's axes (-y is up) to nerfstudio's.
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-_MODELS = (  # by COLMAP's numbers: names, and how many parameters they have
+_MODELS = (  # name and number of parameters, by COLMAP's model id
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -38,7 +38,7 @@ T = TypeVar("T")
 
 
 class _Camera(NamedTuple):
-    """A camera as nerfstudio's ``parse_colmap_camera_params`` takes it."""
+    """Camera as expected by nerfstudio's ``parse_colmap_camera_params``."""
 
     model: str
     width: int
@@ -60,7 +60,7 @@ class Points:
     Attributes:
         positions: in the model's frame.
         colours: RGB.
-        observers: the numbers of the images that observe each point.
+        observers: ids of the images that observe each point.
     """
 
     positions: Float64[np.ndarray, "N 3"]
@@ -69,11 +69,11 @@ class Points:
 
 
 def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
-    """The photographs of the model in ``scene/folder``, which lie in ``scene/images_path``.
+    """Read the cameras of the model in ``scene/folder`` and their photographs in ``scene/images_path``.
 
     Raises:
         FileNotFoundError: a file of the model is missing.
-        SceneError: a file is damaged, or a camera is none.
+        SceneError: a file is damaged, or a camera is invalid.
     """
     cameras = _read(scene / folder, "cameras", _binary_cameras, _text_cameras)
     shots = [_shot(scene, images_path, image, cameras, folder) for image in _images(scene / folder).values()]
@@ -81,7 +81,7 @@ def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
 
 
 def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, Mapping[int, str]]:
-    """The points of a model, and the names of its photographs by their numbers; no points where it has no such file.
+    """Read the points of a model (none without a file of points) and the names of its photographs by id.
 
     Raises:
         SceneError: a file is damaged.
@@ -103,7 +103,7 @@ def _shot(scene: Path, images_path: Path, image: _Image, cameras: Mapping[int, _
         raise SceneError(f"{where}: the camera {image.camera} of {image.name} is not among its cameras")
     try:
         lens = parse_colmap_camera_params(camera)
-    except NotImplementedError as error:  # its words name the model
+    except NotImplementedError as error:  # which names the model
         raise SceneError(f"nerfstudio cannot read the cameras of {scene}: {error}; {UNDISTORT}") from error
     quaternion = np.array(image.quaternion)
     if not np.isfinite(quaternion).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
@@ -117,7 +117,7 @@ def _shot(scene: Path, images_path: Path, image: _Image, cameras: Mapping[int, _
 
 
 def _listed(scene: Path, images_path: Path) -> dict[str, set[str]]:
-    """The splits that ``train_list.txt`` and so on name, as nerfstudio has them."""
+    """Splits listed in ``train_list.txt`` etc., as in nerfstudio."""
     files = {"train": "train_list.txt", "test": "test_list.txt", "val": "validation_list.txt"}
     return {
         split: {(images_path / line).as_posix() for line in (scene / file).read_text("utf-8").splitlines() if line}
@@ -129,11 +129,11 @@ def _listed(scene: Path, images_path: Path) -> dict[str, set[str]]:
 def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable[[Iterator[list[str]]], T]) -> T:
     path = next((path for path in (folder / f"{name}.bin", folder / f"{name}.txt") if path.is_file()), None)
     if path is None:
-        raise FileNotFoundError(f"{folder} is no COLMAP model: {name}.bin and {name}.txt are missing")
+        raise FileNotFoundError(f"{folder} is not a COLMAP model: {name}.bin and {name}.txt are missing")
     try:
         if path.suffix == ".bin":
             return binary(_Bytes(path.read_bytes()))
-        # Lines keep their places where they are empty: an image's second one may be.
+        # Empty lines are kept: an image's second line may be empty.
         lines = (line.split() for line in path.read_text("utf-8").splitlines() if not line.lstrip().startswith("#"))
         return text(lines)
     except (ValueError, IndexError, OverflowError, struct.error, StopIteration) as error:
@@ -143,7 +143,7 @@ def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable
 
 
 class _Bytes:
-    """Bytes that are read from the front; what is not there is a ValueError, whatever a file claims."""
+    """Read binary data from the front; reading past the end raises, whatever counts a file claims."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
@@ -165,7 +165,7 @@ class _Bytes:
         return array
 
     def records(self) -> range:
-        """Of a file that begins with their number, each of which takes 8 bytes at least."""
+        """Indices of the records of a file that begins with their number; each record takes at least 8 bytes."""
         (count,) = self.take("<Q")
         if 8 * count > len(self.data):
             raise ValueError(f"it claims {count} entries in {len(self.data)} bytes")
@@ -199,7 +199,7 @@ def _binary_images(file: _Bytes) -> dict[int, _Image]:
         number, *pose, camera = file.take("<i7di")
         name = file.text()
         (count,) = file.take("<Q")
-        file.array("V24", count)  # the features: x, y and the point
+        file.array("V24", count)  # keypoints: x, y and point id
         images[number] = _Image(tuple(pose[:4]), tuple(pose[4:]), camera, name)
     return images
 
@@ -210,8 +210,8 @@ def _text_images(lines: Iterator[list[str]]) -> dict[int, _Image]:
         pose = tuple(map(float, words[1:8]))
         images[int(words[0])] = _Image(pose[:4], pose[4:], int(words[8]), " ".join(words[9:]))
         if len(pose) != 7 or len(words) < 10:
-            raise ValueError(f"a line of images is NUMBER, 7 of the pose, CAMERA, NAME, not {' '.join(words)[:40]!r}")
-        next(lines, None)  # its features
+            raise ValueError(f"a line of images is ID, 7 pose values, CAMERA, NAME, not {' '.join(words)[:40]!r}")
+        next(lines, None)  # its keypoints
     return images
 
 
@@ -231,7 +231,7 @@ def _text_points(lines: Iterator[list[str]]) -> Points:
         position = [float(word) for word in words[1:4]]
         colour = [int(word) for word in words[4:7]]
         if len(position) != 3 or len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
-            raise ValueError(f"a line of points is NUMBER X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
+            raise ValueError(f"a line of points is ID X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
         positions.append(position)
         colours.append(colour)
         observers.append(np.array(words[8::2], dtype=np.int64))

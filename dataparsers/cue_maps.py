@@ -1,8 +1,8 @@
 """Per-view cue maps on disk: one npz for each photograph, bound to the camera it was made for.
 
 ``scene/cues/<kind>/<image name>.npz`` holds a view's depth, normal and mask, and a record (json) of the camera they
-belong to; ``scene/cues/<kind>/manifest.json`` holds what is true of the whole set. The record travels inside the map:
-writing a view touches one file, and an interrupted set is a smaller set, never a broken one.
+belong to; ``scene/cues/<kind>/manifest.json`` describes the whole set. The record is stored inside the map: writing a
+view touches one file, and an interrupted run leaves a smaller set, never a broken one.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from dataparsers.map_files import (
     UNREADABLE,
     CueMap,
     MapRecord,
-    are_words,
     damage,
     difference,
     is_number,
+    is_string_dict,
     read_arrays,
     read_record,
     resampled,
@@ -43,16 +43,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Manifest:
-    """What is true of a whole set of maps.
+    """Description of a whole set of maps.
 
     Attributes:
         command: the command that makes the set, with ``{scene}`` for the scene's folder.
-        sources: sha256 of each file or folder the maps were made from, by its path relative to the scene; what is
-            neither (a network's weights) is here by its name and revision.
+        sources: sha256 of each file or folder the maps were made from, by its path relative to the scene; revision of
+            anything else (a network's weights), by its name.
         metres_per_unit: metres in one scene unit, None where unknown.
         max_image_size: longer side the photographs are resized to for these maps, None for full size.
-        licence: of the network's weights, for maps that a network made.
-        error: metres that the surface may be off as a whole, None where unknown.
+        licence: licence of the network's weights, for maps that a network made.
+        error: possible offset of the whole surface in metres, None where unknown.
     """
 
     command: str
@@ -65,9 +65,9 @@ class Manifest:
     format: int = FORMAT
 
     def __post_init__(self) -> None:
-        """Refuse what no set of maps has: json may hold anything."""
-        if not isinstance(self.command, str) or not are_words(self.sources):
-            raise TypeError("its command or its sources are no words")
+        """Refuse invalid values: json may hold anything."""
+        if not isinstance(self.command, str) or not is_string_dict(self.sources):
+            raise TypeError("its command or its sources are not strings")
         for source in self.sources:
             if ".." in PurePosixPath(source).parts:
                 raise ValueError(f"its source {source!r} is not inside the scene")
@@ -102,9 +102,9 @@ class CueMaps:
         licence: str | None = None,
         error: float | None = None,
     ) -> CueMaps:
-        """Write the manifest of a set made from the files and folders ``sources`` and from what ``revisions`` names.
+        """Write the manifest of a set made from files and folders (``sources``) and from named ``revisions``.
 
-        Maps already there stay, and count while they match it.
+        Existing maps stay, and are used as long as they match it.
         """
         hashes = {relative_path(path, scene): source_hash(path) for path in sources} | dict(revisions or {})
         maps = cls(scene, kind, Manifest(command, hashes, metres_per_unit, max_image_size, licence, error))
@@ -113,7 +113,7 @@ class CueMaps:
 
     @classmethod
     def open(cls, scene: Path, kind: str) -> CueMaps:
-        """The set that a scene holds.
+        """Open a set of a scene.
 
         Raises:
             FileNotFoundError: the scene has no such maps.
@@ -131,7 +131,7 @@ class CueMaps:
         return cls(scene, kind, manifest)
 
     def with_error(self, error: float | None) -> CueMaps:
-        """The same set where it has become known how far the surface may be off; the maps stay as they are."""
+        """Record how far the surface may be off; the maps stay unchanged."""
         maps = replace(self, manifest=replace(self.manifest, error=error))
         maps._write_manifest()
         return maps
@@ -144,26 +144,26 @@ class CueMaps:
 
     @property
     def folder(self) -> Path:
-        """Where the maps lie."""
+        """Folder of the maps."""
         return self.scene / "cues" / self.kind
 
     @property
     def names(self) -> list[str]:
-        """The images that have a map, sorted."""
+        """Names of the images that have a map, sorted."""
         return sorted(self._files)
 
     def record(self, name: str) -> MapRecord | None:
-        """What the view's map was made for, without decoding it; None when the view has no map."""
+        """Record of a view's map, read without decoding the map; None when the view has none."""
         path = self._path_of(name)
         return None if path is None else self._attempt(read_record, path, name)
 
     def read(self, name: str, camera: Camera, *, any_size: bool = False) -> CueMap | None:
-        """The map of a view, or None when it has none.
+        """Read the map of a view; None when it has none.
 
         Args:
             name: the image's path relative to the scene, with forward slashes.
             camera: the camera the map is to be used with.
-            any_size: take a map of the same camera at another size, and resample it.
+            any_size: whether to accept and resample a map of the same camera at another size.
 
         Raises:
             SceneError: the file is damaged, or its map belongs to another camera, shell or alignment.
@@ -177,10 +177,10 @@ class CueMaps:
         return cue if (own.width, own.height) == (camera.width, camera.height) else resampled(cue, camera)
 
     def check(self, name: str, camera: Camera, *, any_size: bool = False) -> Camera | None:
-        """The camera that a view's map was made for, or None when it has no map, without decoding it.
+        """Camera of a view's map, read without decoding the map; None when the view has none.
 
         Raises:
-            SceneError: as :meth:`read`, of what the map's record tells.
+            SceneError: as :meth:`read`, as far as the map's record shows.
         """
         path = self._path_of(name)
         if path is None:
@@ -196,7 +196,7 @@ class CueMaps:
         return own
 
     def current(self, name: str, camera: Camera) -> bool:
-        """Whether the view has a sound map for this camera and this manifest, so that it need not be made again."""
+        """Whether the view has a valid map for this camera and manifest, which need not be made again."""
         try:
             return self.read(name, camera) is not None
         except SceneError:
@@ -213,7 +213,7 @@ class CueMaps:
             claims.append(path)
 
     def remove(self, name: str) -> None:
-        """Leave a view without a map, so that it is not refused as one of an earlier set."""
+        """Delete the map of a view, which would be refused as one of an earlier set."""
         for path in self._files.pop(name, []):
             path.unlink(missing_ok=True)
 
@@ -229,14 +229,14 @@ class CueMaps:
         strays = [str(claim) for claim in claims if claim != path]
         if strays:
             raise SceneError(
-                f"view {name!r} has two {self.kind} maps: {', '.join(strays)} claims to be its map, but {path} is its "
-                f"place; delete the wrong one, then run `{self.command}`"
+                f"view {name!r} has two {self.kind} maps: {', '.join(strays)} claims to be its map, which belongs "
+                f"at {path}; delete the wrong one, then run `{self.command}`"
             )
         return path if claims else None
 
     @cached_property
     def _files(self) -> dict[str, list[Path]]:
-        """Every map file by the view it says it belongs to, an unreadable one by the view its own name stands for."""
+        """Map files by the view that their record names; an unreadable one by the view of its file name."""
         files: dict[str, list[Path]] = {}
         for path in sorted(self.folder.rglob("*.npz")):
             try:
@@ -248,10 +248,10 @@ class CueMaps:
 
     @cached_property
     def _stale(self) -> str | None:
-        """Which source has changed since the maps were made; a source that is gone tells nothing."""
+        """The first source that has changed since the maps were made, in words; missing sources are ignored."""
         for source, sha256 in self.manifest.sources.items():
             path = self.scene / source
-            # What lies elsewhere is a shell's file: nothing else is opened because a manifest says so.
+            # Outside the scene only a file (a shell) is opened: a manifest may name anything.
             known = path.is_file() or (path.is_dir() and not Path(source).is_absolute())
             if known and sha256 not in (source_hash(path), content_hash(path)):
                 return f"{source} has changed since"
@@ -269,7 +269,7 @@ class CueMaps:
             raise self._refusal(name, f"the file is damaged ({error})") from error
 
     def _refusal(self, name: str, problem: str, max_image_size: int | None = None) -> SceneError:
-        """The refusal of a map, with the command that makes it again, at another size where that is the problem."""
+        """Refusal of a map, with the command that makes it again, at another size where that is the problem."""
         command = self.command
         if max_image_size is not None:
             program, _, rest = re.sub(r" --max-image-size \d+", "", self.manifest.command).partition("{scene}")
@@ -281,17 +281,16 @@ class CueMaps:
 
 
 def find_cues(scene: Path) -> list[str]:
-    """The kinds of cue maps that a scene holds."""
+    """Kinds of cue maps that a scene holds."""
     return sorted(manifest.parent.name for manifest in scene.glob("cues/*/manifest.json"))
 
 
 PLACING = {"shell_to_scene": None, "shell": None, "metres_per_shell_unit": 1.0, "mesher": "planes"}
-"""What of an alignment's json decides where a map lies, and what it is where it is missing: a verdict that is added
-makes no map stale."""
+"""Fields of an alignment's json that place the shell, and their defaults: a verdict added later makes no map stale."""
 
 
 def source_hash(path: Path) -> str:
-    """The :func:`content_hash` of a file or folder, or of an alignment's json a hash of what places the shell."""
+    """:func:`content_hash` of a file or folder; for an alignment's json, hash of the fields that place the shell."""
     if path.suffix == ".json":
         with suppress(SceneError):
             fields = read_json(path)
@@ -301,7 +300,7 @@ def source_hash(path: Path) -> str:
 
 
 def relative_path(path: Path, scene: Path) -> str:
-    """The path relative to the scene where it lies in it, so that a scene can be moved; else absolute."""
+    """Path relative to the scene if it lies inside, so that a scene can be moved; else absolute."""
     path, scene = path.resolve(), scene.resolve()
     return path.relative_to(scene).as_posix() if path.is_relative_to(scene) else str(path)
 

@@ -1,4 +1,4 @@
-"""What goes wrong because of the input, told to the user in one sentence."""
+"""Errors in the input, reported to the user in one sentence."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _DISK = {
 
 
 def explained(error: OSError) -> str:
-    """A sentence of what went wrong with a file."""
+    """Describe a file error in one sentence."""
     name = error.filename or "a file"
     if why := _DISK.get(error.errno or 0):
-        return f"{name} cannot be written, {why}: make room and give the same command again; what was there is kept"
+        return f"{name} cannot be written, {why}: make room and run the same command again; existing files are kept"
     return f"{name} cannot be used: {(error.strerror or str(error)).lower()}"
 
 
 def check_output(path: Path) -> None:
-    """Refuse a place that no file can be written to, before the work that makes it.
+    """Refuse an output path that cannot be written, before the work starts.
 
     Raises:
         SceneError: it is a folder, or lies below a file.
     """
     if path.is_dir():
-        raise SceneError(f"{path} is a folder: name the file that is to be written")
+        raise SceneError(f"{path} is a folder: name a file to write")
     above = next(parent for parent in path.absolute().parents if parent.exists())
     if not above.is_dir():
         raise SceneError(f"{path} cannot be written: {above} is a file, not a folder")
@@ -43,7 +43,7 @@ def check_output(path: Path) -> None:
 
 @contextmanager
 def refusals_end_the_program() -> Iterator[None]:
-    """Turn a refusal into its sentence on stderr and exit status 1; a bug keeps its traceback."""
+    """Turn a refusal into one sentence on stderr and exit status 1; a bug keeps its traceback."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""A scene as nerfstudio sees it: COLMAP or transforms.json cameras, undistorted, with the cue maps of each view."""
+"""Nerfstudio dataparser of a facade: undistorted COLMAP or transforms.json cameras, and the cue maps of each view."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dataparsers.shots import Recording, Shot
 from dataparsers.sparse_points import find_sparse_points
 
 ROUNDING = 1e-6
-"""Share of the cameras' spread up to which rounding to float32 does no harm."""
+"""Harmless rounding of positions to float32, as a share of the cameras' spread."""
 
 
 @dataclass
@@ -34,26 +34,26 @@ class FacadeDataParserConfig(SceneLayout, DataParserConfig):
 
     _target: type = field(default_factory=lambda: FacadeDataParser)
     max_image_size: Optional[int] = None
-    """Longer side of the images in pixels. If not set: the size that the cue maps were made at, the shell's
-    first, else full size."""
+    """Longer side of the images in pixels. If not set: that of the shell's cue maps, else of the monocular ones, else
+    full size."""
     eval_interval: int = 8
     """Every n-th image by sorted name is held out for evaluation, starting with the first."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "up"
-    """How the scene is turned for the viewer."""
+    """How to orient the scene for the viewer."""
     center_method: Literal["poses", "focus", "none"] = "poses"
-    """How the scene is centred for the viewer. Coordinates too large for float32 are centred in any case."""
+    """How to centre the scene for the viewer. Coordinates too large for float32 are always centred."""
 
 
 class FacadeDataParser(DataParser):
-    """Reads a scene and attaches the cue maps.
+    """Read a scene and attach the cue maps.
 
-    Nerfstudio's own parsers round coordinates to float32 before they centre them, which costs decimetres where a scene
-    is georeferenced; here they are centred first, and ``dataparser_transform`` is in double precision.
+    Nerfstudio's own parsers round coordinates to float32 before they centre them, which costs decimetres in a
+    georeferenced scene; here they are centred first, and ``dataparser_transform`` is in double precision.
 
     The outputs' cameras are pinhole cameras. Their metadata holds, in the order of the images, ``views`` (their
     :class:`~dataparsers.photograph.View`), and for the whole scene ``cues`` (the :class:`CueMaps` found, by kind),
-    ``metres_per_unit`` (of nerfstudio's rescaled world) and ``shell_error`` (metres that the shell may be off as a
-    whole), both None where no shell alignment tells.
+    ``metres_per_unit`` (of nerfstudio's rescaled world) and ``shell_error`` (possible offset of the whole shell in
+    metres), both None without a shell alignment.
     """
 
     config: FacadeDataParserConfig
@@ -77,7 +77,7 @@ class FacadeDataParser(DataParser):
             image_filenames=[view.image for view in views],
             cameras=_pinhole_cameras(poses[chosen], views),
             scene_box=SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]])),
-            mask_filenames=masks if len(masks) == len(views) else None,  # nerfstudio knows all or none
+            mask_filenames=masks if len(masks) == len(views) else None,  # nerfstudio takes masks for all or none
             dataparser_scale=scale,
             dataparser_transform=torch.from_numpy(transform[:3]),
             metadata={
@@ -122,7 +122,7 @@ def _views(shots: Sequence[Shot], layout: SceneLayout) -> list[View]:
 
 
 def _lens(shot: Shot) -> Cameras:
-    """The calibrated camera as nerfstudio undistorts it."""
+    """The calibrated camera, for nerfstudio's undistortion."""
     K = shot.camera.K.float()
     return Cameras(
         camera_to_worlds=torch.eye(4)[None, :3],
@@ -140,7 +140,7 @@ def _lens(shot: Shot) -> Cameras:
 def _rescaled(
     recording: Recording, config: FacadeDataParserConfig
 ) -> tuple[torch.Tensor, Float64[np.ndarray, "4 4"], float]:
-    """Poses in nerfstudio's world (OpenGL, float32), and what carries the scene there: a rigid motion, then a scale."""
+    """Poses in nerfstudio's world (OpenGL, float32), and the rigid motion and then scale from the scene to it."""
     poses = np.stack([np.linalg.inv(shot.camera.viewmat.numpy()) for shot in recording.shots])
     poses = recording.applied @ poses @ np.diag([1.0, -1.0, -1.0, 1.0])
     to_origin = np.eye(4)
@@ -161,32 +161,30 @@ def _rescaled(
 
 def _image_size(config: FacadeDataParserConfig, of_maps: int | None) -> int | None:
     if config.max_image_size is not None and config.max_image_size < 1:
-        raise SceneError(f"max_image_size is a number of pixels, at least 1, not {config.max_image_size}")
+        raise SceneError(f"max_image_size must be at least 1 pixel, not {config.max_image_size}")
     return config.max_image_size or of_maps
 
 
 def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) -> list[int]:
-    """The indices of the photographs of a split."""
+    """Indices of the photographs of a split."""
     names = [shot.name for shot in recording.shots]
     if recording.listed:
         listed = recording.listed.get(split, recording.listed.get("test" if split == "val" else "val", set()))
-        strangers = sorted(listed - set(names))
-        if strangers or not listed:
-            what = f"lists {strangers[0]}, which has no camera" if strangers else "lists no photographs"
-            raise SceneError(f"the {split} split of {config.data} {what}: mend the list, or remove all lists")
+        unknown = sorted(listed - set(names))
+        if unknown or not listed:
+            what = f"lists {unknown[0]}, which has no camera" if unknown else "lists no photographs"
+            raise SceneError(f"the {split} split of {config.data} {what}: correct the list, or remove all lists")
         return [k for k, name in enumerate(names) if name in listed]
     interval = config.eval_interval
     if interval < 2:
         raise SceneError(f"eval_interval must be at least 2, not {interval}: 8 holds out every 8th photograph")
     if len(names) < 2:
-        raise SceneError(
-            f"{config.data} has one photograph: one is held out, and at least one more is to be trained on"
-        )
+        raise SceneError(f"{config.data} has one photograph: one is held out, and training needs at least one more")
     return [k for k in range(len(names)) if (k % interval == 0) != (split == "train")]
 
 
 def _pinhole_cameras(poses: torch.Tensor, views: Sequence[View]) -> Cameras:
-    """The poses with the intrinsics and image sizes of the views."""
+    """Cameras with the given poses, and the intrinsics and image sizes of the views."""
     Ks = torch.stack([view.camera.K for view in views]).float()
     return Cameras(
         camera_to_worlds=poses,

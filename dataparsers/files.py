@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and keys of what things were made from."""
+"""Atomic file writes, and hashes of the inputs that outputs were made from."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _UNFINISHED = re.compile(r"\.(.+)\.(\d{1,9})\.tmp(\.\w+)?")
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[IO[bytes]]:
-    """A file opened for writing that takes the name ``path`` only once it is complete."""
+    """Open a file for writing that is renamed to ``path`` once it is complete."""
     temporary = unfinished(path)
     try:
         with temporary.open("wb") as file:
             yield file
         os.replace(temporary, path)
-    except OSError as error:  # a full disk does not say which file it was
+    except OSError as error:  # the error of a full disk names no file
         error.filename = error.filename or str(path)
         raise
     finally:
@@ -36,11 +36,11 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
 
 
 def unfinished(path: Path, suffix: str = "") -> Path:
-    """Where a file or folder is made before it takes its name; what killed processes left of it there is deleted.
+    """Temporary path of a file or folder until it is complete; leftovers of killed processes are deleted.
 
     Args:
-        path: the name that it takes.
-        suffix: for a library that tells formats by it.
+        path: final path.
+        suffix: file suffix, for a library that infers the format from it.
     """
     for left in _left_in(path.parent):
         if _name_of(left) == path.name:
@@ -49,7 +49,7 @@ def unfinished(path: Path, suffix: str = "") -> Path:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what killed processes left :func:`unfinished` in a folder and below it."""
+    """Delete what killed processes left :func:`unfinished` in a folder and below."""
     for path in folder.rglob(".*.tmp*"):
         if _name_of(path):
             _delete(path)
@@ -57,12 +57,12 @@ def remove_leftovers(folder: Path) -> None:
 
 @cache
 def _left_in(folder: Path) -> list[Path]:
-    """What killed processes had left in a folder when this one first wrote to it."""
+    """Leftovers of killed processes in a folder, when this process first wrote to it."""
     return [path for path in folder.glob(".*.tmp*") if _name_of(path)]
 
 
 def _name_of(left: Path) -> str | None:
-    """The name that a file or folder was to take which a process left unfinished that is no more."""
+    """Final name of a file or folder that an ended process left unfinished; else None."""
     match = _UNFINISHED.fullmatch(left.name)
     return match[1] if match and not psutil.pid_exists(int(match[2])) else None
 
@@ -75,7 +75,7 @@ def _delete(path: Path) -> None:
 
 
 def content_hash(path: Path) -> str:
-    """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden ones do not count."""
+    """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden files are ignored."""
     digest = hashlib.sha256()
     if path.is_dir():
         for file in sorted(file for file in path.rglob("[!.]*") if file.is_file()):
@@ -88,12 +88,12 @@ def content_hash(path: Path) -> str:
 
 
 def fingerprint(*parts: object) -> str:
-    """A key that changes with any of the parts, which are such as JSON can hold."""
+    """Hash of the parts, which are values that JSON can hold."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What a json file holds, which must be an object.
+    """Read a json file that holds an object.
 
     Raises:
         SceneError: it is damaged or holds something else.
@@ -101,7 +101,7 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         contents = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
-        raise SceneError(f"{path} is damaged: it is no json ({error})") from error
+        raise SceneError(f"{path} is damaged: it is not json ({error})") from error
     if not isinstance(contents, dict):
-        raise SceneError(f"{path} is damaged: it holds {type(contents).__name__} where an object is wanted")
+        raise SceneError(f"{path} is damaged: it holds {type(contents).__name__} where an object is expected")
     return contents

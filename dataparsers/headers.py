@@ -1,4 +1,4 @@
-"""What headers of PLY and LAS files claim, against the files' size: readers believe them, whatever memory it takes."""
+"""Check PLY and LAS headers against the file size: readers allocate whatever a header claims."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LONGEST_HEADER = 1 << 16
 
 
 def check_ply(path: Path) -> None:
-    """Make sure that a PLY file is as long as its header claims.
+    """Check that a PLY file is as long as its header claims.
 
     Raises:
         ValueError: it is cut off, or its header is damaged.
@@ -27,7 +27,7 @@ def check_ply(path: Path) -> None:
         raise ValueError("it does not begin with the header of a PLY")
     length = len(header) + len(found) + (2 if rest.startswith(b"\r\n") else 1)
     words = [line.split() for line in header.decode("latin-1").splitlines()]
-    elements: list[tuple[str, int, int]] = []  # name, number of them, and the least bytes that one takes
+    elements: list[tuple[str, int, int]] = []  # name, count, and least bytes of one
     for line in words:
         if line[:1] == ["element"]:
             elements.append((line[1], int(line[2]), 0))
@@ -35,11 +35,11 @@ def check_ply(path: Path) -> None:
             name, count, size = elements[-1]
             elements[-1] = name, count, size + _BYTES[line[2] if line[1] == "list" else line[1]]
     if any(count < 0 for _, count, _ in elements):
-        raise ValueError("its header counts less than nothing")
+        raise ValueError("its header has a negative count")
     if ["format", "ascii", "1.0"] in words:
         _check_lines(path, length, elements)
     elif (claimed := length + sum(count * size for _, count, size in elements)) > path.stat().st_size:
-        raise ValueError(f"its header claims {claimed} bytes at least, of which {path.stat().st_size} are there")
+        raise ValueError(f"its header claims at least {claimed} bytes, but it has {path.stat().st_size}")
 
 
 def _check_lines(path: Path, length: int, elements: list[tuple[str, int, int]]) -> None:
@@ -52,12 +52,12 @@ def _check_lines(path: Path, length: int, elements: list[tuple[str, int, int]]) 
         there -= count
 
 
-_LAS_RECORD, _LAS_EXTENDED_RECORD = 54, 60  # least bytes of what describes a LAS file beside its points
-_MOST_POINTS_PER_BYTE = 50  # that LAZ may be compressed to; scans have less than one
+_LAS_RECORD, _LAS_EXTENDED_RECORD = 54, 60  # least bytes of a record of a LAS file besides its points
+_MOST_POINTS_PER_BYTE = 50  # of LAZ; scans have less than one
 
 
 def check_las(path: Path) -> None:
-    """Make sure that a LAS or LAZ file is as long as its header claims (LAS 1.4 specification, table 3).
+    """Check that a LAS or LAZ file is as long as its header claims (LAS 1.4 specification, table 3).
 
     Raises:
         ValueError: it is cut off, or its header is damaged.
@@ -77,7 +77,7 @@ def check_las(path: Path) -> None:
     if length + _LAS_RECORD * records > start:
         raise ValueError(f"its header claims {records} records in {start - length} bytes")
     if extended and extended_start + _LAS_EXTENDED_RECORD * extended > size:
-        raise ValueError(f"its header claims {extended} records behind its points")
+        raise ValueError(f"its header claims {extended} records after its points")
     most = (size - start) * _MOST_POINTS_PER_BYTE if kind & 0x80 else (size - start) // max(each, 1)
     if points > most:
         raise ValueError(f"its header claims {points} points, for which {size} bytes are too few")

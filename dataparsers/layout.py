@@ -1,4 +1,4 @@
-"""Where the files of a scene lie, as far as that can be chosen."""
+"""Paths of the files in a scene, as far as they can be chosen."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Optional
 
 from dataparsers.errors import SceneError
 
-if TYPE_CHECKING:  # they import nerfstudio, which takes seconds, and the command line has these paths
+if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line needs only the paths
     from dataparsers.shots import Recording, Shot
 
 MASKS = Path("masks")
-"""Where masks are looked for, in the scene."""
+"""Default folder of masks, in the scene."""
 
 
 @dataclass(unsafe_hash=True)
 class ScenePaths:
-    """Where in a scene the photographs, the cameras and the masks are."""
+    """Paths of the photographs, cameras and masks in a scene."""
 
     images_path: Path = Path("images")
     """Folder of the photographs in a COLMAP scene, relative to the scene folder."""
@@ -30,14 +30,14 @@ class ScenePaths:
 
     @property
     def chosen(self) -> dict[str, str]:
-        """What is not as usual, by the words of the command line."""
-        usual = vars(ScenePaths())
-        there = {field.name: getattr(self, field.name) for field in fields(ScenePaths)}
-        return {name.replace("_", "-"): str(path) for name, path in there.items() if path != usual[name]}
+        """Paths that differ from the defaults, by the names of their flags."""
+        defaults = vars(ScenePaths())
+        paths = {field.name: getattr(self, field.name) for field in fields(ScenePaths)}
+        return {name.replace("_", "-"): str(path) for name, path in paths.items() if path != defaults[name]}
 
     @property
     def flags(self) -> str:
-        """What the command line must say for these paths, with a blank before it; empty for the usual ones."""
+        """Command-line flags for these paths, with a leading blank; empty for the defaults."""
         return "".join(f" --{name} {shlex.quote(path)}" for name, path in self.chosen.items())
 
     def of(self, scene: Path) -> SceneLayout:
@@ -53,11 +53,11 @@ class SceneLayout(ScenePaths):
     """Scene folder."""
 
     def read(self) -> Recording:
-        """All photographs of the scene and their cameras.
+        """Read all photographs of the scene and their cameras.
 
         Raises:
             FileNotFoundError: the scene has no cameras.
-            SceneError: they are damaged, or those of no camera.
+            SceneError: the cameras are damaged or invalid.
         """
         from dataparsers import colmap_model, transforms
 
@@ -67,7 +67,7 @@ class SceneLayout(ScenePaths):
         return colmap_model.read_recording(self.data, folder, self.images_path)
 
     def colmap_folder(self) -> Path | None:
-        """Where the COLMAP model lies, relative to the scene folder; None where transforms.json holds the cameras.
+        """Folder of the COLMAP model, relative to the scene; None where transforms.json holds the cameras.
 
         Raises:
             FileNotFoundError: the scene has neither.
@@ -88,34 +88,34 @@ class SceneLayout(ScenePaths):
         )
 
     def masks(self, shots: Sequence[Shot]) -> dict[str, Path]:
-        """The mask of each photograph that has one, by its name: what its frame says, else what the folder holds.
+        """Mask files by the names of their photographs: the one that the frame names, else the one in the folder.
 
         Raises:
             FileNotFoundError: a mask or the folder of masks is missing.
-            SceneError: the folder holds a mask of no photograph.
+            SceneError: the folder has files, but no mask of any photograph.
         """
         folder = self.data / (self.masks_path or MASKS)
         if self.masks_path is not None and not folder.is_dir():
             raise FileNotFoundError(f"{folder} is not a folder of masks.")
         if folder.is_dir():
-            places = {shot.name: list(self._places(folder, shot.name)) for shot in shots}
-            masks = {name: next((p for p in paths if p.is_file()), None) for name, paths in places.items()}
+            candidates = {shot.name: list(self._candidates(folder, shot.name)) for shot in shots}
+            masks = {name: next((p for p in paths if p.is_file()), None) for name, paths in candidates.items()}
             if any(folder.iterdir()) and not any(masks.values()) and not any(shot.mask for shot in shots):
-                first = next(iter(places.values()))[0]
+                first = next(iter(candidates.values()))[0]
                 raise SceneError(
-                    f"no photograph has a mask in {folder}: the first one's would be {first}; name them so, or move "
-                    "the folder away"
+                    f"no photograph has a mask in {folder}: the first one's would be {first}; rename the masks, or "
+                    "move the folder away"
                 )
         else:
             masks = {}
         masks |= {shot.name: shot.mask for shot in shots if shot.mask}
         missing = [str(path) for path in masks.values() if path and not path.is_file()]
         if missing:
-            raise FileNotFoundError(f"{len(missing)} masks of {self.data} are not on disk ({missing[0]}, for one).")
+            raise FileNotFoundError(f"{len(missing)} masks of {self.data} are not on disk ({missing[0]}, for example).")
         return {name: path for name, path in masks.items() if path}
 
-    def _places(self, folder: Path, name: str) -> Iterator[Path]:
-        """Where a photograph's mask may lie: named like it, its suffix kept or not, as nerfstudio has it."""
+    def _candidates(self, folder: Path, name: str) -> Iterator[Path]:
+        """Possible paths of a photograph's mask: its name with or without its suffix, as in nerfstudio."""
         path = Path(name)
         inner = path.relative_to(self.images_path) if path.is_relative_to(self.images_path) else path
         for relative in dict.fromkeys((inner, path)):

@@ -1,4 +1,4 @@
-"""The file of one view's cue map: an npz of depth, normal and mask, and the record of the camera they belong to."""
+"""Read and write a view's cue map: an npz of depth, normal, mask and the record of their camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dataparsers.shots import MAX_PIXELS
 
 FORMAT = 1
 LONGEST_RECORD = 1 << 24
-"""Bytes of a map's record: it names its sources, not more."""
+"""Most bytes of a map's record."""
 
 # A pose that went through nerfstudio's float32 cameras comes back within 1e-6 rad and 1e-6 of the scene's size; a
 # camera that was refined, undistorted or resized differently is off by far more than these. 5e-4 of the image's size
@@ -39,13 +39,12 @@ UNREADABLE = (
     *(OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, OverflowError, MemoryError),
     *(RuntimeError, SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-
-"""What a reader of a damaged map may raise."""
+"""Exceptions that reading a damaged map may raise."""
 
 
 @dataclass(frozen=True)
 class CueMap:
-    """What is known of the surface seen in each pixel of one view; the camera frame is OpenCV's.
+    """Surface visible in each pixel of a view; the camera frame is OpenCV's.
 
     Attributes:
         depth: forward z-depth in scene units, 0 where there is none.
@@ -73,20 +72,20 @@ class MapRecord:
     format: int = FORMAT
 
     def __post_init__(self) -> None:
-        """Refuse what no map has."""
-        if not isinstance(self.image, str) or not are_words(self.sources):
-            raise TypeError("its image or its sources are no words")
+        """Refuse invalid values."""
+        if not isinstance(self.image, str) or not is_string_dict(self.sources):
+            raise TypeError("its image or its sources are not strings")
         if (
             type(self.width) is not int
             or type(self.height) is not int
             or not 0 < self.width * self.height <= MAX_PIXELS
         ):
-            raise ValueError(f"it is of {self.width!r}x{self.height!r} pixels")
+            raise ValueError(f"its size is {self.width!r}x{self.height!r} pixels")
         K, viewmat = (np.array(matrix, dtype=np.float64) for matrix in (self.K, self.viewmat))
         if K.shape != (3, 3) or viewmat.shape != (4, 4) or not np.isfinite([K.sum(), viewmat.sum()]).all():
-            raise ValueError("its camera has no intrinsics of 3x3 or no pose of 4x4 numbers")
+            raise ValueError("its camera lacks 3x3 intrinsics or a 4x4 pose of finite numbers")
         if not is_number(self.supported) or not (self.mean_depth is None or is_number(self.mean_depth)):
-            raise TypeError("its share of supported pixels or its mean depth is no number")
+            raise TypeError("its share of supported pixels or its mean depth is not a finite number")
 
     @classmethod
     def of(cls, image: str, cue: CueMap, camera: Camera, sources: dict[str, str]) -> MapRecord:
@@ -110,10 +109,10 @@ class MapRecord:
 
 
 def resampled(cue: CueMap, camera: Camera) -> CueMap:
-    """A map of the same view at another size.
+    """Resample a map to another size of its camera.
 
-    Inverse depth is interpolated linearly, which is exact on planes, except where it has an edge: there, as for normals
-    and masks, the nearest pixel counts.
+    Inverse depth is interpolated linearly, which is exact on planes, except at edges: there, as for normals and masks,
+    the nearest pixel is taken.
     """
     rows, columns = (
         (np.arange(wanted) + 0.5) * there / wanted - 0.5
@@ -141,7 +140,7 @@ def write_map(path: Path, cue: CueMap, record: MapRecord) -> None:
 
 
 def _write_npz(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
-    """An npz, like :func:`numpy.savez_compressed` at a tenth of the time: zlib makes little of a depth's digits."""
+    """Write an npz in a tenth of :func:`numpy.savez_compressed`'s time: depth, which hardly compresses, is stored."""
     with zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
             data = io.BytesIO()
@@ -159,7 +158,7 @@ def read_record(path: Path) -> MapRecord:
 
 
 def read_arrays(path: Path, camera: Camera) -> CueMap:
-    """The arrays of a map of a camera's size; raises one of :data:`UNREADABLE` where the file holds others."""
+    """The arrays of a map of a camera's size; raises one of :data:`UNREADABLE` where they differ in shape or type."""
     size = camera.height, camera.width
     with zipfile.ZipFile(path) as archive:
         return CueMap(
@@ -172,7 +171,7 @@ def read_arrays(path: Path, camera: Camera) -> CueMap:
 def _read_array(
     archive: zipfile.ZipFile, name: str, shape: tuple[int, ...] = (), dtype: str | None = None
 ) -> np.ndarray:
-    """An array of an npz, of this shape and type (text if not given); what claims to be another is not allocated."""
+    """Array of an npz with the given shape and type (text if not given); any other is refused before allocation."""
     with archive.open(f"{name}.npy") as file:
         version = np.lib.format.read_magic(file)
         read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -187,7 +186,7 @@ def _read_array(
 
 
 def damage(cue: CueMap, camera: Camera) -> str | None:
-    """What is wrong with the arrays of a map, in words."""
+    """What is wrong with the arrays of a map, in words; None if nothing is."""
     size = (camera.height, camera.width)
     for name, shape, dtype in (("depth", size, "float32"), ("normal", (*size, 3), "float16"), ("mask", size, "bool")):
         array = getattr(cue, name)
@@ -201,7 +200,7 @@ def damage(cue: CueMap, camera: Camera) -> str | None:
 
 
 def difference(record: MapRecord, own: Camera, camera: Camera, sources: Mapping[str, str]) -> str | None:
-    """How the camera and sources a map was made for differ from those it is wanted for, in words."""
+    """How the camera and sources of a map differ from those wanted, in words; None if they agree."""
     intrinsics = np.abs(_float64(own.K) - _float64(camera.K)).max()
     if not intrinsics <= INTRINSICS_TOLERANCE * max(camera.width, camera.height):
         return f"its intrinsics differ from the camera's by {intrinsics:.3g} pixels"
@@ -210,7 +209,7 @@ def difference(record: MapRecord, own: Camera, camera: Camera, sources: Mapping[
     chord = np.linalg.norm(made[:3, :3] - wanted[:3, :3]) / np.sqrt(8)
     angle = 2 * np.arcsin(np.minimum(chord, 1.0))
     if not angle <= ROTATION_TOLERANCE:
-        return f"its pose is turned by {np.rad2deg(angle):.3g} degrees against the camera's"
+        return f"its pose is turned by {np.rad2deg(angle):.3g} degrees from the camera's"
     moved = np.linalg.norm(made[:3, :3].T @ made[:3, 3] - wanted[:3, :3].T @ wanted[:3, 3])
     if record.mean_depth is not None and not moved <= POSITION_TOLERANCE * record.mean_depth:
         return f"its camera stood {moved:.3g} scene units away (the view's mean depth is {record.mean_depth:.3g})"
@@ -220,13 +219,13 @@ def difference(record: MapRecord, own: Camera, camera: Camera, sources: Mapping[
     return None
 
 
-def are_words(words: object) -> bool:
-    """Whether json has words by words."""
-    return isinstance(words, dict) and all(isinstance(word, str) for pair in words.items() for word in pair)
+def is_string_dict(value: object) -> bool:
+    """Whether a json value maps strings to strings."""
+    return isinstance(value, dict) and all(isinstance(word, str) for pair in value.items() for word in pair)
 
 
 def is_number(value: object) -> bool:
-    """Whether json has a finite number."""
+    """Whether a json value is a finite number."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -1,4 +1,4 @@
-"""A photograph and its user mask, as its pinhole camera sees them."""
+"""Load photographs and user masks, undistorted to their pinhole cameras."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class View:
     """One photograph of a scene.
 
     Attributes:
-        name: the image's path relative to the scene folder, by which maps belong to it.
+        name: the image's path relative to the scene folder, by which its maps are found.
         image: the image file.
         camera: the undistorted camera of the photograph, in the scene's own frame and units.
-        lens: the camera as it was calibrated, where it has lens distortion.
+        lens: the calibrated camera, if it has lens distortion.
         mask: the user's mask file (white is kept), if there is one.
     """
 
@@ -41,25 +41,25 @@ def load_photograph(view: View) -> UInt8[np.ndarray, "H W C"]:
     """The photograph as 8-bit RGB or RGBA: upright, undistorted, at the size of its camera.
 
     Raises:
-        SceneError: the file is no readable image, or its shape is not the camera's.
+        SceneError: the image cannot be read, or its aspect ratio is not the camera's.
     """
-    return _as_seen(view, read_image(view.image), view.image)
+    return _undistorted(view, read_image(view.image), view.image)
 
 
 def load_mask(view: View) -> Bool[np.ndarray, "H W"] | None:
     """The user's mask of the photograph, true where a pixel is kept; None where there is none.
 
     Raises:
-        SceneError: the file is no readable image, or its shape is not the camera's.
+        SceneError: the image cannot be read, or its aspect ratio is not the camera's.
     """
     if view.mask is None:
         return None
-    return _as_seen(view, read_image(view.mask).convert("RGB"), view.mask)[..., 0] > 127
+    return _undistorted(view, read_image(view.mask).convert("RGB"), view.mask)[..., 0] > 127
 
 
 def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "3 3"], np.ndarray]:
-    """Intrinsics and picture of the pinhole camera that nerfstudio makes of a distorted one."""
-    # Nerfstudio's dataparsers are imported while its datamanagers are still half imported.
+    """Undistort an image as nerfstudio does, to the intrinsics and image of a pinhole camera."""
+    # Not at the top: nerfstudio imports dataparsers while its datamanagers are half imported.
     from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 
     parameters, K = lens.distortion_params, lens.get_intrinsics_matrices().numpy().copy()
@@ -69,20 +69,20 @@ def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[n
 
 
 def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-    """Pixels of the photograph as it lies on disk, in the view's undistorted camera.
+    """Map pixels of the photograph's file to the view's undistorted camera.
 
-    Where the EXIF orientation turns the picture and the camera's shape says that SfM turned it too, they are pixels of
-    the turned picture, which is what an image viewer shows.
+    Where the EXIF orientation rotates the image, and the camera's shape shows that SfM rotated it too, they are pixels
+    of the rotated image, which is what an image viewer shows.
 
     Raises:
-        SceneError: the file is no readable image, or its shape is not the camera's.
+        SceneError: the image cannot be read, or its aspect ratio is not the camera's.
     """
     import cv2
     from nerfstudio.cameras.cameras import CameraType
 
     width, height = _calibrated_size(view)
-    picture = _upright(view, read_image(view.image), view.image)
-    pixels = pixels * [width / picture.width, height / picture.height]
+    image = _upright(view, read_image(view.image), view.image)
+    pixels = pixels * [width / image.width, height / image.height]
     if view.lens is None:
         return pixels
     assert view.lens.distortion_params is not None
@@ -100,25 +100,24 @@ def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndar
 
 
 def read_image(path: Path) -> Image.Image:
-    """An image file in mode RGB or RGBA, 8 bits, its EXIF data kept and its orientation not yet applied.
+    """Read an image file as 8-bit RGB or RGBA; EXIF data are kept, the orientation is not applied.
 
     Raises:
-        SceneError: the file is no readable image, or one of floating-point numbers.
+        SceneError: the image cannot be read, or holds floating-point numbers.
     """
     try:
         with Image.open(path) as image:
             if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
-                raise ValueError(f"it claims to be of {image.width}x{image.height} pixels")
+                raise ValueError(f"it claims {image.width}x{image.height} pixels")
             image.load()
         exif = image.getexif()
-    except Exception as error:  # each format's decoder has its own kinds of error for a damaged file
+    except Exception as error:  # each decoder raises its own errors for a damaged file
         reason = " ".join(str(error).split())
         raise SceneError(f"{path} cannot be read as an image ({reason}): put the whole file back") from error
     if image.mode == "F":
         broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""
         raise SceneError(
-            f"{path} holds floating-point numbers{broken}, of which nobody knows what is white: save it with 8 or 16 "
-            "bits"
+            f"{path} holds floating-point numbers{broken}, whose white is undefined: save it with 8 or 16 bits"
         )
     if image.mode.startswith("I"):  # 16 bits
         image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
@@ -128,7 +127,7 @@ def read_image(path: Path) -> Image.Image:
     return image
 
 
-def _as_seen(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray, "H W C"]:
+def _undistorted(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray, "H W C"]:
     upright = _upright(view, image, path)
     if view.lens is not None:
         if upright.size != _calibrated_size(view):
@@ -144,11 +143,11 @@ def _calibrated_size(view: View) -> tuple[int, int]:
 
 
 def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:
-    """SfM may or may not have honoured the EXIF orientation: the shape of its camera tells."""
+    """Apply the EXIF orientation if SfM did, which the shape of its camera shows."""
     width, height = _calibrated_size(view)
     for candidate in (image, ImageOps.exif_transpose(image)):
         aspect = candidate.width / candidate.height
-        rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which tells in thumbnails
+        rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which matters in thumbnails
         if abs(width - height * aspect) < max(0.01 * width, rounding):
             return candidate
     if path != view.image:

@@ -1,4 +1,4 @@
-"""What the files of a scene say of its photographs and their cameras: checked, and in double precision."""
+"""Photographs and cameras listed in a scene's files, validated and in double precision."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from dataparsers.errors import SceneError
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 MAX_PIXELS = 178_956_970
-"""Of a photograph: what Pillow takes for a decompression bomb is more. What claims to be larger is never allocated."""
+"""Most pixels of a photograph: Pillow's limit for decompression bombs. Larger ones are never allocated."""
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 that is rounding: of four printed digits
+_ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A photograph with the camera that the scene's files give it.
+    """A photograph and its camera, as given in the scene's files.
 
     Attributes:
         name: the image's path relative to the scene, with forward slashes.
         image: the image file.
-        camera: as it was calibrated, in the scene's own frame and units, without its distortion.
+        camera: calibrated camera without its distortion, in the scene's own frame and units.
         distortion: k1, k2, k3, k4, p1, p2, as nerfstudio orders them.
         kind: perspective or fisheye.
         mask: the user's mask file, if the scene's files name one.
@@ -46,7 +46,7 @@ class Shot:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether there is nothing to undistort."""
+        """Whether the camera is perspective and without distortion."""
         return self.kind is CameraType.PERSPECTIVE and not any(self.distortion)
 
 
@@ -57,8 +57,8 @@ class Recording:
     Attributes:
         shots: sorted by name.
         applied: rigid motion from the scene's frame to the one that nerfstudio would read.
-        listed: names of the photographs of a split, where files list them; else the interval decides.
-        orientation: how the files want the scene turned for the viewer, if they say so.
+        listed: names of photographs by split, where the files list them; else the interval decides.
+        orientation: orientation method for the viewer, if the files set one.
     """
 
     shots: Sequence[Shot]
@@ -68,26 +68,26 @@ class Recording:
 
 
 def shot(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping[str, Any], where: str) -> Shot:
-    """A photograph of a scene, checked.
+    """Validate a photograph and its camera.
 
     Args:
         scene: the scene's folder.
         name: path of the photograph, relative to the scene.
         pose: camera to scene, OpenCV axes.
-        lens: fl_x, fl_y, cx, cy, w, h, and maybe coefficients of distortion and a camera_model, as in transforms.json.
-        where: file that says so, for messages.
+        lens: fl_x, fl_y, cx, cy, w, h and optionally distortion coefficients and camera_model, as in transforms.json.
+        where: file of the camera, for messages.
 
     Raises:
-        SceneError: the numbers are those of no camera, or the path leaves the scene.
+        SceneError: the camera is invalid, or the path leaves the scene.
     """
     image = inside(scene, name, where)
     where = f"{where}: the camera of {name}"
     width, height = (_number(lens, key, where) for key in ("w", "h"))
     if not (width >= 1 and height >= 1 and width % 1 == height % 1 == 0):
-        raise SceneError(f"{where} is of {width:g}x{height:g} pixels: a picture has whole ones, and at least one")
+        raise SceneError(f"{where} has {width:g}x{height:g} pixels: both must be whole numbers, at least 1")
     if width * height > MAX_PIXELS:
         raise SceneError(
-            f"{where} is of {width:.0f}x{height:.0f} pixels, more than can be read: make the photographs smaller"
+            f"{where} has {width:.0f}x{height:.0f} pixels, more than can be read: make the photographs smaller"
         )
     fx, fy, cx, cy = (_number(lens, key, where) for key in ("fl_x", "fl_y", "cx", "cy"))
     if fx <= 0 or fy <= 0:
@@ -102,7 +102,7 @@ def shot(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping
 
 
 def inside(scene: Path, name: str, where: str) -> Path:
-    """A file that a scene's file names by its path in the scene.
+    """Path of a file named in a scene's file, checked to lie in the scene.
 
     Raises:
         SceneError: the path leads out of the scene.
@@ -119,7 +119,7 @@ def in_order(shots: Sequence[Shot], where: str) -> list[Shot]:
     """The shots sorted by name.
 
     Raises:
-        SceneError: there are none, or two of one photograph.
+        SceneError: there are none, or two of the same photograph.
     """
     if not shots:
         raise SceneError(f"{where} holds no photographs: it is empty")
@@ -149,7 +149,7 @@ def _rigid(pose: np.ndarray, where: str) -> Float64[np.ndarray, "4 4"]:
     rotation = pose[:3, :3]
     turned = np.abs(rotation.T @ rotation - np.eye(3)).max() <= _ORTHONORMAL and np.linalg.det(rotation) > 0
     if pose.shape != (4, 4) or not turned or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise SceneError(f"{where} has a pose that is no rotation and translation: it scales, shears or mirrors")
+        raise SceneError(f"{where} has a pose that is not a rotation and translation: it scales, shears or mirrors")
     u, _, vt = np.linalg.svd(rotation)
     exact = np.eye(4)
     exact[:3, :3], exact[:3, 3] = u @ vt, pose[:3, 3]
@@ -164,5 +164,5 @@ def _number(lens: Mapping[str, Any], key: str, where: str) -> float:
     except (TypeError, ValueError, OverflowError):
         value = float("nan")
     if not math.isfinite(value):
-        raise SceneError(f"{where} has {str(lens[key])[:40]!r} as its {key}, which is no number")
+        raise SceneError(f"{where} has {str(lens[key])[:40]!r} as its {key}, which is not a finite number")
     return value

@@ -1,4 +1,4 @@
-"""The points that structure from motion found, and which photograph sees which."""
+"""Points from structure from motion, and the views that observe them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class SparsePoints:
 
     Attributes:
         positions: in the scene's own frame and units.
-        observed: the indices of the points that each view observes, by the view's name; None where the scene does not
-            tell, as a transforms.json.
-        colours: RGB, where the scene tells.
+        observed: indices of the points that each view observes, by the view's name; None where unknown, as with a
+            transforms.json.
+        colours: RGB, where known.
     """
 
     positions: Float64[np.ndarray, "N 3"]
@@ -37,7 +37,7 @@ class SparsePoints:
         """Pixels and z-depths of the view's points: those it observes, or else all that project into it.
 
         The pixels are projections into the undistorted camera rather than the features that were matched in the
-        distorted photograph. Without observations, points that stand behind a surface are among them.
+        distorted photograph. Without observations, points hidden behind a surface are included.
         """
         observed = slice(None) if self.observed is None else self.observed.get(view.name, np.empty(0, int))
         viewmat, K = view.camera.viewmat.cpu().double().numpy(), view.camera.K.cpu().double().numpy()
@@ -49,7 +49,7 @@ class SparsePoints:
 
 
 def read_sparse_points(layout: SceneLayout) -> SparsePoints:
-    """The SfM points of a scene: of its COLMAP model with their tracks, or of the cloud its transforms.json names.
+    """Read the SfM points of a scene: its COLMAP model's with tracks, or the cloud named in transforms.json.
 
     Raises:
         SceneError: the scene has no points, or their file is damaged.
@@ -57,16 +57,16 @@ def read_sparse_points(layout: SceneLayout) -> SparsePoints:
     points = find_sparse_points(layout)
     if len(points.positions) == 0:
         raise SceneError(
-            f"{layout.data} has no SfM points, which monocular depth and the shell are held against: put points3D.bin "
+            f"{layout.data} has no SfM points, which monocular depth and the shell are compared with: put points3D.bin "
             "beside the COLMAP cameras, or name a cloud as ply_file_path in transforms.json"
         )
     return points
 
 
 def find_sparse_points(layout: SceneLayout) -> SparsePoints:
-    """The SfM points of a scene, of which there may be none.
+    """Read the SfM points of a scene, if any.
 
-    What is NaN, infinite or absurdly far away is left out, and counted in a message.
+    Points that are NaN, infinite or absurdly far away are left out, with a warning.
 
     Raises:
         SceneError: their file is damaged.
@@ -89,7 +89,7 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
 
 
 def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:
-    """The indices of the points that can be meant."""
+    """Indices of the points that are finite and near the others."""
     near = sound(positions)
     if not near.all():
         log.warning(

@@ -1,4 +1,4 @@
-"""Points that cannot be meant: NaN, infinite, or absurdly far from all others."""
+"""Find stray points: NaN, infinite, or absurdly far from all others."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 FAR = 1e6
-"""Times the median distance from the middle of the points: one point there would cost all others their digits."""
+"""Times the median distance from the centre: one point that far would cost the others their precision."""
 
 
 def sound(points: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    """Which points are finite and near the others."""
+    """Mask of the points that are finite and near the others."""
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         return finite

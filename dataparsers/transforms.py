@@ -1,4 +1,4 @@
-"""A transforms.json of nerfstudio: cameras, and the cloud of points that it names."""
+"""Read nerfstudio's transforms.json: cameras, and the point cloud that it names."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from dataparsers.shots import DISTORTION, Recording, Shot, in_order, inside, sho
 
 NAME = "transforms.json"
 GREY = 128
-"""Of points whose file has no colours."""
-# What old versions of ns-process-data did to COLMAP's frame without saying so.
-_UNSAID = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+"""Colour of points whose file has none."""
+# Applied to COLMAP's frame by old versions of ns-process-data, without being recorded.
+_UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *DISTORTION)
 
 
 def read_recording(scene: Path) -> Recording:
-    """The photographs that the scene's transforms.json lists.
+    """Read the photographs listed in the scene's transforms.json.
 
     Raises:
-        SceneError: the file is damaged, or a camera is none.
+        SceneError: the file is damaged, or a camera is invalid.
     """
     path = scene / NAME
     meta = read_json(path)
@@ -40,7 +40,7 @@ def read_recording(scene: Path) -> Recording:
     listed = {split: _names(meta[f"{split}_filenames"], path) for split in _SPLITS if f"{split}_filenames" in meta}
     orientation = meta.get("orientation_override")
     if orientation not in (None, "pca", "up", "vertical", "none"):
-        raise SceneError(f"{path} has {orientation!r} as its orientation_override: pca, up, vertical or none")
+        raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
     return Recording(in_order(shots, str(path)), applied, listed, orientation)
 
 
@@ -48,7 +48,7 @@ _SPLITS = ("train", "val", "test")
 
 
 def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
-    """Positions, in the scene's frame, and colours of the points that transforms.json names; none where it does not.
+    """Positions, in the scene's frame, and colours of the point cloud named in transforms.json; empty if it names none.
 
     Raises:
         FileNotFoundError: the cloud is missing.
@@ -67,7 +67,7 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
         cloud = trimesh.load(path, process=False)
         positions = np.asarray(cloud.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
         colours = np.asarray(cloud.visual.vertex_colors, np.uint8)  # pyright: ignore[reportAttributeAccessIssue]
-    except Exception as error:  # trimesh has its own kinds of error for damaged files
+    except Exception as error:  # trimesh raises errors of any kind for a damaged file
         reason = " ".join(str(error).split())
         raise SceneError(f"the SfM points {path} cannot be read ({reason}): make them again") from error
     undo = np.linalg.inv(_applied(meta, scene))
@@ -83,9 +83,9 @@ def _shot(scene: Path, frame: Any, meta: Mapping[str, Any], applied: np.ndarray,
     except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape != (4, 4):
-        raise SceneError(f"{where} ({frame['file_path']}): its transform_matrix is no matrix of 4x4 numbers")
+        raise SceneError(f"{where} ({frame['file_path']}): its transform_matrix is not a 4x4 matrix of numbers")
     lens = {key: source[key] for key in _LENS for source in (frame, meta) if key in source}
-    for key in DISTORTION if _has_distortion(meta) else ():  # nerfstudio's order: the file's own before the frame's
+    for key in DISTORTION if _has_distortion(meta) else ():  # as in nerfstudio, the file's own take precedence
         lens.pop(key, None)
     lens |= _distortion(meta if _has_distortion(meta) else frame, where)
     path = inside(scene, frame["file_path"], where)
@@ -109,19 +109,19 @@ def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _applied(meta: Mapping[str, Any], scene: Path) -> Float64[np.ndarray, "4 4"]:
-    """What was done to the scene's own frame before the poses were written."""
-    applied = meta.get("applied_transform", _UNSAID if (scene / "colmap/sparse/0").exists() else np.eye(4)[:3])
+    """Transform applied to the scene's own frame before the poses were written."""
+    applied = meta.get("applied_transform", _UNRECORDED if (scene / "colmap/sparse/0").exists() else np.eye(4)[:3])
     try:
         matrix = np.array(applied, dtype=np.float64)[:3]
     except (TypeError, ValueError, OverflowError, IndexError):
         matrix = np.empty(0)
     gram = matrix[:, :3].T @ matrix[:, :3] if matrix.shape == (3, 4) else np.zeros((3, 3))
     if not np.isfinite(matrix).all() or not np.abs(gram - np.eye(3)).max() < 1e-3:
-        raise SceneError(f"{scene / NAME}: its applied_transform is no 3x4 matrix of a rotation and a translation")
+        raise SceneError(f"{scene / NAME}: its applied_transform is not a 3x4 matrix of a rotation and a translation")
     return np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
 
 
 def _names(listed: Any, path: Path) -> set[str]:
     if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-        raise SceneError(f"{path}: a list of filenames holds something else than names")
+        raise SceneError(f"{path}: a list of filenames holds something other than names")
     return {Path(name).as_posix() for name in listed}

@@ -1,4 +1,4 @@
-"""What is in a batch of nerfstudio's, as the types of this project."""
+"""Convert batches of nerfstudio to the types of this project."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from shellgs_method.evaluation import Rendering, geometry_errors, image_errors
 from shellgs_method.reference import Reference
 
 REFERENCES = {"shell": "", "truth": "truth_"}
-"""Kinds of maps that geometry is measured against, and what the names of their metrics begin with."""
+"""Kinds of maps that geometry is measured against, and the prefixes of their metrics."""
 
 
 MARGIN = 2
-"""Pixels around what stands before the shell in which its splats are seen, too."""
+"""Pixels around what stands in front of the shell that its splats also cover."""
 
 
 def kept_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"]:
-    """What the user's mask keeps of an image; all of it where there is none."""
+    """Pixels of an image that the user's mask keeps; all where there is none."""
     if "mask" in batch:
         return batch["mask"].to(image.device)
     return torch.ones_like(image[..., :1], dtype=torch.bool)
@@ -30,17 +30,16 @@ def kept_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W
 def masked_image_errors(
     rgb: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], batch: dict, metres_per_unit: float | None
 ) -> dict[str, float]:
-    """Metrics of :func:`image_errors` over what the user's mask keeps, and in the :func:`regions` of it."""
+    """Metrics of :func:`image_errors` over the pixels that the user's mask keeps, and over their :func:`regions`."""
     return image_errors(rgb, target, regions(batch, metres_per_unit, rgb.device), kept_pixels(batch, target))
 
 
 def reference_errors(
     rendering: Rendering, camera: Camera, batch: dict, metres_per_unit: float | None
 ) -> dict[str, float]:
-    """Metrics of :func:`geometry_errors` against each reference that a batch has: the shell's, and ``truth_…``.
+    """Metrics of :func:`geometry_errors` against each reference in a batch: the shell, and ``truth_…``.
 
-    Where metres are known there is ``truth_f_score_5cm_…`` too, for two of the :func:`regions`: on the shell and before
-    it.
+    Where metres are known, also ``truth_f_score_5cm_…`` over two of the :func:`regions`: on and before the shell.
     """
     metrics, found = {}, references(batch, rendering.depth.device)
     for prefix, reference in found.items():
@@ -55,12 +54,12 @@ def reference_errors(
 
 
 def regions(batch: dict, metres_per_unit: float | None, device: torch.device) -> dict[str, Bool[Tensor, "H W 1"]]:
-    """Parts of a held-out view that images are measured in, by name, all of pixels that training views have seen.
+    """Parts of a held-out view that images are measured in, by name; all within what is visible in training views.
 
-    * ``seen``: all of these.
-    * ``on_shell``, ``off_shell``: on the shell, or where it is not or does not count.
+    * ``seen``: all of it.
+    * ``on_shell``, ``off_shell``: on the shell, or where it is absent or does not count.
     * ``before_shell``: where the truth is nearer than the shell by more than 5 cm (1/200 of its depth where metres are
-      unknown) or, where there is no truth, photographs show something nearer. These pixels are in neither of the two.
+      unknown) or, without truth, where photographs show something nearer. These pixels are in neither of the above.
     """
     if "seen" not in batch:
         return {}
@@ -78,16 +77,16 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
 
 
 def references(batch: dict, device: torch.device) -> dict[str, Reference]:
-    """The maps that a batch has to measure against, by what the names of their metrics begin with."""
+    """Reference maps of a batch, by the prefixes of their metrics."""
     return {
         prefix: reference_maps(batch, kind, device) for kind, prefix in REFERENCES.items() if f"{kind}_depth" in batch
     }
 
 
 def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: bool = False) -> Reference:
-    """The maps of one kind in a batch; what the user masked out is not supported.
+    """Maps of one kind in a batch; pixels that the user masked out are not supported.
 
-    Nor is the shell where photographs contradict it, and beside, unless it is asked for ``everywhere``.
+    Neither is the shell where photographs contradict it, with a margin, unless ``everywhere`` is set.
     """
     depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
     if kind == "shell" and not everywhere:
@@ -99,14 +98,14 @@ def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: boo
 
 
 def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
-    """Where photographs show something before the shell; nowhere if they were not compared."""
+    """Pixels where photographs show something in front of the shell; none if they were not compared."""
     if "nearer_depth" not in batch:
         return torch.zeros(batch["shell_mask"].shape, dtype=torch.bool, device=device)
     return batch["nearer_depth"].to(device) > 0
 
 
 def pinhole_camera(camera: Cameras) -> Camera:
-    """The one camera of a nerfstudio ``Cameras``, which is OpenGL and has its centres at 0.5 as ours."""
+    """Convert the one camera of a nerfstudio ``Cameras``, which is OpenGL, with pixel centres at 0.5 as ours."""
     pose = camera.camera_to_worlds[0]
     rotation = (pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])).T
     viewmat = torch.eye(4, dtype=pose.dtype, device=pose.device)

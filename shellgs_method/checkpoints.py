@@ -1,4 +1,4 @@
-"""Checkpoints read as data, and refused where they are damaged."""
+"""Read checkpoints as data; damaged ones are refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _GAUSSIANS = ("means", "scales", "quats", "features_dc", "features_rest", "opaci
 
 
 def find_checkpoint(folder: Path, step: int | None = None) -> Path:
-    """The checkpoint of a step in a folder, or the last.
+    """Path of the checkpoint of a step in a folder, or of the last one.
 
     Raises:
         SceneError: there is none.
@@ -38,25 +38,25 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
         which = "" if step is None else f" of step {step}"
         raise SceneError(
             f"{folder} holds no checkpoint{which} (step-*.ckpt): --load-dir takes the nerfstudio_models of a run, and "
-            "a run that was stopped before its first has none"
+            "a run that was stopped before its first save has none"
         )
     return folder / f"step-{max(steps) if step is None else step:09d}.ckpt"
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """What a checkpoint holds: numbers, tensors, and the lists and dictionaries of them; on the CPU.
+    """Load a checkpoint to the CPU: numbers, tensors, and lists and dictionaries of them.
 
     Raises:
-        SceneError: it cannot be read, holds anything else, or Gaussians that are none.
+        SceneError: it cannot be read, or holds anything else or invalid Gaussians.
     """
-    remedy = "remove it to go on from an earlier one, or train again"
+    remedy = "remove it to resume from an earlier one, or train again"
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged or hostile file lets torch fail in any way
+    except Exception as error:  # torch may raise anything for a damaged or hostile file
         words = str(error).strip().splitlines() or [type(error).__name__]
         raise SceneError(f"{path} cannot be read as a checkpoint ({words[0][:200]}): {remedy}") from error
     if not isinstance(state, dict) or not isinstance(state.get("step"), int):
-        raise SceneError(f"{path} is no checkpoint of nerfstudio: {remedy}")
+        raise SceneError(f"{path} is not a checkpoint of nerfstudio: {remedy}")
     for part in ("pipeline", "optimizers", "scalers"):
         if not isinstance(state.get(part), dict):
             raise SceneError(f"{path} lacks its {part}: {remedy}")
@@ -68,12 +68,12 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def load_into(pipeline: Pipeline, path: Path, state: Mapping[str, Any]) -> None:
-    """Give a pipeline what its checkpoint holds.
+    """Load a checkpoint into a pipeline.
 
     Args:
         pipeline: made with the run's settings.
-        path: of the checkpoint, for the refusal.
-        state: of :func:`load_checkpoint`.
+        path: path of the checkpoint, for messages.
+        state: what :func:`load_checkpoint` returned.
 
     Raises:
         SceneError: it is of another method, or of other settings.
@@ -82,13 +82,13 @@ def load_into(pipeline: Pipeline, path: Path, state: Mapping[str, Any]) -> None:
         pipeline.load_pipeline(state["pipeline"], state["step"])
     except (KeyError, RuntimeError) as error:  # torch lists all that is missing, unexpected and of another shape
         words = " ".join(str(error).split())[:300]
-        raise SceneError(f"{path} is no checkpoint of this method with these settings ({words})") from error
+        raise SceneError(f"{path} is not a checkpoint of this method with these settings ({words})") from error
 
 
-def guard_nerfstudio() -> None:
-    """Let nerfstudio's own commands load checkpoints as ours do.
+def guard_checkpoint_loading() -> None:
+    """Make nerfstudio's own commands load checkpoints as ours do.
 
-    Theirs tell of a damaged one with a page of torch's, and run what a pickle wants where torch is older than 2.6.
+    Theirs report a damaged one with a page of torch's text, and run the code of a pickle where torch is older than 2.6.
     """
     from nerfstudio.utils import eval_utils  # imports the methods, and so this module
 
@@ -104,10 +104,10 @@ def guard_nerfstudio() -> None:
 
 
 def check_gaussians(state: Mapping[str, Any]) -> None:
-    """Refuse Gaussians of a checkpoint that lack a parameter or are no numbers; other models are left alone.
+    """Refuse Gaussians of a checkpoint that lack a parameter or are not finite; other models are not checked.
 
     Raises:
-        SceneError: with what is wrong.
+        SceneError: says what is wrong.
     """
     stored: dict[str, Tensor] = {
         key.rpartition(".")[2]: value for key, value in state.items() if ".gauss_params." in f".{key}"
@@ -122,4 +122,4 @@ def check_gaussians(state: Mapping[str, Any]) -> None:
     wrong = sum((~value.reshape(len(value), -1).isfinite().all(dim=1)).long() for value in stored.values())
     assert isinstance(wrong, Tensor)
     if wrong.any():
-        raise SceneError(f"{int((wrong > 0).sum())} of its {len(wrong)} Gaussians are no numbers")
+        raise SceneError(f"{int((wrong > 0).sum())} of its {len(wrong)} Gaussians are not finite")

@@ -1,4 +1,4 @@
-"""config.yml read as data. Nerfstudio's is YAML that may build any Python object, which is to say run any program."""
+"""Read config.yml as data. Nerfstudio loads it as YAML that may build any Python object, that is, run any program."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from nerfstudio.engine.trainer import TrainerConfig
 from dataparsers.errors import SceneError, refusals_end_the_program
 
 MAX_BYTES = 1 << 20
-"""Of a config.yml; those of nerfstudio's methods are a hundredth of it."""
+"""Largest config.yml; those of nerfstudio's methods have a hundredth of it."""
 _COMPLETE = ("method_name", "experiment_name", "timestamp", "output_dir", "pipeline", "vis")
-"""Settings that every config.yml has, the last of which is at its end."""
+"""Settings that every config.yml has; the last one is at its end."""
 
 
 RENAMED = {
@@ -29,20 +29,20 @@ RENAMED = {
     "agreement_from": "normal_consistency_from",
     "consistency": "smoothness",
 }
-"""Settings that older files have by another name."""
+"""New names of settings, by their names in older files."""
 
 
 def load_config(path: Path) -> TrainerConfig:
-    """The config of a run, built from the classes of registered methods and of nothing else.
+    """Load the config of a run, building only classes of registered methods.
 
-    Settings that it does not have, being older, are at their defaults; those that are no more are left out.
+    Settings that an older file lacks have their defaults; those that no longer exist are left out.
 
     Args:
         path: a config.yml.
 
     Raises:
         FileNotFoundError: there is no such file.
-        SceneError: it is no whole config of a registered method.
+        SceneError: it is not a complete config of a registered method.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: name the config.yml of a trained run")
@@ -55,7 +55,7 @@ def load_config(path: Path) -> TrainerConfig:
             raise SceneError("it holds no config of a run" if text.strip() else "it is empty")
         lacking = [name for name in _COMPLETE if f"\n{name}:" not in text]
         if lacking:
-            raise SceneError(f"it is cut: {lacking[0]} is not there")
+            raise SceneError(f"it is cut off: {lacking[0]} is missing")
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         what = " ".join(str(error).split())
         raise SceneError(
@@ -66,7 +66,7 @@ def load_config(path: Path) -> TrainerConfig:
 
 @cache
 def _known() -> dict[str, Any]:
-    """The classes, functions and kinds of values that configs of registered methods are made of, by their paths."""
+    """Classes, functions and types of values in the configs of registered methods, by import path."""
     from nerfstudio.configs.dataparser_configs import all_dataparsers  # both import the methods, and so this module
     from nerfstudio.configs.method_configs import all_methods
 
@@ -78,7 +78,7 @@ def _known() -> dict[str, Any]:
 
 
 def _parts(value: Any) -> Iterator[Any]:
-    """Classes and functions that a config holds, and the classes of what it holds."""
+    """Classes and functions in a config, and the classes of its values."""
     if isinstance(value, (type, FunctionType)) and not isinstance(value, GenericAlias):
         yield value
     elif get_origin(value):
@@ -96,19 +96,19 @@ def _parts(value: Any) -> Iterator[Any]:
 
 
 def _find(path: str) -> Any:
-    """What a path names, by its own or by another name that an imported module has for it; nothing is imported."""
+    """The known object of an import path, or of an alias of it in an imported module; nothing is imported."""
     module, _, name = path.rpartition(".")
     elsewhere = vars(sys.modules[module]).get(name) if module in sys.modules else None
     found = _known().get(path, elsewhere)
     if not any(found is each for each in _known().values()):
-        raise SceneError(f"it names {path}, which no registered method's config has; that may be a program to run")
+        raise SceneError(f"it names {path}, which is in no registered method's config; that may be a program to run")
     return found
 
 
 def _object(loader: Any, path: str, node: yaml.Node) -> Any:
     cls = _find(path)
     if not (isinstance(cls, type) and is_dataclass(cls)):
-        raise SceneError(f"it takes {path} for settings")
+        raise SceneError(f"it uses {path} as settings")
     values = {RENAMED.get(name, name): value for name, value in loader.construct_mapping(node, deep=True).items()}
     given = [field for field in fields(cls) if field.init and field.name in values]
     for field in given:
@@ -118,7 +118,7 @@ def _object(loader: Any, path: str, node: yaml.Node) -> Any:
 
 
 def _fits(value: Any, field: Field) -> bool:
-    """Whether a value is of its setting's kind, as far as the default tells."""
+    """Whether a value has its setting's type, as far as the default shows."""
     default = field.default if field.default_factory is MISSING else field.default_factory()
     if value is None or default is None:
         return default is None or not isinstance(default, Real)
@@ -130,8 +130,8 @@ def _fits(value: Any, field: Field) -> bool:
     return True
 
 
-def _applied(loader: Any, path: str, node: yaml.Node) -> Any:
-    """What PyYAML writes as a call: paths, enumerations, and generic classes with their parameters."""
+def _call(loader: Any, path: str, node: yaml.Node) -> Any:
+    """Build what PyYAML writes as a call: paths, enumerations, and generic classes with their parameters."""
     arguments = loader.construct_sequence(node, deep=True)
     if path in ("pathlib.PosixPath", "pathlib.WindowsPath", "pathlib._local.PosixPath", "pathlib._local.WindowsPath"):
         return pathlib.Path(*arguments)
@@ -141,7 +141,7 @@ def _applied(loader: Any, path: str, node: yaml.Node) -> Any:
             return generic[parameters]  # pyright: ignore[reportIndexIssue]
     kind = _find(path)
     if not (isinstance(kind, type) and issubclass(kind, Enum)):
-        raise SceneError(f"it wants {path} to be called")
+        raise SceneError(f"it calls {path}")
     return kind(*arguments)
 
 
@@ -150,20 +150,20 @@ def _tuple(loader: Any, node: Any) -> tuple:
 
 
 def _refused(_loader: Any, path: str, _node: yaml.Node) -> Any:
-    raise SceneError(f"it wants {path} to be imported")
+    raise SceneError(f"it imports {path}")
 
 
 _CONSTRUCTORS: dict[str, Callable[[Any, str, yaml.Node], Any]] = {
     "name:": lambda _loader, path, _node: _find(path),
     "object:": _object,
-    "object/apply:": _applied,
+    "object/apply:": _call,
     "object/new:": _refused,
     "module:": _refused,
 }
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML, and what configs are made of."""
+    """Plain YAML and the tags of configs."""
 
 
 _Loader.add_constructor("tag:yaml.org,2002:python/tuple", _tuple)
@@ -171,22 +171,22 @@ for _tag, _construct in _CONSTRUCTORS.items():
     _Loader.add_multi_constructor(f"tag:yaml.org,2002:python/{_tag}", _construct)
 
 
-def guard_nerfstudio() -> None:
-    """Let nerfstudio's own commands build of a config.yml what :func:`load_config` does.
+def guard_config_loading() -> None:
+    """Make nerfstudio's own commands build from a config.yml only what :func:`load_config` does.
 
-    They read it with ``yaml.Loader``, which calls whatever a file names, in two places that hold the loader by its
-    name; so the loader itself is changed, in processes that know our methods.
+    They read it with ``yaml.Loader``, which calls whatever a file names, in two places that refer to the loader by
+    name; so the loader itself is changed, in processes that import our methods.
     """
 
-    def ending(construct: Callable[[Any, str, yaml.Node], Any]) -> Callable[[Any, str, yaml.Node], Any]:
+    def guarded(construct: Callable[[Any, str, yaml.Node], Any]) -> Callable[[Any, str, yaml.Node], Any]:
         def build(loader: Any, path: str, node: yaml.Node) -> Any:
             with refusals_end_the_program():
                 try:
                     return construct(loader, path, node)
                 except SceneError as error:
-                    raise SceneError(f"{loader.name} is no config.yml of a run: {error}") from error
+                    raise SceneError(f"{loader.name} is not the config.yml of a run: {error}") from error
 
         return build
 
     for tag, construct in _CONSTRUCTORS.items():
-        yaml.Loader.add_multi_constructor(f"tag:yaml.org,2002:python/{tag}", ending(construct))
+        yaml.Loader.add_multi_constructor(f"tag:yaml.org,2002:python/{tag}", guarded(construct))

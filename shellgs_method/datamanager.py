@@ -33,10 +33,10 @@ logger = logging.getLogger(__name__)
 
 COLOUR_BYTES = 3
 MAP_BYTES = 11
-"""Of a pixel: depth float32, normal float16, mask."""
-WORTH_SAYING = 1e9
-"""Bytes in memory from which their sum is told."""
-MOST_OF_MEMORY = 0.6
+"""Bytes of a pixel: depth float32, normal float16, mask."""
+MIN_REPORTED_BYTES = 1e9
+"""Bytes in memory from which their sum is reported."""
+MAX_MEMORY_SHARE = 0.6
 """Share of the free memory that photographs and maps may take."""
 
 
@@ -44,10 +44,10 @@ class FacadeDataset(InputDataset):
     """Photographs at the size of their cameras, with ``K``, ``{cue}_depth``, ``{cue}_normal`` and ``{cue}_mask``.
 
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
-    kind lacks that kind's keys. ``nearer_depth`` is that of what photographs show before the shell, 0 where they show
-    nothing there. With ``bands``, all masks are those of pixels whose wall lies in them. ``seen_by`` tells of the
-    training views: then ``seen`` is true where these have seen what a pixel shows. ``kinds`` are the maps that are
-    read, all that the scene has if not set, and with ``any_size`` they are resampled where they do not fit.
+    kind lacks that kind's keys. ``nearer_depth`` is the depth of what photographs show in front of the shell, else 0.
+    With ``bands``, masks keep only pixels whose wall lies in them. With ``seen_by``, ``seen`` is true where what a
+    pixel shows is visible in a training view. ``kinds`` are the maps to read, all if not set; with ``any_size`` they
+    are resampled where their size differs.
     """
 
     bands: Bands | None = None
@@ -55,13 +55,13 @@ class FacadeDataset(InputDataset):
     kinds: Collection[str] | None = None
     any_size: bool = False
     held: bool = True
-    """Whether maps stay in memory with the photographs; else they are read whenever they are needed."""
+    """Whether maps stay in memory with the photographs; else they are read when needed."""
 
     @property
     def cues(self) -> dict[str, CueMaps]:
-        """The sets of maps that are read, by kind."""
+        """Sets of maps to read, by kind."""
         found = self._dataparser_outputs.metadata["cues"]
-        wanted = set(found) - {"checked"} if self.kinds is None else self.kinds  # that goes with the shell
+        wanted = set(found) - {"checked"} if self.kinds is None else self.kinds  # read with the shell
         return {kind: maps for kind, maps in found.items() if kind in wanted}
 
     @property
@@ -74,7 +74,7 @@ class FacadeDataset(InputDataset):
         return load_photograph(self.views[image_idx])
 
     def get_data(self, image_idx: int, image_type="float32") -> dict:
-        """Everything known of one view."""
+        """Photograph, intrinsics, mask and maps of a view."""
         image = self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx)
         data = {"image_idx": image_idx, "image": image, "K": self.views[image_idx].camera.K.float()}
         mask = load_mask(self.views[image_idx])
@@ -92,7 +92,7 @@ class FacadeDataset(InputDataset):
         return data
 
     def get_metadata(self, data: dict) -> dict:
-        """The cue maps of the view ``data["image_idx"]``."""
+        """Cue maps of the view ``data["image_idx"]``."""
         view = self.views[data["image_idx"]]
         read = {kind: self._read(maps, view) for kind, maps in self.cues.items()}
         cues = {kind: cue for kind, cue in read.items() if cue is not None}
@@ -119,12 +119,12 @@ class FacadeDataset(InputDataset):
 
     @property
     def nbytes(self) -> int:
-        """Of all photographs and maps, in memory."""
+        """Memory that all photographs and maps take."""
         pixels = sum(view.camera.width * view.camera.height for view in self.views)
         return pixels * (COLOUR_BYTES + MAP_BYTES * len(self.cues))
 
     def missing(self) -> dict[str, int]:
-        """How many views have no map that supports a pixel, by kind.
+        """Number of views without a map that supports a pixel, by kind.
 
         Raises:
             SceneError: a view's map belongs to another camera, shell or alignment.
@@ -150,13 +150,13 @@ class FacadeDataset(InputDataset):
 
 @dataclass
 class FacadeDataManagerConfig(FullImageDatamanagerConfig):
-    """Facade batches."""
+    """Data manager of facade batches."""
 
     _target: type = field(default_factory=lambda: FacadeDataManager)
     holdout: Literal["none", "A", "B"] = "none"
-    """Vertical bands of the facade that no cue supervises, and that alone are measured: every other one, A or B."""
+    """Vertical bands of the facade that cues leave out and metrics are limited to: every other one, A or B."""
     band_width: float = 2.0
-    """Width of a band in metres, or in scene units where the shell maps do not know metres."""
+    """Width of a band in metres, or in scene units where the shell maps have no scale."""
 
 
 class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
@@ -165,7 +165,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     config: FacadeDataManagerConfig
 
     def create_train_dataset(self) -> FacadeDataset:
-        """The training views, whose maps leave out the bands held out."""
+        """Training views, whose maps leave out the held-out bands."""
         dataset = super().create_train_dataset()
         held_out = self._held_out
         dataset.bands = held_out and held_out.others
@@ -174,7 +174,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return dataset
 
     def create_eval_dataset(self) -> FacadeDataset:
-        """The held-out views, whose maps are left in the bands held out."""
+        """Held-out views, whose maps are limited to the held-out bands."""
         dataset = super().create_eval_dataset()
         dataset.bands = self._held_out
         dataset.seen_by = lambda: self._seen_by
@@ -187,12 +187,12 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             for view in [*self.train_dataset.views, *held_out] if kind == "shell" else held_out:
                 maps.check(view.name, view.camera, any_size=True)
         except SceneError as error:
-            logger.warning("This training measures nothing against the %s maps: %s.", kind, error)
+            logger.warning("No metrics against the %s maps in this run: %s.", kind, error)
             return False
         return True
 
     def train_on(self, kinds: Collection[str]) -> None:
-        """Read these kinds of maps for the training views, and for the held-out ones what can be measured beside them.
+        """Read these kinds of maps for the training views, and for the held-out ones also the usable references.
 
         Raises:
             SceneError: a map belongs to another camera, or no training view has one, though there is a manifest.
@@ -203,7 +203,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             command = dataset.cues[kind].command
             if missing == len(dataset):
                 raise SceneError(
-                    f"none of the {missing} training views has a {kind} map with a pixel in it, though "
+                    f"none of the {missing} training views has a {kind} map that supports a pixel, though "
                     f"{dataset.cues[kind].folder} has a manifest: run `{command}` to make them again"
                 )
             if missing:
@@ -221,14 +221,14 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
     @property
     def scene_to_world(self) -> Float64[np.ndarray, "4 4"]:
-        """The similarity from the scene to nerfstudio's rescaled world: scale · (transform @ scene)."""
+        """Similarity from the scene to nerfstudio's rescaled world: scale · (transform @ scene)."""
         parsed, similarity = self.train_dataparser_outputs, np.eye(4)
         similarity[:3] = parsed.dataparser_scale * parsed.dataparser_transform.double().numpy()
         return similarity
 
     @cached_property
     def _seen_by(self) -> SeenBy:
-        """What the training views see."""
+        """What is visible in the training views."""
         dataset, cameras, depths = self.train_dataset, [], []
         hidden_by_shell = "shell" in self.eval_dataset.cues
         for index in range(len(dataset)):
@@ -249,12 +249,12 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return facade_bands(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
 
     def shell_seeds(self, spacing: float, most: int, everywhere: bool) -> Seeds:
-        """Seeds on the shell as the training views see it, in nerfstudio's rescaled world.
+        """Seeds on the shell visible in the training views, in nerfstudio's rescaled world.
 
         Args:
-            spacing: in pixels of the closest view.
-            most: number of seeds beyond which they are spread more widely.
-            everywhere: on the shell also where photographs show something before it; else there, where they show it.
+            spacing: distance between seeds, in pixels of the closest view.
+            most: largest number of seeds; the spacing is increased where it would give more.
+            everywhere: seed the shell even where photographs show something in front of it; else seed that instead.
         """
         maps, views = self.train_dataset.cues["shell"], self.train_dataset.views
         batches = [batch for batch in self.cached_train if maps.record(views[batch["image_idx"]].name)]
@@ -284,12 +284,12 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     def _with_maps(self, batch: dict) -> dict:
         return batch if self.train_dataset.held else batch | self.train_dataset.get_metadata(batch)
 
-    def _hold_what_fits(self) -> None:
+    def _hold_maps_if_they_fit(self) -> None:
         dataset, free = self.train_dataset, psutil.virtual_memory().available
-        dataset.held = dataset.nbytes <= MOST_OF_MEMORY * free
-        if dataset.nbytes > WORTH_SAYING:
+        dataset.held = dataset.nbytes <= MAX_MEMORY_SHARE * free
+        if dataset.nbytes > MIN_REPORTED_BYTES:
             kinds = f" and their {' and '.join(dataset.cues)} maps" if dataset.cues else ""
-            how = "" if dataset.held else ": the maps are read from disk in every step, which takes longer"
+            how = "" if dataset.held else ": the maps are read from disk in every step, which is slower"
             CONSOLE.print(
                 f"{len(dataset)} photographs{kinds} take {dataset.nbytes / 1e9:.1f} GB of memory, of which "
                 f"{free / 1e9:.1f} GB are free{how}."
@@ -297,7 +297,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
     def _load_images(self, split, cache_images_device):
         if split == "train":
-            self._hold_what_fits()
+            self._hold_maps_if_they_fit()
         # "cpu" pins memory, which needs CUDA, and nerfstudio switches to it by itself above 500 images; "gpu" means
         # self.device (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
         with refusals_end_the_program():

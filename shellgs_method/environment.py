@@ -1,4 +1,4 @@
-"""What this machine can run, each with its remedy."""
+"""Check what this machine can run, and name remedies."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ OPEN3D_LIBRARIES = "libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at."""
+    """Result of one check."""
 
     subject: str
     works: bool
     detail: str
     needed: bool = True
-    """Nothing runs without it; the others only make it faster or more complete."""
+    """Whether nothing runs without it; the others only make it faster or more complete."""
 
 
 def examine() -> Iterator[Finding]:
-    """Look at everything that a wheel or a package index cannot promise."""
+    """Check everything that a wheel or a package index cannot guarantee."""
     for check in (_torch, _torchvision, _open3d, _compiler, _cuda, _lpips):
         yield check()
 
 
 def install_system_libraries() -> None:
-    """Install what Open3D takes for granted, if asked to, and if it fails to load and apt-get may be used."""
+    """Install the system libraries of Open3D, if it fails to load and apt-get may be used."""
     if not _open3d().works and hasattr(os, "geteuid") and os.geteuid() == 0 and shutil.which("apt-get"):
         environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
         for command in (["update", "-qq"], ["install", "-qq", "-y", *OPEN3D_LIBRARIES.split()]):
@@ -41,7 +41,7 @@ def _torch() -> Finding:
 
 
 def _torchvision() -> Finding:
-    """Builds of torch and torchvision that do not belong together fail with an unknown operator."""
+    """Mismatched builds of torch and torchvision fail with an unknown operator."""
     return _import("torchvision", "torchvision", "pip install --force-reinstall torch torchvision, both from one index")
 
 
@@ -72,12 +72,12 @@ def _cuda() -> Finding:
 
 
 def _lpips() -> Finding:
-    """Looks for the weights and downloads nothing: the first evaluation does."""
+    """Look for the weights without downloading them: the first evaluation does."""
     try:
         from shellgs_method.evaluation.image import lpips_weights
 
         url, cached = lpips_weights()
-    except (ImportError, OSError, RuntimeError) as error:  # a torchvision that does not load is told above
+    except (ImportError, OSError, RuntimeError) as error:  # a torchvision that does not load is reported above
         return Finding("LPIPS weights", False, str(error).splitlines()[0], needed=False)
     works = os.path.exists(cached)
     detail = cached if works else f"fetched by the first evaluation; without network: put {url} at {cached}"

@@ -1,4 +1,4 @@
-"""Steps whose gradients are no numbers: left out, rather than spread over all Gaussians."""
+"""Skip steps whose gradients are not finite, which would spread to all Gaussians."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor, nn
 
 MAX_FAULTS = 10
-"""Steps of a run that may be left out."""
+"""Most steps of a run that may be skipped."""
 _NOT_SUMMED = "features_rest"
-"""Four fifths of a Gaussian's numbers, whose gradients are those of ``features_dc`` times the harmonics."""
+"""Not checked: four fifths of a Gaussian's numbers, with the gradients of ``features_dc`` times the harmonics."""
 
 
 class GuardedOptimizers(Optimizers):
-    """Nerfstudio's optimizers, which take no step on gradients that are no numbers."""
+    """Nerfstudio's optimizers, which skip steps whose gradients are not finite."""
 
-    left_out = False
-    """Whether the last step was left out."""
+    skipped = False
+    """Whether the last step was skipped."""
 
     def optimizer_scaler_step_some(self, grad_scaler, param_groups) -> None:
-        """Step the groups, or none of them. A gradient scaler that is on does this by itself."""
-        self.left_out = not grad_scaler.is_enabled() and not self._gradients_are_numbers()
-        if self.left_out:
+        """Step all groups or none. An enabled gradient scaler does this by itself."""
+        self.skipped = not grad_scaler.is_enabled() and not self._gradients_are_finite()
+        if self.skipped:
             self.zero_grad_all()
         else:
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
-    def _gradients_are_numbers(self) -> bool:
-        """By their sum, which costs one look at each."""
+    def _gradients_are_finite(self) -> bool:
+        """Whether the sum of all gradients is finite, which reads each once."""
         gradients = [
             parameter.grad.sum()
             for group, parameters in self.parameters.items()
@@ -42,7 +42,7 @@ class GuardedOptimizers(Optimizers):
 
 
 def forget_gradients(info: dict[str, Any]) -> None:
-    """Let densification see no gradients of a rendering."""
+    """Zero the gradients of a rendering that densification accumulates."""
     for key in ("means2d", "gradient_2dgs"):
         if isinstance(rendered := info.get(key), Tensor) and rendered.grad is not None:
             rendered.grad.zero_()
@@ -51,7 +51,7 @@ def forget_gradients(info: dict[str, Any]) -> None:
 def remove_broken(
     gaussians: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any]
 ) -> int:
-    """Take out Gaussians with a parameter that is no number; how many these were. All stay where none is whole."""
+    """Remove Gaussians with a parameter that is not finite, unless all are such; return their number."""
     if all(bool(parameter.detach().sum().isfinite()) for parameter in gaussians.values()):
         return 0
     broken: Tensor = sum(  # pyright: ignore[reportAssignmentType]

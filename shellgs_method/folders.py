@@ -1,4 +1,4 @@
-"""Folders that one process at a time works in, and folders that are replaced whole."""
+"""Folders locked by one process, and folders replaced whole."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ except ImportError:  # Windows, where nothing is locked
 
 @contextmanager
 def held(folder: Path) -> Iterator[bool]:
-    """Hold a folder while the context lasts; False where another process holds it. A kill lets go of what it held."""
+    """Lock a folder while the context lasts; False where another process has it. A killed process holds no lock."""
     if fcntl is None:
         yield True
         return
@@ -35,7 +35,7 @@ def held(folder: Path) -> Iterator[bool]:
 
 
 def replace_folder(folder: Path, fresh: Path) -> None:
-    """Put a folder in the place of another, which is removed only then; see :func:`recover_folder`."""
+    """Replace a folder by another; the old one is removed last, see :func:`recover_folder`."""
     old = _old(folder)
     if folder.exists():
         folder.rename(old)
@@ -44,7 +44,7 @@ def replace_folder(folder: Path, fresh: Path) -> None:
 
 
 def recover_folder(folder: Path) -> None:
-    """Bring back what :func:`replace_folder` had put aside when it was killed."""
+    """Restore the folder that a killed :func:`replace_folder` had set aside."""
     old = _old(folder)
     if not folder.exists() and old.exists():
         old.rename(folder)

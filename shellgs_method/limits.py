@@ -1,4 +1,4 @@
-"""What settings of a training can be: those beyond are refused before anything is written."""
+"""Ranges of the settings of a run: values outside are refused before anything is written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataparsers.errors import SceneError
 
 
 class Limits(NamedTuple):
-    """The numbers that a setting may have."""
+    """Range of a setting."""
 
     least: float
     most: float = math.inf
@@ -24,7 +24,7 @@ class Limits(NamedTuple):
         return f"{what} {least}" + (f" to {self.most:g}" if self.most < math.inf else "")
 
     def hold(self, value: Any) -> bool:
-        """Whether a value is one of them."""
+        """Whether a value is in the range."""
         if not isinstance(value, int if self.kind is int else (int, float)) or isinstance(value, bool):
             return False
         return self.least <= value <= self.most and math.isfinite(value) and not (self.odd and value % 2 == 0)
@@ -66,15 +66,15 @@ LIMITS = {
     "ncc_window": Limits(3, 101, int, odd=True),
     "ncc_eps": Limits(TINY, 1),
 }
-"""By the name of a setting; other numbers of the losses are weights and lengths from 0, those in ``…_from`` steps."""
+"""Ranges by the name of a setting; other numbers of the losses are weights and lengths from 0, ``…_from`` are steps."""
 _LOSSES = ("pipeline.model.geometry.", "pipeline.model.extra.", "pipeline.model.mcmc.")
 
 
 def check_settings(config: Any) -> None:
-    """Refuse a trainer's config whose numbers make no sense.
+    """Refuse a trainer's config with a number out of range.
 
     Raises:
-        SceneError: with the first setting that does not, and what it can be.
+        SceneError: names the first such setting and its range.
     """
     for path, value in _settings(config):
         limits = _limits(path)

@@ -1,4 +1,4 @@
-"""One model for every method: primitive x cues, and the weights of the objective's terms."""
+"""The model of every method: primitive x cues, and the weights of the losses."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossC
 from shellgs_method.threads import ThreadsByLoad
 
 MIN_RESET_EVERY = 1000
-"""Fewest iterations between two resets of the opacities, which take as long to come back in a short run as in any."""
+"""Fewest iterations between two opacity resets: opacities recover no faster in a short run."""
 MAX_KEPT_PIXELS = 3_000_000
-"""Pixels of training views whose losses keep what depends on the view alone, of which each takes some 80 bytes."""
+"""Most pixels of training views whose losses are cached, at some 80 bytes each."""
 
 
 class ViewLosses(NamedTuple):
-    """The losses that compare renderings of one view with its photograph and its cue."""
+    """Losses of one view against its photograph and its cue."""
 
     photometric: PhotometricLoss
     cue: CueLosses | None
@@ -67,7 +67,7 @@ class ViewLosses(NamedTuple):
 
 @dataclass
 class FacadeModelConfig(SplatfactoModelConfig):
-    """Gaussians of a facade. Numbers of iterations are those of a run of 30 000 and shrink with a shorter run."""
+    """Gaussians of a facade. Iterations are given for a run of 30 000 and scale with the length of the run."""
 
     _target: type = field(default_factory=lambda: FacadeModel)
     primitive: Primitive = "3d"
@@ -76,23 +76,23 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Maps that supervise the geometry."""
     geometry: GeometryLossConfig = field(default_factory=GeometryLossConfig)
     """Losses against the cues."""
-    # Values, not factories: a config.yml written before these settings were there finds them on the class.
+    # Values, not factories: an older config.yml without these settings finds them on the class.
     extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
     """Terms beyond the paper."""
     depth: DepthKind = "expected"
-    """Depth that is rendered and supervised: expected, median (discs only), or that of the composited plane."""
+    """Depth that is rendered and supervised: expected, median (discs only), or plane (of the composited plane)."""
     shell_counts: Literal["everywhere", "uncontradicted"] = "everywhere"
-    """Where the shell supervises and has seeds: all over, or not where photographs show something before it."""
+    """Where the shell supervises and is seeded: everywhere, or not where photographs show something in front of it."""
     densification: Literal["default", "mcmc"] = "default"
-    """default: clone, split and prune by the gradient; mcmc: move and add by opacity, up to a cap."""
+    """default: clone, split and prune by the gradient; mcmc: relocate and add by opacity, up to a cap."""
     mcmc: MCMCConfig = MCMCConfig()  # noqa: RUF009
     """Settings of mcmc."""
     seeds: Literal["none", "shell"] = "none"
-    """Gaussians to begin with, beside those at the SfM points: none, or spread over the shell."""
+    """Initial Gaussians besides those at the SfM points: none, or spread over the shell."""
     seed_spacing: float = 4.0
-    """Pixels between seeds, in the closest view."""
+    """Spacing of the seeds, in pixels of the closest view."""
     max_seeds: int = 200_000
-    """Most seeds; where the spacing gives more, they are spread more widely."""
+    """Most seeds; the spacing is increased where it would give more."""
 
     background_color: Literal["random", "black", "white"] = "black"
     cull_alpha_thresh: float = 0.005
@@ -100,7 +100,7 @@ class FacadeModelConfig(SplatfactoModelConfig):
     densify_grad_thresh: float = 0.0002
     stop_screen_size_at: int = 0
 
-    # What splatfacto and nerfstudio's base model have and these methods have no use for.
+    # Settings of splatfacto and nerfstudio's base model that these methods do not use.
     use_absgrad: Suppress[bool] = False
     num_downscales: Suppress[int] = 0
     resolution_schedule: Suppress[int] = 3000
@@ -126,19 +126,19 @@ class FacadeModelConfig(SplatfactoModelConfig):
 class FacadeModel(SplatfactoModel):
     """Splatfacto with geometry channels, on any device.
 
-    Outputs: ``rgb``, ``depth`` (forward z in nerfstudio's rescaled units), ``normal`` (camera frame, as the picture
+    Outputs: ``rgb``, ``depth`` (forward z in nerfstudio's rescaled units), ``normal`` (camera frame, as colours
     of :func:`normals_to_colours`), ``accumulation``, ``background``; all [H, W, C].
 
     Splatfacto itself calls CUDA and downloads LPIPS' network when it is built
     (https://github.com/nerfstudio-project/nerfstudio/issues/3290), and its resume leaves the optimizers with the old
-    parameters; the overrides below mend these.
+    parameters; the overrides below fix both.
     """
 
     config: FacadeModelConfig
 
     def populate_modules(self) -> None:
-        """Gaussians at the SfM points."""
-        self._refuse_what_cannot_be()
+        """Create Gaussians at the SfM points."""
+        self._check_settings()
         points, colours = self._seed_points()
         spacing = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))[0][:, 1:].mean(axis=1)
         scales = torch.from_numpy(spacing).float()[:, None].repeat(1, 3)
@@ -158,15 +158,15 @@ class FacadeModel(SplatfactoModel):
 
     @property
     def training_cues(self) -> set[str]:
-        """The kinds of maps that the training views need."""
+        """Kinds of maps that the training views need."""
         return {self.config.cues, self.config.seeds} - {"none"}
 
-    def _refuse_what_cannot_be(self) -> None:
+    def _check_settings(self) -> None:
         config = self.config
         if config.primitive == "3d" and (config.depth == "median" or config.extra.distortion > 0):
-            raise SceneError("median depth and distortion are those of discs: set pipeline.model.primitive to 2d")
+            raise SceneError("median depth and distortion need discs: set pipeline.model.primitive to 2d")
         if config.depth == "plane" and config.extra.empty_space > 0:
-            raise SceneError("empty_space is made of the centres' depths: set pipeline.model.depth to expected")
+            raise SceneError("empty_space needs the depths of the centres: set pipeline.model.depth to expected")
         if config.seeds == "shell" and "shell" not in self.kwargs["metadata"]["cues"]:
             raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
         if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
@@ -186,7 +186,7 @@ class FacadeModel(SplatfactoModel):
         return points, colours
 
     def add_seeds(self, seeds: Seeds) -> None:
-        """Begin with Gaussians that lie on the shell, too."""
+        """Add initial Gaussians on the shell."""
         points, normals, colours, spacing = (torch.from_numpy(each).float() for each in seeds)
         scales = spacing[:, None] * spacing.new_tensor([0.5, 0.5, 0.05])
         x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(dim=-1)
@@ -218,16 +218,16 @@ class FacadeModel(SplatfactoModel):
             self.gauss_params[name] = nn.Parameter(new)
 
     def plan(self, num_iterations: int) -> None:
-        """Fit every schedule to a run of ``num_iterations``."""
+        """Scale every schedule to a run of ``num_iterations``."""
         self.num_iterations = num_iterations
         self.strategy = self._strategy(num_iterations / PAPER_ITERATIONS)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def _strategy(self, shrink: float) -> DefaultStrategy | MCMCStrategy:
-        """The densification, of a run that is ``shrink`` times as long as the config's."""
+        """Densification strategy of a run ``shrink`` times as long as the config's."""
         config = self.config
         start, stop = round(config.warmup_length * shrink), round(config.stop_split_at * shrink)
-        # As it is: a Gaussian that was just split needs its time to settle in a short run too, or all split again.
+        # Not scaled: a Gaussian that was just split needs time to settle in a short run too, or all split again.
         every = config.refine_every
         if config.densification == "mcmc":
             return MCMCStrategy(config.mcmc.cap_max, start, stop, every, config.mcmc.noise)
@@ -250,31 +250,31 @@ class FacadeModel(SplatfactoModel):
         )
 
     def get_training_callbacks(self, training_callback_attributes):
-        """Splatfacto's callbacks; the trainer tells how long the run is."""
+        """Splatfacto's callbacks, after scaling the schedules to the trainer's run."""
         trainer = training_callback_attributes.trainer
         assert trainer is not None
         self.plan(trainer.config.max_num_iterations)
         return super().get_training_callbacks(training_callback_attributes)
 
     def step_post_backward(self, step: int) -> None:
-        """Densify and prune. gsplat 1.4 would reset the opacities at step 0 already."""
+        """Densify and prune, except at step 0, where gsplat 1.4 would reset the opacities."""
         if isinstance(self.strategy, DefaultStrategy):
-            self.strategy.pause_refine_after_reset = self._pause_of_refinement(step, self.strategy.reset_every)
+            self.strategy.pause_refine_after_reset = self._refinement_pause(step, self.strategy.reset_every)
         if step > 0:
             super().step_post_backward(step)
-        if self.config.primitive == "2d":  # a split takes its share of all scales
+        if self.config.primitive == "2d":  # a split divides all scales
             self.scales.data[:, 2] = DISC_LOG_THICKNESS
 
-    def _pause_of_refinement(self, step: int, reset_every: int) -> int:
-        """As splatfacto's: until each photograph was seen since a reset, the gradients tell of the reset.
+    def _refinement_pause(self, step: int, reset_every: int) -> int:
+        """Iterations without densification after an opacity reset, until each photograph was trained on again.
 
-        But only after a reset, where gsplat would also wait at the start; and no longer than half of the time between
-        two, where splatfacto would never densify a scene of many photographs.
+        As in splatfacto, but at most half of the reset interval: splatfacto never densifies a scene of many
+        photographs. There is no pause before the first reset, where gsplat would also wait.
         """
         return min(self.num_train_data + self.config.refine_every, reset_every // 2) if step >= reset_every else 0
 
     def load_state_dict(self, dict, **kwargs):
-        """Load in place: the optimizers, built before, must go on holding the same parameters."""
+        """Load in place: the optimizers are built already and must keep the same parameters."""
         for name, parameter in self.gauss_params.items():
             stored = dict[f"gauss_params.{name}"]
             parameter.data = parameter.data.new_zeros(stored.shape)
@@ -282,7 +282,7 @@ class FacadeModel(SplatfactoModel):
         return nn.Module.load_state_dict(self, dict, **kwargs)
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
-        """Render one camera; the geometry is left out where neither a loss nor a viewer asks for it."""
+        """Render one camera; geometry is skipped in training where no loss needs it."""
         self._threads.follow()
         pinhole = pinhole_camera(camera)
         background = self._get_background_color()
@@ -290,7 +290,7 @@ class FacadeModel(SplatfactoModel):
         if len(gaussians["means"]) == 0:
             return cast(dict[str, Tensor], self.get_empty_outputs(pinhole.width, pinhole.height, background))
         with_geometry = not self.training or self._supervises_geometry
-        # Colours over the background, so that what the photograph says of alpha comes through the colours too.
+        # Colours minus the background, so that the photometric gradient of alpha comes through the colours too.
         features = [self._colours(gaussians, pinhole) - background]
         if with_geometry:
             features += geometry_channels(gaussians, pinhole, self.config.depth)
@@ -298,7 +298,7 @@ class FacadeModel(SplatfactoModel):
         if with_geometry and self.config.extra.empty_space > 0:
             squares, origin = squared_depths(features[-1])
             features.append(squares)
-        # Gradients of the colours are reasons to densify, those of the geometry are not.
+        # Only gradients of the colours densify, not those of the geometry.
         n_densifying = 3 if with_geometry and self.training and self.config.densification == "default" else None
         composited, alpha, self.info = rasterize(
             gaussians["means"],
@@ -333,7 +333,7 @@ class FacadeModel(SplatfactoModel):
 
     @property
     def colors(self) -> Float[Tensor, "N 3"]:
-        """Colours without view dependence. They are harmonics at degree 0 too, where splatfacto's are logistic."""
+        """Colours without view dependence: harmonics at degree 0 too, where splatfacto uses a sigmoid."""
         return SH2RGB(self.features_dc)
 
     @property
@@ -364,7 +364,7 @@ class FacadeModel(SplatfactoModel):
         return {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """R, and the terms of the geometry last rendered: those of a cue where the view has its map."""
+        """Photometric loss R and losses of the geometry last rendered, against the cue where the view has a map."""
         config, progress = self.config, self.step / self.num_iterations
         view = self._view_losses(batch, outputs["background"])
         losses = {"photometric": view.photometric(outputs["rgb"])}
@@ -375,7 +375,7 @@ class FacadeModel(SplatfactoModel):
         return losses | self._shape_losses()
 
     def _view_losses(self, batch: dict, background: Tensor) -> ViewLosses:
-        """The losses of a batch's view; those of training views are kept as far as there is room."""
+        """Losses of a batch's view; those of training views are cached while there is room."""
         index = batch["image_idx"]
         if self.training and index in self._views:
             return self._views[index]
@@ -395,7 +395,7 @@ class FacadeModel(SplatfactoModel):
         return view
 
     def _shape_losses(self) -> dict[str, Tensor]:
-        """Terms of the Gaussians themselves, wherever they are seen from."""
+        """Losses on the opacities and scales of the Gaussians."""
         config, losses = self.config, {}
         if config.extra.flattening > 0:
             visible = (self.info["radii"][0] > 0).view(self.num_points, -1).all(dim=-1)
@@ -407,9 +407,9 @@ class FacadeModel(SplatfactoModel):
 
     @torch.no_grad()
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """All metrics of a held-out view, against the shell and, as ``truth_…``, the true geometry; and its images.
+        """Metrics of a held-out view, against the shell and, as ``truth_…``, the true geometry; and its images.
 
-        Both are there for every method: the shell is a reference even where it is no cue.
+        Every method has both: the shell is a reference even where it is not a cue.
         """
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         normal = colours_to_normals(outputs["normal"])

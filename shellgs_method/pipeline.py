@@ -16,7 +16,7 @@ from rich.progress import track
 from torch import Tensor
 
 from dataparsers.errors import SceneError, refusals_end_the_program
-from shellgs_method.checkpoints import check_gaussians, guard_nerfstudio
+from shellgs_method.checkpoints import check_gaussians, guard_checkpoint_loading
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.model import FacadeModel
@@ -31,26 +31,26 @@ class FacadePipelineConfig(VanillaPipelineConfig):
 
 
 class FacadePipeline(VanillaPipeline):
-    """Evaluation of every held-out view, where some views may have no shell map.
+    """Nerfstudio's pipeline, where some held-out views may have no shell map.
 
-    Nerfstudio's own averages the keys of the first view over all views, and fails where they differ.
+    Nerfstudio's own averages the metrics of the first view over all views, and fails where another view lacks one.
     """
 
     config: FacadePipelineConfig
     datamanager: FacadeDataManager
     last_trained = ""
     """Name of the view that the last step was trained on."""
-    _left: Mapping[str, Any] = MappingProxyType({})
+    _training_state: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def model(self) -> FacadeModel:
-        """The model; nerfstudio's may be wrapped."""
+        """The facade model, unwrapped."""
         model = super().model
         assert isinstance(model, FacadeModel)
         return model
 
     def __init__(self, config: FacadePipelineConfig, *args, **kwargs):
-        guard_nerfstudio()
+        guard_checkpoint_loading()
         with refusals_end_the_program():
             super().__init__(config, *args, **kwargs)
             model, datamanager = self.model, self.datamanager
@@ -59,14 +59,14 @@ class FacadePipeline(VanillaPipeline):
             self.contradicted_shell = ContradictedShell(scene, datamanager.scene_to_world)
             if self.test_mode == "val":
                 datamanager.train_on(model.training_cues)
-            if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run brings all its Gaussians
+            if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run loads all its Gaussians
                 everywhere = model.config.shell_counts == "everywhere"
                 model.add_seeds(datamanager.shell_seeds(model.config.seed_spacing, model.config.max_seeds, everywhere))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's Gaussians.
 
-        Damaged ones, and those of other harmonics than these settings give, end the program with a sentence.
+        Damaged ones, and those of another ``sh_degree`` than the settings', end the program with a message.
         """
         with refusals_end_the_program():
             try:
@@ -78,7 +78,7 @@ class FacadePipeline(VanillaPipeline):
                 if stored.shape[1:] != parameter.shape[1:]:
                     raise SceneError(
                         f"the checkpoint's {name} are of shape {list(stored.shape)}, where these settings (sh_degree) "
-                        f"want {list(parameter.shape)}: load it with the settings that it was trained with"
+                        f"give {list(parameter.shape)}: load it with the settings that it was trained with"
                     )
         super().load_pipeline(loaded_state, step)
 
@@ -89,7 +89,7 @@ class FacadePipeline(VanillaPipeline):
         return super().get_train_loss_dict(step)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What checkpoints hold beside parameters: the densification's sums, views still to come, random numbers."""
+        """Training state for checkpoints: the densification's sums, remaining views, random number generators."""
         if self.test_mode != "val":
             return {}
         data, sums = self.datamanager, self.model.strategy_state
@@ -102,33 +102,33 @@ class FacadePipeline(VanillaPipeline):
         }
 
     def set_extra_state(self, state: Any) -> None:
-        """Keep it until :meth:`go_on`: the schedules, which are planned later, begin with none."""
-        self._left = state
+        """Keep the state until :meth:`restore_training`: planning the schedules, which comes later, would clear it."""
+        self._training_state = state
 
-    def go_on(self) -> None:
-        """Let the training go on as if it had never stopped, where a checkpoint was loaded that tells how.
+    def restore_training(self) -> None:
+        """Restore the training state of a loaded checkpoint, so that the run continues as if never stopped.
 
         Raises:
-            SceneError: what the checkpoint tells does not fit its Gaussians and views.
+            SceneError: the state does not fit the checkpoint's Gaussians and views.
         """
-        left, self._left = self._left, {}
-        if not left:
+        state, self._training_state = self._training_state, {}
+        if not state:
             return
         data, model = self.datamanager, self.model
         try:
-            sums = {name: value.to(model.device) for name, value in left["densification"].items()}
+            sums = {name: value.to(model.device) for name, value in state["densification"].items()}
             if any(len(value) != model.num_points for value in sums.values()):
                 raise ValueError("sums of other Gaussians")
-            if left["views"] and not 0 <= min(left["views"]) <= max(left["views"]) < len(data.train_dataset):
-                return  # another scene, which has an order of its own
+            if state["views"] and not 0 <= min(state["views"]) <= max(state["views"]) < len(data.train_dataset):
+                return  # another scene, with its own order of views
             model.strategy_state.update(sums)
-            data.train_unseen_cameras = list(left["views"]) or data.train_unseen_cameras
-            if left["order"]:
-                version, numbers, gauss = left["order"]
+            data.train_unseen_cameras = list(state["views"]) or data.train_unseen_cameras
+            if state["order"]:
+                version, numbers, gauss = state["order"]
                 data.random_generator.setstate((version, tuple(numbers), gauss))
-            torch.set_rng_state(left["random"])
+            torch.set_rng_state(state["random"])
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            raise SceneError(f"the checkpoint's state of the training is damaged ({error}): train again") from error
+            raise SceneError(f"the checkpoint's training state is damaged ({error}): train again") from error
 
     def get_average_image_metrics(
         self, data_loader, image_prefix: str, step: int | None = None, output_path: Path | None = None, get_std=False
@@ -155,5 +155,5 @@ class FacadePipeline(VanillaPipeline):
 
 
 def _listed(value: Any) -> Any:
-    """Tuples as lists, which are all that a checkpoint may hold."""
+    """Convert a tuple to a list: checkpoints hold no tuples."""
     return list(value) if isinstance(value, tuple) else value

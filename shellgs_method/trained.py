@@ -1,4 +1,4 @@
-"""Trained runs, read back."""
+"""Load trained runs."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from shellgs_method.config_file import load_config
 
 
 def load_run(config_path: Path, test_mode: Literal["test", "inference"]) -> tuple[TrainerConfig, Pipeline, Path]:
-    """Config, pipeline and file of the last checkpoint of the run that a config.yml belongs to.
+    """Load the run of a config.yml: its config, its pipeline and the path of its last checkpoint.
 
-    As nerfstudio's ``eval_setup``, but neither file can run a program, and a damaged one is refused.
+    As nerfstudio's ``eval_setup``, but neither file can run a program, and damaged ones are refused.
 
     Raises:
         FileNotFoundError: there is no such file.
-        SceneError: it is no config of a registered method, or its checkpoint cannot be used.
+        SceneError: it is not the config of a registered method, or its checkpoint cannot be used.
     """
     config = load_config(config_path)
     if config.method_name not in all_methods:
-        raise SceneError(f"{config_path} is of {config.method_name}, which is not installed")
+        raise SceneError(f"{config_path} is of the method {config.method_name}, which is not installed")
     folder = config.get_checkpoint_dir()
     beside = config_path.parent / config.relative_model_dir  # where the run lies if its folder was moved
     checkpoint = find_checkpoint(folder if folder.is_dir() else beside)

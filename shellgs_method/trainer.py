@@ -22,7 +22,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.files import atomic_write
 from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
-from shellgs_method.config_file import guard_nerfstudio
+from shellgs_method.config_file import guard_config_loading
 from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
 from shellgs_method.folders import held
 from shellgs_method.limits import check_settings
@@ -31,19 +31,19 @@ if TYPE_CHECKING:
     from shellgs_method.pipeline import FacadePipeline
 
 PARTIAL = "checkpoint-"
-"""How the folder of a checkpoint that is being written begins."""
+"""Prefix of the folder in which a checkpoint is written."""
 CHECK_EVERY = 100
-"""Steps between two looks at whether all Gaussians are numbers."""
+"""Steps between two checks that all Gaussians are finite."""
 
-guard_nerfstudio()
+guard_config_loading()
 
 
 @contextmanager
 def wandb_refusals() -> Iterator[None]:
-    """Turn what wandb cannot do here (no key, no network) into one sentence.
+    """Turn errors of wandb (no key, no network) into one sentence.
 
     Raises:
-        SceneError: with that sentence.
+        SceneError: wandb cannot be used.
     """
     try:
         from wandb.errors import Error  # slow to import
@@ -62,7 +62,7 @@ class FusedAdamConfig(AdamOptimizerConfig):
     """Adam whose step is one loop over the parameters, on the CPU too."""
 
     fused: bool = True
-    """One kernel; off: torch's default."""
+    """Use one kernel; off: torch's default."""
 
 
 @dataclass
@@ -106,7 +106,7 @@ class FacadeTrainerConfig(TrainerConfig):
 
 
 class FacadeTrainer(Trainer):
-    """Nerfstudio's trainer, with its resume and its checkpoints mended.
+    """Nerfstudio's trainer, with resume and checkpoints fixed.
 
     ``max_num_iterations`` is the length of the run: every schedule follows it, and a resumed run ends there too
     (nerfstudio's would train that many iterations more).
@@ -118,7 +118,7 @@ class FacadeTrainer(Trainer):
     pipeline: FacadePipeline
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Everything that training needs."""
+        """Set up everything that training needs."""
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
             _remove_leftovers(self.base_dir)
             super().setup(test_mode)
@@ -131,46 +131,46 @@ class FacadeTrainer(Trainer):
         return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def train(self) -> None:
-        """Train up to ``max_num_iterations``, counting those of the checkpoint that was loaded."""
+        """Train up to ``max_num_iterations``, including those of a loaded checkpoint."""
         run_length = self.config.max_num_iterations
         if self._start_step >= run_length:
             CONSOLE.print(f"The checkpoint has all {run_length} iterations of this run already: nothing to do.")
             return
         self._last_step, self._faults = run_length - 1, 0
         with refusals_end_the_program():
-            self.pipeline.go_on()
+            self.pipeline.restore_training()
             super().train()
 
     def train_iteration(self, step: int):
-        """One step; left out where its gradients are no numbers. The last one ends the run.
+        """One step, skipped where its gradients are not finite. The last one ends the run.
 
-        Nerfstudio 1.1.5 counts the iterations of a resumed run anew, later ones may not: neither is relied on.
+        Nerfstudio 1.1.5 counts the iterations of a resumed run anew, later versions may not: neither is relied on.
 
         Raises:
-            SceneError: too many steps were left out.
+            SceneError: too many steps were skipped.
         """
         loss, losses, metrics = super().train_iteration(step)
-        if self.optimizers.left_out:
-            self._tell_fault(step, losses)
-        if step % CHECK_EVERY == 0 or self.optimizers.left_out:
+        if self.optimizers.skipped:
+            self._report_fault(step, losses)
+        if step % CHECK_EVERY == 0 or self.optimizers.skipped:
             self._remove_broken_gaussians(step)
         if step >= self._last_step:
             self.stop_training = True
         return loss, losses, metrics
 
-    def _tell_fault(self, step: int, losses: dict[str, torch.Tensor]) -> None:
+    def _report_fault(self, step: int, losses: dict[str, torch.Tensor]) -> None:
         self._faults += 1
         forget_gradients(self.pipeline.model.info)
         terms = [name for name, value in losses.items() if not bool(value.isfinite())]
         what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
         view = self.pipeline.last_trained
         CONSOLE.print(
-            f"[yellow]Step {step} is left out: {what} of {view} is no number ({self._faults} of at most {MAX_FAULTS}).",
+            f"[yellow]Step {step} is skipped: {what} of {view} is not finite ({self._faults} of at most {MAX_FAULTS}).",
         )
         if self._faults > MAX_FAULTS:
             raise SceneError(
-                f"the training ends at step {step}, since more than {MAX_FAULTS} steps had a loss or a gradient that "
-                f"is no number, the last one with {view}: look at its photograph and maps, then go on with "
+                f"training stopped at step {step} after more than {MAX_FAULTS} steps whose loss or gradient is not "
+                f"finite, the last one with {view}: look at its photograph and maps, then resume with "
                 f"--load-dir {self.checkpoint_dir}, where the last good checkpoint is kept"
             )
 
@@ -178,10 +178,10 @@ class FacadeTrainer(Trainer):
         model = self.pipeline.model
         count = remove_broken(model.gauss_params, self.optimizers.optimizers, model.strategy_state)
         if count:
-            CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were no numbers, and are taken out.")
+            CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were not finite, and are removed.")
             if count == model.num_points:
                 raise SceneError(
-                    f"the training ends at step {step}, since no Gaussian is a number any more: lower the learning "
+                    f"training stopped at step {step} because no Gaussian is finite: lower the learning "
                     f"rates; the last good checkpoint is kept in {self.checkpoint_dir}"
                 )
 
@@ -190,7 +190,7 @@ class FacadeTrainer(Trainer):
         super()._after_train()
 
     def _load_checkpoint(self) -> None:
-        """Go on from the checkpoint that ``load_dir`` or ``load_checkpoint`` names, if one does."""
+        """Resume from the checkpoint that ``load_dir`` or ``load_checkpoint`` names, if any."""
         path = self.config.load_checkpoint
         if self.config.load_dir is not None:
             path = find_checkpoint(self.config.load_dir, self.config.load_step)
@@ -206,15 +206,15 @@ class FacadeTrainer(Trainer):
             self.grad_scaler.load_state_dict(state["scalers"])
         except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
             words = " ".join(str(error).split())[:200]
-            raise SceneError(f"{path} is no checkpoint of this method with these settings ({words})") from error
+            raise SceneError(f"{path} is not a checkpoint of this method with these settings ({words})") from error
         self._start_step = state["step"] + 1
-        CONSOLE.print(f"Going on from {path}.")
+        CONSOLE.print(f"Resuming from {path}.")
 
     def save_checkpoint(self, step: int) -> None:
-        """Save a checkpoint so that a kill at any moment leaves a whole one behind.
+        """Save a checkpoint so that a kill at any moment leaves a complete one.
 
         Raises:
-            SceneError: the disk is full, or cannot be written; checkpoints that are there stay.
+            SceneError: the disk is full or cannot be written; existing checkpoints are kept.
         """
         if self.local_rank != 0:
             return
@@ -227,11 +227,11 @@ class FacadeTrainer(Trainer):
                 super().save_checkpoint(step)
                 (saved,) = Path(partial).iterdir()
                 os.replace(saved, folder / saved.name)
-        except (OSError, RuntimeError) as error:  # torch says nothing of the disk
+        except (OSError, RuntimeError) as error:  # torch's error does not mention the disk
             free = shutil.disk_usage(self.base_dir).free
             raise SceneError(
                 f"the checkpoint of step {step} cannot be written to {folder} ({str(error).splitlines()[0][:200]}; the "
-                f"disk has {free / 1e6:.0f} MB free): make room, and go on with --load-dir {folder} if it has one"
+                f"disk has {free / 1e6:.0f} MB free): make room, then resume with --load-dir {folder} if it has one"
             ) from error
         finally:
             self.checkpoint_dir = folder
@@ -241,7 +241,7 @@ class FacadeTrainer(Trainer):
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove what saves that were killed have left of their checkpoints."""
+    """Remove the partial checkpoints of killed saves."""
     for partial in folder.glob(f"{PARTIAL}*"):
         with held(partial) as abandoned:
             if abandoned:

@@ -1,4 +1,4 @@
-"""Inputs that are damaged at random, and what must come of them: a result, or one sentence."""
+"""Random damage to inputs, which must end in a result or in one sentence."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from shellgs_method.shell.registration.picks import align_picks, read_picks
 from shellgs_method.shell.registration.positions import align_positions, read_positions
 
 SECONDS = 20
-"""That a case may take before it counts as a hang."""
+"""Time after which a case counts as a hang."""
 
 # Damage
 
@@ -50,7 +50,7 @@ JSON: st.SearchStrategy[Any] = st.recursive(
 
 @st.composite
 def damaged_bytes(draw: st.DrawFn, data: bytes) -> bytes:
-    """Bytes that are cut, or in which some are others, more, or gone."""
+    """Bytes that are cut, or of which some are changed, inserted or removed."""
     for _ in range(draw(st.integers(1, 3))):
         at = draw(st.integers(0, len(data)) | st.integers(0, min(len(data), 400)))  # headers more often
         what = draw(st.sampled_from(["cut", "flip", "overwrite", "insert", "drop"]))
@@ -70,7 +70,7 @@ def damaged_bytes(draw: st.DrawFn, data: bytes) -> bytes:
 
 @st.composite
 def damaged_json(draw: st.DrawFn, value: Any) -> Any:
-    """Json in which an entry, as deep as it comes, is another or gone."""
+    """Json in which one entry, at any depth, is changed or removed."""
     if isinstance(value, (dict, list)) and value and draw(st.integers(0, 9)):
         keys = list(value) if isinstance(value, dict) else list(range(len(value)))
         key = draw(st.sampled_from(keys))
@@ -85,7 +85,7 @@ def damaged_json(draw: st.DrawFn, value: Any) -> Any:
 
 @st.composite
 def damaged_text(draw: st.DrawFn, text: str) -> str:
-    """Lines of words in which some words are others, more, or gone."""
+    """Lines of words of which some are changed, inserted or removed."""
     lines = [line.split(" ") for line in text.split("\n")]
     word = NUMBERS.map(repr) | st.text(max_size=8) | st.sampled_from(["#", '"', "'", "\t", "frame_00001.png", "1e12"])
     for _ in range(draw(st.integers(1, 4))):
@@ -95,11 +95,11 @@ def damaged_text(draw: st.DrawFn, text: str) -> str:
     return "\n".join(" ".join(line) for line in lines)
 
 
-# What is damaged, and what it is read by
+# What is damaged, and what reads it
 
 
 class Workbench:
-    """A scene whose files are damaged one at a time, and mended again."""
+    """A scene whose files are damaged one at a time, and restored."""
 
     def __init__(self, scene: Path):
         self.scene = scene
@@ -121,7 +121,7 @@ class Workbench:
             path.write_bytes(before)
 
     def read_scene(self, scene: Path) -> None:
-        """All that training and `shellgs align` read of cameras, points and photographs."""
+        """Read the cameras, points and photographs that training and `shellgs align` read."""
         config = FacadeDataParserConfig(data=scene)
         views = read_views(config)
         with suppress_refusal():
@@ -142,7 +142,7 @@ class Workbench:
                 maps.read(view.name, view.camera)
             maps.read(view.name, view.camera.resized(24, 16), any_size=True)
 
-    def judge(self, alignment: Alignment) -> None:
+    def validate_and_cast(self, alignment: Alignment) -> None:
         validate(self.mesh, alignment, self.views, self.points)
         ShellCaster(self.mesh, alignment.shell_to_scene).cast(self.views[0].camera)
 
@@ -152,7 +152,7 @@ class Workbench:
         ShellCaster(mesh, np.eye(4)).cast(self.views[0].camera)
 
     def _colmap(self) -> Path:
-        """The same scene with a COLMAP model, as text; its binary twin lies beside it."""
+        """The same scene with a COLMAP text model."""
         scene = self.scene.with_name("colmap")
         scene.mkdir()
         (scene / "images").symlink_to(self.scene / "images")
@@ -290,7 +290,7 @@ def _alignments(bench: Workbench, data: st.DataObject) -> None:
     path = bench.scene / ALIGNMENT
     damaged = data.draw(damaged_json(json.loads(path.read_text())))
     with bench.holding(path, json.dumps(damaged).encode()):
-        bench.judge(Alignment.load(path))
+        bench.validate_and_cast(Alignment.load(path))
 
 
 def _matrices(bench: Workbench, data: st.DataObject) -> None:
@@ -303,7 +303,7 @@ def _matrices(bench: Workbench, data: st.DataObject) -> None:
         path.write_text(json.dumps(rows) if path.suffix == ".json" else "\n".join(" ".join(map(repr, r)) for r in rows))
     content = path.read_bytes()
     with bench.holding(path, data.draw(damaged_bytes(content))):
-        bench.judge(Alignment.from_matrix_file(path, "shell.ply"))
+        bench.validate_and_cast(Alignment.from_matrix_file(path, "shell.ply"))
 
 
 def _picks(bench: Workbench, data: st.DataObject) -> None:
@@ -344,12 +344,12 @@ KINDS: dict[str, Act] = {
 }
 
 
-# What must come of it
+# Outcomes
 
 
 @contextmanager
 def suppress_refusal() -> Iterator[None]:
-    """Go on after a sentence."""
+    """Continue after a refusal."""
     with suppress(SceneError, FileNotFoundError):
         yield
 
@@ -369,7 +369,7 @@ def no_hang() -> Iterator[None]:
 
 
 def outcome(bench: Workbench, kind: str, data: st.DataObject) -> str:
-    """What a case ends in: used or refused. Anything else that happens is an error that comes through."""
+    """Outcome of a case, used or refused. Any other error is raised."""
     try:
         with no_hang():
             KINDS[kind](bench, data)

@@ -1,4 +1,4 @@
-"""What tests share: a tiny synthetic facade, and the rasterizer with and without a compiler."""
+"""Shared fixtures: a tiny synthetic facade, and the rasterizer with and without a compiler."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def scene(pristine_scene: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def shellgs(capsys, monkeypatch) -> Callable[..., str]:
-    """The `shellgs` command in this process: its output on one line, or ``refused: `` and what it ended with."""
+    """Run `shellgs` in this process; returns its output on one line, or ``refused: `` and its message."""
 
     def command(*words: object) -> str:
         monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
@@ -50,7 +50,7 @@ def shellgs(capsys, monkeypatch) -> Callable[..., str]:
 
 @pytest.fixture
 def compiler(monkeypatch) -> None:
-    """Lets kernels be compiled from scratch, where that is possible."""
+    """Compile kernels from scratch; skip where there is no compiler."""
     try:
         get_cpp_compiler()
     except InvalidCxxCompiler as error:
@@ -61,13 +61,13 @@ def compiler(monkeypatch) -> None:
 
 @pytest.fixture
 def eager(monkeypatch) -> None:
-    """Tests pay for compilation only where it matters."""
+    """Do not compile kernels, which takes long."""
     monkeypatch.setenv("SHELLGS_COMPILE", "0")
 
 
 @pytest.fixture
 def offline_wandb(monkeypatch) -> Iterator[None]:
-    """Weights & Biases without an account, a network or words on the terminal."""
+    """Weights & Biases without an account, a network or terminal output."""
     for name, value in {"MODE": "offline", "SILENT": "true", "CONSOLE": "off"}.items():
         monkeypatch.setenv(f"WANDB_{name}", value)
     import wandb  # slow

@@ -1,4 +1,4 @@
-"""Runs of the methods as ns-train sets them up, and what they render."""
+"""Set up runs of the methods as ns-train does, and render them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def trainer_of(
     load_dir: Path | None = None,
     change: Callable[[FacadeTrainerConfig], object] = lambda _: None,
 ) -> FacadeTrainer:
-    """A trainer as ns-train sets it up; ``change`` does to its config what flags would."""
+    """A trainer as ns-train sets it up; ``change`` edits its config, as flags would."""
     config = copy.deepcopy(getattr(method_configs, method).config)
     config.pipeline.datamanager.data = scene
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
@@ -68,7 +68,7 @@ def render(trainer: FacadeTrainer) -> dict[str, Tensor]:
 
 @contextmanager
 def small_disk(largest: int) -> Iterator[None]:
-    """A disk that takes no file of more bytes."""
+    """Limit files to ``largest`` bytes, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest, before[1]))
     try:

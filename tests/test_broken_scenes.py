@@ -1,4 +1,4 @@
-"""Scene files that are damaged, absurd or hostile: one sentence, exit status 1, and nothing else touched."""
+"""Damaged, absurd or hostile scene files: one sentence, exit status 1, and nothing else changed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def refused(shellgs: Command, scene: Path, *words: object) -> str:
-    """The one sentence that a command ends with, having touched nothing in the scene."""
+    """The one sentence that a command ends with, having changed nothing in the scene."""
     before = contents(scene)
     output = shellgs(*words)
     assert output.startswith("refused: shellgs: ")
@@ -81,11 +81,11 @@ def text(content: str | bytes) -> Callable[[Path], object]:
 
 
 BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "empty": (text(""), "transforms.json is damaged: it is no json"),
-    "cut": (lambda scene: text((scene / "transforms.json").read_bytes()[:200])(scene), "is no json"),
-    "binary": (text(b"\xff\xfe\x00\x01"), "is no json"),
-    "deep": (text("[" * 100_000), "is no json"),
-    "a list": (text("[]"), "it holds list where an object is wanted"),
+    "empty": (text(""), "transforms.json is damaged: it is not json"),
+    "cut": (lambda scene: text((scene / "transforms.json").read_bytes()[:200])(scene), "is not json"),
+    "binary": (text(b"\xff\xfe\x00\x01"), "is not json"),
+    "deep": (text("[" * 100_000), "is not json"),
+    "a list": (text("[]"), "it holds list where an object is expected"),
     "no frames": (lambda scene: remove(scene, "frames"), "has no list of frames"),
     "frames of words": (lambda scene: change(scene, None, frames=["a"]), "frame 1: there is no file_path"),
     "no photographs": (lambda scene: change(scene, None, frames=[]), "holds no photographs"),
@@ -94,22 +94,22 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a negative focal length": (lambda scene: change(scene, None, fl_y=-300.0), "must be positive"),
     "a focal length of nan": (lambda scene: change(scene, None, fl_x=float("nan")), "'nan' as its fl_x"),
     "a focal length of words": (lambda scene: change(scene, None, fl_x="wide"), "'wide' as its fl_x"),
-    "a list as focal length": (lambda scene: change(scene, None, fl_x=[1]), "as its fl_x, which is no number"),
-    "an endless focal length": (lambda scene: change(scene, None, fl_x=10**400), "as its fl_x, which is no number"),
+    "a list as focal length": (lambda scene: change(scene, None, fl_x=[1]), "fl_x, which is not a finite number"),
+    "an endless focal length": (lambda scene: change(scene, None, fl_x=10**400), "fl_x, which is not a finite number"),
     "an infinite centre": (lambda scene: change(scene, None, cx=float("inf")), "'inf' as its cx"),
-    "no width": (lambda scene: change(scene, None, w=0), "is of 0x32 pixels"),
-    "half a pixel": (lambda scene: change(scene, None, h=31.5), "is of 48x31.5 pixels"),
-    "a huge picture": (lambda scene: change(scene, None, w=64_000, h=48_000), "is of 64000x48000 pixels, more than"),
+    "no width": (lambda scene: change(scene, None, w=0), "has 0x32 pixels"),
+    "half a pixel": (lambda scene: change(scene, None, h=31.5), "has 48x31.5 pixels"),
+    "a huge image": (lambda scene: change(scene, None, w=64_000, h=48_000), "has 64000x48000 pixels, more than"),
     "an unknown model": (lambda scene: change(scene, None, camera_model="SPHERE"), "is SPHERE, but only perspective"),
     "a model of numbers": (lambda scene: change(scene, None, camera_model=4), "is 4, but only perspective"),
     "distortion of words": (lambda scene: change(scene, None, k1="strong"), "'strong' as its k1"),
     "five coefficients": (lambda scene: change(scene, None, distortion_params=[0] * 5), "distortion_params are k1"),
     "a pose of nan": (lambda scene: pose(scene, 3, lambda m: m.fill(np.nan)), "frame_00004.png has NaN"),
-    "a pose that mirrors": (lambda scene: pose(scene, 3, lambda m: np.negative(m[:3, 0], m[:3, 0])), "no rotation"),
+    "a pose that mirrors": (lambda scene: pose(scene, 3, lambda m: np.negative(m[:3, 0], m[:3, 0])), "not a rotation"),
     "a pose that scales": (lambda scene: pose(scene, 3, lambda m: np.multiply(m[:3, :3], 2, m[:3, :3])), "it scales"),
-    "a pose of zeros": (lambda scene: pose(scene, 3, lambda m: m.fill(0)), "frame_00004.png has a pose that is no"),
-    "half a pose": (lambda scene: change(scene, 3, transform_matrix=[[1, 0, 0, 0]]), "no matrix of 4x4 numbers"),
-    "a pose of words": (lambda scene: change(scene, 3, transform_matrix="here"), "no matrix of 4x4 numbers"),
+    "a pose of zeros": (lambda scene: pose(scene, 3, lambda m: m.fill(0)), "frame_00004.png has a pose that is not"),
+    "half a pose": (lambda scene: change(scene, 3, transform_matrix=[[1, 0, 0, 0]]), "not a 4x4 matrix of numbers"),
+    "a pose of words": (lambda scene: change(scene, 3, transform_matrix="here"), "not a 4x4 matrix of numbers"),
     "one photograph twice": (
         lambda scene: change(scene, 3, file_path="images/frame_00005.png"),
         "two cameras for the photograph images/frame_00005.png",
@@ -122,8 +122,8 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no photograph": (lambda scene: change(scene, 3, file_path="images/x.png"), "1 of 10 images"),
     "a mask out of the scene": (lambda scene: change(scene, 3, mask_path="../m.png"), "is not inside the scene"),
     "no mask": (lambda scene: change(scene, 3, mask_path="m.png"), "1 masks of"),
-    "a transform of words": (lambda scene: change(scene, None, applied_transform="up"), "its applied_transform is no"),
-    "a list of numbers": (lambda scene: change(scene, None, train_filenames=[1]), "something else than names"),
+    "a transform of words": (lambda scene: change(scene, None, applied_transform="up"), "its applied_transform is not"),
+    "a list of numbers": (lambda scene: change(scene, None, train_filenames=[1]), "something other than names"),
     "no orientation": (lambda scene: change(scene, None, orientation_override="left"), "as its orientation_override"),
 }
 
@@ -149,7 +149,7 @@ BAD_CLOUDS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda scene: (scene / "sparse_pc.ply").write_bytes(
             CUT_PLY.replace(b"ascii", b"binary_little_endian").replace(b"vertex 9", b"vertex 4000000000")
         ),
-        "claims 48000000",
+        "claims at least 48000000",
     ),
 }
 
@@ -238,7 +238,7 @@ def test_a_broken_colmap_model_is_refused_in_a_sentence(scene, shellgs, fault):
     [
         ({"eval_interval": 0}, lambda scene: None, "eval_interval must be at least 2, not 0"),
         ({"eval_interval": 1}, lambda scene: None, "eval_interval must be at least 2, not 1"),
-        ({"max_image_size": 0}, lambda scene: None, "at least 1, not 0"),
+        ({"max_image_size": 0}, lambda scene: None, "at least 1 pixel, not 0"),
         ({}, lambda scene: change(scene, None, train_filenames=["images/x.png"]), "lists images/x.png, which has no"),
         ({}, lambda scene: change(scene, None, test_filenames=["images/frame_00001.png"]), "lists no photographs"),
     ],
@@ -283,7 +283,7 @@ def float_tiff(path: Path) -> None:
         (float_tiff, "frame_00002.png holds floating-point numbers and NaN or infinite ones"),
     ],
 )
-def test_a_photograph_that_is_none_is_refused_by_name(scene, spoil, words):
+def test_an_invalid_photograph_is_refused_by_name(scene, spoil, words):
     view = read_views(FacadeDataParserConfig(data=scene))[1]
     spoil(view.image)
     with pytest.raises(SceneError, match=words):
@@ -300,7 +300,7 @@ def test_a_photograph_with_a_huge_header_is_refused_by_capture(tmp_path, shellgs
 
 
 @pytest.mark.parametrize("kept", [0.3, 0.02])
-def test_a_damaged_video_is_not_told_to_be_converted_alone(tmp_path, shellgs, kept):
+def test_the_advice_for_a_damaged_video_is_not_only_to_convert_it(tmp_path, shellgs, kept):
     write_video(tmp_path / "walk.mp4", [photograph(seed=k) for k in range(9)])
     data = (tmp_path / "walk.mp4").read_bytes()
     (tmp_path / "walk.mp4").write_bytes(data[: int(kept * len(data))])
@@ -344,7 +344,7 @@ def test_a_las_that_claims_more_than_it_holds_is_refused_at_once(tmp_path, damag
 
 @pytest.mark.parametrize("kept", [0.99, 0.7, 0.5])
 def test_an_ascii_ply_that_is_cut_in_its_faces_is_refused(scene, shellgs, kept):
-    """Half a building would be cast, without a word."""
+    """Half a building would be cast without a warning."""
     mesh = load_shell(scene / "shell" / "facade.ply")
     lines = [" ".join(map(repr, vertex)) for vertex in mesh.vertices.tolist()]
     faces = [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
@@ -396,7 +396,7 @@ def test_a_matrix_in_a_damaged_npy_is_refused(scene, shellgs, damage):
     assert "matrix.npy: this is not a 4x4 matrix" in refused(shellgs, scene, *words)
 
 
-def test_sfm_points_that_cannot_be_meant_are_left_out_and_counted(scene, caplog):
+def test_stray_sfm_points_are_left_out_and_counted(scene, caplog):
     folder = model(scene)
     for k, point in enumerate(("1e12 0 0", "nan 0 0")):
         with (folder / "points3D.txt").open("a") as file:
@@ -485,8 +485,8 @@ def test_a_manifest_of_wrong_types_is_refused_by_name(scene, fields):
         parse(scene)
 
 
-def test_a_source_that_is_no_file_is_never_read(scene):
-    """Reading /dev/zero would never end, and a folder elsewhere is none of a scene's."""
+def test_a_source_that_is_not_a_file_is_never_read(scene):
+    """Reading /dev/zero would never end, and a folder elsewhere is not part of the scene."""
     path = scene / "cues" / "shell" / "manifest.json"
     manifest = json.loads(path.read_text())
     path.write_text(json.dumps(manifest | {"sources": {"/dev/zero": "0", "/": "0"}}))
@@ -558,7 +558,7 @@ def small_files():
 
 
 @pytest.mark.parametrize("command", ["cast", "align"])
-def test_a_full_disk_is_one_sentence_and_costs_nothing(scene, shellgs, command, request):
+def test_a_full_disk_ends_in_one_sentence_and_loses_nothing(scene, shellgs, command, request):
     for path in (scene / "cues" / "shell").rglob("*.npz"):
         path.unlink()
     before = contents(scene)
@@ -578,7 +578,7 @@ def test_a_full_disk_is_one_sentence_and_costs_nothing(scene, shellgs, command, 
     ("number", "words"), [(errno.EROFS, "the disk is read-only"), (errno.EACCES, "permission denied")]
 )
 @pytest.mark.parametrize("command", ["cast", "align"])
-def test_a_scene_that_cannot_be_written_is_one_sentence(scene, shellgs, monkeypatch, command, number, words):
+def test_a_scene_that_cannot_be_written_ends_in_one_sentence(scene, shellgs, monkeypatch, command, number, words):
     def refuse(*_, **__):
         raise OSError(number, os.strerror(number), str(scene / "shell"))
 
@@ -586,7 +586,7 @@ def test_a_scene_that_cannot_be_written_is_one_sentence(scene, shellgs, monkeypa
     assert words in refused(shellgs, scene, command, scene)
 
 
-def test_what_a_killed_cast_left_is_removed_by_the_next(scene, shellgs):
+def test_leftovers_of_a_killed_cast_are_removed_by_the_next(scene, shellgs):
     dead, alive = (scene / "cues/shell/images" / f".frame_00001.png.npz.{pid}.tmp" for pid in (2**22 - 3, os.getpid()))
     dead.touch()
     alive.touch()
@@ -595,7 +595,7 @@ def test_what_a_killed_cast_left_is_removed_by_the_next(scene, shellgs):
     assert alive.exists()
 
 
-def test_what_a_killed_process_left_of_a_file_or_folder_is_removed_when_it_is_written_again(tmp_path):
+def test_leftovers_of_a_killed_process_are_removed_when_the_file_or_folder_is_written_again(tmp_path):
     panel, scene, other = (tmp_path / f".{name}.{2**22 - 3}.tmp" for name in ("panel.png", "scene", "other.png"))
     panel.touch()
     other.touch()

@@ -1,4 +1,4 @@
-"""The versions that the tests were run with, in constraints.txt, are such as pyproject.toml allows."""
+"""The tested versions in constraints.txt are allowed by pyproject.toml."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 
 
-def test_every_dependency_has_a_version_that_is_allowed():
+def test_every_dependency_has_an_allowed_version():
     lines = (line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#"))
     tested = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
     project = (ROOT / "pyproject.toml").read_text().partition("[project.scripts]")[0]

@@ -1,4 +1,4 @@
-"""Cue maps on disk: what goes in comes out, and what does not belong to a camera is refused with a reason."""
+"""Cue maps on disk: read as written, and refused with a reason if they do not belong to the camera."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def map_file(maps: CueMaps) -> Path:
 
 
 def rewrite(maps: CueMaps, **changes: np.ndarray) -> None:
-    """Change arrays of VIEW's file behind the set's back."""
+    """Change arrays of VIEW's file directly."""
     with np.load(map_file(maps)) as file:
         arrays = dict(file)
     np.savez_compressed(map_file(maps), **{**arrays, **changes})
 
 
 def refusal(maps: CueMaps, camera: Camera | None = None) -> str:
-    """The message of the refusal to read VIEW, which always names the view and the command that mends it."""
+    """The refusal of VIEW's map, which always names the view and the command that makes it again."""
     with pytest.raises(SceneError) as caught:
         maps.read(VIEW, camera or a_camera())
     message = str(caught.value)
@@ -94,7 +94,7 @@ def test_a_view_without_a_map_has_none(maps: CueMaps):
     assert maps.read("images/b.jpg", a_camera()) is None
 
 
-def test_the_record_tells_the_supported_share(maps: CueMaps):
+def test_the_record_has_the_supported_share(maps: CueMaps):
     record = maps.record(VIEW)
     assert record is not None
     assert record.supported == pytest.approx(8 / 12)
@@ -190,12 +190,12 @@ def test_a_file_without_a_record_is_refused(maps: CueMaps):
         ("mask", np.ones((HEIGHT, WIDTH), bool), "pixels of the mask without depth"),
     ],
 )
-def test_arrays_that_are_no_map_are_refused(maps: CueMaps, key: str, array: np.ndarray, words: str):
+def test_invalid_arrays_are_refused(maps: CueMaps, key: str, array: np.ndarray, words: str):
     rewrite(maps, **{key: array})
     assert words in refusal(maps)
 
 
-def test_arrays_that_are_no_map_are_not_stored(maps: CueMaps):
+def test_invalid_arrays_are_not_stored(maps: CueMaps):
     with pytest.raises(SceneError, match=r"images/b\.jpg.*NaN"):
         maps.write("images/b.jpg", replace(a_map(), depth=np.full((HEIGHT, WIDTH), np.nan, np.float32)), a_camera())
     assert not (maps.folder / "images/b.jpg.npz").exists()
@@ -229,7 +229,7 @@ def test_a_map_left_over_from_another_alignment_is_refused(maps: CueMaps):
     assert "another shell/alignment.json" in refusal(again)
 
 
-def test_only_a_sound_map_of_the_same_camera_is_current(maps: CueMaps):
+def test_only_a_valid_map_of_the_same_camera_is_current(maps: CueMaps):
     assert maps.current(VIEW, a_camera())
     assert not maps.current("images/b.jpg", a_camera())
     assert not maps.current(VIEW, a_camera().shrunk(8))
@@ -237,19 +237,19 @@ def test_only_a_sound_map_of_the_same_camera_is_current(maps: CueMaps):
     assert not maps.current(VIEW, a_camera())
 
 
-def test_writing_again_mends_a_damaged_map(maps: CueMaps):
+def test_writing_again_replaces_a_damaged_map(maps: CueMaps):
     map_file(maps).write_bytes(b"PK")
     maps.write(VIEW, a_map(), a_camera())
     assert equal(maps.read(VIEW, a_camera()), a_map())
 
 
-def test_a_map_that_sees_nothing_is_stored(maps: CueMaps):
+def test_an_empty_map_is_stored(maps: CueMaps):
     nothing = CueMap(*(np.zeros_like(array) for array in (a_map().depth, a_map().normal, a_map().mask)))
     maps.write("images/sky.jpg", nothing, a_camera())
     assert equal(maps.read("images/sky.jpg", a_camera()), nothing)
 
 
-def test_a_scene_without_maps_is_told_apart(tmp_path: Path):
+def test_opening_a_set_that_does_not_exist_is_refused(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="no shell maps"):
         CueMaps.open(tmp_path, "shell")
 
@@ -270,7 +270,7 @@ def test_a_moved_scene_keeps_its_maps(maps: CueMaps, tmp_path: Path):
 
 
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
-def test_an_interrupted_write_leaves_what_was_there(tmp_path: Path, interruption: BaseException):
+def test_an_interrupted_write_keeps_the_earlier_file(tmp_path: Path, interruption: BaseException):
     path = tmp_path / "x.bin"
     path.write_bytes(b"before")
 

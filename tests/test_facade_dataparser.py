@@ -1,4 +1,4 @@
-"""What nerfstudio is told of a scene."""
+"""What the dataparser gives nerfstudio."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_colmap_and_transforms_json_give_the_same_cameras(scene):
 @pytest.mark.parametrize("kind", ["transforms.json", "ns-process-data", "COLMAP"])
 @pytest.mark.parametrize("method", [{}, {"orientation_method": "pca", "center_method": "focus"}])
 def test_the_rescaled_world_is_that_of_nerfstudios_own_parsers(scene, kind, method):
-    """So that runs of before, and of other methods, see the same cameras and points."""
+    """So that earlier runs, and other methods, have the same cameras and points."""
     common = {"data": scene, "downscale_factor": 1, "load_3D_points": True, **method}
     if kind == "COLMAP":
         write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
@@ -114,14 +114,14 @@ def test_scene_cameras_undo_nerfstudios_rescaling(pristine_scene):
 
 
 @pytest.mark.parametrize("orientation", ["up", "none"])
-def test_maps_fit_their_cameras_whatever_way_nerfstudio_turns_the_world(pristine_scene, orientation):
+def test_maps_fit_their_cameras_however_nerfstudio_orients_the_world(pristine_scene, orientation):
     outputs = parse(pristine_scene, "train", orientation_method=orientation)
     batch = FacadeDataset(outputs)[0]
     assert {"shell_depth", "shell_normal", "shell_mask", "truth_depth"} <= batch.keys()
 
 
 def test_shell_depth_is_in_units_of_the_rescaled_world(pristine_scene):
-    """A point seen in one view has, carried through nerfstudio's poses, the depth that its neighbour's map tells."""
+    """A point of one view, projected by nerfstudio's poses, has the depth in its neighbour's map."""
     outputs = parse(pristine_scene, "train")
     dataset = FacadeDataset(outputs)
     (here, there), (pose, other) = (dataset[3], dataset[4]), outputs.cameras.camera_to_worlds[3:5]
@@ -149,7 +149,7 @@ def test_images_and_cameras_shrink_together(pristine_scene):
     assert (views[0].camera.width, views[0].camera.height) == (24, 16)
 
 
-def test_maps_of_another_size_are_refused_with_the_command_that_mends_them(pristine_scene):
+def test_maps_of_another_size_are_refused_with_the_command_that_makes_them_again(pristine_scene):
     dataset = FacadeDataset(parse(pristine_scene, max_image_size=24))
     with pytest.raises(SceneError, match=r"frame_00002.*48x32.*24x16.*shellgs cast"):
         dataset[0]
@@ -168,8 +168,8 @@ def test_metres_per_unit_are_those_of_the_rescaled_world(pristine_scene):
     assert outputs.metadata["metres_per_unit"] == pytest.approx(in_scene / outputs.dataparser_scale)
 
 
-def test_a_distorted_camera_becomes_the_pinhole_camera_of_its_undistorted_picture(scene):
-    """A straight line of the world, bent by the lens, is straight again in the photograph that is trained on."""
+def test_a_distorted_camera_becomes_the_pinhole_camera_of_its_undistorted_image(scene):
+    """A straight line of the world, bent by the lens, is straight again in the undistorted photograph."""
     views = read_views(FacadeDataParserConfig(data=scene))
     write_colmap(scene, views, list(range(1, 11)), model="OPENCV", extra="-0.2 0.05 0 0")
     view = read_views(FacadeDataParserConfig(data=scene))[0]
@@ -177,7 +177,7 @@ def test_a_distorted_camera_becomes_the_pinhole_camera_of_its_undistorted_pictur
     assert view.lens is not None
     calibrated = view.lens.get_intrinsics_matrices().numpy()
     height, width = int(view.lens.height), int(view.lens.width)
-    # Paint x = 0.15 of the normalised plane as the distorted camera sees it.
+    # Paint x = 0.15 of the normalised plane in the distorted image.
     y, x = np.mgrid[:height, :width] + 0.5
     zero_centred = calibrated - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     pixels = np.stack([x - 0.5, y - 0.5], axis=-1).reshape(-1, 1, 2)

@@ -1,4 +1,4 @@
-"""Numbers that are none, settings that make no sense, disks that are full: what a training does about them."""
+"""What training does about NaN and infinity, invalid settings and full disks."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from shellgs_method.trainer import FacadeTrainer
 pytestmark = pytest.mark.usefixtures("eager")
 
 
-# numbers that are none
+# NaN and infinity
 
 
-def all_numbers(trainer: FacadeTrainer) -> bool:
-    """Whether Gaussians, the optimizers' moments and the densification's sums are numbers."""
+def all_finite(trainer: FacadeTrainer) -> bool:
+    """Whether Gaussians, the optimizers' moments and the densification's sums are finite."""
     model = model_of(trainer)
     moments = [value for adam in trainer.optimizers.optimizers.values() for value in adam.state.values()]
     tensors = [*model.gauss_params.values(), *(each for state in moments for each in state.values())]
@@ -60,28 +60,28 @@ SPOILED = {"a map": spoil_map, "a photograph": spoil_photograph, "a gradient": s
 
 
 @pytest.mark.parametrize("what", SPOILED)
-def test_a_view_that_is_no_number_is_named_and_left_out_and_harms_nothing_else(pristine_scene, tmp_path, capsys, what):
+def test_a_view_that_is_not_finite_is_named_and_skipped_and_harms_nothing_else(pristine_scene, tmp_path, capsys, what):
     trainer = trainer_of(pristine_scene, tmp_path, "shellgs", iterations=9)
     name = SPOILED[what](trainer, slice(2, 3))
     trainer.train()
     said = " ".join(capsys.readouterr().out.split())
-    assert f"of {name} is no number (1 of at most {MAX_FAULTS})" in said
-    assert all_numbers(trainer)
+    assert f"of {name} is not finite (1 of at most {MAX_FAULTS})" in said
+    assert all_finite(trainer)
     assert render(trainer)["rgb"].isfinite().all()
     assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000008.ckpt"]
 
 
 @pytest.mark.parametrize("what", ["a map", "a gradient"])
-def test_more_than_a_few_end_the_run_with_the_last_good_checkpoint(pristine_scene, tmp_path, what):
+def test_too_many_skipped_steps_end_the_run_with_the_last_good_checkpoint(pristine_scene, tmp_path, what):
     def save_often(config):
         config.steps_per_save = 4
 
     trainer = trainer_of(pristine_scene, tmp_path, "shellgs", iterations=60, change=save_often)
     SPOILED[what](trainer, slice(0, 7))  # all but one
-    with pytest.raises(SystemExit, match=r"^shellgs: the training ends at step \d+, .*frame_\d+.png.*--load-dir"):
+    with pytest.raises(SystemExit, match=r"^shellgs: training stopped at step \d+ .*frame_\d+.png.*--load-dir"):
         trainer.train()
     (kept,) = trainer.checkpoint_dir.iterdir()
-    assert all_numbers(trainer)
+    assert all_finite(trainer)
     again = trainer_of(pristine_scene, tmp_path / "again", "shellgs", 60, load_dir=trainer.checkpoint_dir)
     assert f"step-{again._start_step - 1:09d}.ckpt" == kept.name
 
@@ -97,21 +97,21 @@ def test_more_than_a_few_end_the_run_with_the_last_good_checkpoint(pristine_scen
         ("features_rest", math.nan),
     ],
 )
-def test_a_gaussian_that_is_no_number_is_taken_out(pristine_scene, tmp_path, capsys, name, value):
+def test_a_gaussian_that_is_not_finite_is_removed(pristine_scene, tmp_path, capsys, name, value):
     trainer = trainer_of(pristine_scene, tmp_path, "shellgs", iterations=3)
     model, before = model_of(trainer), model_of(trainer).num_points
     model.gauss_params[name].data[7] = value
     trainer.train()
-    assert "1 Gaussians were no numbers" in " ".join(capsys.readouterr().out.split())
+    assert "1 Gaussians were not finite" in " ".join(capsys.readouterr().out.split())
     assert model.num_points == before - 1
-    assert all_numbers(trainer)
+    assert all_finite(trainer)
     assert render(trainer)["rgb"].isfinite().all()
 
 
-def test_a_run_whose_gaussians_are_all_no_numbers_ends(pristine_scene, tmp_path):
+def test_a_run_without_a_finite_gaussian_ends(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=3)
     model_of(trainer).scales.data[:] = torch.nan
-    with pytest.raises(SystemExit, match=r"^shellgs: the training ends at step 0, since no Gaussian is a number"):
+    with pytest.raises(SystemExit, match=r"^shellgs: training stopped at step 0 because no Gaussian is finite"):
         trainer.train()
 
 
@@ -149,7 +149,7 @@ def test_a_run_whose_gaussians_are_all_no_numbers_ends(pristine_scene, tmp_path)
         ("pipeline.model.extra.normal_consistency-from", "-1"),
     ],
 )
-def test_a_setting_that_makes_no_sense_is_refused_by_ns_train_before_anything_is_written(
+def test_a_setting_out_of_range_is_refused_by_ns_train_before_anything_is_written(
     tmp_path, monkeypatch, capsys, flag, value
 ):
     monkeypatch.chdir(tmp_path)
@@ -174,7 +174,7 @@ def test_the_viewer_of_our_methods_listens_on_this_machine_alone(pristine_scene,
     assert addresses == {"127.0.0.1"}
 
 
-# runs that go on
+# resumed runs
 
 
 @pytest.mark.parametrize("subtracts", [False, True], ids=["anew", "from the start"])
@@ -196,7 +196,7 @@ def test_a_resumed_run_ends_at_its_length_however_nerfstudio_counts(pristine_sce
     assert second.optimizers.optimizers["means"].state[model_of(second).means]["step"] == 7
 
 
-def test_what_a_killed_save_left_goes_at_the_next_start_and_what_is_being_saved_stays(pristine_scene, tmp_path):
+def test_leftovers_of_killed_saves_are_removed_at_the_next_start_but_not_a_save_in_progress(pristine_scene, tmp_path):
     first = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=1)
     first.train()
     for name in ("checkpoint-abc", "checkpoint-def"):
@@ -210,7 +210,7 @@ def test_what_a_killed_save_left_goes_at_the_next_start_and_what_is_being_saved_
 # disks
 
 
-def test_a_full_disk_ends_a_training_with_its_name_and_keeps_the_checkpoint_before(pristine_scene, tmp_path):
+def test_a_full_disk_ends_training_and_keeps_the_earlier_checkpoint(pristine_scene, tmp_path):
     first = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=2)
     first.train()
     before = first.checkpoint_dir / "step-000000001.ckpt"

@@ -1,6 +1,6 @@
-"""Random damage to every file of a scene: a result or a sentence, in bounded time and memory.
+"""Random damage to every file of a scene ends in a result or a sentence, in bounded time and memory.
 
-`python -m benchmarks.damage` runs two thousand cases of it and counts.
+`python -m benchmarks.damage` runs two thousand cases and counts the outcomes.
 """
 
 from __future__ import annotations

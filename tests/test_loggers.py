@@ -1,4 +1,4 @@
-"""What tensorboard and wandb are told while a method trains."""
+"""What tensorboard and wandb log while a method trains."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from shellgs_method.evaluation.colours import GREY, MAX_ERROR
 from shellgs_method.trainer import FacadeTrainer
 
 LAST = 30
-ALL, ONE, PICTURES = "Eval Images Metrics Dict (all images)/", "Eval Images Metrics/", "Eval Images/"
+ALL, ONE, IMAGES = "Eval Images Metrics Dict (all images)/", "Eval Images Metrics/", "Eval Images/"
 MAPS = {f"{of}{what}" for of in ("", "truth_") for what in ("depth", "normal", "normal_error")}
 
 
 def watched(scene: Path, folder: Path, vis: Literal["tensorboard", "wandb"]) -> FacadeTrainer:
-    """A shellgs run that is logged at its last."""
+    """A shellgs run that logs at its last step."""
 
     def watch(config):
         config.vis, config.logging.steps_per_log = vis, LAST
@@ -40,7 +40,7 @@ def watched(scene: Path, folder: Path, vis: Literal["tensorboard", "wandb"]) -> 
 
 @pytest.fixture(scope="module")
 def tensorboard(pristine_scene, tmp_path_factory) -> tuple[FacadeTrainer, EventAccumulator]:
-    """A run with its tensorboard, as read back."""
+    """A run and its tensorboard events."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SHELLGS_COMPILE", "0")
         trainer = watched(pristine_scene, tmp_path_factory.mktemp("run"), "tensorboard")
@@ -60,7 +60,7 @@ def test_tensorboard_gets_every_term_of_the_loss(tensorboard):
 
 
 @pytest.mark.usefixtures("eager")
-def test_tensorboard_gets_all_held_out_figures(tensorboard):
+def test_tensorboard_gets_all_held_out_metrics(tensorboard):
     trainer, events = tensorboard
     expected = trainer.pipeline.get_average_eval_image_metrics()
     timing = {"num_rays_per_sec", "fps"}
@@ -73,22 +73,22 @@ def test_tensorboard_gets_all_held_out_figures(tensorboard):
     assert last(events, ONE).keys() | of_some == expected.keys() - timing - counts | {"num_rays"}
 
 
-def test_tensorboard_gets_pictures_of_depth_normals_and_error_for_either_reference(tensorboard):
+def test_tensorboard_gets_images_of_depth_normals_and_error_for_both_references(tensorboard):
     _, events = tensorboard
-    assert set(events.Tags()["images"]) == {PICTURES + name for name in MAPS | {"img"}}
+    assert set(events.Tags()["images"]) == {IMAGES + name for name in MAPS | {"img"}}
     for name in MAPS | {"img"}:
-        (event,) = events.Images(PICTURES + name)
+        (event,) = events.Images(IMAGES + name)
         assert (event.width, event.height) == ((48, 32) if name.endswith("error") else (96, 32))  # side by side
 
 
-def test_the_error_picture_says_what_the_figure_does(tensorboard):
-    """The share of its pixels that are darker than 20° is the figure of that name, of the same view."""
+def test_the_error_image_agrees_with_the_metric(tensorboard):
+    """The share of its pixels below 20° is the metric of that name, of the same view."""
     _, events = tensorboard
     for prefix in ("", "truth_"):
-        (event,) = events.Images(f"{PICTURES}{prefix}normal_error")
-        picture = np.asarray(Image.open(io.BytesIO(event.encoded_image_string)))
+        (event,) = events.Images(f"{IMAGES}{prefix}normal_error")
+        pixels = np.asarray(Image.open(io.BytesIO(event.encoded_image_string)))
         scale = np.concatenate([255 * colormaps["inferno"](np.arange(256))[:, :3], [[GREY] * 3]])
-        level = np.linalg.norm(picture[..., None, :] - scale, axis=-1).argmin(axis=-1)
+        level = np.linalg.norm(pixels[..., None, :] - scale, axis=-1).argmin(axis=-1)
         share = (level[level < 256] / 255 * MAX_ERROR < 20).mean()
         assert share == pytest.approx(last(events, ONE)[f"{prefix}normal_below_20deg"], abs=0.01)
         assert share > 0.03
@@ -112,7 +112,7 @@ def test_wandb_offline_gets_all_that_tensorboard_gets(tensorboard, pristine_scen
 
 
 def recorded(run: Path) -> Iterator[tuple[str, str]]:
-    """Names and values of what an offline run has recorded."""
+    """Names and values that an offline run has recorded."""
     store = DataStore()
     store.open_for_scan(str(next(run.glob("*.wandb"))))
     while data := store.scan_data():

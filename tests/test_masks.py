@@ -1,4 +1,4 @@
-"""What the user masks out: found without a flag, trained nowhere, measured nowhere."""
+"""User masks are found without a flag, and what they mask out is neither trained on nor measured."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def test_a_photograph_without_a_mask_is_kept_whole(scene):
 
 def test_masks_of_no_photograph_are_refused(scene):
     paint(scene / "masks" / "elsewhere.png", left=12)
-    with pytest.raises(SceneError, match=r"no photograph has a mask in .*masks/frame_00001.png.png; name them so"):
+    with pytest.raises(SceneError, match=r"no photograph has a mask in .*masks/frame_00001.png.png; rename the masks"):
         read_views(FacadeDataParserConfig(data=scene))
     with pytest.raises(FileNotFoundError, match="painted is not a folder of masks"):
         read_views(FacadeDataParserConfig(data=scene, masks_path=Path("painted")))
 
 
-def test_cast_leaves_masked_pixels_out_and_knows_when_masks_change(scene):
+def test_cast_leaves_masked_pixels_out_and_notices_changed_masks(scene):
     paint_all(scene)
     cli.cast(scene)
     maps, view = CueMaps.open(scene, "shell"), read_views(FacadeDataParserConfig(data=scene))[4]
@@ -78,7 +78,7 @@ def test_cast_leaves_masked_pixels_out_and_knows_when_masks_change(scene):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
 
 
-def test_align_judges_by_what_masks_keep(scene):
+def test_align_validates_with_what_masks_keep(scene):
     alignment = Alignment.load(scene / ALIGNMENT)
     mesh, config = load_shell(scene / alignment.shell), FacadeDataParserConfig(data=scene)
     points = read_sparse_points(config)
@@ -86,7 +86,7 @@ def test_align_judges_by_what_masks_keep(scene):
     paint_all(scene)
     after = validate(mesh, alignment, read_views(config), points)
     for quantity in (lambda view: view.supported, lambda view: len(view.errors)):
-        all_of_it, kept = (sum(map(quantity, judged.views)) for judged in (before, after))
+        all_of_it, kept = (sum(map(quantity, result.views)) for result in (before, after))
         assert 0.3 * all_of_it < kept < 0.95 * all_of_it
 
 
@@ -96,7 +96,7 @@ def test_a_mask_of_another_shape_is_refused_by_its_own_name(scene):
         load_mask(read_views(FacadeDataParserConfig(data=scene))[1])
 
 
-def test_masked_pixels_are_in_no_figure_of_a_picture(monkeypatch):
+def test_masked_pixels_are_in_no_image_metric(monkeypatch):
     """PSNR by hand; SSIM and LPIPS do not change with what is rendered there."""
     generator = torch.Generator().manual_seed(0)
     target, noise = torch.rand(40, 48, 3, generator=generator), torch.rand(40, 48, 3, generator=generator)
@@ -150,7 +150,7 @@ def test_a_masked_view_is_measured_where_it_is_kept(scene, tmp_path):
 
 
 @pytest.mark.usefixtures("eager")
-def test_a_photograph_that_is_masked_altogether_is_refused_by_name(scene, tmp_path):
+def test_a_fully_masked_photograph_is_refused_by_name(scene, tmp_path):
     paint(scene / "masks" / "frame_00002.png", left=48)
     with pytest.raises(SystemExit, match=r"shellgs: the mask .*masks/frame_00002.png is black everywhere"):
         trainer_of(scene, tmp_path, "photo_gs").train()

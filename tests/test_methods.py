@@ -40,7 +40,7 @@ METHODS = {
 
 @pytest.fixture
 def mono_scene(scene: Path) -> Path:
-    """The scene with the truth as what a perfect network sees, and no shell."""
+    """The scene with the truth as the maps of a perfect network, and no shell."""
     truth = CueMaps.open(scene, "truth")
     mono = CueMaps.create(scene, "mono", command="shellgs mono {scene}")
     for view in read_views(FacadeDataParserConfig(data=scene)):
@@ -75,8 +75,8 @@ def test_the_methods_are_points_of_primitive_and_cues():
     }
 
 
-def test_the_papers_methods_begin_at_the_sfm_points_alone():
-    """Supervision rather than initialization: one start for all."""
+def test_the_papers_methods_start_from_the_sfm_points_alone():
+    """They differ in supervision, not in initialization."""
     models = {name: getattr(method_configs, attribute).config.pipeline.model for name, attribute in METHODS.items()}
     assert {name for name, model in models.items() if model.seeds != "none"} == {"shellgs-metric"}
     assert "shellgs-metric" not in PAPER
@@ -107,7 +107,7 @@ def test_an_ablation_is_a_registered_method_with_something_changed(name):
     assert config.pipeline != getattr(method_configs, METHODS[ABLATIONS[name][0]]).config.pipeline
 
 
-def test_a_config_file_from_before_the_settings_beyond_the_paper_still_loads():
+def test_a_config_file_without_the_settings_beyond_the_paper_still_loads():
     stored = yaml.load(
         "!!python/object:shellgs_method.model.FacadeModelConfig\n"
         "cues: shell\n"
@@ -149,7 +149,7 @@ def test_2dgs_trains_to_more_discs_of_no_thickness(discs):
 
 
 def test_a_disc_splits_within_its_plane(discs):
-    """Gsplat's own split, on what the model gives it: children are scattered along the first two axes alone."""
+    """Gsplat's own split of the model's discs scatters children along the first two axes alone."""
     model = model_of(discs)
     params = torch.nn.ParameterDict({name: value.detach().clone() for name, value in model.gauss_params.items()})
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
@@ -183,7 +183,7 @@ def test_2dgs_renders_images_and_has_its_own_losses(discs):
     assert losses.keys() == {"photometric", "normal_consistency", "distortion"}
 
 
-def test_the_terms_of_2dgs_start_when_they_are_to(discs):
+def test_the_terms_of_2dgs_start_at_their_iterations(discs):
     model, (_, batch) = model_of(discs), held_out(discs)
     outputs, extra = render(discs), model.config.extra
     model.config.extra = ExtraLossConfig(normal_consistency=0.05, distortion=10.0)  # from 7000 and 3000 of 30 000
@@ -213,7 +213,7 @@ def test_distortion_of_3d_gaussians_is_refused(pristine_scene, tmp_path):
 # Primitive x cues
 
 
-def test_discs_take_the_shells_cues(pristine_scene, tmp_path):
+def test_discs_can_be_supervised_by_the_shell(pristine_scene, tmp_path):
     def discs(config):
         config.pipeline.model.primitive = "2d"
 
@@ -278,8 +278,8 @@ def test_all_switches_are_off_in_the_papers_setting(untrained):
     assert terms(geometry, cue, paper=GeometryLossConfig()).keys() == {"depth", "normal", "smoothness"}
 
 
-def test_the_normals_of_depth_move_gaussians_where_those_composited_hardly_do(untrained):
-    """Shifting all splats of a pixel along its ray does not change N's value; it is what the other term acts on."""
+def test_normals_of_depth_have_a_depth_gradient_and_composited_ones_have_none(untrained):
+    """Shifting all splats of a pixel along its ray changes the normals of depth, but not the composited ones."""
     geometry, cue = rendered(untrained)
     (loss,) = terms(geometry, cue, depth_normal=0.1).values()
     (gradient,) = torch.autograd.grad(loss, geometry.depth, retain_graph=True)
@@ -300,7 +300,7 @@ def test_point_to_plane_is_in_metres(untrained):
 
 
 @pytest.mark.parametrize(("error", "expected"), [(None, 0.05), (0.003, 0.05), (0.08, 0.08), (0.5, 0.15)])
-def test_the_tolerance_is_what_the_alignment_may_be_off(error, expected):
+def test_the_tolerance_follows_the_error_of_the_alignment(error, expected):
     assert ExtraLossConfig().tolerance_for(error) == expected
     assert ExtraLossConfig(tolerance=0.3).tolerance_for(error) == 0.3
 
@@ -337,7 +337,7 @@ def test_shellgs_metric_brings_the_surface_to_the_shell(pristine_scene, tmp_path
     assert distance("shellgs_metric") < 0.8 * distance("shellgs")
 
 
-def test_the_occlusion_gate_waits_and_then_spares_what_stands_before_the_shell(untrained):
+def test_the_occlusion_gate_waits_and_then_ignores_what_stands_before_the_shell(untrained):
     geometry, cue = rendered(untrained)
     distance = torch.zeros_like(geometry.depth)
     distance[:, ::2] = 0.3  # 60 cm behind what is rendered
@@ -351,7 +351,7 @@ def test_the_occlusion_gate_waits_and_then_spares_what_stands_before_the_shell(u
     assert gated(progress=0.15, gate=0.7)["point_to_plane"].item() > 0.1
 
 
-def test_the_flattening_term_is_the_mean_thickness_of_what_the_view_shows(untrained):
+def test_the_flattening_term_is_the_mean_thickness_of_the_visible_gaussians(untrained):
     model = model_of(untrained)
     model.config.extra = ExtraLossConfig(flattening=100.0)
     outputs = render(untrained)
@@ -362,8 +362,8 @@ def test_the_flattening_term_is_the_mean_thickness_of_what_the_view_shows(untrai
     torch.testing.assert_close(loss, 100 * model.scales[visible].exp().amin(dim=-1).mean())
 
 
-def test_the_unit_that_flattening_is_in_is_the_size_of_the_camera_path(untrained):
-    """Nerfstudio rescales every scene so, whence the weight means the same in each."""
+def test_flattening_is_in_units_of_the_size_of_the_camera_path(untrained):
+    """Nerfstudio rescales every scene to it, so that a weight means the same in each."""
     outputs = data_of(untrained).train_dataparser_outputs
     assert outputs.cameras.camera_to_worlds[:, :, 3].abs().max() == pytest.approx(1, rel=0.2)
 
@@ -415,7 +415,7 @@ def test_mcmc_never_has_more_gaussians_than_its_cap(pristine_scene, tmp_path):
     assert model_of(trainer).num_points == 100
 
 
-def test_mcmc_brings_its_regularisers(pristine_scene, tmp_path):
+def test_mcmc_adds_its_regularisers(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=mcmc(1000))
     trainer.pipeline.eval()
     model, outputs = model_of(trainer), render(trainer)

@@ -49,16 +49,16 @@ def test_rendered_normals_are_unit_and_face_the_camera(trained):
     rays = pinhole_camera(held_out(trained)[0]).rays()[seen]
     assert seen.sum() > 200
     torch.testing.assert_close(normal.norm(dim=-1), torch.ones(len(normal)))
-    # The composite of facing normals faces the pixel's own ray but for grazing ones.
+    # The composite of facing normals faces the pixel's own ray except at grazing angles.
     assert ((normal * rays).sum(dim=-1) < 0).float().mean() > 0.98
 
 
-def test_what_depends_on_a_training_view_alone_is_computed_once_where_there_is_room(trained, monkeypatch):
+def test_losses_of_a_training_view_are_cached_while_there_is_room(trained, monkeypatch):
     model, (_, batch), outputs = model_of(trained), held_out(trained), render(trained)
     assert len(model._views) == 8  # of 10, two are held out
     monkeypatch.setattr(model, "_views", {})
     held_out_view = model._view_losses(batch, outputs["background"])
-    assert model._view_losses(batch, outputs["background"]) is not held_out_view  # it has the number of another view
+    assert model._view_losses(batch, outputs["background"]) is not held_out_view  # its index is also a training view's
     monkeypatch.setattr(model, "training", True)
     kept = model._view_losses(batch, outputs["background"])
     assert model._view_losses(batch, outputs["background"]) is kept
@@ -69,14 +69,14 @@ def test_what_depends_on_a_training_view_alone_is_computed_once_where_there_is_r
 
 @pytest.mark.parametrize(("step", "pause"), [(0, 0), (999, 0), (1000, 108), (2500, 108)])
 def test_densification_pauses_after_a_reset_until_each_photograph_was_seen(trained, step, pause):
-    assert model_of(trained)._pause_of_refinement(step, reset_every=1000) == pause
+    assert model_of(trained)._refinement_pause(step, reset_every=1000) == pause
 
 
 def test_densification_does_not_pause_from_one_reset_to_the_next(trained):
-    assert model_of(trained)._pause_of_refinement(300, reset_every=100) == 50
+    assert model_of(trained)._refinement_pause(300, reset_every=100) == 50
 
 
-def test_training_makes_the_picture_and_the_normals_better(trained, pristine_scene, tmp_path):
+def test_training_improves_image_and_normals(trained, pristine_scene, tmp_path):
     untrained = trainer_of(pristine_scene, tmp_path)
     untrained.pipeline.eval()
     before, after = (
@@ -107,7 +107,7 @@ def test_a_nerfstudio_camera_looks_along_minus_z_and_ours_along_plus_z():
     torch.testing.assert_close(camera.viewmat @ ahead_right_up, torch.tensor([0.5, -0.25, 1.0, 1.0]))
 
 
-def test_schedules_shrink_with_the_run(pristine_scene, tmp_path):
+def test_schedules_scale_with_the_run(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, iterations=3000)
     strategy = model_of(trainer).strategy
     assert isinstance(strategy, DefaultStrategy)
@@ -120,7 +120,7 @@ def test_schedules_shrink_with_the_run(pristine_scene, tmp_path):
 
 
 def test_geometry_weights_follow_the_run(trained):
-    """With the same rendering and batch, D's share falls from 0.5 to 0.1 over the run, N's and C's stay."""
+    """With the same rendering and batch, the depth weight falls from 0.5 to 0.1 over the run, the others stay."""
     model = model_of(trained)
     outputs, (_, batch) = render(trained), held_out(trained)
     losses = []
@@ -141,7 +141,7 @@ def test_a_view_without_a_map_trains_with_its_photograph_alone(trained):
     assert model.get_loss_dict(outputs, batch).keys() == {"photometric", "depth", "normal", "smoothness"}
 
 
-def test_what_the_user_masked_out_supervises_nothing(trained):
+def test_masked_out_pixels_supervise_nothing(trained):
     model = model_of(trained)
     outputs, (_, batch) = render(trained), held_out(trained)
     losses = model.get_loss_dict(outputs, batch | {"mask": torch.zeros(32, 48, 1, dtype=torch.bool)})
@@ -183,7 +183,7 @@ def test_a_checkpoint_loads_as_weights_only(trained):
     assert not any("lpips" in key for key in loaded["pipeline"])
 
 
-def test_a_resumed_run_moves_the_restored_parameters_and_ends_where_it_was_planned_to(pristine_scene, tmp_path):
+def test_a_resumed_run_trains_the_restored_parameters_to_the_planned_end(pristine_scene, tmp_path):
     first = trainer_of(pristine_scene, tmp_path / "first", iterations=4)
     first.train()
     saved = {name: parameter.detach().clone() for name, parameter in model_of(first).gauss_params.items()}
@@ -239,7 +239,7 @@ def test_a_resumed_run_loads_another_number_of_gaussians(pristine_scene, tmp_pat
     first.train()
 
 
-def test_a_finished_run_is_left_as_it_is(trained, pristine_scene, tmp_path):
+def test_resuming_a_finished_run_changes_nothing(trained, pristine_scene, tmp_path):
     again = trainer_of(pristine_scene, tmp_path, iterations=60, load_dir=trained.checkpoint_dir)
     again.train()
     assert not again.checkpoint_dir.exists()
@@ -277,7 +277,7 @@ def test_every_method_is_measured_against_shell_and_truth(pristine_scene, tmp_pa
     assert np.isfinite(list(metrics.values())).all()
 
 
-def test_a_held_out_view_without_a_map_counts_for_the_pictures_only(scene, tmp_path):
+def test_a_held_out_view_without_a_map_has_image_metrics_only(scene, tmp_path):
     (scene / "cues" / "shell" / "images" / "frame_00001.png.npz").unlink()
     trainer = trainer_of(scene, tmp_path, iterations=5)
     trainer.train()

@@ -1,4 +1,4 @@
-"""Runs that come from elsewhere, or were damaged: their files are data, and faults are told in a sentence."""
+"""Damaged runs and runs of others: their files are read as data, and faults are reported in one sentence."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def run(pristine_run: Path, tmp_path: Path, eager) -> Path:
 
 
 def refusal(monkeypatch, *words: object) -> str:
-    """What a command of ours that is refused ends with."""
+    """The message that a refused command ends with."""
     monkeypatch.setattr("sys.argv", ["shellgs", *map(str, words)])
     with pytest.raises(SystemExit) as end:
         cli.main()
@@ -102,13 +102,13 @@ def test_a_program_in_config_yml_is_not_run_by_nerfstudios_commands(tmp_path, re
     again = copy.deepcopy(all_methods["photo-gs"])
     again.load_config = path
     read = {"ns-eval": partial(eval_setup, path), "ns-train": partial(train.main, again)}[reader]
-    with pytest.raises(SystemExit, match=r"^shellgs: .* is no config.yml of a run"):
+    with pytest.raises(SystemExit, match=r"^shellgs: .* is not the config.yml of a run"):
         read()
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("name", [name for name, config in all_methods.items() if isinstance(config, TrainerConfig)])
-def test_the_config_of_every_method_comes_back_as_it_was_written(name, tmp_path):
+def test_the_config_of_every_method_is_read_as_it_was_written(name, tmp_path):
     config = copy.deepcopy(all_methods[name])
     config.set_timestamp()
     config.experiment_name = "facade"
@@ -117,7 +117,7 @@ def test_the_config_of_every_method_comes_back_as_it_was_written(name, tmp_path)
     assert yaml.load((tmp_path / "config.yml").read_text(), Loader=yaml.Loader) == config  # as nerfstudio reads it
 
 
-def test_a_config_of_before_a_setting_was_there_has_its_default_and_one_that_is_gone_is_left_out(run):
+def test_an_older_config_has_defaults_for_new_settings_and_drops_those_that_are_gone(run):
     text = (run / "config.yml").read_text()
     assert "    seeds: none\n" in text
     (run / "config.yml").write_text(text.replace("    seeds: none\n", "    of_an_earlier_build: 3\n"))
@@ -140,7 +140,7 @@ def test_settings_keep_their_values_under_the_names_of_an_older_config(tmp_path)
 DAMAGE: dict[str, tuple[Callable[[str], str], str]] = {
     "empty": (lambda _: "", "it is empty"),
     "cut in the middle": (lambda text: text[: len(text) // 2], "cannot be read"),
-    "without its end": (lambda text: text[: text.index("\ntimestamp")], "it is cut: timestamp"),
+    "without its end": (lambda text: text[: text.index("\ntimestamp")], "it is cut off: timestamp"),
     "cut in a word": (
         lambda text: text[: text.index("FacadePipelineConfig") + 4],
         "names shellgs_method.pipeline.Faca",
@@ -189,7 +189,7 @@ def rewrite(path: Path, change: Callable[[dict], object]) -> None:
 
 
 class Program:
-    """What pickle runs when it is read."""
+    """An object that makes a folder when it is unpickled."""
 
     def __init__(self, mark: Path):
         self.mark = mark
@@ -209,7 +209,7 @@ CHECKPOINTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "misnamed": (lambda path: path.rename(path.with_name("last.ckpt")), "holds no checkpoint"),
     "gone": (lambda path: path.unlink(), "holds no checkpoint"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read as a checkpoint"),
-    "a list": (lambda path: torch.save([1], path), "no checkpoint of nerfstudio"),
+    "a list": (lambda path: torch.save([1], path), "not a checkpoint of nerfstudio"),
     "a program": (lambda path: torch.save({"step": 1, "pipeline": Program(path.parent / "mark")}, path), "checkpoint"),
     "a pickle": (lambda path: path.write_bytes(pickle.dumps(Program(path.parent / "mark"))), "checkpoint"),
     "without its model": (lambda path: rewrite(path, lambda state: state.pop("pipeline")), "lacks its pipeline"),
@@ -232,10 +232,10 @@ CHECKPOINTS: dict[str, tuple[Callable[[Path], object], str]] = {
         ),
         "sh_degree",
     ),
-    "of NaN": (lambda path: rewrite(path, nan_means), "1 of its 300 Gaussians are no numbers"),
+    "of NaN": (lambda path: rewrite(path, nan_means), "1 of its 300 Gaussians are not finite"),
     "of another method": (
         lambda path: rewrite(path, lambda state: state.update(pipeline={"_model.field.weight": torch.ones(3)})),
-        "no checkpoint of this method with these settings",
+        "not a checkpoint of this method with these settings",
     ),
 }
 
@@ -257,7 +257,7 @@ def test_a_damaged_checkpoint_is_refused_with_a_sentence(run, pristine_scene, tm
 def test_a_checkpoint_without_an_optimizer_is_not_resumed(run, pristine_scene, tmp_path):
     rewrite(run / LAST, lambda state: state["optimizers"]["means"]["state"].clear())
     rewrite(run / LAST, lambda state: state["optimizers"]["means"]["param_groups"].clear())
-    with pytest.raises(SystemExit, match=r"^shellgs: .*no checkpoint of this method with these settings"):
+    with pytest.raises(SystemExit, match=r"^shellgs: .*not a checkpoint of this method with these settings"):
         trainer_of(pristine_scene, tmp_path / "resumed", "photo_gs", load_dir=(run / LAST).parent)
 
 
@@ -267,7 +267,7 @@ def test_a_run_whose_folder_was_moved_is_found_beside_its_config(run, tmp_path):
     assert checkpoint == moved / LAST
 
 
-def test_a_run_without_its_config_is_named(tmp_path, monkeypatch):
+def test_a_missing_config_is_named(tmp_path, monkeypatch):
     assert "does not exist" in refusal(monkeypatch, "evaluate", tmp_path / "config.yml")
 
 
@@ -288,7 +288,7 @@ def test_a_run_without_its_config_is_named(tmp_path, monkeypatch):
         (["mesh", "--margin", "-1"], "a --margin from 0"),
     ],
 )
-def test_a_place_or_a_number_that_cannot_be_is_refused_before_the_work(run, monkeypatch, words, why):
+def test_an_invalid_output_or_number_is_refused_before_the_work(run, monkeypatch, words, why):
     monkeypatch.chdir(run)
     Path("file").touch()
     for name in ("folder", "folder.ply"):
@@ -299,9 +299,9 @@ def test_a_place_or_a_number_that_cannot_be_is_refused_before_the_work(run, monk
 
 
 @pytest.mark.parametrize("command", ["evaluate", "splats", "mesh"])
-def test_a_full_disk_is_told_with_its_name_and_harms_nothing_that_is_there(run, monkeypatch, command):
+def test_a_full_disk_is_reported_with_the_file_and_changes_no_existing_file(run, monkeypatch, command):
     target = {"evaluate": run / "eval.json", "splats": run / "splats.ply", "mesh": run / "mesh.ply"}[command]
-    target.write_text("of before")
+    target.write_text("earlier")
     before = files(run)
     ball = trimesh.creation.icosphere()
     ball.metadata["voxel"] = 1.0

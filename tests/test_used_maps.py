@@ -1,4 +1,4 @@
-"""Which maps a training reads, and which a measurement: those it does not need cannot stop it."""
+"""Which maps training and evaluation read: those that they do not need cannot stop them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("eager")
 
 
 def spoil(scene: Path, kind: str) -> None:
-    """Maps that belong to other cameras."""
+    """Write maps that belong to other cameras."""
     views = read_views(FacadeDataParserConfig(data=scene))
     maps = CueMaps.create(scene, kind, command=f"shellgs {kind} {{scene}}")
     nothing = CueMap(np.zeros((32, 48), np.float32), np.zeros((32, 48, 3), np.float16), np.zeros((32, 48), bool))
@@ -42,9 +42,9 @@ def test_maps_that_a_method_does_not_train_on_do_not_stop_it(scene, tmp_path, ki
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert {"psnr", "psnr_seen"} <= metrics.keys()
     assert ("normal_deg" in metrics, "truth_normal_deg" in metrics) == (kind != "shell", kind != "truth")
-    told = [record.message for record in caplog.records if "measures nothing against" in record.message]
-    assert len(told) == (kind != "mono")
-    assert all(f"the {kind} maps" in message for message in told)
+    warnings = [record.message for record in caplog.records if "No metrics against" in record.message]
+    assert len(warnings) == (kind != "mono")
+    assert all(f"the {kind} maps" in message for message in warnings)
 
 
 def test_only_what_is_trained_on_is_held_in_memory(scene, tmp_path):
@@ -52,7 +52,7 @@ def test_only_what_is_trained_on_is_held_in_memory(scene, tmp_path):
     assert {key for key in batch if key.endswith("_depth")} == {"shell_depth"}
 
 
-def test_a_cast_at_another_size_leaves_every_method_its_truth(scene, tmp_path):
+def test_a_cast_at_another_size_does_not_stop_metrics_against_the_truth(scene, tmp_path):
     cli.cast(scene, max_image_size=24)
     trainer = trainer_of(scene, tmp_path, "shellgs", iterations=2)
     trainer.train()
@@ -61,8 +61,8 @@ def test_a_cast_at_another_size_leaves_every_method_its_truth(scene, tmp_path):
 
 
 @pytest.mark.parametrize("size", [(24, 16), (36, 24), (96, 64)])
-def test_a_resampled_map_is_that_of_the_camera_of_its_size(scene, size):
-    """On planes to float32's rounding; at edges the nearest pixel counts."""
+def test_a_resampled_map_equals_one_cast_at_that_size(scene, size):
+    """On planes to float32's rounding; at edges the nearest pixel is taken."""
     alignment = Alignment.load(scene / ALIGNMENT)
     caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
     camera = read_views(FacadeDataParserConfig(data=scene))[4].camera
@@ -78,7 +78,7 @@ def test_a_resampled_map_is_that_of_the_camera_of_its_size(scene, size):
 
 
 @pytest.mark.parametrize("empty", [False, True])
-def test_maps_that_are_all_gone_are_told_of_before_training(scene, tmp_path, empty):
+def test_missing_maps_of_all_views_are_refused_before_training(scene, tmp_path, empty):
     for path in (scene / "cues" / "shell").rglob("*.npz"):
         path.unlink()
     if empty:
@@ -97,11 +97,11 @@ def test_training_views_without_a_map_are_counted(scene, tmp_path, caplog):
     assert "1 of the 8 training views have no shell map" in caplog.text
 
 
-def test_memory_is_told_of_and_maps_that_do_not_fit_are_read_in_every_step(scene, tmp_path, monkeypatch, capsys):
+def test_memory_is_reported_and_maps_that_do_not_fit_are_read_in_every_step(scene, tmp_path, monkeypatch, capsys):
     held, read = (trainer_of(scene, tmp_path / name, "shellgs_metric", iterations=2) for name in ("a", "b"))
     data_of(held).cached_train  # noqa: B018
     assert "of memory" not in capsys.readouterr().out
-    monkeypatch.setattr("shellgs_method.datamanager.WORTH_SAYING", 1e5)
+    monkeypatch.setattr("shellgs_method.datamanager.MIN_REPORTED_BYTES", 1e5)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1e5})())
     data_of(read).train_dataset.held = True
     data_of(read).__dict__.pop("cached_train", None)
@@ -115,7 +115,7 @@ def test_memory_is_told_of_and_maps_that_do_not_fit_are_read_in_every_step(scene
     assert len(model_of(held).gauss_params["means"]) == len(model_of(read).gauss_params["means"])
 
 
-def test_a_map_of_another_size_names_the_command_for_the_size_that_is_wanted(scene):
+def test_a_map_of_another_size_is_refused_with_the_command_for_the_wanted_size(scene):
     cli.cast(scene, max_image_size=40)
     view = read_views(FacadeDataParserConfig(data=scene))[0]
     with pytest.raises(
