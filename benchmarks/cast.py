@@ -83,7 +83,7 @@ def cast_bare(caster: ShellCaster, rays: list[o3d.core.Tensor]) -> float:
     """Seconds of the ray caster alone."""
     start = time.perf_counter()
     for view in rays:
-        caster.scene.cast_rays(view)
+        caster.triangles.scene.cast_rays(view)
     return time.perf_counter() - start
 
 

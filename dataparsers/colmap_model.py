@@ -119,11 +119,15 @@ def _shot(scene: Path, images_path: Path, image: _Image, cameras: Mapping[int, _
 def _listed(scene: Path, images_path: Path) -> dict[str, set[str]]:
     """Splits listed in ``train_list.txt`` etc., as in nerfstudio."""
     files = {"train": "train_list.txt", "test": "test_list.txt", "val": "validation_list.txt"}
-    return {
-        split: {(images_path / line).as_posix() for line in (scene / file).read_text("utf-8").splitlines() if line}
-        for split, file in files.items()
-        if (scene / file).is_file()
-    }
+    listed = {}
+    for split, file in files.items():
+        if (scene / file).is_file():
+            try:
+                names = (scene / file).read_text("utf-8").splitlines()
+            except UnicodeDecodeError as error:
+                raise SceneError(f"{scene / file} is not a text file: list one photograph in each line") from error
+            listed[split] = {(images_path / name).as_posix() for name in names if name}
+    return listed
 
 
 def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable[[Iterator[list[str]]], T]) -> T:

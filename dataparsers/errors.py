@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,6 +48,9 @@ def refusals_end_the_program() -> Iterator[None]:
     """Turn a refusal into one sentence on stderr and exit status 1; a bug keeps its traceback."""
     try:
         yield
+    except BrokenPipeError:  # `shellgs --help | head`: whoever read the output has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered goes nowhere
+        raise SystemExit(1) from None
     except OSError as error:
         ours = error.errno is None  # raised with a sentence, not by the system
         raise SystemExit(f"shellgs: {error if ours else explained(error)}") from error

@@ -56,6 +56,8 @@ class ExtraLossConfig:
     """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05)."""
     normal_consistency_from: int = 7000
     """First iteration of that term."""
+    normal_consistency_on: Literal["everywhere", "unsupervised"] = "everywhere"
+    """Pixels of that term: all, or those that no cue supervises, so that walls continue beyond the shell."""
     distortion: float = 0.0
     """Weight of the depth distortion of 2DGS; discs only."""
     distortion_from: int = 3000
@@ -177,22 +179,31 @@ def cue_losses(
 
 
 def self_losses(
-    geometry: Geometry, extra: ExtraLossConfig, progress: float, kept: Bool[Tensor, "H W 1"] | None = None
+    geometry: Geometry,
+    extra: ExtraLossConfig,
+    progress: float,
+    kept: Bool[Tensor, "H W 1"],
+    supervised: Bool[Tensor, "H W 1"] | None = None,
 ) -> dict[str, Tensor]:
     """Weighted terms of 2DGS on the rendered geometry, without a cue, at ``progress`` in [0, 1] of the run.
 
-    They are means over the pixels kept by the user's mask.
+    They are means over the pixels kept by the user's mask; normal consistency may be 0 in the ``supervised`` ones.
     """
     iteration = progress * PAPER_ITERATIONS
     losses = {}
     if extra.normal_consistency > 0 and iteration >= extra.normal_consistency_from:
-        losses["normal_consistency"] = extra.normal_consistency * normal_consistency_loss(
-            geometry.normal, geometry.depth_normal, geometry.alpha, kept
+        where = kept
+        if extra.normal_consistency_on == "unsupervised" and supervised is not None:
+            where = kept & ~supervised
+        share = where.sum() / kept.sum().clamp_min(1)  # a pixel weighs the same however few count
+        losses["normal_consistency"] = (
+            extra.normal_consistency
+            * share
+            * normal_consistency_loss(geometry.normal, geometry.depth_normal, geometry.alpha, where)
         )
     if extra.distortion > 0 and iteration >= extra.distortion_from:
         assert geometry.distortion is not None
-        mean = geometry.distortion.mean() if kept is None else weighted_mean(geometry.distortion, kept)
-        losses["distortion"] = extra.distortion * mean
+        losses["distortion"] = extra.distortion * weighted_mean(geometry.distortion, kept)
     return losses
 
 

@@ -50,6 +50,9 @@ class Triangles:
         vertices: in any unit.
         faces: indices of three vertices each.
 
+    Attributes:
+        scene: Open3D's ray casting scene.
+
     Raises:
         ImportError: Open3D cannot be loaded.
     """
@@ -57,33 +60,33 @@ class Triangles:
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
         o3d = import_open3d()
         self._tensor = o3d.core.Tensor.from_numpy
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
+        self.scene = o3d.t.geometry.RaycastingScene()
+        self.scene.add_triangles(
             self._tensor(np.ascontiguousarray(vertices, np.float32)),
             self._tensor(np.ascontiguousarray(faces, np.uint32)),
         )
 
-    def cast(self, rays: Float32[np.ndarray, "*N 6"]) -> Hits:
+    def cast_rays(self, rays: Float32[np.ndarray, "*N 6"]) -> Hits:
         """First hits of rays, made by :func:`rays_from`."""
-        answer = self._scene.cast_rays(self._tensor(rays))
+        answer = self.scene.cast_rays(self._tensor(rays))
         t, triangle = answer["t_hit"].numpy(), answer["primitive_ids"].numpy().astype(np.int64)
         triangle[np.isinf(t)] = -1
         return Hits(t, triangle, answer["primitive_normals"].numpy())
 
     def blocked(self, rays: Float32[np.ndarray, "*N 6"]) -> Bool[np.ndarray, " *N"]:
         """Whether rays hit anything at all."""
-        return self._scene.test_occlusions(self._tensor(rays)).numpy()
+        return self.scene.test_occlusions(self._tensor(rays)).numpy()
 
     def closest(self, points: Float[np.ndarray, "N 3"]) -> Closest:
         """The nearest point of the surface to each point."""
         threads = 1 if len(points) < _FEW else 0  # 0: all
-        answer = self._scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, np.float32)), threads)
+        answer = self.scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, np.float32)), threads)
         triangle = answer["primitive_ids"].numpy().astype(np.int64)
         return Closest(answer["points"].numpy(), triangle, answer["primitive_normals"].numpy())
 
     def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
         """Unsigned distance of each point from the surface."""
-        return self._scene.compute_distance(self._tensor(np.ascontiguousarray(points, np.float32))).numpy()
+        return self.scene.compute_distance(self._tensor(np.ascontiguousarray(points, np.float32))).numpy()
 
 
 def rays_from(

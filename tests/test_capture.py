@@ -460,7 +460,13 @@ def test_a_finished_capture_is_not_repeated_and_other_settings_are_refused(truth
 
 @pytest.mark.slow
 def test_a_scene_captured_with_masks_loads_with_them(truth, tmp_path):
-    capture(truth / "images", tmp_path / "scene", CaptureConfig(masks=truth / "shell" / "masks" / "images"))
+    (tmp_path / "masks").mkdir()
+    for path in (truth / "images").iterdir():
+        with Image.open(path) as photo:
+            mask = np.full((photo.height, photo.width), 255, np.uint8)
+        mask[:, : mask.shape[1] // 8] = 0
+        Image.fromarray(mask).save(tmp_path / "masks" / f"{path.name}.png")
+    capture(truth / "images", tmp_path / "scene", CaptureConfig(masks=tmp_path / "masks"))
     for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene", masks_path=Path("masks")))[:3]:
         mask = load_mask(view)
         assert mask is not None

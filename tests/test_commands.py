@@ -114,6 +114,17 @@ def test_ns_render_writes_images_of_every_output(demo, tmp_path):
         assert len(list((tmp_path / "test" / output).iterdir())) == 2
 
 
+def test_a_reader_that_stops_early_gets_no_error(tmp_path):
+    """As in `shellgs --help | head`."""
+    script = "from dataparsers.errors import *\nwith refusals_end_the_program():\n  for k in range(10**6): print(k)"
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout
+        assert process.stderr
+        assert process.stdout.readline() == b"0\n"
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
 def test_ns_train_lists_the_methods_and_describes_their_settings(tmp_path):
     assert {"shellgs", "mono-gs", "photo-gs", "2dgs"} <= set(run("ns-train", "--help", cwd=tmp_path).split())
     described = run("ns-train", "shellgs", "--help", cwd=tmp_path)

@@ -64,7 +64,7 @@ def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, mode
     rays = np.empty((HEIGHT, WIDTH, 6), np.float32)
     rays[..., :3] = -viewmat[:3, :3].T @ viewmat[:3, 3] - caster.origin
     rays[..., 3:] = rays_through(model, coefficients) @ viewmat[:3, :3]
-    depth = caster.scene.cast_rays(rays)["t_hit"].numpy()
+    depth = caster.triangles.cast_rays(rays).t
     shade = np.where(np.isfinite(depth), 40 + 200 * np.clip(depth / 25, 0, 1), 0).astype(np.uint8)
     Image.fromarray(np.repeat(shade[..., None], 3, axis=2)).save(view.image)
     photograph = load_photograph(view)[..., 0].astype(float)

@@ -70,6 +70,8 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
     try:
         ray.init(address or "local", include_dashboard=None if address else False, log_to_driver=False)
     except (ConnectionError, RuntimeError, ValueError) as error:
+        if not address:
+            raise SceneError(f"Ray cannot start on this machine ({error})") from error
         raise SceneError(f"there is no Ray cluster at {address}: start one with `ray start --head`") from error
     failures: dict[Run, str] = {}
     try:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float64
 from dataparsers.camera import Camera
 from dataparsers.files import atomic_write
 from shellgs_method.shell import Alignment, ShellMesh
+from shellgs_method.shell.geometry.similarity import scale_of
 
 UpAxis = Literal["y", "z"]
 
@@ -80,7 +81,7 @@ class Frame:
     @property
     def scale(self) -> float:
         """Scene units in one unit of this frame."""
-        return float(np.cbrt(np.linalg.det(self.to_scene[:3, :3])))
+        return scale_of(self.to_scene)
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the scene in this frame, with depths in this frame's unit."""

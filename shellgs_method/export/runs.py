@@ -24,6 +24,7 @@ from shellgs_method.export.splats import Splats
 from shellgs_method.export.tsdf import DepthView
 from shellgs_method.model import FacadeModel, reference_errors
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
+from shellgs_method.shell.geometry.files import up_axis
 from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.trained import load_run
 
@@ -84,8 +85,7 @@ class TrainedRun:
         if self.shell is None:
             cameras = positions(view.camera for dataset in self.datasets for view in dataset.views)
             return scene_frame(self.up or "z", cameras.mean(axis=0))
-        gltf = self.shell[0].shell.lower().endswith((".glb", ".gltf"))
-        return shell_frame(*self.shell, up=self.up or ("y" if gltf else "z"))
+        return shell_frame(*self.shell, up=self.up or up_axis(self.shell[0].shell))
 
     @property
     def shell_in_frame(self) -> ShellMesh:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dataparsers.files import atomic_write
 from shellgs_method.rasterizer import spherical_harmonics
+from shellgs_method.shell.geometry.similarity import scale_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,7 @@ class Splats:
 
         The harmonics rotate with the Gaussians, so that renders stay the same.
         """
-        scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
+        scale = scale_of(similarity)
         rotation = similarity[:3, :3] / scale
         turned = Rotation.from_matrix(rotation) * Rotation.from_quat(self.quats.double().numpy()[:, [1, 2, 3, 0]])
         bands = harmonics_rotation(torch.from_numpy(rotation), math.isqrt(self.harmonics.shape[1]) - 1)

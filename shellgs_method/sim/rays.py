@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from shellgs_method.open3d import import_open3d
+from shellgs_method.triangles import Triangles, rays_from
 
 
-class Surface:
+class Surface(Triangles):
     """A triangle mesh for ray casting and distances, in float32, so the origin must be near.
 
     Attributes:
@@ -20,25 +20,20 @@ class Surface:
     """
 
     def __init__(self, vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> None:
-        self._tensor = import_open3d().core.Tensor
         self.vertices, self.faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         crosses = np.cross(b - a, c - a)
         doubled = np.linalg.norm(crosses, axis=1)
         self.centres = (a + b + c) / 3
         self.normals, self.areas = crosses / np.maximum(doubled, 1e-300)[:, None], doubled / 2
-        self._scene = import_open3d().t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            self._tensor(self.vertices.astype(np.float32)), self._tensor(self.faces.astype(np.uint32))
-        )
+        super().__init__(self.vertices, self.faces)
 
     def cast(
         self, origins: Float64[np.ndarray, "*N 3"], directions: Float64[np.ndarray, "*N 3"]
     ) -> tuple[Float32[np.ndarray, " *N"], Int64[np.ndarray, " *N"]]:
         """First hit of each ray: the multiple of its direction (inf if none) and the triangle (-1 if none)."""
-        answer = self._scene.cast_rays(self._rays(origins, directions))
-        t = answer["t_hit"].numpy()
-        return t, np.where(np.isfinite(t), answer["primitive_ids"].numpy().astype(np.int64), -1)
+        hits = self.cast_rays(rays_from(origins, directions))
+        return hits.t, hits.triangle
 
     def sees(
         self, points: Float64[np.ndarray, "*N 3"], targets: Float64[np.ndarray, "*N 3"], slack: float = 1e-3
@@ -49,15 +44,11 @@ class Surface:
         t, _ = self.cast(np.broadcast_to(points, away.shape), away / np.maximum(length, 1e-9))
         return t >= length[..., 0] - slack
 
-    def distance(self, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
-        """Unsigned distances of points, in metres."""
-        return self._scene.compute_distance(self._tensor(points.astype(np.float32))).numpy()
-
     def signed_distance(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
         """Distances of points, in metres: positive on the side that the nearest triangle's normal points to."""
-        answer = self._scene.compute_closest_points(self._tensor(points.astype(np.float32)))
-        away = points - answer["points"].numpy()
-        side = np.einsum("nc,nc->n", away, self.normals[answer["primitive_ids"].numpy().astype(np.int64)])
+        closest = self.closest(points)
+        away = points - closest.point
+        side = np.einsum("nc,nc->n", away, self.normals[closest.triangle])
         return np.where(side < 0, -1.0, 1.0) * np.linalg.norm(away, axis=1)
 
     def samples(self, count: int, seed: int = 0) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
@@ -66,11 +57,6 @@ class Surface:
         chosen = rng.choice(len(self.areas), count, p=self.areas / self.areas.sum())
         weights = rng.dirichlet(np.ones(3), count)
         return np.einsum("nk,nkd->nd", weights, self.vertices[self.faces[chosen]]), chosen
-
-    def _rays(self, origins: np.ndarray, directions: np.ndarray):
-        rays = np.empty((*directions.shape[:-1], 6), np.float32)
-        rays[..., :3], rays[..., 3:] = origins, directions
-        return self._tensor(rays)
 
 
 def outward(

@@ -14,6 +14,7 @@ from scipy.spatial import Delaunay, KDTree, QhullError
 from dataparsers.errors import SceneError
 from dataparsers.strays import sound
 from shellgs_method.open3d import import_open3d, reason
+from shellgs_method.triangles import Triangles
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +113,7 @@ def mesh_cloud(
     if len(faces) == 0:
         raise SceneError(f"the points make no surface with the mesher {mesher!r}: try another, or a denser cloud")
     sample = np.random.default_rng(0).permutation(len(kept))[:200_000]
-    distance = _distances(vertices, faces, kept[sample])
+    distance = Triangles(vertices, faces).distance(kept[sample])
     report = Meshing(
         mesher=mesher,
         points=len(points),
@@ -285,13 +286,6 @@ def _merge(parts: list[_Part]) -> tuple[np.ndarray, np.ndarray]:
         faces.append(renumbered.reshape(-1, 3) + count)
         count += len(used)
     return np.concatenate(vertices), np.concatenate(faces)
-
-
-def _distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    o3d = import_open3d()
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32)))
-    return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 
 def _legacy(points: np.ndarray, normals: np.ndarray | None = None):

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -33,6 +34,11 @@ class Geometry:
     vertices: Float64[np.ndarray, "V 3"]
     faces: Int64[np.ndarray, "F 3"]
     scanners: Float64[np.ndarray, "S 3"]
+
+
+def up_axis(shell: str) -> Literal["y", "z"]:
+    """The axis of a shell's file that points up: y in glTF, by that format's convention, else z."""
+    return "y" if shell.lower().endswith((".glb", ".gltf")) else "z"
 
 
 def read_geometry(path: Path) -> Geometry:

@@ -7,9 +7,9 @@ from jaxtyping import Float16, Float32, Float64
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
-from shellgs_method.open3d import import_open3d
 from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.triangles import Triangles
 
 
 class ShellCaster:
@@ -20,7 +20,7 @@ class ShellCaster:
         shell_to_scene: similarity from that frame to the scene's.
 
     Attributes:
-        scene: Open3D's ray casting scene, whose origin is :attr:`origin`.
+        triangles: the shell relative to :attr:`origin`.
         origin: centre of the shell's bounding box, in the scene's frame.
         extent: longest side of the bounding box, in scene units.
 
@@ -29,15 +29,12 @@ class ShellCaster:
     """
 
     def __init__(self, mesh: ShellMesh, shell_to_scene: Float64[np.ndarray, "4 4"]) -> None:
-        self._o3d = import_open3d()
         placed = transformed(mesh.vertices, shell_to_scene)
         # Embree computes in float32, whose steps are 3 cm at 4e5: its coordinates are relative to the shell's centre.
         self.origin = (placed.min(0) + placed.max(0)) / 2
         self.extent = float(np.ptp(placed, axis=0).max())
         placed -= self.origin
-        tensor = self._o3d.core.Tensor
-        self.scene = self._o3d.t.geometry.RaycastingScene()
-        self.scene.add_triangles(tensor(placed.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
+        self.triangles = Triangles(placed, mesh.faces)
         a, b, c = (placed[mesh.faces[:, k]] for k in range(3))
         normals = np.cross(b - a, c - a)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -45,7 +42,7 @@ class ShellCaster:
         self._rays = np.empty((0, 0, 6), np.float32)
 
     def rays(self, camera: Camera) -> Float32[np.ndarray, "H W 6"]:
-        """Origin and direction of each pixel's ray in the frame of :attr:`scene`, valid until the next call.
+        """Origin and direction of each pixel's ray in the frame of :attr:`triangles`, valid until the next call.
 
         Directions have z = 1 in the camera's frame, so that the ray parameter of a hit is its z-depth.
         """
@@ -63,12 +60,10 @@ class ShellCaster:
 
     def cast(self, camera: Camera) -> CueMap:
         """Cast the shell into a camera: z-depth in scene units, normals facing the camera, and the mask of hits."""
-        hits = self.scene.cast_rays(self._o3d.core.Tensor.from_numpy(self.rays(camera)))
-        depth = hits["t_hit"].numpy()
-        mask = np.isfinite(depth)
-        depth[~mask] = 0
-        triangles = hits["primitive_ids"].numpy()  # 2³² - 1 for a miss, which clips to the last row
-        return CueMap(depth, self._facing(camera).take(triangles, axis=0, mode="clip"), mask)
+        hits = self.triangles.cast_rays(self.rays(camera))
+        mask = np.isfinite(hits.t)
+        hits.t[~mask] = 0
+        return CueMap(hits.t, self._facing(camera)[hits.triangle], mask)
 
     def _facing(self, camera: Camera) -> Float16[np.ndarray, "F+1 3"]:
         """Normal of each triangle in the camera's frame, facing the camera; the last row is zero, for misses.
@@ -81,7 +76,7 @@ class ShellCaster:
         return np.concatenate([facing, np.zeros((1, 3))]).astype(np.float16)
 
     def _pose(self, camera: Camera) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"]]:
-        """Camera centre in the frame of :attr:`scene`, and rotation from world to camera."""
+        """Camera centre in the frame of :attr:`triangles`, and rotation from world to camera."""
         viewmat = camera.viewmat.detach().cpu().double().numpy()
         rotation = viewmat[:3, :3]
         return -rotation.T @ viewmat[:3, 3] - self.origin, rotation

@@ -13,6 +13,11 @@ def transformed(
     return points @ similarity[:3, :3].T + similarity[:3, 3]
 
 
+def scale_of(similarity: Float64[np.ndarray, "4 4"]) -> float:
+    """The factor by which a similarity multiplies lengths."""
+    return float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+
+
 def fit_similarity(source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"]) -> np.ndarray:
     """Least-squares similarity from source to target points (Umeyama 1991), as a 4x4 matrix."""
     centre, goal = source.mean(0), target.mean(0)

@@ -14,6 +14,7 @@ from dataparsers.camera import positions, upwards
 from dataparsers.cue_maps import CueMaps, source_hash
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
+from shellgs_method.shell.geometry.files import up_axis
 from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.surface import ShellSurface
 from shellgs_method.shell.registration.alignment import Alignment
@@ -101,7 +102,7 @@ def place_by_guess(
         SceneError: the points show no wall, or it fits nowhere.
     """
     surface = ShellSurface(mesh, metres_per_shell_unit)
-    up = np.array([0.0, 1.0, 0.0] if shell.lower().endswith((".glb", ".gltf")) else [0.0, 0.0, 1.0])
+    up = np.array([0.0, 1.0, 0.0] if up_axis(shell) == "y" else [0.0, 0.0, 1.0])
     cameras = [view.camera for view in views]
     best, *rivals = propose(surface, points.positions, positions(cameras), upwards(cameras), up)
     history = ["Proposed from the outline of the main wall; not yet confirmed."]

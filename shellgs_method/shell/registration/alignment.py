@@ -17,7 +17,7 @@ from dataparsers.files import atomic_write, read_json, remove_leftovers
 from dataparsers.photograph import View
 from shellgs_method.shell.geometry.clouds import Mesher
 from shellgs_method.shell.geometry.mesh import ShellMesh, load_shell
-from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.shell.geometry.similarity import scale_of, transformed
 
 ALIGNMENT = Path("shell/alignment.json")
 """Alignment file, in the scene's folder."""
@@ -66,7 +66,7 @@ class Alignment:
     @property
     def scale(self) -> float:
         """Scene units in one shell unit."""
-        return float(np.cbrt(np.linalg.det(self.shell_to_scene[:3, :3])))
+        return scale_of(self.shell_to_scene)
 
     @property
     def rotation(self) -> Float64[np.ndarray, "3 3"]:

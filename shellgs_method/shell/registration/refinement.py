@@ -119,7 +119,7 @@ def refine(
 def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evidence, np.ndarray, np.ndarray]:
     """One step: its evidence, the similarity to apply, and the mask of points within the gate."""
     closest = surface.closest(points)
-    offset = points - closest.foot
+    offset = points - closest.point
     used = np.linalg.norm(offset, axis=1) < gate
     if used.sum() < 7:
         raise SceneError(

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from dataparsers.photograph import View, load_mask
 from shellgs_method.shell.geometry.raycast import ShellCaster
-from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.shell.geometry.similarity import scale_of, transformed
 
 if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints
@@ -70,7 +70,7 @@ def look(
 ) -> ViewSupport:
     """Cast the shell into a thumbnail of the view, and compare it with the view's SfM points inside its mask."""
     thumbnail = view.camera.shrunk(_THUMBNAIL)
-    metres = float(np.cbrt(np.linalg.det(survey_from_scene[:3, :3])))
+    metres = scale_of(survey_from_scene)
     cue = caster.cast(thumbnail)
     kept = load_mask(replace(view, camera=thumbnail))
     cue = cue if kept is None else replace(cue, mask=cue.mask & kept)

@@ -230,8 +230,8 @@ def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.nd
 def _signed_distances(surface: ShellSurface, points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
     """Distance of each point from the shell, positive on the side of the nearest camera."""
     closest = surface.closest(points)
-    towards = cameras[KDTree(cameras).query(closest.foot)[1]] - closest.foot
+    towards = cameras[KDTree(cameras).query(closest.point)[1]] - closest.point
     normal = closest.normal * np.sign(np.einsum("nd,nd->n", closest.normal, towards))[:, None]
-    offset = points - closest.foot
+    offset = points - closest.point
     side = np.where(np.einsum("nd,nd->n", normal, offset) < 0, -1.0, 1.0)
     return side * np.linalg.norm(offset, axis=1)
