@@ -233,7 +233,6 @@ def test_missing_images_are_refused_by_name(scene):
 
 def test_a_list_of_photographs_that_is_not_text_is_refused_by_name(scene):
     write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
-    (scene / "transforms.json").unlink()
     (scene / "test_list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match=r"test_list.txt is not a text file"):
         read_views(FacadeDataParserConfig(data=scene))

@@ -239,7 +239,7 @@ def test_wrong_points_are_mirror_images_in_the_panes(facade):
     wrong = points.positions[points.is_mirrored]
     assert wrong[:, 1].max() > 10.0
     mirrored = (wrong * [1, -1, 1] + [0, 2 * RECESS, 0]).astype(np.float32)
-    distance = facade.daylight.world._scene.compute_distance(o3d.core.Tensor.from_numpy(mirrored)).numpy()
+    distance = facade.daylight.world._triangles.distance(mirrored)
     assert distance.max() < 4 * NOISE * 35
 
 
