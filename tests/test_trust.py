@@ -279,13 +279,13 @@ def test_a_missing_config_is_named(tmp_path, monkeypatch):
     [
         (["evaluate", "--output-path", "folder"], "folder is a folder"),
         (["evaluate", "--output-path", "file/eval.json"], "is a file, not a folder"),
-        (["evaluate", "--output-path", "eval.json", "--renders", "file"], "file is a file: name a folder"),
+        (["evaluate", "--output-path", "eval.json", "--renders", "file"], "file is a file: give a folder"),
         (["splats", "--output", "folder"], "folder is a folder"),
         (["mesh", "--output", "folder.ply"], "folder.ply is a folder"),
         (["mesh", "--output", "file/mesh.ply"], "is a file, not a folder"),
-        (["mesh", "--faces", "0"], "at least 4 --faces"),
-        (["mesh", "--voxel", "nan"], "a --voxel above 0"),
-        (["mesh", "--margin", "-1"], "a --margin from 0"),
+        (["mesh", "--faces", "0"], "--faces must be at least 4"),
+        (["mesh", "--voxel", "nan"], "--voxel above 0"),
+        (["mesh", "--margin", "-1"], "--margin at least 0"),
     ],
 )
 def test_an_invalid_output_or_number_is_refused_before_the_work(run, monkeypatch, words, why):
