@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +15,8 @@ from dataparsers.layout import ScenePaths
 if TYPE_CHECKING:
     from shellgs_method.export import Frame
 
-console = Console()
+# Without a terminal rich assumes 80 columns, which cut the tables of a log.
+console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160)
 
 Scene = Annotated[Path, tyro.conf.Positional]
 Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
