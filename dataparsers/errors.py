@@ -43,15 +43,24 @@ def check_output(path: Path) -> None:
         raise SceneError(f"{path} cannot be written: {above} is a file, not a folder")
 
 
+def _stdout_is_closed() -> bool:
+    """Whether nobody reads the output any more, as after `shellgs --help | head`; what is buffered is then dropped."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
+
+
 @contextmanager
 def refusals_end_the_program() -> Iterator[None]:
     """Turn a refusal into one sentence on stderr and exit status 1; a bug keeps its traceback."""
     try:
         yield
-    except BrokenPipeError:  # `shellgs --help | head`: whoever read the output has left
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered goes nowhere
-        raise SystemExit(1) from None
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _stdout_is_closed():
+            raise SystemExit(1) from None
         ours = error.errno is None  # raised with a sentence, not by the system
         raise SystemExit(f"shellgs: {error if ours else explained(error)}") from error
     except SceneError as error:

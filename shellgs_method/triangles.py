@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int64
+from jaxtyping import Bool, Float, Float32, Int, Int32
 
 from shellgs_method.open3d import import_open3d
 
@@ -23,7 +23,7 @@ class Hits(NamedTuple):
     """
 
     t: Float32[np.ndarray, " *N"]
-    triangle: Int64[np.ndarray, " *N"]
+    triangle: Int32[np.ndarray, " *N"]
     normal: Float32[np.ndarray, "*N 3"]
 
 
@@ -37,7 +37,7 @@ class Closest(NamedTuple):
     """
 
     point: Float32[np.ndarray, "N 3"]
-    triangle: Int64[np.ndarray, " N"]
+    triangle: Int32[np.ndarray, " N"]
     normal: Float32[np.ndarray, "N 3"]
 
 
@@ -69,9 +69,7 @@ class Triangles:
     def cast_rays(self, rays: Float32[np.ndarray, "*N 6"]) -> Hits:
         """First hits of rays, made by :func:`rays_from`."""
         answer = self.scene.cast_rays(self._tensor(rays))
-        t, triangle = answer["t_hit"].numpy(), answer["primitive_ids"].numpy().astype(np.int64)
-        triangle[np.isinf(t)] = -1
-        return Hits(t, triangle, answer["primitive_normals"].numpy())
+        return Hits(answer["t_hit"].numpy(), _index(answer), answer["primitive_normals"].numpy())
 
     def blocked(self, rays: Float32[np.ndarray, "*N 6"]) -> Bool[np.ndarray, " *N"]:
         """Whether rays hit anything at all."""
@@ -81,12 +79,16 @@ class Triangles:
         """The nearest point of the surface to each point."""
         threads = 1 if len(points) < _FEW else 0  # 0: all
         answer = self.scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, np.float32)), threads)
-        triangle = answer["primitive_ids"].numpy().astype(np.int64)
-        return Closest(answer["points"].numpy(), triangle, answer["primitive_normals"].numpy())
+        return Closest(answer["points"].numpy(), _index(answer), answer["primitive_normals"].numpy())
 
     def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
         """Unsigned distance of each point from the surface."""
         return self.scene.compute_distance(self._tensor(np.ascontiguousarray(points, np.float32))).numpy()
+
+
+def _index(answer) -> Int32[np.ndarray, " *N"]:
+    """Triangles of an answer of Open3D's, which marks a miss by 2³² - 1: as signed integers, without a copy, by -1."""
+    return answer["primitive_ids"].numpy().view(np.int32)
 
 
 def rays_from(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from shellgs_method.triangles import Triangles, rays_from
 
@@ -30,7 +30,7 @@ class Surface(Triangles):
 
     def cast(
         self, origins: Float64[np.ndarray, "*N 3"], directions: Float64[np.ndarray, "*N 3"]
-    ) -> tuple[Float32[np.ndarray, " *N"], Int64[np.ndarray, " *N"]]:
+    ) -> tuple[Float32[np.ndarray, " *N"], Int32[np.ndarray, " *N"]]:
         """First hit of each ray: the multiple of its direction (inf if none) and the triangle (-1 if none)."""
         hits = self.cast_rays(rays_from(origins, directions))
         return hits.t, hits.triangle

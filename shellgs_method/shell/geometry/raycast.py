@@ -61,9 +61,9 @@ class ShellCaster:
     def cast(self, camera: Camera) -> CueMap:
         """Cast the shell into a camera: z-depth in scene units, normals facing the camera, and the mask of hits."""
         hits = self.triangles.cast_rays(self.rays(camera))
-        mask = np.isfinite(hits.t)
+        mask = hits.triangle >= 0
         hits.t[~mask] = 0
-        return CueMap(hits.t, self._facing(camera)[hits.triangle], mask)
+        return CueMap(hits.t, self._facing(camera).take(hits.triangle, axis=0, mode="wrap"), mask)  # -1: the last row
 
     def _facing(self, camera: Camera) -> Float16[np.ndarray, "F+1 3"]:
         """Normal of each triangle in the camera's frame, facing the camera; the last row is zero, for misses.
