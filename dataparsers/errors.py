@@ -46,7 +46,7 @@ def check_output(path: Path) -> None:
 def _stdout_is_closed() -> bool:
     """Whether nobody reads the output any more, as after `shellgs --help | head`; what is buffered is then dropped."""
     try:
-        sys.stdout.flush()
+        print(flush=True)  # a flush alone may have nothing left to write
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return True

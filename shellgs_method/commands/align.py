@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def align(
     scene: Scene,
-    shell: Annotated[Optional[Path], tyro.conf.Positional] = None,
+    shell: Annotated[Optional[Path], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL]")] = None,
     matrix: Optional[Path] = None,
     picks: Optional[Path] = None,
     positions: Optional[Path] = None,

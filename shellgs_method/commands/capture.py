@@ -14,7 +14,7 @@ _CAPTURE = CaptureConfig()
 
 
 def capture(
-    source: Annotated[Path, tyro.conf.Positional],
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
     scene: Scene,
     config: Annotated[CaptureConfig, tyro.conf.arg(name="")] = _CAPTURE,
 ) -> None:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 # Without a terminal rich assumes 80 columns, which cut the tables of a log.
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160)
 
-Scene = Annotated[Path, tyro.conf.Positional]
+Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+RunConfig = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG")]
 Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
 PATHS = ScenePaths()
 UpAxis = Literal["y", "z"]

@@ -13,7 +13,7 @@ from shellgs_method.commands.common import PATHS, Paths, console
 
 
 def compare(
-    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE [SCENE ...]")],
     methods: tuple[str, ...] = ("photo-gs", "mono-gs", "2dgs", "shellgs"),
     seeds: tuple[int, ...] = (0,),
     iterations: int = 30_000,

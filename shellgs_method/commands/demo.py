@@ -11,7 +11,7 @@ from shellgs_method.commands.common import console
 
 
 def demo(
-    folder: Annotated[Path, tyro.conf.Positional] = Path("demo"),
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[FOLDER]")] = Path("demo"),
     iterations: int = 1500,
     width: int = 320,
     height: int = 180,

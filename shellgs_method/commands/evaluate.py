@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Literal, Optional
 
-import tyro
-
-from shellgs_method.commands.common import console
+from shellgs_method.commands.common import RunConfig, console
 
 
 def evaluate(
-    config: Annotated[Path, tyro.conf.Positional],
+    config: RunConfig,
     output_path: Path = Path("eval.json"),
     holdout: Optional[Literal["A", "B"]] = None,
     renders: Optional[Path] = None,

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from math import inf
 from pathlib import Path
-from typing import Annotated, Optional
-
-import tyro
+from typing import Optional
 
 from dataparsers.errors import SceneError
-from shellgs_method.commands.common import UpAxis, console, place
+from shellgs_method.commands.common import RunConfig, UpAxis, console, place
 
 
 def mesh(
-    config: Annotated[Path, tyro.conf.Positional],
+    config: RunConfig,
     output: Optional[Path] = None,
     voxel: Optional[float] = None,
     faces: int = 200_000,

@@ -14,7 +14,7 @@ _SIM = SimSettings()
 
 
 def sim(
-    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG [CONFIG ...] FOLDER")],
     settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
     up: Optional[UpAxis] = None,
 ) -> None:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
-
-import tyro
+from typing import Optional
 
 from dataparsers.errors import check_output
-from shellgs_method.commands.common import UpAxis, console, place
+from shellgs_method.commands.common import RunConfig, UpAxis, console, place
 
 
 def splats(
-    config: Annotated[Path, tyro.conf.Positional],
+    config: RunConfig,
     output: Optional[Path] = None,
     up: Optional[UpAxis] = None,
 ) -> None:
