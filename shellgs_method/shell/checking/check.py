@@ -33,7 +33,7 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 2
+VERSION = 3
 """Version of the maps: maps of another version are made again."""
 
 
