@@ -21,18 +21,6 @@ from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
-_OPTIONS = {
-    "cpp.enable_floating_point_contract_flag": "fast",
-    # One loop for all splats of a chunk, whatever their number and the number of channels.
-    "max_fusion_size": 4096,
-    "cpp.max_horizontal_fusion_size": 4096,
-    "fx_graph_cache": True,
-    "cpp.dynamic_threads": True,  # torch's number of threads at run time, not at compile time
-    "assert_indirect_indexing": False,
-    # Store shared subexpressions earlier than by default (30) instead of inlining them at each use: the kernels run as
-    # fast and compile in a half to a third of the time.
-    "realize_opcount_threshold": 10,
-}
 _LONG = 5.0  # seconds
 _failed = False  # one failure to compile is enough for a process
 
@@ -80,6 +68,26 @@ def nothing_compiled_yet() -> bool:
     return os.environ.get("SHELLGS_COMPILE") != "0" and not any(Path(cache_dir()).glob("*"))
 
 
+def _options() -> dict[str, Any]:
+    """Inductor's options, for the installed torch."""
+    from torch._inductor import config  # slow
+
+    # A switch in older versions of torch; on means the compiler's default, which is "fast" for GCC.
+    contract = "fast" if isinstance(config.cpp.enable_floating_point_contract_flag, str) else True
+    return {
+        "cpp.enable_floating_point_contract_flag": contract,
+        # One loop for all splats of a chunk, whatever their number and the number of channels.
+        "max_fusion_size": 4096,
+        "cpp.max_horizontal_fusion_size": 4096,
+        "fx_graph_cache": True,
+        "cpp.dynamic_threads": True,  # torch's number of threads at run time, not at compile time
+        "assert_indirect_indexing": False,
+        # Store shared subexpressions earlier than by default (30) instead of inlining them at each use: the kernels run
+        # as fast and compile in a half to a third of the time.
+        "realize_opcount_threshold": 10,
+    }
+
+
 @functools.cache
 def _compiled(kernel: Callable[..., Any], key: tuple[tuple[tuple[bool, ...], bool], ...]) -> Callable[..., Any]:
     """Compile a kernel; ``key`` says which dimensions of each tensor vary, and whether it needs gradients."""
@@ -87,7 +95,7 @@ def _compiled(kernel: Callable[..., Any], key: tuple[tuple[tuple[bool, ...], boo
     _keep_freed_memory()
     # Dynamo limits the compilations per code object: each key gets its own.
     own = FunctionType(kernel.__code__.replace(), kernel.__globals__, kernel.__name__)
-    compiled = torch.compile(own, fullgraph=True, options=_OPTIONS)
+    compiled = torch.compile(own, fullgraph=True, options=_options())
     varies = [varies for varies, _ in key]
     first = True
 
