@@ -6,7 +6,6 @@ import csv
 import filecmp
 import io
 import json
-import multiprocessing
 import os
 import re
 import shutil
@@ -14,6 +13,7 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -315,16 +315,37 @@ def test_a_killed_run_resumes_from_its_checkpoint(pristine_scene, tmp_path):
     assert f"--load-dir {runs[0].checkpoints}" in resumed
 
 
+def test_commands_start_without_python_in_a_fork(tmp_path):
+    """Clean-up of other threads' objects in a fork may wait for threads that it has not: libswscale's did, for ever."""
+
+    class Held:
+        def __del__(self, process: int = os.getpid(), marker: Path = tmp_path / "cleaned in a fork") -> None:
+            if os.getpid() != process:
+                marker.touch()
+
+    def hold() -> None:
+        local.held = Held()
+        done.wait()
+
+    local, done = threading.local(), threading.Event()
+    thread = threading.Thread(target=hold)
+    thread.start()
+    follow(["python", "-c", "pass"])
+    done.set()
+    thread.join()
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
 def test_killing_a_comparison_ends_its_commands(tmp_path):
     sleep = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
-    comparison = multiprocessing.get_context("fork").Process(target=follow, args=(["python", "-c", sleep],))
-    comparison.start()
+    following = f"from shellgs_method.compare.launch import follow; follow(['python', '-c', {sleep!r}])"
+    comparison = subprocess.Popen([sys.executable, "-c", following])
     while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
         time.sleep(0.05)
     command = psutil.Process(int((tmp_path / "pid").read_text()))
     comparison.kill()
-    comparison.join()
+    comparison.wait()
     command.wait(timeout=10)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 import shlex
-import signal
 import subprocess
 import sys
 import threading
@@ -26,8 +24,13 @@ BIN = Path(sys.executable).parent
 LAST_LINES = 30
 PROGRESS_SECONDS = 30.0
 """Seconds between two progress messages where the output is not a terminal."""
-_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
-_PR_SET_PDEATHSIG = 1
+# On Linux the kernel ends a command with its parent, or a killed comparison's runs would keep training. Not by a
+# ``preexec_fn``: Python that runs in a fork of many threads may never return.
+_ENDING_WITH_PARENT = (
+    "import ctypes, os, signal, sys; PR_SET_PDEATHSIG = 1; ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM); "
+    "os.execv(sys.argv[1], sys.argv[1:])"
+)
+_PREFIX = [sys.executable, "-ISc", _ENDING_WITH_PARENT] if sys.platform == "linux" else []
 _STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
@@ -90,12 +93,11 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
     """
     output: list[str] = []
     with subprocess.Popen(
-        [BIN / command[0], *command[1:]],
+        [*_PREFIX, BIN / command[0], *command[1:]],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        preexec_fn=_end_with_parent if _LIBC else None,
     ) as process:
         assert process.stdout is not None
         try:
@@ -149,12 +151,6 @@ def _status(task: Task) -> str:
     left = minutes * (total / task.completed - 1)
     at = f"{task.completed:.0f} of {total:.0f} iterations"
     return f"{task.description}: {at}, {minutes:.1f} min, at most about {left:.1f} min left"
-
-
-def _end_with_parent() -> None:
-    """Let the kernel end this process with its parent, or a killed comparison's runs would keep training."""
-    assert _LIBC is not None
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _finish_visibly(run: Run, console: Console, progress: Progress) -> None:
