@@ -66,12 +66,7 @@ shellgs_metric = _method(
         shell_counts="uncontradicted",
         seeds="shell",
         densify_grad_thresh=THRESHOLD_METRIC,
-        extra=ExtraLossConfig(
-            empty_space=1.0,
-            normal_consistency=0.05,  # continues walls where the shell does not supervise
-            normal_consistency_from=0,
-            normal_consistency_on="unsupervised",
-        ),
+        extra=ExtraLossConfig(empty_space=1.0),
     ),
 )
 mono_gs = _method(
