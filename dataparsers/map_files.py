@@ -146,7 +146,8 @@ def _write_npz(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
             data = io.BytesIO()
             np.lib.format.write_array(data, array, allow_pickle=False)
             method = zipfile.ZIP_STORED if name == "depth" else zipfile.ZIP_DEFLATED
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getbuffer(), method, compresslevel=1)
+            # Not getbuffer(): a view of it in the traceback of a failed write crashed Python 3.12 (garbage collection).
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getvalue(), method, compresslevel=1)
 
 
 def read_record(path: Path) -> MapRecord:
