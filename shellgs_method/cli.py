@@ -24,7 +24,8 @@ COMMANDS = (demo, capture, align, cast, mono, compare, evaluate, mesh, splats, s
 
 def main() -> None:
     """Entry point."""
-    warnings.filterwarnings("ignore", category=FutureWarning)  # raised by dependencies, no use to a user
+    for category in (FutureWarning, SyntaxWarning):  # raised by dependencies, no use to a user
+        warnings.filterwarnings("ignore", category=category)
     with refusals_end_the_program():
         tyro.extras.subcommand_cli_from_dict(
             {command.__name__: command for command in COMMANDS},
