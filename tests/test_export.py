@@ -122,7 +122,7 @@ def test_gaussians_move_with_the_similarity():
     similarity[:3, 3] = [1, 2, 3]
 
     def covariances(splats: Splats) -> np.ndarray:
-        axes = Rotation.from_quat(splats.quats.numpy(), scalar_first=True).as_matrix()
+        axes = Rotation.from_quat(splats.quats[:, [1, 2, 3, 0]].numpy()).as_matrix()
         axes = axes * splats.scales.exp().numpy()[:, None]
         return axes @ axes.transpose(0, 2, 1)
 

@@ -254,4 +254,5 @@ def _better_half(costs: Float[Tensor, "V h w"], weights: Float[Tensor, "V h w"])
 
 def _smooth(pixels: _Pixels, maps: Float[Tensor, "C h w"]) -> Float[Tensor, "C h w"]:
     colours = pixels.features[None, :3]
-    return guided_blur(colours, maps[None], _WINDOW, _EDGES, "replicate", _SUBSAMPLE, **_SEPARABLE)[0]
+    subsample = 1 if any(size % _SUBSAMPLE for size in maps.shape[-2:]) else _SUBSAMPLE  # kornia 0.8 needs a multiple
+    return guided_blur(colours, maps[None], _WINDOW, _EDGES, "replicate", subsample, **_SEPARABLE)[0]
