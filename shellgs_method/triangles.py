@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
 
 from shellgs_method.open3d import import_open3d
 
@@ -89,6 +89,23 @@ class Triangles:
 def _index(answer) -> Int32[np.ndarray, " *N"]:
     """Triangles of an answer of Open3D's, which marks a miss by 2³² - 1: as signed integers, without a copy, by -1."""
     return answer["primitive_ids"].numpy().view(np.int32)
+
+
+def area_vectors(vertices: Float64[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float64[np.ndarray, "F 3"]:
+    """Normals of triangles, by their winding, with the triangles' areas as lengths."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def sampled(
+    vertices: Float64[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], count: int, seed: int = 0
+) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
+    """Random points on triangles, uniform by area, and the triangle of each; the same for the same seed."""
+    areas = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(areas), count, p=areas / areas.sum())
+    weights = rng.dirichlet(np.ones(3), count)
+    return np.einsum("nk,nkd->nd", weights, vertices[faces[chosen]]), chosen
 
 
 def rays_from(

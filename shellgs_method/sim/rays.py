@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from shellgs_method.triangles import Triangles, rays_from
+from shellgs_method.triangles import Triangles, area_vectors, rays_from, sampled
 
 
 class Surface(Triangles):
@@ -21,11 +21,10 @@ class Surface(Triangles):
 
     def __init__(self, vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> None:
         self.vertices, self.faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        crosses = np.cross(b - a, c - a)
-        doubled = np.linalg.norm(crosses, axis=1)
-        self.centres = (a + b + c) / 3
-        self.normals, self.areas = crosses / np.maximum(doubled, 1e-300)[:, None], doubled / 2
+        vectors = area_vectors(self.vertices, self.faces)
+        self.areas: Float64[np.ndarray, " F"] = np.linalg.norm(vectors, axis=1)
+        self.normals = vectors / np.maximum(self.areas, 1e-300)[:, None]
+        self.centres = self.vertices[self.faces].mean(axis=1)
         super().__init__(self.vertices, self.faces)
 
     def cast(
@@ -53,10 +52,7 @@ class Surface(Triangles):
 
     def samples(self, count: int, seed: int = 0) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
         """Random points, uniform by area, and the triangle of each; the same for the same seed."""
-        rng = np.random.default_rng(seed)
-        chosen = rng.choice(len(self.areas), count, p=self.areas / self.areas.sum())
-        weights = rng.dirichlet(np.ones(3), count)
-        return np.einsum("nk,nkd->nd", weights, self.vertices[self.faces[chosen]]), chosen
+        return sampled(self.vertices, self.faces, count, seed)
 
 
 def outward(

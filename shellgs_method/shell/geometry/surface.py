@@ -7,7 +7,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.similarity import centred, transformed
-from shellgs_method.triangles import Triangles, rays_from
+from shellgs_method.triangles import Triangles, area_vectors, rays_from, sampled
 
 
 class ShellSurface(Triangles):
@@ -37,11 +37,6 @@ class ShellSurface(Triangles):
 
     def samples(self, count: int) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
         """Sample points uniformly on the surface, with their normals; the same points in each call."""
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        normal = np.cross(b - a, c - a)
-        area = np.linalg.norm(normal, axis=1)
-        random = np.random.default_rng(0)
-        chosen = random.choice(len(area), count, p=area / area.sum())
-        weights = random.dirichlet(np.ones(3), count)
-        points = np.einsum("nk,nkd->nd", weights, np.stack([a, b, c], axis=1)[chosen])
-        return points, (normal / np.maximum(area, 1e-300)[:, None])[chosen]
+        points, triangle = sampled(self.vertices, self.faces, count)
+        normals = area_vectors(self.vertices, self.faces[triangle])
+        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
