@@ -369,8 +369,8 @@ class FacadeModel(SplatfactoModel):
         view = self._view_losses(batch, outputs["background"])
         losses = {"photometric": view.photometric(outputs["rgb"])}
         if self.geometry is not None:
-            kept, supervised = kept_pixels(batch, outputs["rgb"]), view.cue.cue.mask if view.cue else None
-            losses |= self_losses(self.geometry, config.extra, progress, kept, supervised)
+            kept, with_cue = kept_pixels(batch, outputs["rgb"]), batch.get(f"{config.cues}_mask")
+            losses |= self_losses(self.geometry, config.extra, progress, kept, with_cue)
             if view.cue is not None:
                 losses |= view.cue(self.geometry, progress)
         return losses | self._shape_losses()

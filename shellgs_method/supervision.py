@@ -56,8 +56,9 @@ class ExtraLossConfig:
     """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05)."""
     normal_consistency_from: int = 7000
     """First iteration of that term."""
-    normal_consistency_on: Literal["everywhere", "unsupervised"] = "everywhere"
-    """Pixels of that term: all, or those that no cue supervises, so that walls continue beyond the shell."""
+    normal_consistency_on: Literal["everywhere", "without_cue"] = "everywhere"
+    """Pixels of that term: all, or those without a cue, so that walls continue beyond the shell, but not what
+    photographs show in front of it."""
     distortion: float = 0.0
     """Weight of the depth distortion of 2DGS; discs only."""
     distortion_from: int = 3000
@@ -183,18 +184,18 @@ def self_losses(
     extra: ExtraLossConfig,
     progress: float,
     kept: Bool[Tensor, "H W 1"],
-    supervised: Bool[Tensor, "H W 1"] | None = None,
+    with_cue: Bool[Tensor, "H W 1"] | None = None,
 ) -> dict[str, Tensor]:
     """Weighted terms of 2DGS on the rendered geometry, without a cue, at ``progress`` in [0, 1] of the run.
 
-    They are means over the pixels kept by the user's mask; normal consistency may be 0 in the ``supervised`` ones.
+    They are means over the pixels kept by the user's mask; normal consistency may be 0 in those ``with_cue``.
     """
     iteration = progress * PAPER_ITERATIONS
     losses = {}
     if extra.normal_consistency > 0 and iteration >= extra.normal_consistency_from:
         where = kept
-        if extra.normal_consistency_on == "unsupervised" and supervised is not None:
-            where = kept & ~supervised
+        if extra.normal_consistency_on == "without_cue" and with_cue is not None:
+            where = kept & ~with_cue.to(kept.device)
         share = where.sum() / kept.sum().clamp_min(1)  # a pixel weighs the same however few count
         losses["normal_consistency"] = (
             extra.normal_consistency

@@ -136,22 +136,22 @@ def test_masked_pixels_are_in_no_term_of_the_rendered_geometry():
     assert terms(1.0)["distortion"] == 1
 
 
-def test_normal_consistency_can_leave_out_what_a_cue_supervises():
+def test_normal_consistency_can_leave_out_pixels_with_a_cue():
     normal = torch.randn(6, 8, 3, generator=torch.Generator().manual_seed(0))
     camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]]), 8, 6)
     geometry = Geometry(torch.full((6, 8, 1), 5.0), normal, torch.ones(6, 8, 1), camera)
-    kept, supervised = torch.ones(6, 8, 1, dtype=torch.bool), torch.zeros(6, 8, 1, dtype=torch.bool)
-    kept[0], supervised[:, 4:] = False, True
+    kept, with_cue = torch.ones(6, 8, 1, dtype=torch.bool), torch.zeros(6, 8, 1, dtype=torch.bool)
+    kept[0], with_cue[:, 4:] = False, True
 
-    def term(on: Literal["everywhere", "unsupervised"], supervised: torch.Tensor | None) -> torch.Tensor:
+    def term(on: Literal["everywhere", "without_cue"], with_cue: torch.Tensor | None) -> torch.Tensor:
         extra = ExtraLossConfig(normal_consistency=2.0, normal_consistency_from=0, normal_consistency_on=on)
-        return self_losses(geometry, extra, 0.5, kept, supervised)["normal_consistency"]
+        return self_losses(geometry, extra, 0.5, kept, with_cue)["normal_consistency"]
 
     each = 1 - (normal * geometry.depth_normal).sum(-1, keepdim=True)
-    torch.testing.assert_close(term("everywhere", supervised), 2 * each[kept].mean())
-    torch.testing.assert_close(term("unsupervised", None), 2 * each[kept].mean())
-    expected = 2 * each[kept & ~supervised].sum() / kept.sum()
-    torch.testing.assert_close(term("unsupervised", supervised), expected)
+    torch.testing.assert_close(term("everywhere", with_cue), 2 * each[kept].mean())
+    torch.testing.assert_close(term("without_cue", None), 2 * each[kept].mean())
+    expected = 2 * each[kept & ~with_cue].sum() / kept.sum()
+    torch.testing.assert_close(term("without_cue", with_cue), expected)
 
 
 @pytest.mark.usefixtures("eager")

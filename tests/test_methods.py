@@ -324,6 +324,23 @@ def test_empty_space_waits_for_its_first_iteration(untrained):
     assert begun["empty_space"].item() > 0.1
 
 
+def test_surfaces_continue_without_a_cue_and_not_where_something_is_in_front_of_the_shell(untrained):
+    model, (camera, batch) = model_of(untrained), data_of(untrained).next_train(0)
+    extra, cued = model.config.extra, torch.ones_like(batch["shell_mask"])
+    in_front = cued * batch["shell_depth"].clamp_min(1)
+
+    def consistency(cued: torch.Tensor) -> float:
+        changed = {**batch, "shell_mask": cued, "nearer_depth": in_front}
+        return float(model.get_loss_dict(model(camera), changed)["normal_consistency"])
+
+    model.config.extra = ExtraLossConfig(
+        normal_consistency=1.0, normal_consistency_from=0, normal_consistency_on="without_cue"
+    )
+    without, half, everywhere = (consistency(mask) for mask in (~cued, cued & (torch.rand(cued.shape) < 0.5), cued))
+    model.config.extra = extra
+    assert without > half > everywhere == 0
+
+
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 def test_shellgs_metric_brings_the_surface_to_the_shell(pristine_scene, tmp_path, primitive):
     def choose(config):
