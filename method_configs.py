@@ -65,8 +65,14 @@ shellgs_metric = _method(
         cues="shell",
         shell_counts="uncontradicted",
         seeds="shell",
+        init_opacity=0.5,
         densify_grad_thresh=THRESHOLD_METRIC,
-        extra=ExtraLossConfig(empty_space=1.0),
+        extra=ExtraLossConfig(
+            empty_space=1.0,
+            normal_consistency=0.1,  # continues walls beyond the shell
+            normal_consistency_from=3000,
+            normal_consistency_on="without_cue",
+        ),
     ),
 )
 mono_gs = _method(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Optional, cast
 
@@ -93,6 +92,8 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Spacing of the seeds, in pixels of the closest view."""
     max_seeds: int = 200_000
     """Most seeds; the spacing is increased where it would give more."""
+    init_opacity: float = 0.1
+    """Opacity of the initial Gaussians; 0.1 in 3DGS."""
 
     background_color: Literal["random", "black", "white"] = "black"
     cull_alpha_thresh: float = 0.005
@@ -209,7 +210,7 @@ class FacadeModel(SplatfactoModel):
             "quats": quats,
             "features_dc": RGB2SH(colours),
             "features_rest": torch.zeros(len(means), num_sh_bases(self.config.sh_degree) - 1, 3),
-            "opacities": torch.full((len(means), 1), math.log(0.1 / 0.9)),
+            "opacities": torch.full((len(means), 1), self.config.init_opacity).logit(),
         }
         for name, new in added.items():
             if name in self.gauss_params:

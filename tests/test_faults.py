@@ -136,6 +136,7 @@ def test_a_run_without_a_finite_gaussian_ends(pristine_scene, tmp_path):
         ("pipeline.model.cull-alpha-thresh", "1.5"),
         ("pipeline.model.ssim-lambda", "-0.2"),
         ("pipeline.model.seed-spacing", "0"),
+        ("pipeline.model.init-opacity", "1"),
         ("pipeline.model.mcmc.cap-max", "0"),
         ("pipeline.model.geometry.ncc-window", "8"),
         ("pipeline.model.geometry.ncc-window", "1"),
