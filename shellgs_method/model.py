@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, Optional, cast
 
 import torch
 from gsplat.strategy import DefaultStrategy
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.models.splatfacto import (
@@ -62,6 +62,8 @@ class ViewLosses(NamedTuple):
 
     photometric: PhotometricLoss
     cue: CueLosses | None
+    with_cue: Bool[Tensor, "H W 1"] | None
+    """Pixels with a cue, believed or not; None in a view without a map."""
 
 
 @dataclass
@@ -370,8 +372,8 @@ class FacadeModel(SplatfactoModel):
         view = self._view_losses(batch, outputs["background"])
         losses = {"photometric": view.photometric(outputs["rgb"])}
         if self.geometry is not None:
-            kept, with_cue = kept_pixels(batch, outputs["rgb"]), batch.get(f"{config.cues}_mask")
-            losses |= self_losses(self.geometry, config.extra, progress, kept, with_cue)
+            kept = kept_pixels(batch, outputs["rgb"])
+            losses |= self_losses(self.geometry, config.extra, progress, kept, view.with_cue)
             if view.cue is not None:
                 losses |= view.cue(self.geometry, progress)
         return losses | self._shape_losses()
@@ -384,12 +386,13 @@ class FacadeModel(SplatfactoModel):
         config = self.config
         target = self.composite_with_background(self.get_gt_img(batch["image"]), background)
         kept = batch["mask"].to(self.device) if "mask" in batch else None
-        cue = None
+        cue = with_cue = None
         if f"{config.cues}_depth" in batch:
+            with_cue = batch[f"{config.cues}_mask"].to(self.device)
             maps = reference_maps(batch, config.cues, self.device, config.shell_counts == "everywhere")
             shell_error = self.kwargs["metadata"].get("shell_error")
             cue = CueLosses(maps, config.geometry, config.extra, self.metres_per_unit, shell_error)
-        view = ViewLosses(PhotometricLoss(target, kept, config.ssim_lambda), cue)
+        view = ViewLosses(PhotometricLoss(target, kept, config.ssim_lambda), cue, with_cue)
         changes = config.background_color == "random" and batch["image"].shape[-1] == 4
         room = MAX_KEPT_PIXELS // target[..., 0].numel()
         if self.training and not changes and len(self._views) < room:

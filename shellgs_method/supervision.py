@@ -195,7 +195,7 @@ def self_losses(
     if extra.normal_consistency > 0 and iteration >= extra.normal_consistency_from:
         where = kept
         if extra.normal_consistency_on == "without_cue" and with_cue is not None:
-            where = kept & ~with_cue.to(kept.device)
+            where = kept & ~with_cue
         share = where.sum() / kept.sum().clamp_min(1)  # a pixel weighs the same however few count
         losses["normal_consistency"] = (
             extra.normal_consistency

@@ -9,6 +9,8 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float64, Int64
 
+from shellgs_method.triangles import area_vectors
+
 HYPOTHESES, VOTERS = 200, 4000
 AGREEMENT = np.cos(np.radians(20))
 """Minimum cosine between a triangle's normal and its plane's: scans are noisy."""
@@ -75,9 +77,9 @@ def find_planes(
         gap: cracks up to this width in the outline are closed, in metres.
     """
     corners = vertices[faces]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(crosses, axis=1)
-    normals, areas = crosses / np.maximum(doubled, 1e-300)[:, None], doubled / 2
+    vectors = area_vectors(vertices, faces)
+    areas = np.linalg.norm(vectors, axis=1)
+    normals = vectors / np.maximum(areas, 1e-300)[:, None]
     rng, planes = np.random.default_rng(0), []
     left, rest = np.flatnonzero(areas > 1e-8), []
     scanned = len(left) > 0 and areas[left].mean() < SMALL

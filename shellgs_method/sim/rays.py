@@ -50,9 +50,9 @@ class Surface(Triangles):
         side = np.einsum("nc,nc->n", away, self.normals[closest.triangle])
         return np.where(side < 0, -1.0, 1.0) * np.linalg.norm(away, axis=1)
 
-    def samples(self, count: int, seed: int = 0) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
-        """Random points, uniform by area, and the triangle of each; the same for the same seed."""
-        return sampled(self.vertices, self.faces, count, seed)
+    def samples(self, count: int) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
+        """Random points, uniform by area, and the triangle of each; the same in each call."""
+        return sampled(self.vertices, self.faces, self.areas, count)
 
 
 def outward(

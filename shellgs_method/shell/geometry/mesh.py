@@ -15,6 +15,7 @@ from dataparsers.files import atomic_write, content_hash
 from dataparsers.strays import sound
 from shellgs_method.shell.geometry.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.geometry.files import read_geometry
+from shellgs_method.triangles import area_vectors
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +60,8 @@ class ShellMesh:
     def _areas(self) -> np.ndarray:
         """Area of each triangle relative to the shell's size squared; 0 where it is only rounding error."""
         extent = np.ptp(self.bounds, axis=0).max()
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2 / max(extent, np.finfo(float).tiny) ** 2
+        areas = np.linalg.norm(area_vectors(self.vertices, self.faces), axis=1)
+        areas /= max(extent, np.finfo(float).tiny) ** 2
         return np.where(areas > 1e-14, areas, 0.0)
 
 

@@ -9,7 +9,7 @@ from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
 from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.similarity import transformed
-from shellgs_method.triangles import Triangles
+from shellgs_method.triangles import Triangles, area_vectors
 
 
 class ShellCaster:
@@ -35,10 +35,10 @@ class ShellCaster:
         self.extent = float(np.ptp(placed, axis=0).max())
         placed -= self.origin
         self.triangles = Triangles(placed, mesh.faces)
-        a, b, c = (placed[mesh.faces[:, k]] for k in range(3))
-        normals = np.cross(b - a, c - a)
+        normals = area_vectors(placed, mesh.faces)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-        self._planes = np.concatenate([normals, np.einsum("fc,fc->f", normals, a)[:, None]], axis=1)  # n · x = d
+        offsets = np.einsum("fc,fc->f", normals, placed[mesh.faces[:, 0]])
+        self._planes = np.concatenate([normals, offsets[:, None]], axis=1)  # n · x = d
         self._rays = np.empty((0, 0, 6), np.float32)
 
     def rays(self, camera: Camera) -> Float32[np.ndarray, "H W 6"]:

@@ -37,6 +37,7 @@ class ShellSurface(Triangles):
 
     def samples(self, count: int) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
         """Sample points uniformly on the surface, with their normals; the same points in each call."""
-        points, triangle = sampled(self.vertices, self.faces, count)
-        normals = area_vectors(self.vertices, self.faces[triangle])
-        return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        vectors = area_vectors(self.vertices, self.faces)
+        areas = np.linalg.norm(vectors, axis=1)
+        points, triangle = sampled(self.vertices, self.faces, areas, count)
+        return points, vectors[triangle] / areas[triangle, None]
