@@ -176,7 +176,7 @@ def _gradients(
     behind = table.new_zeros(len(gradients), 1 if n_densifying is None else 2, TILE * TILE)
     for group in _in_groups(plans[::-1], MAX_SUMMED // (CHUNK * LANES * grad_table[0].nbytes)):
         splats = torch.cat([plan.splats[: plan.n_composited] for plan in group])
-        grad_rows = table.new_empty(*splats.shape, grad_table.shape[1])
+        grad_rows = _after_a_row(table.new_empty(len(splats) + 1, *splats.shape[1:], grad_table.shape[1]))
         for plan, plan_rows in zip(group, grad_rows.split([plan.n_composited for plan in group]), strict=True):
             _backward_plan(plan, plan_rows, gradients, behind, table, kernels, n_densifying)
         grad_table += _sum_by_splat(grad_rows.flatten(0, 2), splats.flatten(), len(table))
@@ -237,8 +237,14 @@ def _plan(tiles: Int[Tensor, "n"], first_chunk: int, bins: Bins, table: Float[Te
     chunk, group = to_do.nonzero(as_tuple=True)
     rank = ((chunk + first_chunk)[:, None] * CHUNK + torch.arange(CHUNK, device=tiles.device))[..., None]
     position = torch.where(rank < counts[group][:, None], starts[group][:, None] + rank, len(bins.splats) - 1)
-    splats = bins.splats.index_select(0, position.flatten()).view_as(position)
+    position = F.pad(position, (0, 0, 0, 0, 1, 0))
+    splats = _after_a_row(bins.splats.index_select(0, position.flatten()).view_as(position))
     return _Plan(tiles, centres.to(table), first_chunk, splats, to_do.sum(1).cumsum(0).tolist())
+
+
+def _after_a_row(padded: Float[Tensor, "1+rows *shape"]) -> Float[Tensor, "rows *shape"]:
+    """All rows but the first, so that no slice of them starts the storage: a kernel compiled for others rejects it."""
+    return padded[1:]
 
 
 def _pixels(table: Tensor) -> tuple[Float[Tensor, "1 P 1"], Float[Tensor, "1 P 1"]]:

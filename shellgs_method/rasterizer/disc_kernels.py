@@ -127,7 +127,7 @@ def _intersect(
 
     The intersection decides where ``ahead`` is positive. Hits are numbers, 1 or 0: stored booleans do not vectorise.
     """
-    u, v, a, b, c, d, p, q, r, n, *_ = splat.unbind(-3)
+    u, v, a, b, c, d, p, q, r, n = splat[..., :_N_SHAPE, :, :].unbind(-3)
     dx, dy = x - u, y - v
     inverse_depth = p + q * dx + r * dy
     in_front = (inverse_depth > 0) & (inverse_depth <= 1 / NEAR_PLANE)

@@ -14,7 +14,7 @@ from torch import Tensor
 from shellgs_method.rasterizer.kernels import Kernels, attenuate, backward_step_groups, look_up
 
 _NULL_SHAPE = (0.0, 0.0, 0.0, 0.0, 0.0, math.inf)
-_FEATURES = slice(len(_NULL_SHAPE), None)
+_N_SHAPE = len(_NULL_SHAPE)
 
 
 def _forward(
@@ -31,7 +31,7 @@ def _forward(
     sums = list(totals)
     for splat in params[:, :, None].unbind(3):
         _, weight, transmittance = attenuate(_exponent(splat, x, y), transmittance, stop)
-        values = splat[:, _FEATURES].unbind(1)
+        values = splat[:, _N_SHAPE:].unbind(1)
         sums = [total + weight * value for total, value in zip(sums, values, strict=True)]
     for total, new in zip(totals, sums, strict=True):
         total.copy_(new)
@@ -62,7 +62,7 @@ def _backward(
     befores, grad_z = list(behinds), []
     for splat, (z, alpha, weight) in zip(reversed(chunk), reversed(recomputed), strict=True):
         groups = [gradients, others] if others else [gradients]
-        grad_z.append(backward_step_groups(befores, z, alpha, weight, groups, splat[:, _FEATURES].unbind(1)))
+        grad_z.append(backward_step_groups(befores, z, alpha, weight, groups, splat[:, _N_SHAPE:].unbind(1)))
     for behind, before in zip(behinds, befores, strict=True):
         behind.copy_(before)
 
@@ -87,7 +87,7 @@ def _backward(
 
 
 def _exponent(splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Float[Tensor, "1 P 1"]) -> Tensor:
-    u, v, a, b, c, n, *_ = splat.unbind(1)
+    u, v, a, b, c, n = splat[:, :_N_SHAPE].unbind(1)  # unbinding more takes longer to compile
     dx, dy = x - u, y - v
     return (a * dx + b * dy) * dx + c * dy * dy + n
 
