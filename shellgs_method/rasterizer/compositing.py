@@ -243,7 +243,7 @@ def _plan(tiles: Int[Tensor, "n"], first_chunk: int, bins: Bins, table: Float[Te
 
 
 def _after_a_row(padded: Float[Tensor, "1+rows *shape"]) -> Float[Tensor, "rows *shape"]:
-    """All rows but the first, so that no slice of them starts the storage: a kernel compiled for others rejects it."""
+    """All rows but the first: no slice of them starts the storage, for which a kernel would be compiled once more."""
     return padded[1:]
 
 
