@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -242,7 +242,7 @@ def _plan(tiles: Int[Tensor, "n"], first_chunk: int, bins: Bins, table: Float[Te
     return _Plan(tiles, centres.to(table), first_chunk, splats, to_do.sum(1).cumsum(0).tolist())
 
 
-def _after_a_row(padded: Float[Tensor, "1+rows *shape"]) -> Float[Tensor, "rows *shape"]:
+def _after_a_row(padded: Shaped[Tensor, "1+rows *shape"]) -> Shaped[Tensor, "rows *shape"]:
     """All rows but the first: no slice of them starts the storage, for which a kernel would be compiled once more."""
     return padded[1:]
 
