@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 
@@ -77,6 +77,15 @@ def project(
     in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = in_camera[:, 2]
     return (in_camera / np.where(np.abs(depth) > 1e-9, depth, 1e-9)[:, None] @ K.T)[:, :2], depth
+
+
+def in_view(
+    camera: Camera, points: Float64[np.ndarray, "N 3"]
+) -> tuple[Bool[np.ndarray, " N"], Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
+    """Which points of the world project into the image, and the pixels and z-depths of these."""
+    pixels, depth = project(camera, points)
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    return inside, pixels[inside], depth[inside]
 
 
 def upwards(cameras: Iterable[Camera]) -> Float64[np.ndarray, " 3"]:

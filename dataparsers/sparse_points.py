@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
 from dataparsers import colmap_model, transforms
+from dataparsers.camera import in_view
 from dataparsers.errors import SceneError
 from dataparsers.layout import SceneLayout
 from dataparsers.photograph import View
@@ -40,12 +41,8 @@ class SparsePoints:
         distorted photograph. Without observations, points hidden behind a surface are included.
         """
         observed = slice(None) if self.observed is None else self.observed.get(view.name, np.empty(0, int))
-        viewmat, K = view.camera.viewmat.cpu().double().numpy(), view.camera.K.cpu().double().numpy()
-        points = self.positions[observed] @ viewmat[:3, :3].T + viewmat[:3, 3]
-        points = points[points[:, 2] > 0]
-        pixels = (points / points[:, 2:] @ K.T)[:, :2]
-        inside = ((pixels >= 0) & (pixels < [view.camera.width, view.camera.height])).all(axis=-1)
-        return pixels[inside], points[inside, 2]
+        _, pixels, depth = in_view(view.camera, self.positions[observed])
+        return pixels, depth
 
 
 def read_sparse_points(layout: SceneLayout) -> SparsePoints:

@@ -11,7 +11,7 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float64, Int64
 
-from dataparsers.camera import project
+from dataparsers.camera import in_view
 from dataparsers.cue_maps import CueMaps
 from dataparsers.files import atomic_write
 from dataparsers.photograph import View
@@ -90,14 +90,13 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         cue, check = shell.read(view.name, camera), checked.read(view.name, camera)
         assert cue is not None
         assert check is not None
-        pixels, z = project(camera, places)
-        inside = (z > 0) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+        inside, pixels, z = in_view(camera, places)
         k = np.flatnonzero(inside)
-        columns, rows = pixels[k].astype(int).T
-        visible = np.abs(cue.depth[rows, columns] / z[k] - 1) < _SAME
+        columns, rows = pixels.astype(int).T
+        visible = np.abs(cue.depth[rows, columns] / z - 1) < _SAME
         seen[k] += visible
         occluded = visible & check.mask[rows, columns]
-        along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z[k]  # per unit of depth
+        along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
     contradicted = np.isfinite(distances).sum(axis=0)
     median = np.full(len(places), np.nan)
