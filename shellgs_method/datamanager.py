@@ -27,7 +27,7 @@ from shellgs_method.bands import Bands, facade_bands
 from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.reference import Reference
-from shellgs_method.seeding import SeededView, Seeds, shell_seeds
+from shellgs_method.seeding import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
 
 logger = logging.getLogger(__name__)
 
@@ -261,9 +261,23 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         num_pixels = sum(batch["image"][..., 0].numel() for batch in batches)
         return shell_seeds((self._seeded_view(batch, everywhere) for batch in batches), num_pixels, spacing, most)
 
+    def skybox_seeds(self, count: int) -> Seeds:
+        """Seeds all around the scene, in nerfstudio's rescaled world, coloured by what is not on the shell."""
+        points = self.train_dataparser_outputs.metadata["points3D_xyz"].double().numpy()
+        num_pixels = sum(batch["image"][..., 0].numel() for batch in self.cached_train)
+        return skybox_seeds(map(self._sky_view, self.cached_train), num_pixels, points, count)
+
+    def _sky_view(self, batch: dict) -> SkyView:
+        cpu, batch = torch.device("cpu"), self._with_maps(batch)
+        image = _colours(batch)
+        far = kept_pixels(batch, image)
+        if "shell_mask" in batch:
+            far = far & ~batch["shell_mask"].to(cpu)
+        return SkyView(self.train_dataset.camera(batch["image_idx"]), image, far)
+
     def _seeded_view(self, batch: dict, everywhere: bool) -> SeededView:
         index, cpu, batch = batch["image_idx"], torch.device("cpu"), self._with_maps(batch)
-        image = batch["image"][..., :3].to(cpu) / (255 if batch["image"].dtype == torch.uint8 else 1)
+        image = _colours(batch)
         camera, shell = self.train_dataset.camera(index), reference_maps(batch, "shell", cpu, everywhere)
         if not everywhere and "nearer_depth" in batch:
             nearer = batch["nearer_depth"].to(cpu)
@@ -302,3 +316,9 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         # self.device (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
         with refusals_end_the_program():
             return super()._load_images(split, cache_images_device if torch.cuda.is_available() else "gpu")
+
+
+def _colours(batch: dict) -> Float[Tensor, "H W 3"]:
+    """The photograph in [0, 1], on the CPU."""
+    image = batch["image"][..., :3].cpu()
+    return image / (255 if image.dtype == torch.uint8 else 1)

@@ -1,4 +1,4 @@
-"""MCMC densification (3DGS as Markov chain Monte Carlo, Kheradmand et al. 2024) in plain torch, on any device.
+"""Densification by gradient that keeps large Gaussians far away, and MCMC densification, on any device.
 
 gsplat's ``MCMCStrategy`` needs CUDA kernels for the relocation and for the covariances of the noise.
 """
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from gsplat.strategy import Strategy
+from gsplat.strategy import DefaultStrategy, Strategy
 from gsplat.strategy.ops import _multinomial_sample, _update_param_with_optimizer
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -19,6 +19,29 @@ from shellgs_method.rasterizer import quats_to_rotations
 
 MAX_COPIES = 51
 """Maximum number of Gaussians that one is divided into, as in the authors' code: more would make no visible change."""
+
+
+@dataclass
+class SkyboxStrategy(DefaultStrategy):
+    """gsplat's default densification, except that the size above which Gaussians are pruned grows with their distance.
+
+    The cameras are within 1 of the origin. Farther away the limit is that at 1 times the distance, since the Gaussians
+    of a skybox are large.
+    """
+
+    @torch.no_grad()
+    def _prune_gs(
+        self,
+        params: nn.ParameterDict,
+        optimizers: dict[str, Optimizer],
+        state: dict[str, Any],
+        step: int,
+    ) -> int:
+        scene_scale = state["scene_scale"]
+        state["scene_scale"] = params["means"].norm(dim=-1).clamp_min(1)
+        count = super()._prune_gs(params, optimizers, state, step)
+        state["scene_scale"] = scene_scale
+        return count
 
 
 @dataclass(frozen=True)

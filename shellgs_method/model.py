@@ -33,7 +33,7 @@ from shellgs_method.batches import (
     reference_maps,
     references,
 )
-from shellgs_method.densification import MCMCConfig, MCMCStrategy
+from shellgs_method.densification import MCMCConfig, MCMCStrategy, SkyboxStrategy
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
 from shellgs_method.geometry import (
     DISC_LOG_THICKNESS,
@@ -94,6 +94,8 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Spacing of the seeds, in pixels of the closest view."""
     max_seeds: int = 200_000
     """Most seeds; the spacing is increased where it would give more."""
+    skybox_seeds: int = 0
+    """Initial Gaussians on a sphere around the scene, for the sky and what is far."""
     init_opacity: float = 0.1
     """Opacity of the initial Gaussians; 0.1 in 3DGS."""
 
@@ -189,7 +191,7 @@ class FacadeModel(SplatfactoModel):
         return points, colours
 
     def add_seeds(self, seeds: Seeds) -> None:
-        """Add initial Gaussians on the shell."""
+        """Add flat initial Gaussians at seeds."""
         points, normals, colours, spacing = (torch.from_numpy(each).float() for each in seeds)
         scales = spacing[:, None] * spacing.new_tensor([0.5, 0.5, 0.05])
         x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(dim=-1)
@@ -236,7 +238,8 @@ class FacadeModel(SplatfactoModel):
             return MCMCStrategy(config.mcmc.cap_max, start, stop, every, config.mcmc.noise)
         reset_every = config.reset_alpha_every * every
         reset_every = max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every))
-        return DefaultStrategy(
+        strategy = SkyboxStrategy if config.skybox_seeds > 0 else DefaultStrategy
+        return strategy(
             refine_start_iter=start,
             refine_stop_iter=stop,
             refine_every=every,

@@ -57,11 +57,17 @@ class FacadePipeline(VanillaPipeline):
             assert isinstance(datamanager, FacadeDataManager)
             scene = Path(datamanager.config.dataparser.data)
             self.contradicted_shell = ContradictedShell(scene, datamanager.scene_to_world)
-            if self.test_mode == "val":
+            if self.test_mode == "val":  # a trained run loads all its Gaussians
                 datamanager.train_on(model.training_cues)
-            if model.config.seeds == "shell" and self.test_mode == "val":  # a trained run loads all its Gaussians
-                everywhere = model.config.shell_counts == "everywhere"
-                model.add_seeds(datamanager.shell_seeds(model.config.seed_spacing, model.config.max_seeds, everywhere))
+                self._add_seeds()
+
+    def _add_seeds(self) -> None:
+        config, data = self.model.config, self.datamanager
+        if config.seeds == "shell":
+            everywhere = config.shell_counts == "everywhere"
+            self.model.add_seeds(data.shell_seeds(config.seed_spacing, config.max_seeds, everywhere))
+        if config.skybox_seeds > 0:
+            self.model.add_seeds(data.skybox_seeds(config.skybox_seeds))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's Gaussians.

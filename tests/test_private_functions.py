@@ -34,6 +34,12 @@ PRIVATE = [
     ("shellgs_method/trainer.py", "nerfstudio.engine.trainer", "Trainer._after_train", "self"),
     ("shellgs_method/model.py", "nerfstudio.models.splatfacto", "SplatfactoModel._get_background_color", "self"),
     ("shellgs_method/viewer.py", "nerfstudio.viewer.viewer_elements", "ViewerControl._setup", "self viewer"),
+    (
+        "shellgs_method/densification.py",
+        "gsplat.strategy.default",
+        "DefaultStrategy._prune_gs",
+        "self params optimizers state step",
+    ),
     ("shellgs_method/densification.py", "gsplat.strategy.ops", "_multinomial_sample", "weights n"),
     (
         "shellgs_method/densification.py",
