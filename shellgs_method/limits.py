@@ -61,7 +61,7 @@ LIMITS = {
     "sh_degree_interval": FROM_ONE,
     "seed_spacing": LENGTH,
     "max_seeds": FROM_ONE,
-    "skybox_seeds": COUNT,
+    "skybox_seeds": Limits(0, 1e6, int),
     "init_opacity": Limits(0.01, 0.99),
     "cap_max": FROM_ONE,
     "noise": Limits(0, 1e12),
