@@ -116,6 +116,7 @@ class FacadeTrainer(Trainer):
 
     optimizers: GuardedOptimizers
     pipeline: FacadePipeline
+    _faults = 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up everything that training needs."""
@@ -136,7 +137,7 @@ class FacadeTrainer(Trainer):
         if self._start_step >= run_length:
             CONSOLE.print(f"The checkpoint has all {run_length} iterations of this run already: nothing to do.")
             return
-        self._last_step, self._faults = run_length - 1, 0
+        self._faults = 0
         with refusals_end_the_program():
             self.pipeline.restore_training()
             super().train()
@@ -154,7 +155,7 @@ class FacadeTrainer(Trainer):
             self._report_fault(step, losses)
         if step % CHECK_EVERY == 0 or self.optimizers.skipped:
             self._remove_broken_gaussians(step)
-        if step >= self._last_step:
+        if step >= self.config.max_num_iterations - 1:
             self.stop_training = True
         return loss, losses, metrics
 
@@ -186,7 +187,7 @@ class FacadeTrainer(Trainer):
                 )
 
     def _after_train(self) -> None:
-        self.step = min(self.step, self._last_step)
+        self.step = min(self.step, self.config.max_num_iterations - 1)
         super()._after_train()
 
     def _load_checkpoint(self) -> None:

@@ -13,6 +13,7 @@ from nerfstudio.cameras.cameras import Cameras
 from runs import held_out, model_of, render, trainer_of
 from scipy.spatial.transform import Rotation
 
+import benchmarks.step
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.batches import pinhole_camera
@@ -257,6 +258,13 @@ def test_a_failed_save_leaves_the_last_checkpoint(trained, monkeypatch):
         trained.save_checkpoint(77)
     assert sorted(trained.checkpoint_dir.iterdir()) == before
     assert not list(trained.base_dir.glob("checkpoint-*"))
+
+
+def test_the_parts_of_a_step_are_timed_on_a_trained_run(trained, capsys):
+    trained.config.save_config()
+    benchmarks.step.main(benchmarks.step.Benchmark((trained.config.get_base_dir() / "config.yml",), steps=1))
+    printed = capsys.readouterr().out
+    assert all(part in printed for part in ("backward", "whole step", "rasterizer alone"))
 
 
 @pytest.mark.parametrize("method", ["shellgs", "photo_gs"])
