@@ -1,64 +1,140 @@
 """How much geometry in front of the shell the photographs reveal, on the synthetic facade with its true geometry.
 
 python -m benchmarks.check --width 640
+python -m benchmarks.check --passers-by --keep moving/
 """
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
 import tyro
+from jaxtyping import Bool
+from PIL import Image
 
-from dataparsers.cue_maps import CueMaps
+from dataparsers.cue_maps import CueMap, CueMaps, transients
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
+from dataparsers.photograph import View
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, check_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
-from shellgs_method.synthetic.appearance import rays
-from shellgs_method.synthetic.geometry import Material
+from shellgs_method.synthetic.appearance import Daylight, photograph, rays
+from shellgs_method.synthetic.geometry import Material, Mesh, box, merge
 from shellgs_method.synthetic.scene import Facade
+from shellgs_method.synthetic.world import World
 
 NEARER = 0.1
 """Metres by which the true geometry must be nearer than the shell to count."""
 
 
-def main(width: int = 320, views: int = 40, seed: int = 0) -> None:
-    """Print recall and precision over the pixels of all views, recall by material, and times."""
+def main(width: int = 320, views: int = 40, seed: int = 0, passers_by: bool = False, keep: Path | None = None) -> None:
+    """Print recall and precision over the pixels of all views, recall by material, and times.
+
+    Args:
+        width: width of the photographs.
+        views: number of photographs.
+        seed: seed of the facade.
+        passers_by: add pedestrians and cars, others in each training photograph, and measure how well they are found.
+        keep: copy the scene here, to train on.
+    """
     config = FacadeConfig(width=width, height=width * 9 // 16, views=views, seed=seed)
     facade = Facade.build(config)
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "scene"
         write_scene(scene, config)
         parsed = FacadeDataParserConfig(data=scene)
-        photographs = read_views(parsed)
+        held_out, photographs = held_out_names(parsed), read_views(parsed)
+        moving = add_passers_by(facade, photographs, held_out, config.supersampling) if passers_by else {}
         start = time.perf_counter()
         cast_views(scene, photographs, Alignment.load(scene / ALIGNMENT))
         cast = time.perf_counter() - start
-        seconds = check_views(scene, photographs, held_out_names(parsed)).seconds
-        shell, truth, checked = (CueMaps.open(scene, kind) for kind in ("shell", "truth", "checked"))
-        unit = shell.manifest.metres_per_unit
-        assert unit is not None
-        there, found, right = Counter[str](), 0, Counter[str]()
-        for view, camera in zip(photographs, facade.cameras, strict=True):
-            on, real, said = (maps.read(view.name, view.camera) for maps in (shell, truth, checked))
-            assert on is not None
-            assert real is not None
-            assert said is not None
-            before = (on.depth > 0) & (real.depth > 0) & ((on.depth - real.depth) * unit > NEARER)
-            material = facade.daylight.world.cast(*rays(camera)).material
-            found += int(said.mask.sum())
-            for kind in np.unique(material[before]):
-                name = Material(kind).name.lower()
-                there[name] += int((before & (material == kind)).sum())
-                right[name] += int((before & said.mask & (material == kind)).sum())
+        seconds = check_views(scene, photographs, held_out).seconds
+        print(f"{views} views of {width} x {config.height}")
+        if moving:
+            print_moving(scene, [view for view in photographs if view.name in moving], moving)
+        else:
+            print_still(scene, photographs, facade)
+        print(f"compared in {seconds:.1f} s, {seconds / cast:.1f} times as long as the cast took ({cast:.1f} s)")
+        if keep is not None:
+            shutil.copytree(scene, keep)
+
+
+def print_still(scene: Path, photographs: list[View], facade: Facade) -> None:
+    """Print recall and precision of what stands in front of the shell, and recall by material."""
+    shell, truth, checked = (CueMaps.open(scene, kind) for kind in ("shell", "truth", "checked"))
+    unit = shell.manifest.metres_per_unit
+    assert unit is not None
+    there, found, right = Counter[str](), 0, Counter[str]()
+    for view, camera in zip(photographs, facade.cameras, strict=True):
+        on, real, said = (read(maps, view) for maps in (shell, truth, checked))
+        before = (on.depth > 0) & (real.depth > 0) & ((on.depth - real.depth) * unit > NEARER)
+        material = facade.daylight.world.cast(*rays(camera)).material
+        found += int(said.mask.sum())
+        for kind in np.unique(material[before]):
+            name = Material(kind).name.lower()
+            there[name] += int((before & (material == kind)).sum())
+            right[name] += int((before & said.mask & (material == kind)).sum())
     recall, precision = sum(right.values()) / sum(there.values()), sum(right.values()) / max(found, 1)
-    print(f"{views} views of {width} x {config.height}: recall {recall:.2f}, precision {precision:.2f}")
+    print(f"recall {recall:.2f}, precision {precision:.2f}")
     for name, count in there.most_common():
         print(f"  {name:8} {count / sum(there.values()):6.1%} of the pixels, recall {right[name] / count:.2f}")
-    print(f"compared in {seconds:.1f} s, {seconds / cast:.1f} times as long as the cast took ({cast:.1f} s)")
+
+
+def print_moving(scene: Path, photographs: list[View], moving: dict[str, Bool[np.ndarray, "h w"]]) -> None:
+    """Print recall and precision of what moved in front of the shell."""
+    shell, checked = CueMaps.open(scene, "shell"), CueMaps.open(scene, "checked")
+    there = found = right = 0
+    for view in photographs:
+        on, said = read(shell, view), read(checked, view)
+        moved = transients(said, on)
+        there += int((moving[view.name] & (on.depth > 0)).sum())
+        found += int(moved.sum())
+        right += int((moved & moving[view.name]).sum())
+    print(f"of what moved in front of the shell: recall {right / there:.2f}, precision {right / max(found, 1):.2f}")
+
+
+def add_passers_by(
+    facade: Facade, photographs: list[View], held_out: Collection[str], supersampling: int
+) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """Photograph the training views again with two pedestrians, and in some a car; masks of these by view."""
+    rng, masks = np.random.default_rng(5), {}
+    still = facade.daylight.world
+    for view, camera in zip(photographs, facade.cameras, strict=True):
+        if view.name in held_out:
+            continue
+        added = merge(street_life(camera.position.numpy(), rng))
+        world = World(merge([facade.mesh, added]))
+        image = photograph(Daylight(world, facade.daylight.lattice), camera, supersampling, rng)
+        Image.fromarray(image).save(view.image)
+        masks[view.name] = World(added).cast(*rays(camera)).t < still.cast(*rays(camera)).t - 0.02
+    return masks
+
+
+def street_life(camera: np.ndarray, rng: np.random.Generator) -> Iterator[Mesh]:
+    """Two pedestrians on the pavement near a camera, and a car in some of the photographs from across the street."""
+    for _ in range(2):
+        x, y, height = camera[0] + rng.uniform(-4, 4), rng.uniform(-3.8, -0.8), rng.uniform(1.5, 1.9)
+        paints = [Material.POLE, Material.TRUNK, Material.CAR, Material.LEAF]
+        trousers, coat = (Material(int(rng.choice(paints))) for _ in range(2))
+        yield box((x - 0.25, y - 0.15, 0), (x + 0.25, y + 0.15, 0.55 * height), trousers)
+        yield box((x - 0.28, y - 0.17, 0.55 * height), (x + 0.28, y + 0.17, 0.86 * height), coat)
+        yield box((x - 0.1, y - 0.1, 0.86 * height), (x + 0.1, y + 0.1, height), Material.COLUMN)
+    if camera[1] < -9 and rng.random() < 0.6:
+        x = camera[0] + rng.uniform(-6, 3)
+        yield box((x, -6.8, 0.25), (x + 4.3, -5, 0.9), Material.CAR)
+        yield box((x + 0.9, -6.65, 0.9), (x + 3.5, -5.15, 1.5), Material.CAR)
+
+
+def read(maps: CueMaps, view: View) -> CueMap:
+    """A view's map, which must exist."""
+    cue = maps.read(view.name, view.camera)
+    assert cue is not None
+    return cue
 
 
 if __name__ == "__main__":

@@ -33,10 +33,11 @@ from dataparsers.map_files import (
     read_arrays,
     read_record,
     resampled,
+    transients,
     write_map,
 )
 
-__all__ = ["CueMap", "CueMaps", "Manifest", "MapRecord", "find_cues", "relative_path", "source_hash"]
+__all__ = ["CueMap", "CueMaps", "Manifest", "MapRecord", "find_cues", "relative_path", "source_hash", "transients"]
 
 T = TypeVar("T")
 

@@ -108,6 +108,14 @@ class MapRecord:
         return Camera(viewmat, K, self.width, self.height)
 
 
+def transients(checked: CueMap, shell: CueMap) -> Bool[np.ndarray, "H W"]:
+    """Pixels of a view's checked map where only its own photograph shows something in front of the shell.
+
+    Their depth is the shell's; that of other occluders is at least 1.2 % less.
+    """
+    return checked.mask & (checked.depth > 0.995 * shell.depth)
+
+
 def resampled(cue: CueMap, camera: Camera) -> CueMap:
     """Resample a map to another size of its camera.
 

@@ -90,11 +90,19 @@ def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: boo
     """
     depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
     if kind == "shell" and not everywhere:
-        before = contradicted(batch, device).float().permute(2, 0, 1)
-        mask = mask & ~max_pool2d(before, 2 * MARGIN + 1, 1, MARGIN).bool().permute(1, 2, 0)
+        mask = mask & ~_with_margin(contradicted(batch, device))
     if "mask" in batch:
         mask = mask & batch["mask"].to(device)
     return Reference(depth, normal.float(), mask)
+
+
+def static_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"] | None:
+    """:func:`kept_pixels` that, as far as is known, show nothing that moved; None where all do."""
+    kept = kept_pixels(batch, image) if "mask" in batch else None
+    if "transient" not in batch or not batch["transient"].any():
+        return kept
+    static = ~_with_margin(batch["transient"].to(image.device))
+    return static if kept is None else static & kept
 
 
 def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
@@ -102,6 +110,10 @@ def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
     if "nearer_depth" not in batch:
         return torch.zeros(batch["shell_mask"].shape, dtype=torch.bool, device=device)
     return batch["nearer_depth"].to(device) > 0
+
+
+def _with_margin(mask: Bool[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
+    return max_pool2d(mask.float().permute(2, 0, 1), 2 * MARGIN + 1, 1, MARGIN).bool().permute(1, 2, 0)
 
 
 def pinhole_camera(camera: Cameras) -> Camera:

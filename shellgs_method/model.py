@@ -32,6 +32,7 @@ from shellgs_method.batches import (
     reference_errors,
     reference_maps,
     references,
+    static_pixels,
 )
 from shellgs_method.densification import MCMCConfig, MCMCStrategy, SkyboxStrategy
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
@@ -84,6 +85,8 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Depth that is rendered and supervised: expected, median (discs only), or plane (of the composited plane)."""
     shell_counts: Literal["everywhere", "uncontradicted"] = "everywhere"
     """Where the shell supervises and is seeded: everywhere, or not where photographs show something in front of it."""
+    ignore_transients: bool = False
+    """Leave out of the photometric loss what moved: what only one photograph shows in front of the shell."""
     densification: Literal["default", "mcmc"] = "default"
     """default: clone, split and prune by the gradient; mcmc: relocate and add by opacity, up to a cap."""
     mcmc: MCMCConfig = MCMCConfig()  # noqa: RUF009
@@ -389,6 +392,8 @@ class FacadeModel(SplatfactoModel):
         config = self.config
         target = self.composite_with_background(self.get_gt_img(batch["image"]), background)
         kept = batch["mask"].to(self.device) if "mask" in batch else None
+        if config.ignore_transients:
+            kept = static_pixels(batch, target)
         cue = with_cue = None
         if f"{config.cues}_depth" in batch:
             with_cue = batch[f"{config.cues}_mask"].to(self.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 import trimesh
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
-from runs import small_disk, trainer_of
+from runs import data_of, model_of, small_disk, trainer_of
 from scipy.spatial import KDTree
 from viser import SceneApi
 
@@ -23,14 +24,18 @@ from dataparsers.photograph import View
 from shellgs_method.batches import reference_errors, reference_maps, regions
 from shellgs_method.evaluation import Rendering
 from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
+from shellgs_method.shell.checking.check import _told_apart
 from shellgs_method.shell.checking.contradiction import (
+    ALONE,
     CONFIRMED,
     CONTRADICTED,
     MOVES,
     OFFSETS,
+    Agreement,
     ShellView,
+    Sweep,
     _better_half,
-    agreed_score,
+    agreement,
     neighbours,
     sides,
     sweep,
@@ -80,13 +85,21 @@ def street(
 CAMERAS = [camera_at(x) for x in np.linspace(-2.5, 2.5, 9)]
 
 
+MIDDLE = len(CAMERAS) // 2
+
+
+def agreed(views: list[ShellView], judged: int = MIDDLE) -> tuple[Sweep, Agreement]:
+    """Sweep and agreement of one view."""
+    sweeps = [sweep(view, [other for other in views if other is not view]) for view in views]
+    beside = [index for index in range(len(views)) if index != judged]
+    found_there = [sweeps[k] for k in beside]
+    return sweeps[judged], agreement(views[judged], sweeps[judged], [views[k] for k in beside], found_there)
+
+
 def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Sweep score, agreed score and depth of the middle view."""
-    sweeps = [sweep(view, [other for other in views if other is not view]) for view in views]
-    middle = len(views) // 2
-    beside = [index for index in range(len(views)) if index != middle]
-    score = agreed_score(views[middle], sweeps[middle], [views[k] for k in beside], [sweeps[k] for k in beside])
-    return sweeps[middle].score.float(), score, WALL / (1 + sweeps[middle].offset)
+    found, both = agreed(views)
+    return found.score.float(), both.score, WALL / (1 + found.offset)
 
 
 @pytest.mark.parametrize("depth", [7.0, 5.0, 3.5])
@@ -110,6 +123,47 @@ def test_a_wall_that_agrees_with_the_shell_is_confirmed():
 def test_a_mirror_shows_farther_things_and_does_not_contradict_the_shell():
     _, score, _ = scores([view for view, _ in street(CAMERAS, mirror=True)])
     assert (score > CONTRADICTED).float().mean() < 0.01
+
+
+def with_passer_by(views: list[ShellView]) -> tuple[list[ShellView], np.ndarray]:
+    """The views with something in front of the wall in the middle one alone, and its mask there."""
+    image = views[MIDDLE].image.numpy().copy()
+    mask = np.zeros(image.shape[:2], bool)
+    mask[20:, 60:85] = True
+    image[mask] = [60, 40, 160]
+    return [replace(view, image=torch.from_numpy(image)) if k == MIDDLE else view for k, view in enumerate(views)], mask
+
+
+def test_a_passer_by_is_alone_in_its_photograph():
+    views, mask = with_passer_by([view for view, _ in street(CAMERAS)])
+    alone = agreed(views)[1].alone.numpy() > ALONE
+    assert (alone & mask).sum() / mask.sum() > 0.9
+    assert (alone & mask).sum() / alone.sum() > 0.9
+    for judged in (MIDDLE - 1, MIDDLE + 2):
+        assert (agreed(views, judged)[1].alone > ALONE).float().mean() < 0.002
+
+
+def test_another_exposure_is_not_something_that_moved():
+    views = [view for view, _ in street(CAMERAS)]
+    brighter = (1.4 * views[MIDDLE].image.float()).clamp(0, 255).to(torch.uint8)
+    views[MIDDLE] = replace(views[MIDDLE], image=brighter)
+    assert (agreed(views)[1].alone > ALONE).float().mean() < 0.002
+
+
+def test_where_other_photographs_differ_too_nothing_has_moved():
+    alone = agreed([view for view, _ in street(CAMERAS, mirror=True)])[1].alone
+    assert (alone > ALONE).float().mean() < 0.02
+
+
+def test_an_object_either_moved_or_stands():
+    """Two objects: of one, most pixels are alone; of the other, most are contradicted."""
+    static, alone = torch.zeros(2, 4, 12, dtype=torch.bool).numpy()
+    static[:, 0], alone[:, 1:4] = True, True
+    static[:, 7:10], alone[:, 10] = True, True
+    stands, moved = _told_apart(static, alone)
+    columns = np.arange(12)
+    assert (moved == (columns < 4)).all()
+    assert (stands == ((columns >= 7) & (columns < 10))).all()
 
 
 @pytest.mark.parametrize("offset", [OFFSETS[3], OFFSETS[8]])
@@ -192,6 +246,31 @@ def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request(
     assert parts["before_shell"] == [False, True] + [False] * 6
     assert parts["on_shell"] == [True, False] + [True] * 5 + [False]
     assert parts["off_shell"] == [False] * 7 + [True]
+
+
+def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(shellgs, scene: Path, tmp_path: Path):
+    """A square on one training photograph: `shellgs cast` names the photograph; training leaves out the square."""
+    name, square = "images/frame_00006.png", np.s_[10:20, 20:30]
+    with Image.open(scene / name) as photograph:
+        image = np.array(photograph)
+    image[square] = [200, 30, 160]
+    Image.fromarray(image).save(scene / name)
+    assert f"mostly in {name}" in " ".join(shellgs("cast", scene).split())
+    trainer = trainer_of(scene, tmp_path, "shellgs_metric")
+    model, data = model_of(trainer), data_of(trainer)
+    index = [view.name for view in data.train_dataset.views].index(name)
+    batch = next(batch for batch in data.cached_train if batch["image_idx"] == index)
+    losses = model._view_losses(batch, torch.zeros(3))
+    kept = losses.photometric.mask
+    assert kept is not None
+    assert losses.cue is not None
+    left_out = ~kept[..., 0].numpy()
+    assert left_out[square].mean() > 0.9
+    assert left_out.sum() < 2 * 14 * 14  # with a margin of 2 pixels
+    assert losses.cue.cue.mask[..., 0].numpy()[square].mean() > 0.9
+    model.config.ignore_transients = False
+    model._views.clear()
+    assert model._view_losses(batch, torch.zeros(3)).photometric.mask is None
 
 
 def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):

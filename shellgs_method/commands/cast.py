@@ -12,7 +12,6 @@ from shellgs_method.commands.panels import save_panel, views_with_maps
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dataparsers.cue_maps import CueMaps
     from dataparsers.facade import FacadeDataParserConfig
     from dataparsers.photograph import View
 
@@ -30,8 +29,9 @@ def cast(
     """Cast the aligned shell into every view of a scene: depth, normals and mask, in scene/cues/shell.
 
     Then the photographs are compared with each other, on the shell and in front of it: where they agree on something
-    nearer, such as a tree or a railing, the shell does not count. The result is in scene/cues/checked. Occluders that
-    it misses can be painted black in scene/shell/masks/<image path>.png. The same command resumes an interrupted cast.
+    nearer, such as a tree or a railing, the shell does not count. What hides it in one photograph only, such as a
+    passer-by, is ignored in training. The result is in scene/cues/checked. Occluders that it misses can be painted
+    black in scene/shell/masks/<image path>.png. The same command resumes an interrupted cast.
 
     Args:
         scene: Scene folder.
@@ -74,7 +74,6 @@ def cast(
 
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     """Compare the photographs, and print where and how much they contradict the shell."""
-    from dataparsers.cue_maps import CueMaps
     from dataparsers.facade import held_out_names, read_views
     from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 
@@ -92,17 +91,26 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
             f"{verdicts.share:.1%} of the shell is contradicted by {MANY} or more photographs and half of those that "
             f"see it: look at {verdicts.witness}, and at {places}, red where the building differs."
         )
-    panel = _save_check_panel(CueMaps.open(scene, "checked"), views)
-    console.print(f"Look at {panel}: red is what occludes the shell, green where they confirm it.")
+    if verdicts.moved_in:
+        console.print(
+            f"In {len(verdicts.moved_in)} views something hides the shell that no other photograph shows, such as a "
+            f"passer-by or a car, mostly in {verdicts.moved_in[0]}: shellgs-metric ignores it."
+        )
+    panel = _save_check_panel(scene, views)
+    console.print(f"Look at {panel}: red is what occludes the shell, blue what moved, green where they confirm it.")
 
 
-def _save_check_panel(maps: CueMaps, views: Sequence[View]) -> Path:
+def _save_check_panel(scene: Path, views: Sequence[View]) -> Path:
     """Save an image of some views and where photographs contradict or confirm the shell."""
+    from dataparsers.cue_maps import CueMaps
     from dataparsers.photograph import load_photograph
     from shellgs_method.evaluation.figures import save_figure
     from shellgs_method.shell import check_panel
 
-    some = views_with_maps(maps, views, 4)
-    panel = maps.folder / "panel.png"
-    save_figure(panel, check_panel([load_photograph(view)[..., :3] for view, _ in some], [cue for _, cue in some]))
+    checked, shell = CueMaps.open(scene, "checked"), CueMaps.open(scene, "shell")
+    some = views_with_maps(checked, views, 4)
+    panel = checked.folder / "panel.png"
+    images, maps = [load_photograph(view)[..., :3] for view, _ in some], [cue for _, cue in some]
+    on_shell = [cue for view, _ in some if (cue := shell.read(view.name, view.camera))]
+    save_figure(panel, check_panel(images, maps, on_shell))
     return panel

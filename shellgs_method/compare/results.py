@@ -23,7 +23,11 @@ Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finish runs; return those that failed, with the reason."""
 PANELS = (
     ("shell", "supervision", "the shell maps of a view."),
-    ("checked", "contradicted", "where photographs contradict the shell (red) and where they confirm it (green)."),
+    (
+        "checked",
+        "contradicted",
+        "where photographs contradict the shell (red; blue: what moved) and where they confirm it (green).",
+    ),
 )
 """Panels of a scene's maps: kind of the maps, name of the copy, caption."""
 WRITING = "Writing tables, images and report ..."

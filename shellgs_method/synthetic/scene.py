@@ -74,11 +74,13 @@ class Facade:
 
     Attributes:
         layout: parameters of the building.
+        mesh: building and street.
         daylight: lit building and street.
         cameras: camera of each photograph, in the order of the walk.
     """
 
     layout: Layout
+    mesh: Mesh
     daylight: Daylight
     cameras: list[Camera]
 
@@ -87,9 +89,9 @@ class Facade:
         """Build the facade of a configuration."""
         layout = Layout(config.bays, config.storeys)
         tree, texture, hand = _generators(config.seed, 3)
-        world = World(merge([building(layout), street(layout, tree)]))
-        daylight = Daylight(world, texture.uniform(-1.0, 1.0, (256, 256)).astype(np.float32))
-        return cls(layout, daylight, walk(layout.length, config.views, config.width, config.height, hand))
+        mesh = merge([building(layout), street(layout, tree)])
+        daylight = Daylight(World(mesh), texture.uniform(-1.0, 1.0, (256, 256)).astype(np.float32))
+        return cls(layout, mesh, daylight, walk(layout.length, config.views, config.width, config.height, hand))
 
     def truth(self, camera: Camera) -> CueMap:
         """True depth and normals in scene units, of everything but the sky; the mask is the building."""

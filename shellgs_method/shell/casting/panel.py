@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
 
-from dataparsers.cue_maps import CueMap
+from dataparsers.cue_maps import CueMap, transients
 from shellgs_method.evaluation.colours import GREY, normal_colours
 
 
@@ -45,12 +45,18 @@ def supervision_panel(
     return figure
 
 
-def check_panel(images: Sequence[UInt8[np.ndarray, "H W 3"]], checked: Sequence[CueMap]) -> Figure:
-    """Plot where photographs contradict the shell (red) and confirm it (green); save it with ``.savefig(path)``.
+def check_panel(
+    images: Sequence[UInt8[np.ndarray, "H W 3"]], checked: Sequence[CueMap], shell: Sequence[CueMap]
+) -> Figure:
+    """Plot where photographs contradict the shell (red; blue: what moved) and confirm it (green).
 
     Args:
         images: the photographs.
         checked: their maps by :func:`~shellgs_method.shell.check_views`.
+        shell: their shell maps.
+
+    Returns:
+        The figure; save it with ``.savefig(path)``.
     """
     height, width = checked[0].mask.shape
     columns = 2
@@ -58,11 +64,13 @@ def check_panel(images: Sequence[UInt8[np.ndarray, "H W 3"]], checked: Sequence[
     figure = Figure(figsize=(16, (8 * height / width + 0.3) * rows), dpi=100, layout="constrained")
     for ax in figure.subplots(rows, columns, squeeze=False).flat:
         ax.set_axis_off()
-    for ax, image, cue in zip(figure.axes, images, checked, strict=False):
+    for ax, image, cue, on_shell in zip(figure.axes, images, checked, shell, strict=False):
         shown = image / 255
-        confirmed = (cue.depth > 0) & ~cue.mask
+        moved, confirmed = transients(cue, on_shell), (cue.depth > 0) & ~cue.mask
         shown[cue.mask] = 0.3 * shown[cue.mask] + [0.7, 0.0, 0.0]
+        shown[moved] = image[moved] / 255 * 0.3 + [0.0, 0.0, 0.7]
         shown[confirmed] = 0.75 * shown[confirmed] + [0.0, 0.25, 0.0]
         ax.imshow(shown)
-        ax.set_title(f"contradicted {cue.mask.mean():.1%}, confirmed {confirmed.mean():.0%} of the pixels")
+        contradicted = f"contradicted {cue.mask.mean():.1%} (moved {moved.mean():.1%})"
+        ax.set_title(f"{contradicted}, confirmed {confirmed.mean():.0%} of the pixels")
     return figure

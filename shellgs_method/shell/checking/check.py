@@ -9,9 +9,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from rich.progress import track
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -20,11 +21,12 @@ from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.files import atomic_write, content_hash, fingerprint
 from dataparsers.photograph import View, load_photograph
 from shellgs_method.shell.checking.contradiction import (
+    ALONE,
     CONFIRMED,
     CONTRADICTED,
     ShellView,
     Sweep,
-    agreed_score,
+    agreement,
     sides,
     sweep,
 )
@@ -33,7 +35,7 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 3
+VERSION = 4
 """Version of the maps: maps of another version are made again."""
 
 
@@ -58,8 +60,8 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     """Compare the photographs on the shell and in front of it, and store the maps in ``scene/cues/checked``.
 
     The mask of a map marks pixels with an occluder, something in front of the shell. The depth is that of the
-    occluder, or the shell's where photographs confirm it, and 0 where they are inconclusive: on plain or reflecting
-    walls, and where few views overlap.
+    occluder, or the shell's if only this photograph shows one, which moved. Elsewhere it is the shell's where
+    photographs confirm it, and 0 where they are inconclusive: on plain or reflecting walls, where few views overlap.
 
     Held-out photographs are compared with the training photographs, but not the other way round, so that the maps of
     training views contain nothing of the held-out ones.
@@ -140,12 +142,14 @@ class _TrainingViews:
             found = sweep(seen, list(self.views.values()))
         names = self._neighbours(seen)
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
-        score = agreed_score(seen, found, others, found_there)
+        agreed = agreement(seen, found, others, found_there)
         size, hit = cue.depth.shape, cue.depth > 0
-        occluded = _resized(score, size).numpy() > CONTRADICTED
+        score, alone = (_resized(scores, size).numpy() for scores in agreed)
+        static, moved = _told_apart(score > CONTRADICTED, alone > ALONE)
+        occluded = static | moved
         confirmed = ~occluded & (_resized(found.score.float(), size).numpy() < CONFIRMED)
         nearer = cue.depth / (1 + _nearest(found.offset.float(), size).numpy())
-        depth = np.where(occluded, nearer, np.where(confirmed, cue.depth, 0)) * hit
+        depth = np.where(static, nearer, np.where(moved | confirmed, cue.depth, 0)) * hit
         return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), occluded & hit)
 
     def _neighbours(self, seen: ShellView) -> list[str]:
@@ -157,6 +161,20 @@ class _TrainingViews:
         found = sides(seen.camera, [self.views[name].camera for name in names])
         near = [sorted(each for each in side if each[0] < reach)[:NEIGHBOURS] for side in found]
         return [names[index] for side in near for _, index in side]
+
+
+def _told_apart(
+    static: Bool[np.ndarray, "h w"], alone: Bool[np.ndarray, "h w"]
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Masks of what stands in front of the shell and of what moved there: an object is the one or the other.
+
+    Parts of a plain car may match others by chance, and parts of a lamp post may be visible in too few views.
+    """
+    found = static | alone
+    objects = cv2.connectedComponents(found.astype(np.uint8))[1]
+    sizes, alone_sizes = np.bincount(objects.ravel()), np.bincount(objects.ravel(), (alone & ~static).ravel())
+    moved = found & (alone_sizes > sizes / 2)[objects]
+    return static & ~moved, moved
 
 
 def _read(shell: CueMaps, view: View) -> CueMap:

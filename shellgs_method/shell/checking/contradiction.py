@@ -33,6 +33,8 @@ PER_SIDE = 4
 CONTRADICTED = 0.14
 """Score above which a pixel is contradicted. With 0.08 more are found, and renders of what is in front of the shell
 improve, but mirrors contradict the shell too, and surfaces left to the photographs alone are less accurate."""
+ALONE = 0.12
+"""Difference from the colours that other photographs agree on above which a pixel shows something that moved."""
 CONFIRMED = -0.03
 """Score of the best nearer depth below which the shell is confirmed."""
 
@@ -129,10 +131,17 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
     return Sweep(score.where(view.depth > 0, -1.0).half(), offset.half())
 
 
-def agreed_score(
-    view: ShellView, found: Sweep, others: Sequence[ShellView], found_there: Sequence[Sweep]
-) -> Float[Tensor, "h w"]:
-    """Score a view's sweep in the light of its neighbours' sweeps: -1 where there is no shell.
+class Agreement(NamedTuple):
+    """What the photographs of a view and its neighbours agree on; both maps are -1 where there is no shell."""
+
+    score: Float[Tensor, "h w"]
+    """How much better they agree in front of the shell than on it, above :data:`CONTRADICTED` for an occluder."""
+    alone: Float[Tensor, "h w"]
+    """Difference of the view's colours from its neighbours' on the shell, less twice what these differ by."""
+
+
+def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_there: Sequence[Sweep]) -> Agreement:
+    """Judge a view's sweep in the light of its neighbours' sweeps.
 
     Where a neighbour's sweep finds an occluder, the shell is hidden from it, so its photograph does not count for the
     shell; and an occluder in one view should be an occluder in the others.
@@ -144,7 +153,7 @@ def agreed_score(
         found_there: their sweeps.
     """
     pixels = _Pixels(view)
-    shell, nearer, trust, support = [], [], [], []
+    shell, shown, nearer, trust, support = [], [], [], [], []
     for other, sweep_there in zip(others, found_there, strict=True):
         neighbour = _Neighbour(pixels, other)
         look = neighbour.look(pixels.surface / (1 + found.offset.float()))
@@ -156,18 +165,21 @@ def agreed_score(
         found_offset = _sampled(sweep_there.offset.float(), look.grid, "nearest")
         alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
         shell.append(neighbour.on_shell.masked_fill(hidden, torch.nan))
+        unseen = (neighbour.visible == 0) | (of_shell > 0.5)
+        shown.append(neighbour.features(neighbour.shell).masked_fill(unseen, torch.nan))
         nearer.append(neighbour.disagreement(look).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
         support.append((of_nearer * torch.where(alike, 1.0, 0.4)).masked_fill(hidden, torch.nan))
     if len(shell) < 2:
-        return torch.full_like(view.depth, -1.0)
+        return Agreement(*torch.full((2, *view.depth.shape), -1.0))
     shell, nearer, trust, support = map(torch.stack, (shell, nearer, trust, support))
     agreed = support.nanmean(dim=0).nan_to_num(0.0)
     trusted = (trust * shell.isfinite()).sum(dim=0) > 1
     better = _better_half(shell, trust) - _better_half(nearer, torch.ones_like(trust))
     better = torch.where(trusted, better, 0.3 * (agreed - 0.3))  # hidden from the neighbours: only their sweeps count
     score = _smooth(pixels, (better + _SUPPORT * agreed)[None])[0]
-    return score.where(view.depth > 0, -1.0)
+    maps = torch.stack([score, _alone(pixels, torch.stack(shown))])
+    return Agreement(*maps.where(view.depth > 0, -1.0))
 
 
 class _Look(NamedTuple):
@@ -214,12 +226,35 @@ class _Neighbour:
         u, v = (2 / size * along / near - 1 for size, along in zip(self._size, (x, y), strict=True))
         return _Look(torch.stack([u, v], dim=-1)[None], z, (z > 0) & (u.abs() < 1) & (v.abs() < 1))
 
+    def features(self, look: _Look) -> Float[Tensor, "5 h w"]:
+        """The other photograph's features at these positions."""
+        return grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
+
     def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
         """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
-        there = grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
-        difference = (self._features - there).abs_()
+        difference = (self._features - self.features(look)).abs_()
         colours, gradients = difference[:3].mean(dim=0) / _COLOUR, difference[3:].mean(dim=0) / _GRADIENT
         return (colours.clamp_max_(1) + gradients.clamp_max_(1)) / 2
+
+
+def _alone(pixels: _Pixels, shown: Float[Tensor, "V 5 h w"]) -> Float[Tensor, "h w"]:
+    """How much more a view differs from others on the shell than these do from each other; 0 where one or none sees it.
+
+    A view's exposure and white balance may differ: its colours are scaled by the median ratio to the others'.
+
+    Args:
+        pixels: the view's.
+        shown: the others' features on the shell; NaN where it is hidden from them.
+    """
+    colours = shown[:, :3]
+    typical = colours.nanmedian(dim=0).values
+    spread = (colours - typical).abs().mean(dim=1).nanquantile(0.75, dim=0)
+    known = shown[:, 0].isfinite().sum(dim=0) >= 2
+    own = pixels.features[:3]
+    gain = (typical / own.clamp_min(0.01)).where(known, torch.nan).flatten(1).nanmedian(dim=1).values
+    alone = (gain.nan_to_num(1.0)[:, None, None] * own - typical).abs().mean(dim=0) - 2 * spread
+    alone, weight = _smooth(pixels, torch.stack([alone.where(known, 0.0), known.float()]))
+    return alone / weight.clamp_min(0.05)
 
 
 def _sampled(

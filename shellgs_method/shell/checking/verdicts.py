@@ -12,7 +12,7 @@ import trimesh
 from jaxtyping import Bool, Float64, Int64
 
 from dataparsers.camera import in_view
-from dataparsers.cue_maps import CueMaps
+from dataparsers.cue_maps import CueMaps, transients
 from dataparsers.files import atomic_write
 from dataparsers.photograph import View
 from shellgs_method.voxels import cell_means, voxel_cells
@@ -22,6 +22,8 @@ CONTRADICTED_PLACES = "cues/checked/contradicted.ply"
 MANY = 6
 """Photographs that must contradict a point, and be half of those that see it, for the building to differ from its shell
 there. An occluder farther in front of the shell hides different points in each photograph."""
+MOVED = 0.004
+"""Share of a view's shell above which what moved is worth mentioning."""
 _STEP = 4  # stride in pixels of the lifted points
 _ACROSS = 300  # points along the longest side of the shell
 _SAME = 0.01  # relative difference of depth within which a point is visible in a view's shell map
@@ -34,11 +36,12 @@ class Verdicts:
     Attributes:
         places: the points.
         seen: number of views in which each is visible.
-        contradicted: number of these views that show something in front of it.
+        contradicted: number of these views that show something in front of it, other than what moved.
         distance: median distance of that from the point; NaN where no view contradicts it.
         views: names of all views.
         differs: mask of the points where the building differs from the shell, by :data:`MANY`.
         by_view: number of these points that each view contradicts.
+        moved: share of each view's shell that is hidden by something that moved, since no other view shows it.
     """
 
     places: Float64[np.ndarray, "N 3"]
@@ -48,6 +51,7 @@ class Verdicts:
     views: list[str]
     differs: Bool[np.ndarray, " N"]
     by_view: Int64[np.ndarray, " V"]
+    moved: Float64[np.ndarray, " V"]
 
     @property
     def share(self) -> float:
@@ -58,6 +62,11 @@ class Verdicts:
     def witness(self) -> str:
         """Name of the view that contradicts most of these points."""
         return self.views[int(self.by_view.argmax())]
+
+    @property
+    def moved_in(self) -> list[str]:
+        """Names of the views in which more than :data:`MOVED` of the shell is hidden by what moved, the most first."""
+        return [self.views[i] for i in np.argsort(-self.moved) if self.moved[i] > MOVED]
 
     def write(self, path: Path) -> None:
         """Write the points as a ply, redder where a larger share of the views contradicts them."""
@@ -85,7 +94,8 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     if places is None:
         places = _seen_places(sized, shell)
     seen, distances = np.zeros(len(places), np.int64), np.full((len(sized), len(places)), np.nan, np.float32)
-    for distance, view in zip(distances, sized, strict=True):
+    moved = np.zeros(len(sized))
+    for i, (distance, view) in enumerate(zip(distances, sized, strict=True)):
         camera = view.camera.shrunk(shell.manifest.max_image_size)
         cue, check = shell.read(view.name, camera), checked.read(view.name, camera)
         assert cue is not None
@@ -95,7 +105,9 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         columns, rows = pixels.astype(int).T
         visible = np.abs(cue.depth[rows, columns] / z - 1) < _SAME
         seen[k] += visible
-        occluded = visible & check.mask[rows, columns]
+        moving = transients(check, cue)
+        moved[i] = moving.sum() / max((cue.depth > 0).sum(), 1)
+        occluded = visible & (check.mask & ~moving)[rows, columns]
         along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
     contradicted = np.isfinite(distances).sum(axis=0)
@@ -104,7 +116,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     median[some] = np.nanmedian(distances[:, some], axis=0)
     differs = (contradicted >= MANY) & (2 * contradicted >= seen)
     by_view = np.isfinite(distances[:, differs]).sum(axis=1)
-    return Verdicts(places, seen, contradicted, median, [view.name for view in sized], differs, by_view)
+    return Verdicts(places, seen, contradicted, median, [view.name for view in sized], differs, by_view, moved)
 
 
 def _seen_places(views: Sequence[View], shell: CueMaps) -> Float64[np.ndarray, "N 3"]:
