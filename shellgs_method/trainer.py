@@ -123,6 +123,7 @@ class FacadeTrainer(Trainer):
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
             _remove_leftovers(self.base_dir)
             super().setup(test_mode)
+        self._last_step = self.config.max_num_iterations - 1  # later versions of nerfstudio change the setting
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """Optimizers whose learning rates decay over the run."""
@@ -155,7 +156,7 @@ class FacadeTrainer(Trainer):
             self._report_fault(step, losses)
         if step % CHECK_EVERY == 0 or self.optimizers.skipped:
             self._remove_broken_gaussians(step)
-        if step >= self.config.max_num_iterations - 1:
+        if step >= self._last_step:
             self.stop_training = True
         return loss, losses, metrics
 
@@ -187,7 +188,7 @@ class FacadeTrainer(Trainer):
                 )
 
     def _after_train(self) -> None:
-        self.step = min(self.step, self.config.max_num_iterations - 1)
+        self.step = min(self.step, self._last_step)
         super()._after_train()
 
     def _load_checkpoint(self) -> None:
