@@ -166,7 +166,7 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
         alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
         shell.append(neighbour.on_shell.masked_fill(hidden, torch.nan))
         unseen = (neighbour.visible == 0) | (of_shell > 0.5)
-        shown.append(neighbour.features(neighbour.shell).masked_fill(unseen, torch.nan))
+        shown.append(neighbour.shown[:3].masked_fill(unseen, torch.nan))
         nearer.append(neighbour.disagreement(look).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
         support.append((of_nearer * torch.where(alike, 1.0, 0.4)).masked_fill(hidden, torch.nan))
@@ -216,7 +216,9 @@ class _Neighbour:
         hidden = ~self.shell.inside | ((surface > 0) & (self.shell.z > 1.01 * surface))
         self.visible = (~hidden).float()
         """1 where the shell is visible in the other view: inside its image, not behind another part of the shell."""
-        self.on_shell = self.disagreement(self.shell)
+        self.shown = self._at(self.shell)
+        """The other photograph's features on the shell."""
+        self.on_shell = self._disagreement(self.shown)
         """Disagreement of the two photographs on the shell."""
 
     def look(self, depth: Float[Tensor, "h w"]) -> _Look:
@@ -226,29 +228,30 @@ class _Neighbour:
         u, v = (2 / size * along / near - 1 for size, along in zip(self._size, (x, y), strict=True))
         return _Look(torch.stack([u, v], dim=-1)[None], z, (z > 0) & (u.abs() < 1) & (v.abs() < 1))
 
-    def features(self, look: _Look) -> Float[Tensor, "5 h w"]:
-        """The other photograph's features at these positions."""
-        return grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
-
     def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
         """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
-        difference = (self._features - self.features(look)).abs_()
+        return self._disagreement(self._at(look))
+
+    def _at(self, look: _Look) -> Float[Tensor, "5 h w"]:
+        return grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
+
+    def _disagreement(self, there: Float[Tensor, "5 h w"]) -> Float[Tensor, "h w"]:
+        difference = (self._features - there).abs_()
         colours, gradients = difference[:3].mean(dim=0) / _COLOUR, difference[3:].mean(dim=0) / _GRADIENT
         return (colours.clamp_max_(1) + gradients.clamp_max_(1)) / 2
 
 
-def _alone(pixels: _Pixels, shown: Float[Tensor, "V 5 h w"]) -> Float[Tensor, "h w"]:
+def _alone(pixels: _Pixels, shown: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "h w"]:
     """How much more a view differs from others on the shell than these do from each other; 0 where one or none sees it.
 
     A view's exposure and white balance may differ: its colours are scaled by the median ratio to the others'.
 
     Args:
         pixels: the view's.
-        shown: the others' features on the shell; NaN where it is hidden from them.
+        shown: the others' colours on the shell; NaN where it is hidden from them.
     """
-    colours = shown[:, :3]
-    typical = colours.nanmedian(dim=0).values
-    spread = (colours - typical).abs().mean(dim=1).nanquantile(0.75, dim=0)
+    typical = shown.nanmedian(dim=0).values
+    spread = (shown - typical).abs().mean(dim=1).nanquantile(0.75, dim=0)
     known = shown[:, 0].isfinite().sum(dim=0) >= 2
     own = pixels.features[:3]
     gain = (typical / own.clamp_min(0.01)).where(known, torch.nan).flatten(1).nanmedian(dim=1).values
