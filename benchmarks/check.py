@@ -26,6 +26,7 @@ from shellgs_method.synthetic import FacadeConfig, write_scene
 from shellgs_method.synthetic.appearance import Daylight, photograph, rays
 from shellgs_method.synthetic.geometry import Material, Mesh, box, merge
 from shellgs_method.synthetic.scene import Facade
+from shellgs_method.synthetic.street import car
 from shellgs_method.synthetic.world import World
 
 NEARER = 0.1
@@ -125,9 +126,7 @@ def street_life(camera: np.ndarray, rng: np.random.Generator) -> Iterator[Mesh]:
         yield box((x - 0.28, y - 0.17, 0.55 * height), (x + 0.28, y + 0.17, 0.86 * height), coat)
         yield box((x - 0.1, y - 0.1, 0.86 * height), (x + 0.1, y + 0.1, height), Material.COLUMN)
     if camera[1] < -9 and rng.random() < 0.6:
-        x = camera[0] + rng.uniform(-6, 3)
-        yield box((x, -6.8, 0.25), (x + 4.3, -5, 0.9), Material.CAR)
-        yield box((x + 0.9, -6.65, 0.9), (x + 3.5, -5.15, 1.5), Material.CAR)
+        yield car(camera[0] + rng.uniform(-6, 3), -5.0)
 
 
 def read(maps: CueMaps, view: View) -> CueMap:

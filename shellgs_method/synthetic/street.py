@@ -34,9 +34,13 @@ def _street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
             x = np.floor(x / HOUSE) * HOUSE
             yield box((x, y - 4, 0), (x + HOUSE, y + 4, rng.uniform(*heights)), Material.HOUSE)
     for x in np.arange(np.floor((middle - 24) / CAR) * CAR, middle + 24, CAR):
-        y = -14.5 + rng.uniform(-0.2, 0.2)
-        yield box((x, y - 1.8, 0.25), (x + 4.3, y, 0.9), Material.CAR)
-        yield box((x + 0.9, y - 1.65, 0.9), (x + 3.5, y - 0.15, 1.5), Material.CAR)
+        yield car(x, -14.5 + rng.uniform(-0.2, 0.2))
+
+
+def car(x: float, y: float) -> Mesh:
+    """A car along x: its rear at ``x``, the side that faces the building at ``y``."""
+    body = box((x, y - 1.8, 0.25), (x + 4.3, y, 0.9), Material.CAR)
+    return merge([body, box((x + 0.9, y - 1.65, 0.9), (x + 3.5, y - 0.15, 1.5), Material.CAR)])
 
 
 def _crown(centre: np.ndarray, rng: np.random.Generator, leaves: int = 700, size: float = 0.12) -> Mesh:
