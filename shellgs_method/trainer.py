@@ -116,13 +116,13 @@ class FacadeTrainer(Trainer):
 
     optimizers: GuardedOptimizers
     pipeline: FacadePipeline
-    _faults = 0
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up everything that training needs."""
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
             _remove_leftovers(self.base_dir)
             super().setup(test_mode)
+        self._faults = 0
         self._last_step = self.config.max_num_iterations - 1  # later versions of nerfstudio change the setting
 
     def setup_optimizers(self) -> GuardedOptimizers:
@@ -138,7 +138,6 @@ class FacadeTrainer(Trainer):
         if self._start_step >= run_length:
             CONSOLE.print(f"The checkpoint has all {run_length} iterations of this run already: nothing to do.")
             return
-        self._faults = 0
         with refusals_end_the_program():
             self.pipeline.restore_training()
             super().train()
