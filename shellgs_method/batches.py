@@ -96,13 +96,13 @@ def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: boo
     return Reference(depth, normal.float(), mask)
 
 
-def static_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"] | None:
-    """:func:`kept_pixels` that, as far as is known, show nothing that moved; None where all do."""
-    kept = kept_pixels(batch, image) if "mask" in batch else None
-    if "transient" not in batch or not batch["transient"].any():
-        return kept
-    static = ~_with_margin(batch["transient"].to(image.device))
-    return static if kept is None else static & kept
+def photometric_pixels(
+    batch: dict, image: Float[Tensor, "H W 3"], ignore_transients: bool
+) -> Bool[Tensor, "H W 1"] | None:
+    """Pixels of a photograph to train on, None for all: :func:`kept_pixels`, without what is known to have moved."""
+    if ignore_transients and "transient" in batch and batch["transient"].any():
+        return kept_pixels(batch, image) & ~_with_margin(batch["transient"].to(image.device))
+    return kept_pixels(batch, image) if "mask" in batch else None
 
 
 def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:

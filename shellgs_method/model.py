@@ -28,11 +28,11 @@ from dataparsers.errors import SceneError
 from shellgs_method.batches import (
     kept_pixels,
     masked_image_errors,
+    photometric_pixels,
     pinhole_camera,
     reference_errors,
     reference_maps,
     references,
-    static_pixels,
 )
 from shellgs_method.densification import MCMCConfig, MCMCStrategy, SkyboxStrategy
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
@@ -391,9 +391,7 @@ class FacadeModel(SplatfactoModel):
             return self._views[index]
         config = self.config
         target = self.composite_with_background(self.get_gt_img(batch["image"]), background)
-        kept = batch["mask"].to(self.device) if "mask" in batch else None
-        if config.ignore_transients:
-            kept = static_pixels(batch, target)
+        kept = photometric_pixels(batch, target, config.ignore_transients)
         cue = with_cue = None
         if f"{config.cues}_depth" in batch:
             with_cue = batch[f"{config.cues}_mask"].to(self.device)

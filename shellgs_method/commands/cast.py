@@ -108,9 +108,11 @@ def _save_check_panel(scene: Path, views: Sequence[View]) -> Path:
     from shellgs_method.shell import check_panel
 
     checked, shell = CueMaps.open(scene, "checked"), CueMaps.open(scene, "shell")
-    some = views_with_maps(checked, views, 4)
     panel = checked.folder / "panel.png"
-    images, maps = [load_photograph(view)[..., :3] for view, _ in some], [cue for _, cue in some]
-    on_shell = [cue for view, _ in some if (cue := shell.read(view.name, view.camera))]
-    save_figure(panel, check_panel(images, maps, on_shell))
+    some = [
+        (load_photograph(view)[..., :3], check, cue)
+        for view, check in views_with_maps(checked, views, 4)
+        if (cue := shell.read(view.name, view.camera))
+    ]
+    save_figure(panel, check_panel(some))
     return panel

@@ -45,30 +45,27 @@ def supervision_panel(
     return figure
 
 
-def check_panel(
-    images: Sequence[UInt8[np.ndarray, "H W 3"]], checked: Sequence[CueMap], shell: Sequence[CueMap]
-) -> Figure:
+def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:
     """Plot where photographs contradict the shell (red; blue: what moved) and confirm it (green).
 
     Args:
-        images: the photographs.
-        checked: their maps by :func:`~shellgs_method.shell.check_views`.
-        shell: their shell maps.
+        views: photograph, map by :func:`~shellgs_method.shell.check_views` and shell map of each.
 
     Returns:
         The figure; save it with ``.savefig(path)``.
     """
-    height, width = checked[0].mask.shape
+    height, width = views[0][1].mask.shape
     columns = 2
-    rows = -(-len(images) // columns)
+    rows = -(-len(views) // columns)
     figure = Figure(figsize=(16, (8 * height / width + 0.3) * rows), dpi=100, layout="constrained")
     for ax in figure.subplots(rows, columns, squeeze=False).flat:
         ax.set_axis_off()
-    for ax, image, cue, on_shell in zip(figure.axes, images, checked, shell, strict=False):
+    for ax, (image, cue, shell) in zip(figure.axes, views, strict=False):
         shown = image / 255
-        moved, confirmed = transients(cue, on_shell), (cue.depth > 0) & ~cue.mask
-        shown[cue.mask] = 0.3 * shown[cue.mask] + [0.7, 0.0, 0.0]
-        shown[moved] = image[moved] / 255 * 0.3 + [0.0, 0.0, 0.7]
+        moved, confirmed = transients(cue, shell), (cue.depth > 0) & ~cue.mask
+        still = cue.mask & ~moved
+        shown[still] = 0.3 * shown[still] + [0.7, 0.0, 0.0]
+        shown[moved] = 0.3 * shown[moved] + [0.0, 0.0, 0.7]
         shown[confirmed] = 0.75 * shown[confirmed] + [0.0, 0.25, 0.0]
         ax.imshow(shown)
         contradicted = f"contradicted {cue.mask.mean():.1%} (moved {moved.mean():.1%})"

@@ -94,8 +94,8 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     if places is None:
         places = _seen_places(sized, shell)
     seen, distances = np.zeros(len(places), np.int64), np.full((len(sized), len(places)), np.nan, np.float32)
-    moved = np.zeros(len(sized))
-    for i, (distance, view) in enumerate(zip(distances, sized, strict=True)):
+    moved = []
+    for distance, view in zip(distances, sized, strict=True):
         camera = view.camera.shrunk(shell.manifest.max_image_size)
         cue, check = shell.read(view.name, camera), checked.read(view.name, camera)
         assert cue is not None
@@ -106,7 +106,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         visible = np.abs(cue.depth[rows, columns] / z - 1) < _SAME
         seen[k] += visible
         moving = transients(check, cue)
-        moved[i] = moving.sum() / max((cue.depth > 0).sum(), 1)
+        moved.append(moving.sum() / max((cue.depth > 0).sum(), 1))
         occluded = visible & (check.mask & ~moving)[rows, columns]
         along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
@@ -116,7 +116,8 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     median[some] = np.nanmedian(distances[:, some], axis=0)
     differs = (contradicted >= MANY) & (2 * contradicted >= seen)
     by_view = np.isfinite(distances[:, differs]).sum(axis=1)
-    return Verdicts(places, seen, contradicted, median, [view.name for view in sized], differs, by_view, moved)
+    names = [view.name for view in sized]
+    return Verdicts(places, seen, contradicted, median, names, differs, by_view, np.array(moved))
 
 
 def _seen_places(views: Sequence[View], shell: CueMaps) -> Float64[np.ndarray, "N 3"]:
