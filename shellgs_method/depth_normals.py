@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from dataparsers.camera import Camera
 
@@ -17,10 +17,17 @@ def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[T
     (top - bottom) points against the pixel's ray. Zero on the image's border and where the pixel or one of its four
     neighbours has no depth, which the Sobel windows of kornia's ``depth_to_normals`` would take for a surface.
     """
-    points = depth * camera.rays().to(depth)
-    horizontal = points[1:-1, 2:] - points[1:-1, :-2]
-    vertical = points[:-2, 1:-1] - points[2:, 1:-1]
-    normal = normalize(torch.linalg.cross(horizontal, vertical), dim=-1, eps=1e-20)
-    known = depth > 0
+    return normals_along_rays(depth, camera.rays().to(depth))
+
+
+def normals_along_rays(depth: Float[Tensor, "H W 1"], rays: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    """:func:`normals_from_depth` given the camera's rays, which are scaled to z = 1; a kernel for ``run_fused``."""
+    # Coordinate by coordinate, since loops are vectorised along the last dimension, which should be long.
+    points = [pad(depth[..., 0] * ray, (1, 1, 1, 1)) for ray in rays.unbind(-1)]
+    a = [each[1:-1, 2:] - each[1:-1, :-2] for each in points]  # right - left
+    b = [each[:-2, 1:-1] - each[2:, 1:-1] for each in points]  # top - bottom
+    normal = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    length = (normal[0].square() + normal[1].square() + normal[2].square()).clamp_min(1e-36).sqrt()
+    known = points[2] > 0
     complete = known[1:-1, 1:-1] & known[1:-1, 2:] & known[1:-1, :-2] & known[:-2, 1:-1] & known[2:, 1:-1]
-    return pad(normal.where(complete, 0.0), (0, 0, 1, 1, 1, 1))
+    return torch.stack([torch.where(complete, each / length, 0.0) for each in normal], dim=-1)

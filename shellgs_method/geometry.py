@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
-from shellgs_method.depth_normals import normals_from_depth
+from shellgs_method.depth_normals import normals_along_rays
 from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer import quats_to_rotations
 from shellgs_method.rasterizer.projection import rotate, to_camera
@@ -66,7 +66,7 @@ class Geometry:
     @cached_property
     def depth_normal(self) -> Float[Tensor, "H W 3"]:
         """Unit normals of the depth, zero on the image border."""
-        return normals_from_depth(self.depth, self.camera)
+        return run_fused(normals_along_rays, self.depth, self.camera.rays().to(self.depth), varying=2)
 
 
 def geometry_channels(

@@ -14,6 +14,8 @@ from torch.autograd import gradcheck
 
 from dataparsers.camera import Camera
 from shellgs_method import fusion
+from shellgs_method.depth_normals import normals_along_rays
+from shellgs_method.fusion import run_fused
 from shellgs_method.losses import (
     ExponentialDecay,
     NccLoss,
@@ -388,7 +390,12 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
     mask = torch.rand(height, width, 1, generator=random) < 0.9
     x, y = 0.125 + 0.001 * torch.randn(2, height, width, 1, generator=random)
     a, b, normal, target = torch.rand(4, height, width, 3, generator=random) - 0.5
-    rays = torch.ones(height, width, 3)
+    K = torch.tensor([[50.0, 0, width / 2], [0, 50, height / 2], [0, 0, 1]])
+    rays = Camera(torch.eye(4), K, width, height).rays()
+
+    def normals(depth):
+        return run_fused(normals_along_rays, depth, rays, varying=2)
+
     return {
         "photometric": (PhotometricLoss(b + 0.5), a + 0.5),
         "photometric, masked": (PhotometricLoss(b + 0.5, mask), a + 0.5),
@@ -397,6 +404,8 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
         "smoothness": (SmoothnessLoss(x, mask), normal),
         "point to plane": (PointToPlaneLoss(x, target, rays, mask), y),
         "empty space": (partial(PointToPlaneLoss(x, target, rays, mask).of_all, alpha=b[..., :1] + 0.5), y),
+        "normals of depth": (lambda depth: (target * normals(depth)).sum(), y),
+        "normal consistency": (lambda normal: normal_consistency_loss(normal, target, x, mask), normal),
     }
 
 
@@ -418,7 +427,7 @@ def test_compiled_losses_match_plain_torch_at_all_image_sizes(compiler):
                 torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
         assert not fusion._failed
         assert size == (30, 40) or fusion._compiled.cache_info().currsize == n_kernels
-    assert n_kernels == 8
+    assert n_kernels == 10
 
 
 @pytest.mark.parametrize(

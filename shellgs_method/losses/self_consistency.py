@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.fusion import run_fused
+from shellgs_method.losses.reduction import mean_weights, weighted_mean
 
 
 def normal_consistency_loss(
@@ -25,8 +27,14 @@ def normal_consistency_loss(
         alpha: accumulated opacity A.
         mask: pixels that count; all by default.
     """
-    terms = 1 - (normal * depth_normal * alpha.detach()).sum(dim=-1, keepdim=True)
-    return terms.mean() if mask is None else weighted_mean(terms, mask)
+    weights = mean_weights(torch.ones_like(alpha, dtype=torch.bool) if mask is None else mask, like=alpha)
+    return weights.sum() - run_fused(_agreement, normal, depth_normal, weights * alpha.detach(), varying=2)
+
+
+def _agreement(
+    normal: Float[Tensor, "H W 3"], depth_normal: Float[Tensor, "H W 3"], weights: Float[Tensor, "H W 1"]
+) -> Float[Tensor, ""]:
+    return (weights * normal * depth_normal).sum()
 
 
 def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> Float[Tensor, ""]:
