@@ -18,7 +18,7 @@ import tyro
 from jaxtyping import Bool
 from PIL import Image
 
-from dataparsers.cue_maps import CueMap, CueMaps, transients
+from dataparsers.cue_maps import CueMaps, transients
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from dataparsers.photograph import View
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, check_views
@@ -72,7 +72,7 @@ def print_still(scene: Path, photographs: list[View], facade: Facade) -> None:
     assert unit is not None
     there, found, right = Counter[str](), 0, Counter[str]()
     for view, camera in zip(photographs, facade.cameras, strict=True):
-        on, real, said = (read(maps, view) for maps in (shell, truth, checked))
+        on, real, said = (maps.require(view.name, view.camera) for maps in (shell, truth, checked))
         before = (on.depth > 0) & (real.depth > 0) & ((on.depth - real.depth) * unit > NEARER)
         material = facade.daylight.world.cast(*rays(camera)).material
         found += int(said.mask.sum())
@@ -91,7 +91,7 @@ def print_moving(scene: Path, photographs: list[View], moving: dict[str, Bool[np
     shell, checked = CueMaps.open(scene, "shell"), CueMaps.open(scene, "checked")
     there = found = right = 0
     for view in photographs:
-        on, said = read(shell, view), read(checked, view)
+        on, said = shell.require(view.name, view.camera), checked.require(view.name, view.camera)
         moved = transients(said, on)
         there += int((moving[view.name] & (on.depth > 0)).sum())
         found += int(moved.sum())
@@ -127,13 +127,6 @@ def street_life(camera: np.ndarray, rng: np.random.Generator) -> Iterator[Mesh]:
         yield box((x - 0.1, y - 0.1, 0.86 * height), (x + 0.1, y + 0.1, height), Material.COLUMN)
     if camera[1] < -9 and rng.random() < 0.6:
         yield car(camera[0] + rng.uniform(-6, 3), -5.0)
-
-
-def read(maps: CueMaps, view: View) -> CueMap:
-    """A view's map, which must exist."""
-    cue = maps.read(view.name, view.camera)
-    assert cue is not None
-    return cue
 
 
 if __name__ == "__main__":

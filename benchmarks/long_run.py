@@ -198,8 +198,7 @@ def repeat_maps(scene: Path, kind: str, views: Sequence[View]) -> None:
         if k < PLACES:
             camera = view.camera
             place = f"images/frame_{k + 1:05d}.png"
-            cue = shell.read(place, camera)
-            assert cue is not None
+            cue = shell.require(place, camera)
             maps.write(view.name, cue, camera)
             file = maps.folder / f"{view.name}.npz"
             packed[k] = without_record(file), MapRecord.of(view.name, cue, camera, maps.manifest.sources)

@@ -177,6 +177,17 @@ class CueMaps:
             raise self._refusal(name, problem)
         return cue if (own.width, own.height) == (camera.width, camera.height) else resampled(cue, camera)
 
+    def require(self, name: str, camera: Camera) -> CueMap:
+        """Read the map of a view that must have one.
+
+        Raises:
+            SceneError: it has none, or as :meth:`read`.
+        """
+        cue = self.read(name, camera)
+        if cue is None:
+            raise SceneError(f"view {name!r} has no {self.kind} map: run `{self.command}`")
+        return cue
+
     def check(self, name: str, camera: Camera, *, any_size: bool = False) -> Camera | None:
         """Camera of a view's map, read without decoding the map; None when the view has none.
 

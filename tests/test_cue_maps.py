@@ -92,6 +92,8 @@ def test_the_manifest_is_read_as_it_was_written(maps: CueMaps):
 
 def test_a_view_without_a_map_has_none(maps: CueMaps):
     assert maps.read("images/b.jpg", a_camera()) is None
+    with pytest.raises(SceneError, match=r"view 'images/b.jpg' has no shell map: run `shellgs cast"):
+        maps.require("images/b.jpg", a_camera())
 
 
 def test_the_record_has_the_supported_share(maps: CueMaps):

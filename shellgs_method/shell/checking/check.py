@@ -98,7 +98,7 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
             [view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}"
         )
         for view in track(missing, description="comparing the photographs"):
-            maps.write(view.name, training.compare(view, _read(shell, view)), view.camera)
+            maps.write(view.name, training.compare(view, shell.require(view.name, view.camera)), view.camera)
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
     records = [(shell.record(view.name), maps.record(view.name)) for view in views]
@@ -119,7 +119,7 @@ class _TrainingViews:
     @classmethod
     def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
         """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
-        shell_views = {view.name: _shell_view(view, _read(shell, view)) for view in views}
+        shell_views = {view.name: _shell_view(view, shell.require(view.name, view.camera)) for view in views}
         sweeps = {}
         for index, (name, view) in enumerate(track(shell_views.items(), "looking before the shell", len(views))):
             file = unfinished / f"{index}.npy"
@@ -175,12 +175,6 @@ def _told_apart(
     sizes, alone_sizes = np.bincount(objects.ravel()), np.bincount(objects.ravel(), (alone & ~static).ravel())
     moved = found & (alone_sizes > sizes / 2)[objects]
     return static & ~moved, moved
-
-
-def _read(shell: CueMaps, view: View) -> CueMap:
-    cue = shell.read(view.name, view.camera)
-    assert cue is not None
-    return cue
 
 
 def _shell_view(view: View, cue: CueMap) -> ShellView:

@@ -97,9 +97,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     moved = []
     for distance, view in zip(distances, sized, strict=True):
         camera = view.camera.shrunk(shell.manifest.max_image_size)
-        cue, check = shell.read(view.name, camera), checked.read(view.name, camera)
-        assert cue is not None
-        assert check is not None
+        cue, check = shell.require(view.name, camera), checked.require(view.name, camera)
         inside, pixels, z = in_view(camera, places)
         k = np.flatnonzero(inside)
         columns, rows = pixels.astype(int).T
@@ -125,9 +123,7 @@ def _seen_places(views: Sequence[View], shell: CueMaps) -> Float64[np.ndarray, "
     lifted = []
     for view in views:
         camera = view.camera.shrunk(shell.manifest.max_image_size).to(torch.float64)
-        cue = shell.read(view.name, camera)
-        assert cue is not None
-        depth = cue.depth[::_STEP, ::_STEP, None].astype(np.float64)
+        depth = shell.require(view.name, camera).depth[::_STEP, ::_STEP, None].astype(np.float64)
         points = (depth * camera.rays().numpy()[::_STEP, ::_STEP])[depth[..., 0] > 0]
         lifted.append((points - camera.viewmat[:3, 3].numpy()) @ camera.viewmat[:3, :3].numpy())
     points = np.concatenate([*lifted, np.empty((0, 3))])
