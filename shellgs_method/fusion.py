@@ -30,7 +30,17 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying:
 
     The first ``varying`` dimensions of each tensor may vary between calls, unless they are 1; the others may not.
     """
-    global _failed
+    # Dynamo takes the shape of a parameter as constant, but densification changes it; a view is an ordinary tensor.
+    args = tuple([_plain(each) for each in arg] if isinstance(arg, list) else _plain(arg) for arg in args)
+    return fused(kernel, *args, varying=varying)(*args)
+
+
+def fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying: int = 1) -> Callable[..., Any]:
+    """The kernel that :func:`run_fused` runs for such arguments, which are no parameters.
+
+    Finding it takes as long as running a small one: in a loop whose arguments differ in sizes greater than 1 only, find
+    it once.
+    """
     tensors = _flatten(args)
     fusible = (
         tensors[0].dtype == torch.float32
@@ -38,20 +48,12 @@ def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying:
         and all(tensor.numel() for tensor in tensors)
     )
     if _failed or not fusible or os.environ.get("SHELLGS_COMPILE") == "0":
-        return kernel(*args)
-    # Dynamo takes the shape of a parameter as constant, but densification changes it; a view is an ordinary tensor.
-    args = tuple([_plain(each) for each in arg] if isinstance(arg, list) else _plain(arg) for arg in args)
+        return kernel
     with_grad = torch.is_grad_enabled()
     key = tuple(
         (tuple(size > 1 for size in tensor.shape[:varying]), with_grad and tensor.requires_grad) for tensor in tensors
     )
-    try:
-        return _compiled(kernel, key)(*args)
-    except Exception as error:  # missing compiler, missing headers, full disk, a torch that compiles differently, …
-        _failed = True
-        reason = next(iter(str(error).strip().splitlines()), "")
-        logger.warning("Rasterizer and losses run without torch.compile, slower: %s: %s", type(error).__name__, reason)
-        return kernel(*args)
+    return _compiled(kernel, key)
 
 
 def detached(tensor: Tensor) -> Tensor:
@@ -95,19 +97,29 @@ def _compiled(kernel: Callable[..., Any], key: tuple[tuple[tuple[bool, ...], boo
     _keep_freed_memory()
     # Dynamo limits the compilations per code object: each key gets its own.
     own = FunctionType(kernel.__code__.replace(), kernel.__globals__, kernel.__name__)
-    compiled = torch.compile(own, fullgraph=True, options=_options())
-    varies = [varies for varies, _ in key]
-    first = True
+    compiled = None
 
     def call(*args: Tensor | list[Tensor]) -> Any:
-        nonlocal first
-        if not first:
-            return compiled(*args)
-        for tensor, dynamic in zip(_flatten(args), varies, strict=True):
-            torch._dynamo.mark_dynamic(tensor, [dim for dim, each in enumerate(dynamic) if each])
-        start = time.perf_counter()
-        result = compiled(*args)
-        first = False
+        global _failed
+        nonlocal compiled
+        if _failed:
+            return kernel(*args)
+        try:
+            if compiled is not None:
+                return compiled(*args)
+            start = time.perf_counter()
+            new = torch.compile(own, fullgraph=True, options=_options())
+            for tensor, (dynamic, _) in zip(_flatten(args), key, strict=True):
+                torch._dynamo.mark_dynamic(tensor, [dim for dim, each in enumerate(dynamic) if each])
+            result = new(*args)
+        except Exception as error:  # missing compiler, missing headers, full disk, a torch that compiles differently, …
+            _failed = True
+            reason = next(iter(str(error).strip().splitlines()), "")
+            logger.warning(
+                "Rasterizer and losses run without torch.compile, slower: %s: %s", type(error).__name__, reason
+            )
+            return kernel(*args)
+        compiled = new
         seconds = time.perf_counter() - start
         level = logging.WARNING if seconds > _LONG else logging.INFO  # explain a long wait
         name = f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}"

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from shellgs_method.fusion import run_fused
+from shellgs_method.fusion import fused
 from shellgs_method.rasterizer.binning import TILE, Bins, stable_order
 from shellgs_method.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
 
@@ -146,14 +146,14 @@ def _composite_plan(
     transmittance = F.pad(transmittance, (0, 0, 0, plan.tiles.numel() - len(transmittance)))
     (transmittance,) = _side_by_side(transmittance[:, None], len(plan.tiles))
     active = counts > plan.first_chunk * CHUNK
+    forward = None
     for i in range(len(plan.ends)):
         rows = plan.splats[plan.chunk(i)]
         n = len(rows)
         plan.transmittances.append(transmittance[:n])
-        transmittance, brightest = run_fused(
-            kernels.forward,
-            *(transmittance[:n], [total[:n] for total in totals], table, rows, plan.centres[:n], *pixels, stop[:n]),
-        )
+        args = transmittance[:n], [total[:n] for total in totals], table, rows, plan.centres[:n], *pixels, stop[:n]
+        forward = forward or fused(kernels.forward, *args)
+        transmittance, brightest = forward(*args)
         if (i + 1) % chunks_per_look == 0 or i + 1 == len(plan.ends):
             active = (brightest > 0) & (counts[:n] > (plan.first_chunk + i + 1) * CHUNK)
             n_active = int(active.sum())
@@ -195,15 +195,17 @@ def _backward_plan(
     """Fill in the gradients of a plan's splats, and update ``behind`` to the state before them."""
     pixels, stop = _pixels(table), _stop(plan, table)
     gradients_here, behind_here = _gather(gradients, plan.tiles), _gather(behind, plan.tiles)
+    backward = None
     for i, transmittance in reversed([*enumerate(plan.transmittances)]):
         rows, n = plan.chunk(i), len(transmittance)
         totals = [gradient[:n] for gradient in gradients_here]
         groups = (totals, []) if n_densifying is None else (totals[:n_densifying], totals[n_densifying:])
-        run_fused(
-            kernels.backward,
+        args = (
             *(transmittance, [each[:n] for each in behind_here], *groups),
             *(grad_rows[rows], table, plan.splats[rows], plan.centres[:n], *pixels, stop[:n]),
         )
+        backward = backward or fused(kernels.backward, *args)
+        backward(*args)
     behind.index_copy_(0, plan.tiles.flatten(), torch.stack(behind_here, -1).permute(0, 2, 3, 1).flatten(0, 1))
 
 
