@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from threading import Lock
 from typing import IO
 
 import numpy as np
@@ -40,6 +41,8 @@ UNREADABLE = (
     *(RuntimeError, SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
 """Exceptions that reading a damaged map may raise."""
+_PARSING = Lock()
+"""NumPy parses headers with ``ast``, which fails in Python 3.11 if two threads do so at once."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,8 @@ def _read_array(
     with archive.open(f"{name}.npy") as file:
         version = np.lib.format.read_magic(file)
         read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        there, fortran, found = read_header[version](file)
+        with _PARSING:
+            there, fortran, found = read_header[version](file)
         wanted = np.dtype(dtype) if dtype else found
         if there != shape or found != wanted or found.kind == "O" or (dtype is None and found.kind != "U"):
             raise ValueError(f"its {name} is {found} {list(there)}, not {dtype or 'text'} {list(shape)}")

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import errno
+import gc
 import json
 import math
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,6 +86,31 @@ def refusal(maps: CueMaps, camera: Camera | None = None) -> str:
 
 def test_a_map_is_read_as_it_was_written(maps: CueMaps):
     assert equal(maps.read(VIEW, a_camera()), a_map())
+
+
+@pytest.fixture
+def busy_threads() -> Iterator[None]:
+    """Garbage is collected all the time, and another thread runs whenever it is."""
+
+    def let_others_run(*_) -> None:
+        time.sleep(1e-4)
+
+    before = gc.get_threshold()
+    gc.callbacks.append(let_others_run)
+    gc.set_threshold(20)
+    yield
+    gc.callbacks.remove(let_others_run)
+    gc.set_threshold(*before)
+
+
+def test_threads_at_different_depths_of_their_stacks_can_read_at_once(maps: CueMaps, busy_threads):
+    """As nerfstudio's, which load a scene: Python 3.11 cannot parse the headers of two arrays at once."""
+
+    def read(depth: int) -> list[CueMap | None]:
+        return read(depth - 1) if depth else [maps.read(VIEW, a_camera()) for _ in range(20)]
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(equal(cue, a_map()) for cues in threads.map(read, (0, 10, 20, 30)) for cue in cues)
 
 
 def test_the_manifest_is_read_as_it_was_written(maps: CueMaps):
