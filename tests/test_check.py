@@ -25,6 +25,7 @@ from shellgs_method.batches import reference_errors, reference_maps, regions
 from shellgs_method.evaluation import Rendering
 from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 from shellgs_method.shell.checking.check import _told_apart
+from shellgs_method.shell.checking.colours import ColourModel
 from shellgs_method.shell.checking.contradiction import (
     ALONE,
     CONFIRMED,
@@ -82,6 +83,13 @@ def street(
     return views
 
 
+def image_with(view: ShellView, mask: np.ndarray, colour: list[int]) -> ShellView:
+    """The view with a mask in one colour."""
+    image = view.image.numpy().copy()
+    image[mask] = colour
+    return replace(view, image=torch.from_numpy(image))
+
+
 CAMERAS = [camera_at(x) for x in np.linspace(-2.5, 2.5, 9)]
 
 
@@ -125,13 +133,42 @@ def test_a_mirror_shows_farther_things_and_does_not_contradict_the_shell():
     assert (score > CONTRADICTED).float().mean() < 0.01
 
 
+def test_colours_tell_a_dark_post_from_the_wall():
+    masks = [before for _, before in street(CAMERAS, post=5.0)]
+    views = [image_with(view, mask, [30, 20, 25]) for (view, _), mask in zip(street(CAMERAS), masks, strict=True)]
+    model = ColourModel(views, [sweep(view, [other for other in views if other is not view]) for view in views])
+    for view, mask in zip(views, masks, strict=True):
+        ratio = model.log_ratio(view.image)
+        assert (ratio[mask] > 2).all()
+        assert ratio[~mask].median() < 0
+
+
+def test_colours_say_nothing_where_nothing_is_in_front_of_the_shell():
+    views = [view for view, _ in street(CAMERAS)]
+    sweeps = [Sweep(torch.full((HEIGHT, WIDTH), -0.1), torch.zeros(HEIGHT, WIDTH)) for _ in views]
+    assert ColourModel(views, sweeps).log_ratio(views[0].image).abs().max() < 1e-5
+
+
+def test_the_ratio_of_colours_is_that_of_their_shares():
+    """Two colours far apart: the one fills 3/4 of the pixels in front of the shell and 1/4 of those on it."""
+    image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
+    score = torch.full((HEIGHT, WIDTH), -0.1)
+    score[:, WIDTH // 2 :] = CONTRADICTED + 0.1
+    image[: HEIGHT // 4, : WIDTH // 2] = 200
+    image[: 3 * HEIGHT // 4, WIDTH // 2 :] = 200
+    view = ShellView(camera_at(0.0), image, torch.full((HEIGHT, WIDTH), WALL))
+    ratio = ColourModel([view], [Sweep(score, score)]).log_ratio(image)
+    light = (0.75 + 0.01 * 0.25) / 1.01 / 0.25
+    dark = (0.25 + 0.01 * 0.75) / 1.01 / 0.75
+    expected = torch.where(image[..., 0] > 0, np.log(light), np.log(dark))
+    torch.testing.assert_close(ratio, expected.float(), atol=1e-3, rtol=0)
+
+
 def with_passer_by(views: list[ShellView]) -> tuple[list[ShellView], np.ndarray]:
     """The views with something in front of the wall in the middle one alone, and its mask there."""
-    image = views[MIDDLE].image.numpy().copy()
-    mask = np.zeros(image.shape[:2], bool)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[20:, 60:85] = True
-    image[mask] = [60, 40, 160]
-    return [replace(view, image=torch.from_numpy(image)) if k == MIDDLE else view for k, view in enumerate(views)], mask
+    return [image_with(view, mask, [60, 40, 160]) if k == MIDDLE else view for k, view in enumerate(views)], mask
 
 
 def test_a_passer_by_is_alone_in_its_photograph():

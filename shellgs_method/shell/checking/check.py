@@ -20,6 +20,7 @@ from torch.nn.functional import interpolate
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.files import atomic_write, content_hash, fingerprint
 from dataparsers.photograph import View, load_photograph
+from shellgs_method.shell.checking.colours import ColourModel
 from shellgs_method.shell.checking.contradiction import (
     ALONE,
     CONFIRMED,
@@ -35,8 +36,10 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 4
+VERSION = 5
 """Version of the maps: maps of another version are made again."""
+
+_COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
 
 
 @dataclass(frozen=True)
@@ -111,10 +114,11 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
 
 @dataclass(frozen=True)
 class _TrainingViews:
-    """The training views and their sweeps."""
+    """The training views, their sweeps, and the colours in front of the shell and on it."""
 
     views: dict[str, ShellView]
     sweeps: dict[str, Sweep]
+    colours: ColourModel
 
     @classmethod
     def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
@@ -131,7 +135,7 @@ class _TrainingViews:
                 with atomic_write(file) as stream:
                     stream.write(content.getvalue())
             sweeps[name] = Sweep(*torch.from_numpy(np.load(file, allow_pickle=False)))
-        return cls(shell_views, sweeps)
+        return cls(shell_views, sweeps, ColourModel(shell_views.values(), sweeps.values()))
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -143,8 +147,9 @@ class _TrainingViews:
         names = self._neighbours(seen)
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
         agreed = agreement(seen, found, others, found_there)
+        coloured = agreed.score + _COLOUR * (self.colours.log_ratio(seen.image) - _NEUTRAL)
         size, hit = cue.depth.shape, cue.depth > 0
-        score, alone = (_resized(scores, size).numpy() for scores in agreed)
+        score, alone = (_resized(scores, size).numpy() for scores in (coloured, agreed.alone))
         static, moved = _told_apart(score > CONTRADICTED, alone > ALONE)
         occluded = static | moved
         confirmed = ~occluded & (_resized(found.score.float(), size).numpy() < CONFIRMED)

@@ -31,8 +31,9 @@ finer steps of depth than the offsets have."""
 PER_SIDE = 4
 """Neighbours on either side of a view: what is occluded on one side is visible from the other."""
 CONTRADICTED = 0.14
-"""Score above which a pixel is contradicted. With 0.08 more are found, and renders of what is in front of the shell
-improve, but mirrors contradict the shell too, and surfaces left to the photographs alone are less accurate."""
+"""Score above which a pixel is contradicted, if its colour counts neither way. With 0.08 more are found, and renders of
+what is in front of the shell improve, but mirrors contradict the shell too, and surfaces left to the photographs alone
+are less accurate."""
 ALONE = 0.12
 """Difference from the colours that other photographs agree on above which a pixel shows something that moved."""
 CONFIRMED = -0.03
