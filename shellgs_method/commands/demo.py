@@ -12,7 +12,7 @@ from shellgs_method.commands.common import console
 
 def demo(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[FOLDER]")] = Path("demo"),
-    iterations: int = 1500,
+    iterations: int = 750,
     width: int = 320,
     height: int = 180,
     views: int = 40,
