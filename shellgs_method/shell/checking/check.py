@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -114,11 +115,15 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
 
 @dataclass(frozen=True)
 class _TrainingViews:
-    """The training views, their sweeps, and the colours in front of the shell and on it."""
+    """The training views and their sweeps."""
 
     views: dict[str, ShellView]
     sweeps: dict[str, Sweep]
-    colours: ColourModel
+
+    @cached_property
+    def colours(self) -> ColourModel:
+        """Colours in front of the shell and on it."""
+        return ColourModel(self.views.values(), self.sweeps.values())
 
     @classmethod
     def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
@@ -135,7 +140,7 @@ class _TrainingViews:
                 with atomic_write(file) as stream:
                     stream.write(content.getvalue())
             sweeps[name] = Sweep(*torch.from_numpy(np.load(file, allow_pickle=False)))
-        return cls(shell_views, sweeps, ColourModel(shell_views.values(), sweeps.values()))
+        return cls(shell_views, sweeps)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""

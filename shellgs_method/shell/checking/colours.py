@@ -11,12 +11,10 @@ from torch import Tensor
 
 from shellgs_method.shell.checking.contradiction import CONTRADICTED, ShellView, Sweep
 
-CERTAIN = 0.0
-"""Score of a sweep below which its pixel counts as one of the shell."""
-
+_ON_SHELL = 0.0  # score of a sweep below which its pixel counts as one of the shell
 _BINS, _BLUR = 32, 2.0  # of a histogram, a channel
 _SAME = 0.01  # pixels of the shell that are added to those in front of it, as a share: few say nothing
-_MOST = 3.0
+_MOST = 3.0  # absolute log-ratio
 
 
 class ColourModel:
@@ -30,10 +28,9 @@ class ColourModel:
         for view, found in zip(views, sweeps, strict=True):
             bins, score = _bins(view.image), found.score.float()
             in_front += torch.bincount(bins[score > CONTRADICTED], minlength=_BINS**3)
-            on_shell += torch.bincount(bins[(view.depth > 0) & (score < CERTAIN)], minlength=_BINS**3)
-        in_front, on_shell = in_front + _SAME * on_shell, on_shell
-        shares = [_blurred(counts / counts.sum().clamp_min(1)) + 1e-7 for counts in (in_front, on_shell)]
-        self._log_ratio = (shares[0] / shares[1]).log().clamp(-_MOST, _MOST).float()
+            on_shell += torch.bincount(bins[(view.depth > 0) & (score < _ON_SHELL)], minlength=_BINS**3)
+        in_front += _SAME * on_shell
+        self._log_ratio = (_likelihood(in_front) / _likelihood(on_shell)).log().clamp(-_MOST, _MOST).float()
 
     def log_ratio(self, image: UInt8[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
         """Log of the ratio of likelihoods of a photograph's colours, in front of the shell to on it, at most 3."""
@@ -45,5 +42,7 @@ def _bins(image: UInt8[Tensor, "h w 3"]) -> Int64[Tensor, "h w"]:
     return (red * _BINS + green) * _BINS + blue
 
 
-def _blurred(histogram: Float[Tensor, "bins"]) -> Float[Tensor, "bins"]:
-    return torch.from_numpy(gaussian_filter(histogram.reshape(3 * (_BINS,)).numpy(), _BLUR)).flatten()
+def _likelihood(counts: Float[Tensor, "bins"]) -> Float[Tensor, "bins"]:
+    """Share of each bin, blurred, and above 0."""
+    shares = (counts / counts.sum().clamp_min(1)).reshape(3 * (_BINS,)).numpy()
+    return torch.from_numpy(gaussian_filter(shares, _BLUR)).flatten() + 1e-7
