@@ -18,7 +18,7 @@ import tyro
 from jaxtyping import Bool
 from PIL import Image
 
-from dataparsers.cue_maps import CueMaps, transients
+from dataparsers.cue_maps import CueMaps, Findings
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from dataparsers.photograph import View
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, check_views
@@ -75,11 +75,13 @@ def print_still(scene: Path, photographs: list[View], facade: Facade) -> None:
         on, real, said = (maps.require(view.name, view.camera) for maps in (shell, truth, checked))
         before = (on.depth > 0) & (real.depth > 0) & ((on.depth - real.depth) * unit > NEARER)
         material = facade.daylight.world.cast(*rays(camera)).material
-        found += int(said.mask.sum())
+        said = Findings.of(said, on)
+        in_front = said.occluder | said.moved
+        found += int(in_front.sum())
         for kind in np.unique(material[before]):
             name = Material(kind).name.lower()
             there[name] += int((before & (material == kind)).sum())
-            right[name] += int((before & said.mask & (material == kind)).sum())
+            right[name] += int((before & in_front & (material == kind)).sum())
     recall, precision = sum(right.values()) / sum(there.values()), sum(right.values()) / max(found, 1)
     print(f"recall {recall:.2f}, precision {precision:.2f}")
     for name, count in there.most_common():
@@ -92,7 +94,7 @@ def print_moving(scene: Path, photographs: list[View], moving: dict[str, Bool[np
     there = found = right = 0
     for view in photographs:
         on, said = shell.require(view.name, view.camera), checked.require(view.name, view.camera)
-        moved = transients(said, on)
+        moved = Findings.of(said, on).moved
         there += int((moving[view.name] & (on.depth > 0)).sum())
         found += int(moved.sum())
         right += int((moved & moving[view.name]).sum())

@@ -25,6 +25,7 @@ from dataparsers.map_files import (
     FORMAT,
     UNREADABLE,
     CueMap,
+    Findings,
     MapRecord,
     damage,
     difference,
@@ -33,11 +34,10 @@ from dataparsers.map_files import (
     read_arrays,
     read_record,
     resampled,
-    transients,
     write_map,
 )
 
-__all__ = ["CueMap", "CueMaps", "Manifest", "MapRecord", "find_cues", "relative_path", "source_hash", "transients"]
+__all__ = ["CueMap", "CueMaps", "Findings", "Manifest", "MapRecord", "find_cues", "relative_path", "source_hash"]
 
 T = TypeVar("T")
 

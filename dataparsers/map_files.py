@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Lock
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 import torch
@@ -111,12 +111,28 @@ class MapRecord:
         return Camera(viewmat, K, self.width, self.height)
 
 
-def transients(checked: CueMap, shell: CueMap) -> Bool[np.ndarray, "H W"]:
-    """Pixels of a view's checked map where only its own photograph shows something in front of the shell.
+class Findings(NamedTuple):
+    """What photographs show at the pixels of the shell in a view; all false where they are inconclusive."""
 
-    Their depth is the shell's; that of other occluders is at least 1.2 % less.
-    """
-    return checked.mask & (checked.depth > 0.995 * shell.depth)
+    occluder: Bool[np.ndarray, "H W"]
+    """Something stands in front of the shell."""
+    moved: Bool[np.ndarray, "H W"]
+    """Only this view's photograph shows something in front of it."""
+    beyond: Bool[np.ndarray, "H W"]
+    """The background: at its borders, the shell is larger than the building."""
+    confirmed: Bool[np.ndarray, "H W"]
+    """The shell."""
+
+    @classmethod
+    def of(cls, checked: CueMap, shell: CueMap) -> Findings:
+        """Decode a view's checked map.
+
+        Its mask is set where the view does not show the shell. There, its depth is the occluder's, which is at least
+        1.2 % less than the shell's; the shell's if it moved; and more for the background.
+        """
+        nearer, farther = checked.depth < 0.995 * shell.depth, checked.depth > 1.005 * shell.depth
+        hidden = checked.mask
+        return cls(hidden & nearer, hidden & ~nearer & ~farther, hidden & farther, (checked.depth > 0) & ~hidden)
 
 
 def resampled(cue: CueMap, camera: Camera) -> CueMap:

@@ -57,7 +57,7 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
     """Parts of a held-out view that images are measured in, by name; all within what is visible in training views.
 
     * ``seen``: all of it.
-    * ``on_shell``, ``off_shell``: on the shell, or where it is absent or does not count.
+    * ``on_shell``, ``off_shell``: on the shell, or where it is absent, does not count or is larger than the building.
     * ``before_shell``: where the truth is nearer than the shell by more than 5 cm (1/200 of its depth where metres are
       unknown) or, without truth, where photographs show something nearer. These pixels are in neither of the above.
     """
@@ -72,7 +72,7 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
         truth = batch["truth_depth"].to(device)
         gap = 0.05 / metres_per_unit if metres_per_unit else shell / 200
         before = seen & (truth > 0) & (truth < shell - gap)
-    rest = seen & ~before
+    on_shell, rest = on_shell & ~_beyond(batch, device), seen & ~before
     return {"seen": seen, "on_shell": rest & on_shell, "off_shell": rest & ~on_shell, "before_shell": before}
 
 
@@ -86,11 +86,11 @@ def references(batch: dict, device: torch.device) -> dict[str, Reference]:
 def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: bool = False) -> Reference:
     """Maps of one kind in a batch; pixels that the user masked out are not supported.
 
-    Neither is the shell where photographs contradict it, with a margin, unless ``everywhere`` is set.
+    Neither is the shell where photographs show something else, with a margin, unless ``everywhere`` is set.
     """
     depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
     if kind == "shell" and not everywhere:
-        mask = mask & ~_with_margin(contradicted(batch, device))
+        mask = mask & ~_with_margin(contradicted(batch, device) | _beyond(batch, device))
     if "mask" in batch:
         mask = mask & batch["mask"].to(device)
     return Reference(depth, normal.float(), mask)
@@ -110,6 +110,11 @@ def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
     if "nearer_depth" not in batch:
         return torch.zeros(batch["shell_mask"].shape, dtype=torch.bool, device=device)
     return batch["nearer_depth"].to(device) > 0
+
+
+def _beyond(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
+    """Pixels of the shell where photographs show the background; none if they were not compared."""
+    return batch.get("beyond", torch.zeros_like(batch["shell_mask"])).to(device)
 
 
 def _with_margin(mask: Bool[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:

@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMap, CueMaps, transients
+from dataparsers.cue_maps import CueMap, CueMaps, Findings
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
@@ -45,7 +45,7 @@ class FacadeDataset(InputDataset):
 
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
     kind lacks that kind's keys. ``nearer_depth`` is the depth of what photographs show in front of the shell, else 0;
-    ``transient`` is true where only this one shows something in front of it.
+    ``transient`` is true where only this one shows something in front of it, ``beyond`` where they show the background.
     With ``bands``, masks keep only pixels whose wall lies in them. With ``seen_by``, ``seen`` is true where what a
     pixel shows is visible in a training view. ``kinds`` are the maps to read, all if not set; with ``any_size`` they
     are resampled where their size differs.
@@ -104,9 +104,10 @@ class FacadeDataset(InputDataset):
         maps = {}
         checked = self._dataparser_outputs.metadata["cues"].get("checked")
         if "shell" in cues and checked and (found := self._read(checked, view)):
-            before = torch.from_numpy(found.mask & inside)[..., None]
-            maps["transient"] = before & torch.from_numpy(transients(found, cues["shell"]))[..., None]
-            maps["nearer_depth"] = self._rescaled_depth(found).where(before & ~maps["transient"], 0.0)
+            occluder, maps["transient"], maps["beyond"], _ = (
+                torch.from_numpy(mask & inside)[..., None] for mask in Findings.of(found, cues["shell"])
+            )
+            maps["nearer_depth"] = self._rescaled_depth(found).where(occluder, 0.0)
         for kind, cue in cues.items():
             maps[f"{kind}_depth"] = self._rescaled_depth(cue)
             maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)

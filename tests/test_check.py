@@ -18,12 +18,13 @@ from scipy.spatial import KDTree
 from viser import SceneApi
 
 from dataparsers.camera import Camera, positions
-from dataparsers.cue_maps import CueMap, CueMaps
+from dataparsers.cue_maps import CueMap, CueMaps, Findings
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from dataparsers.photograph import View
 from shellgs_method.batches import reference_errors, reference_maps, regions
 from shellgs_method.evaluation import Rendering
 from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
+from shellgs_method.shell.checking import check as checking
 from shellgs_method.shell.checking.check import _told_apart
 from shellgs_method.shell.checking.colours import ColourModel
 from shellgs_method.shell.checking.contradiction import (
@@ -250,6 +251,52 @@ def test_maps_are_made_once_and_again_only_if_missing(scene: Path):
     assert contents(scene) == before
 
 
+def test_photographs_larger_than_the_maps_are_compared_at_their_own_size(shellgs, scene: Path, monkeypatch):
+    sizes, original = set(), checking.sweep
+
+    def noting(view, others):
+        sizes.update(each.camera.width for each in (view, *others))
+        return original(view, others)
+
+    monkeypatch.setattr(checking, "sweep", noting)
+    shellgs("cast", scene, "--max-image-size", 24)
+    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    assert sizes == {view.camera.width}
+    assert CueMaps.open(scene, "checked").require(view.name, view.camera.shrunk(24)).depth.shape[1] == 24
+
+
+def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
+    """A wall below a white sky, whose shell is 6 pixels too high and has a hole; in one view, a wall is behind it."""
+    sky, wall = np.s_[:20], np.full((HEIGHT, WIDTH), WALL, np.float32)
+    wall[:14] = wall[40:50, 60:70] = 0
+    shell, views = CueMaps.create(tmp_path, "shell", command="cast"), []
+    for index, (view, _) in enumerate(street(CAMERAS)):
+        image = view.image.numpy().copy()
+        image[sky] = 250
+        if index == MIDDLE:
+            image[:20, 60:80] = image[20:40, 60:80]
+        name = f"{index}.png"
+        Image.fromarray(image).save(tmp_path / name)
+        views.append(View(name, tmp_path / name, view.camera))
+        shell.write(name, CueMap(wall, np.zeros((HEIGHT, WIDTH, 3), np.float16), wall > 0), view.camera)
+    assert check_views(tmp_path, views, []).contradicted == pytest.approx(6 / 50, abs=0.03)
+    checked, inside = CueMaps.open(tmp_path, "checked"), wall > 0
+    inside[sky] = False
+    for view in views:
+        found = Findings.of(checked.require(view.name, view.camera), shell.require(view.name, view.camera))
+        assert (found.beyond == ((wall > 0) & ~inside)).mean() > 0.99
+        assert not (found.occluder | found.moved)[sky].any()
+        assert found.occluder.mean() < 0.01
+
+
+def test_a_checked_map_says_what_a_pixel_shows():
+    shell = np.full((1, 5), 8, np.float32)
+    depth, hidden = np.array([[5, 8, 16, 8, 0]], np.float32), np.array([[True, True, True, False, False]])
+    normal = np.zeros((1, 5, 3), np.float16)
+    found = Findings.of(CueMap(depth, normal, hidden), CueMap(shell, normal, shell > 0))
+    assert [mask[0].tolist() for mask in found] == np.eye(4, 5, dtype=bool).tolist()
+
+
 def test_a_full_disk_raises_an_error_that_says_so(scene: Path):
     with small_disk(3_000), pytest.raises(OSError, match="File too large") as refusal:
         check(scene)
@@ -276,6 +323,7 @@ def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request(
     nearer = torch.tensor([0.0, 1.5] + [0.0] * 6).view(1, 8, 1)
     batch = {"shell_depth": torch.full((1, 8, 1), 2.0), "shell_normal": torch.zeros(1, 8, 3), "shell_mask": mask}
     batch |= {"nearer_depth": nearer, "seen": torch.ones(1, 8, 1, dtype=torch.bool)}
+    beyond = {"beyond": torch.arange(8).view(1, 8, 1) == 6}
     cpu = torch.device("cpu")
     assert reference_maps(batch, "shell", cpu).mask.view(-1).tolist() == [False] * 4 + [True] * 3 + [False]
     assert (reference_maps(batch, "shell", cpu, everywhere=True).mask == mask).all()
@@ -283,6 +331,11 @@ def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request(
     assert parts["before_shell"] == [False, True] + [False] * 6
     assert parts["on_shell"] == [True, False] + [True] * 5 + [False]
     assert parts["off_shell"] == [False] * 7 + [True]
+    assert reference_maps(batch | beyond, "shell", cpu).mask.view(-1).tolist() == [False] * 8
+    assert (reference_maps(batch | beyond, "shell", cpu, everywhere=True).mask == mask).all()
+    parts = {name: part.view(-1).tolist() for name, part in regions(batch | beyond, 1.0, cpu).items()}
+    assert parts["on_shell"] == [True, False] + [True] * 4 + [False, False]
+    assert parts["off_shell"] == [False] * 6 + [True, True]
 
 
 def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(shellgs, scene: Path, tmp_path: Path):

@@ -80,7 +80,7 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     views = read_views(config)
     found = check_views(scene, views, held_out_names(config))
     console.print(
-        f"Photographs contradict {found.contradicted:.1%} of these pixels: something occludes the shell there "
+        f"Photographs contradict {found.contradicted:.1%} of these pixels: they show an occluder or the background "
         f"({found.checked} views compared, {found.skipped} already there, in {found.seconds:.1f} s)."
     )
     verdicts = shell_verdicts(scene, views)
@@ -97,7 +97,10 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
             f"passer-by or a car, mostly in {verdicts.moved_in[0]}: shellgs-metric ignores it."
         )
     panel = _save_check_panel(scene, views)
-    console.print(f"Look at {panel}: red is what occludes the shell, blue what moved, green where they confirm it.")
+    console.print(
+        f"Look at {panel}: red is what occludes the shell, blue what moved, yellow the background; "
+        "they confirm what is green."
+    )
 
 
 def _save_check_panel(scene: Path, views: Sequence[View]) -> Path:

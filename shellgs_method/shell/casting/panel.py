@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import matplotlib
 import numpy as np
 from jaxtyping import UInt8
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from dataparsers.cue_maps import CueMap, transients
+from dataparsers.cue_maps import CueMap, Findings
 from shellgs_method.evaluation.colours import GREY, normal_colours
 
 
@@ -46,7 +47,7 @@ def supervision_panel(
 
 
 def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:
-    """Plot where photographs contradict the shell (red; blue: what moved) and confirm it (green).
+    """Plot what photographs show at the shell: occluders (red), what moved (blue), the background (yellow), it (green).
 
     Args:
         views: photograph, map by :func:`~shellgs_method.shell.check_views` and shell map of each.
@@ -62,12 +63,10 @@ def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap
         ax.set_axis_off()
     for ax, (image, cue, shell) in zip(figure.axes, views, strict=False):
         shown = image / 255
-        moved, confirmed = transients(cue, shell), (cue.depth > 0) & ~cue.mask
-        still = cue.mask & ~moved
-        shown[still] = 0.3 * shown[still] + [0.7, 0.0, 0.0]
-        shown[moved] = 0.3 * shown[moved] + [0.0, 0.0, 0.7]
-        shown[confirmed] = 0.75 * shown[confirmed] + [0.0, 0.25, 0.0]
+        found = Findings.of(cue, shell)
+        for mask, colour, alpha in zip(found, "rbyg", (0.7, 0.7, 0.7, 0.25), strict=True):
+            shown[mask] = (1 - alpha) * shown[mask] + alpha * np.array(to_rgb(colour))
         ax.imshow(shown)
-        contradicted = f"contradicted {cue.mask.mean():.1%} (moved {moved.mean():.1%})"
-        ax.set_title(f"{contradicted}, confirmed {confirmed.mean():.0%} of the pixels")
+        occluder, moved, beyond, confirmed = (f"{mask.mean():.1%}" for mask in found)
+        ax.set_title(f"occluders {occluder}, moved {moved}, background {beyond}, confirmed {confirmed} of the pixels")
     return figure

@@ -34,10 +34,10 @@ from shellgs_method.shell.checking.contradiction import (
 )
 
 MAX_SIZE = 640
-"""Longer side in pixels at which photographs are compared."""
+"""Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 5
+VERSION = 6
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -50,7 +50,7 @@ class CheckSummary:
     Attributes:
         checked: number of views whose map was made.
         skipped: number of views that already had a map.
-        contradicted: share of the shell's pixels in all views that have something in front of them.
+        contradicted: share of the shell's pixels in all views that show something else.
         seconds: wall time.
     """
 
@@ -63,9 +63,8 @@ class CheckSummary:
 def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -> CheckSummary:
     """Compare the photographs on the shell and in front of it, and store the maps in ``scene/cues/checked``.
 
-    The mask of a map marks pixels with an occluder, something in front of the shell. The depth is that of the
-    occluder, or the shell's if only this photograph shows one, which moved. Elsewhere it is the shell's where
-    photographs confirm it, and 0 where they are inconclusive: on plain or reflecting walls, where few views overlap.
+    The maps are those that :class:`~dataparsers.cue_maps.Findings` decodes. Photographs are inconclusive on plain or
+    reflecting walls, and where few views overlap.
 
     Held-out photographs are compared with the training photographs, but not the other way round, so that the maps of
     training views contain nothing of the held-out ones.
@@ -91,18 +90,16 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
         metres_per_unit=shell.manifest.metres_per_unit,
         max_image_size=shell.manifest.max_image_size,
     )
-    views = [
-        replace(view, camera=view.camera.shrunk(shell.manifest.max_image_size))
-        for view in views
-        if shell.record(view.name)
-    ]
-    missing = [view for view in views if not maps.current(view.name, view.camera)]
+    views = [view for view in views if shell.record(view.name)]
+    cameras = {view.name: view.camera.shrunk(shell.manifest.max_image_size) for view in views}
+    missing = [view for view in views if not maps.current(view.name, cameras[view.name])]
     if missing:
         training = _TrainingViews.of(
             [view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}"
         )
         for view in track(missing, description="comparing the photographs"):
-            maps.write(view.name, training.compare(view, shell.require(view.name, view.camera)), view.camera)
+            camera = cameras[view.name]
+            maps.write(view.name, training.compare(view, shell.require(view.name, camera)), camera)
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
     records = [(shell.record(view.name), maps.record(view.name)) for view in views]
@@ -128,7 +125,10 @@ class _TrainingViews:
     @classmethod
     def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
         """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
-        shell_views = {view.name: _shell_view(view, shell.require(view.name, view.camera)) for view in views}
+        size = shell.manifest.max_image_size
+        shell_views = {
+            view.name: _shell_view(view, shell.require(view.name, view.camera.shrunk(size))) for view in views
+        }
         sweeps = {}
         for index, (name, view) in enumerate(track(shell_views.items(), "looking before the shell", len(views))):
             file = unfinished / f"{index}.npy"
@@ -155,12 +155,14 @@ class _TrainingViews:
         coloured = agreed.score + _COLOUR * (self.colours.log_ratio(seen.image) - _NEUTRAL)
         size, hit = cue.depth.shape, cue.depth > 0
         score, alone = (_resized(scores, size).numpy() for scores in (coloured, agreed.alone))
-        static, moved = _told_apart(score > CONTRADICTED, alone > ALONE)
-        occluded = static | moved
-        confirmed = ~occluded & (_resized(found.score.float(), size).numpy() < CONFIRMED)
-        nearer = cue.depth / (1 + _nearest(found.offset.float(), size).numpy())
-        depth = np.where(static, nearer, np.where(moved | confirmed, cue.depth, 0)) * hit
-        return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), occluded & hit)
+        beyond = _resized(agreed.beyond.float(), size).numpy() > 0.5
+        static, moved = _told_apart((score > CONTRADICTED) & ~beyond, (alone > ALONE) & ~beyond)
+        hidden = static | moved | beyond
+        confirmed = ~hidden & (_resized(found.score.float(), size).numpy() < CONFIRMED)
+        nearer = 1 / (1 + _nearest(found.offset.float(), size).numpy())
+        kinds, relative = [static, beyond, moved | confirmed], [nearer, np.full_like(nearer, 2), np.ones_like(nearer)]
+        depth = cue.depth * np.select(kinds, relative, 0.0)
+        return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
 
     def _neighbours(self, seen: ShellView) -> list[str]:
         """Names of the nearest training views on either side that look in about the same direction."""

@@ -9,9 +9,8 @@ from jaxtyping import Float, Int64, UInt8
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from shellgs_method.shell.checking.contradiction import CONTRADICTED, ShellView, Sweep
+from shellgs_method.shell.checking.contradiction import CONFIRMED, CONTRADICTED, ShellView, Sweep
 
-_ON_SHELL = 0.0  # score of a sweep below which its pixel counts as one of the shell
 _BINS, _BLUR = 32, 2.0  # of a histogram, a channel
 _SAME = 0.01  # pixels of the shell that are added to those in front of it, as a share: few say nothing
 _MOST = 3.0  # absolute log-ratio
@@ -28,7 +27,7 @@ class ColourModel:
         for view, found in zip(views, sweeps, strict=True):
             bins, score = _bins(view.image), found.score.float()
             in_front += torch.bincount(bins[score > CONTRADICTED], minlength=_BINS**3)
-            on_shell += torch.bincount(bins[(view.depth > 0) & (score < _ON_SHELL)], minlength=_BINS**3)
+            on_shell += torch.bincount(bins[(view.depth > 0) & (score < CONFIRMED)], minlength=_BINS**3)
         in_front += _SAME * on_shell
         self._log_ratio = (_likelihood(in_front) / _likelihood(on_shell)).log().clamp(-_MOST, _MOST).float()
 

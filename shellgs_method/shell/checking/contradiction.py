@@ -1,21 +1,24 @@
-"""Decide whether photographs agree on the shell, or on something in front of it.
+"""Decide whether photographs show the shell, something in front of it, or the background.
 
 A plane sweep between the shell and the cameras, per pixel of each view. Its costs are smoothed with the edges of the
 photograph preserved (cost-volume filtering, Hosni et al. 2013, with the guided filter of He et al. 2010); a second pass
 makes the views consistent. Reflections in glass appear farther away than the shell, never nearer, so only nearer
-depths are tried.
+depths are tried. The background behind the borders of a shell that reaches too far is found by its colours, and by the
+silhouettes of other views.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from inspect import signature
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float16, Int64, UInt8
 from kornia.filters import guided_blur
+from scipy.ndimage import binary_fill_holes
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -46,6 +49,7 @@ _WINDOW, _EDGES = 13, 1e-3  # guided filter: window side in pixels, regularisati
 # Separable, with coefficients subsampled by 2 (He and Sun 2015), it is 7 times faster; recall and precision stay
 # within 0.01. Before kornia 0.9, it is not separable, and fails to subsample odd sizes.
 _FAST: Any = {"separable": True, "subsample": 2} if "separable" in signature(guided_blur).parameters else {}
+_FEATHERED = 4  # times the silhouette is feathered
 _COLOUR, _GRADIENT = 0.12, 0.06  # truncation of colour and gradient differences, for values in [0, 1]
 _SUPPORT = 0.2  # weight of the other views' scores relative to the photographs
 
@@ -63,6 +67,18 @@ class ShellView:
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
     depth: Float[Tensor, "h w"]
+
+    @cached_property
+    def silhouette(self) -> Bool[Tensor, "h w"]:
+        """Pixels inside the building's silhouette, by the photograph: at its borders, a shell may reach too far.
+
+        The mask of the shell, without its holes, is feathered with the photograph as guide (He et al., Guided Image
+        Filtering, 2010): a pixel is outside if those of its colour around it are. Repeated for wider strips.
+        """
+        pixels, inside = _Pixels(self), torch.from_numpy(binary_fill_holes((self.depth > 0).numpy()))
+        for _ in range(_FEATHERED):
+            inside &= _smooth(pixels, inside.float()[None])[0] > 0.5
+        return inside
 
 
 class Sweep(NamedTuple):
@@ -133,12 +149,14 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
 
 
 class Agreement(NamedTuple):
-    """What the photographs of a view and its neighbours agree on; both maps are -1 where there is no shell."""
+    """What the photographs of a view and its neighbours agree on; scores are -1 where there is no shell."""
 
     score: Float[Tensor, "h w"]
     """How much better they agree in front of the shell than on it, above :data:`CONTRADICTED` for an occluder."""
     alone: Float[Tensor, "h w"]
     """Difference of the view's colours from its neighbours' on the shell, less twice what these differ by."""
+    beyond: Bool[Tensor, "h w"]
+    """The shell is outside of the silhouette, in this view or in most of its neighbours that see it."""
 
 
 def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_there: Sequence[Sweep]) -> Agreement:
@@ -154,7 +172,7 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
         found_there: their sweeps.
     """
     pixels = _Pixels(view)
-    shell, shown, nearer, trust, support = [], [], [], [], []
+    shell, shown, nearer, trust, support, outside = [], [], [], [], [], []
     for other, sweep_there in zip(others, found_there, strict=True):
         neighbour = _Neighbour(pixels, other)
         look = neighbour.look(pixels.surface / (1 + found.offset.float()))
@@ -170,17 +188,22 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
         shown.append(neighbour.shown[:3].masked_fill(unseen, torch.nan))
         nearer.append(neighbour.disagreement(look).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
+        out = _sampled((~other.silhouette).float(), neighbour.shell.grid, "nearest")
+        outside.append(out.masked_fill(neighbour.visible == 0, torch.nan))
         support.append((of_nearer * torch.where(alike, 1.0, 0.4)).masked_fill(hidden, torch.nan))
     if len(shell) < 2:
-        return Agreement(*torch.full((2, *view.depth.shape), -1.0))
-    shell, nearer, trust, support = map(torch.stack, (shell, nearer, trust, support))
+        nothing = torch.full_like(view.depth, -1.0)
+        return Agreement(nothing, nothing, ~view.silhouette)
+    shell, nearer, trust, support, outside = map(torch.stack, (shell, nearer, trust, support, outside))
     agreed = support.nanmean(dim=0).nan_to_num(0.0)
     trusted = (trust * shell.isfinite()).sum(dim=0) > 1
     better = _better_half(shell, trust) - _better_half(nearer, torch.ones_like(trust))
     better = torch.where(trusted, better, 0.3 * (agreed - 0.3))  # hidden from the neighbours: only their sweeps count
     score = _smooth(pixels, (better + _SUPPORT * agreed)[None])[0]
-    maps = torch.stack([score, _alone(pixels, torch.stack(shown))])
-    return Agreement(*maps.where(view.depth > 0, -1.0))
+    alone = _alone(pixels, torch.stack(shown))
+    elsewhere = (outside.isfinite().sum(dim=0) > 1) & (outside.nanmean(dim=0) > 0.5)
+    score, alone = (each.where(view.depth > 0, -1.0) for each in (score, alone))
+    return Agreement(score, alone, ~view.silhouette | elsewhere)
 
 
 class _Look(NamedTuple):

@@ -12,7 +12,7 @@ import trimesh
 from jaxtyping import Bool, Float64, Int64
 
 from dataparsers.camera import in_view
-from dataparsers.cue_maps import CueMaps, transients
+from dataparsers.cue_maps import CueMaps, Findings
 from dataparsers.files import atomic_write
 from dataparsers.photograph import View
 from shellgs_method.voxels import cell_means, voxel_cells
@@ -103,9 +103,9 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         columns, rows = pixels.astype(int).T
         visible = np.abs(cue.depth[rows, columns] / z - 1) < _SAME
         seen[k] += visible
-        moving = transients(check, cue)
-        moved.append(moving.sum() / max((cue.depth > 0).sum(), 1))
-        occluded = visible & (check.mask & ~moving)[rows, columns]
+        found = Findings.of(check, cue)
+        moved.append(found.moved.sum() / max((cue.depth > 0).sum(), 1))
+        occluded = visible & found.occluder[rows, columns]
         along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
     contradicted = np.isfinite(distances).sum(axis=0)
