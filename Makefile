@@ -3,7 +3,7 @@ BIN := .venv/bin
 .PHONY: demo test docs libraries
 .NOTPARALLEL:
 
-demo: .venv/checked  ## install; make the synthetic facade, train photo-gs, shellgs and shellgs-metric on it, compare
+demo: .venv/checked  ## install; make the synthetic facade, train photo-gs and shellgs-metric on it, compare
 	$(BIN)/shellgs demo
 
 # OpenMP's threads spin while they wait; training adapts to what else runs (threads.py), but these tests are short.

@@ -16,7 +16,7 @@ from shellgs_method.compare.results import compare
 from shellgs_method.compare.runs import grid
 from shellgs_method.synthetic import FacadeConfig, settings_of, write_scene
 
-METHODS = ("photo-gs", "shellgs", "shellgs-metric")
+METHODS = ("photo-gs", "shellgs-metric")
 
 
 def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Console) -> None:
@@ -41,7 +41,7 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
         write_scene(scene, config)
     console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
     try:
-        follow(["shellgs", "cast", str(scene)])
+        follow([["shellgs", "cast", str(scene)]])
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
     runs = grid([scene], METHODS, [0], iterations, folder)

@@ -40,12 +40,12 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def config(demo: Path) -> Path:
-    return demo / "runs" / "scene" / "shellgs" / "shellgs" / "seed-0" / "config.yml"
+    return demo / "runs" / "scene" / "shellgs-metric" / "shellgs-metric" / "seed-0" / "config.yml"
 
 
 def test_the_demo_writes_a_table_and_images(demo):
     table = (demo / "results.md").read_text()
-    assert all(word in table for word in ("photo-gs", "shellgs", "PSNR", "Normal (°)", "CD (m)"))
+    assert all(word in table for word in ("photo-gs", "shellgs-metric", "PSNR", "Normal (°)", "CD (m)"))
     for path in (demo / "strip.png", demo / "contradicted.png", demo / "scene" / "cues" / "shell" / "panel.png"):
         with Image.open(path) as image:
             assert np.asarray(image).std() > 10
@@ -54,7 +54,7 @@ def test_the_demo_writes_a_table_and_images(demo):
 def test_the_demo_prints_its_progress_and_what_to_look_at_first(demo):
     output = demo.with_name("log.txt").read_text()
     assert "A synthetic facade, 10 photographs of 64 x 48 pixels: demo/scene" in output
-    assert "seed-0 finished, 3 of 3." in output
+    assert "seed-0 finished, 2 of 2." in output
     first = output[output.index("Look first at") :].splitlines()[1:4]
     assert [(demo.parent / line.split(": ")[0].split()[-1]).exists() for line in first[:2]] == [True, True]
     assert "ns-viewer --load-config" in first[2]

@@ -35,7 +35,7 @@ from dataparsers.errors import SceneError
 from dataparsers.layout import SceneLayout, ScenePaths
 from shellgs_method import cli
 from shellgs_method.compare import cluster, launch
-from shellgs_method.compare.launch import follow, launch_locally
+from shellgs_method.compare.launch import CommandError, follow, launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_metrics
 from shellgs_method.compare.plots import DOT, dotted, recorded_metrics
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
@@ -146,7 +146,7 @@ def test_the_paths_of_a_scene_reach_every_run(pristine_scene, tmp_path):
     paths = ScenePaths(images_path=Path("photos"), colmap_path=Path("model"))
     ours, splatfacto = grid([pristine_scene], ["shellgs", "splatfacto"], [0], 20, tmp_path, paths=paths)
     for run in (ours, splatfacto):
-        assert " ".join(next(run.commands())).endswith(" facade-data --images-path photos --colmap-path model")
+        assert " ".join(run.commands()[0]).endswith(" facade-data --images-path photos --colmap-path model")
     with pytest.raises(FileNotFoundError, match="nor a COLMAP model in model"):
         ours.settle()
 
@@ -315,7 +315,13 @@ def test_a_killed_run_resumes_from_its_checkpoint(pristine_scene, tmp_path):
     assert f"--load-dir {runs[0].checkpoints}" in resumed
 
 
-def test_commands_start_without_python_in_a_fork(tmp_path):
+def write_script(path: Path, text: str = "") -> Path:
+    path.write_text(f"#!{sys.executable}\n{text}")
+    path.chmod(stat.S_IRWXU)
+    return path
+
+
+def test_commands_start_without_python_in_a_fork(tmp_path, monkeypatch):
     """Clean-up of other threads' objects in a fork may wait for threads that it has not: libswscale's did, for ever."""
 
     class Held:
@@ -327,19 +333,24 @@ def test_commands_start_without_python_in_a_fork(tmp_path):
         local.held = Held()
         done.wait()
 
+    monkeypatch.setattr(launch, "BIN", write_script(tmp_path / "nothing").parent)
     local, done = threading.local(), threading.Event()
     thread = threading.Thread(target=hold)
     thread.start()
-    follow(["python", "-c", "pass"])
+    follow([["nothing"]])
     done.set()
     thread.join()
-    assert not list(tmp_path.iterdir())
+    assert not (tmp_path / "cleaned in a fork").exists()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
 def test_killing_a_comparison_ends_its_commands(tmp_path):
     sleep = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
-    following = f"from shellgs_method.compare.launch import follow; follow(['python', '-c', {sleep!r}])"
+    write_script(tmp_path / "sleep", sleep)
+    following = (
+        "import pathlib; from shellgs_method.compare import launch; "
+        f"launch.BIN = pathlib.Path({str(tmp_path)!r}); launch.follow([['sleep']])"
+    )
     comparison = subprocess.Popen([sys.executable, "-c", following])
     while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
         time.sleep(0.05)
@@ -347,6 +358,19 @@ def test_killing_a_comparison_ends_its_commands(tmp_path):
     comparison.kill()
     comparison.wait()
     command.wait(timeout=10)
+
+
+def test_commands_share_a_process_up_to_the_first_that_fails(tmp_path, monkeypatch):
+    monkeypatch.setattr(launch, "BIN", tmp_path)
+    write_script(
+        tmp_path / "count", "import sys; sys.count = getattr(sys, 'count', 0) + int(sys.argv[1]); print(sys.count)"
+    )
+    write_script(tmp_path / "fail", "import sys; sys.exit('out of counts')")
+    commands, started, log = [["count", "1"], ["count", "2"], ["fail"], ["count", "4"]], [], tmp_path / "log.txt"
+    with pytest.raises(CommandError, match=r"fail failed:(.|\n)*out of counts"):
+        follow(commands, started.append, log=log)
+    assert started == commands[:3]
+    assert log.read_text() == "$ count 1\n1\n$ count 2\n3\n$ fail\nout of counts\n"
 
 
 @pytest.mark.usefixtures("fake_commands")

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, Task
 
+from shellgs_method.compare.in_turn import command_in_turn, heading
 from shellgs_method.compare.runs import Run
 from shellgs_method.fusion import nothing_compiled_yet
 
@@ -24,13 +25,6 @@ BIN = Path(sys.executable).parent
 LAST_LINES = 30
 PROGRESS_SECONDS = 30.0
 """Seconds between two progress messages where the output is not a terminal."""
-# On Linux the kernel ends a command with its parent, or a killed comparison's runs would keep training. Not by a
-# ``preexec_fn``: Python that runs in a fork of many threads may never return.
-_ENDING_WITH_PARENT = (
-    "import ctypes, os, signal, sys; PR_SET_PDEATHSIG = 1; ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM); "
-    "os.execv(sys.argv[1], sys.argv[1:])"
-)
-_PREFIX = [sys.executable, "-ISc", _ENDING_WITH_PARENT] if sys.platform == "linux" else []
 _STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
@@ -74,26 +68,32 @@ def finish(
 
     Args:
         run: the run, settled.
-        announce: called with each command before it starts.
+        announce: called with each command when it starts.
         step: called with each iteration that nerfstudio reports.
 
     Raises:
         CommandError: a command failed.
     """
-    for command in run.commands():
-        announce(command)
-        follow(command, step, run.folder / "log.txt")
+    if commands := run.commands():
+        follow(commands, announce, step, run.folder / "log.txt")
 
 
-def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None, log: Path | None = None) -> None:
-    """Run a command of this environment, without showing its output.
+def follow(
+    commands: Sequence[Sequence[str]],
+    announce: Callable[[Sequence[str]], None] = lambda _: None,
+    step: Callable[[int], None] = lambda _: None,
+    log: Path | None = None,
+) -> None:
+    """Run commands of this environment in turn, in one process, without showing their output.
 
     Raises:
-        CommandError: the command failed.
+        CommandError: a command failed.
     """
     output: list[str] = []
+    waiting = list(commands)
+    current = waiting[0]
     with subprocess.Popen(
-        [*_PREFIX, BIN / command[0], *command[1:]],
+        command_in_turn(commands, BIN),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -103,7 +103,9 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
         try:
             for line in process.stdout:
                 output.append(line)
-                if match := _STEP.match(line):
+                if waiting and line == heading(waiting[0]):
+                    announce(current := waiting.pop(0))
+                elif match := _STEP.match(line):
                     step(int(match[1]))
         except BaseException:
             process.terminate()
@@ -111,9 +113,9 @@ def follow(command: Sequence[str], step: Callable[[int], None] = lambda _: None,
         finally:
             if log:
                 with log.open("a") as file:
-                    file.writelines([f"$ {shlex.join(command)}\n", *output])
+                    file.writelines(output)
     if process.returncode:
-        raise CommandError(f"{command[0]} failed:\n{''.join(output[-LAST_LINES:])}")
+        raise CommandError(f"{current[0]} failed:\n{''.join(output[-LAST_LINES:])}")
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -163,14 +163,15 @@ class Run:
         """Whether it is trained and all its metrics are measured."""
         return self.trained and all(self.metrics(half).exists() for half in (None, *self.halves))
 
-    def commands(self) -> Iterator[list[str]]:
-        """The remaining commands as lists of words; advance the iterator only once the previous command is done."""
-        if not self.trained:
-            yield self._train()
+    def commands(self) -> list[list[str]]:
+        """The remaining commands as lists of words."""
+        commands = [] if self.trained else [self._train()]
         for half in (None, *self.halves):
             if not self.metrics(half).exists():
                 extra = ["--renders", self.renders] if half is None else ["--holdout", half]
-                yield _words("shellgs", "evaluate", self.config, "--output-path", self.metrics(half), *extra)
+                words = ["shellgs", "evaluate", self.config, "--output-path", self.metrics(half), *extra]
+                commands.append(_words(*words))
+        return commands
 
     def _train(self) -> list[str]:
         variant, every = self.variant, max(self.iterations // max(self.curve_points, 1), 1)
