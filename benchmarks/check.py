@@ -23,7 +23,7 @@ from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_view
 from dataparsers.photograph import View
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, check_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
-from shellgs_method.synthetic.appearance import Daylight, photograph, rays
+from shellgs_method.synthetic.appearance import Daylight, developed, exposed, rays
 from shellgs_method.synthetic.geometry import Material, Mesh, box, merge
 from shellgs_method.synthetic.scene import Facade
 from shellgs_method.synthetic.street import car
@@ -112,7 +112,7 @@ def add_passers_by(
             continue
         added = merge(street_life(camera.position.numpy(), rng))
         world = World(merge([facade.mesh, added]))
-        image = photograph(Daylight(world, facade.daylight.lattice), camera, supersampling, rng)
+        image = developed(exposed(Daylight(world, facade.daylight.lattice), camera, supersampling), rng)
         Image.fromarray(image).save(view.image)
         masks[view.name] = World(added).cast(*rays(camera)).t < still.cast(*rays(camera)).t - 0.02
     return masks

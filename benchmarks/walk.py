@@ -11,7 +11,7 @@ import tyro
 from rich.progress import track
 
 from dataparsers.errors import check_output, refusals_end_the_program
-from shellgs_method.synthetic.appearance import photograph
+from shellgs_method.synthetic.appearance import developed, exposed
 from shellgs_method.synthetic.building import shell
 from shellgs_method.synthetic.scene import Facade, FacadeConfig, write_scan
 
@@ -41,7 +41,7 @@ def walk(
         stream = container.add_stream("libx264", rate=RATE, options={"crf": "18"})
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for camera in track(facade.cameras, "video", transient=True):
-            image = photograph(facade.daylight, camera, 2, noise)
+            image = developed(exposed(facade.daylight, camera, 2), noise)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode())
 

@@ -1,14 +1,19 @@
-"""Set the number of torch threads to the number of free cores.
+"""Divide the machine's cores among threads.
 
 A lone process is fastest with all cores, and with threads that spin while they wait for each other, as OpenMP's do by
 default. Spinning threads of parallel processes block each other's cores: each process is then fastest with one thread
-per core of its own. The number is therefore updated regularly from the machine's load.
+per core of its own. Training therefore updates torch's number of threads regularly from the machine's load.
+
+Work on many small arrays is faster with a thread for each of several items than with several threads for one.
 """
 
 from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import psutil
@@ -18,6 +23,8 @@ LOOK_EVERY = 2.0
 """Seconds between two measurements of the load."""
 ENOUGH = 0.6
 """Share of a core that must be free for another thread."""
+MAX_WORKERS = 4
+"""Most items worked on at once, as each needs memory of its own."""
 
 
 @dataclass(frozen=True)
@@ -55,3 +62,16 @@ class ThreadsByLoad:
         cores = int(load.cores_since(self._load) + 1 - ENOUGH)
         self._load = load
         torch.set_num_threads(min(max(cores, 1), self._most))
+
+
+@contextmanager
+def workers() -> Iterator[ThreadPoolExecutor]:
+    """Threads for independent items that share torch's threads; without such items, they would all work on one."""
+    threads = torch.get_num_threads()
+    count = min(threads, MAX_WORKERS)
+    torch.set_num_threads(threads // count)
+    try:
+        with ThreadPoolExecutor(count) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 import torch
 
 from shellgs_method import threads
-from shellgs_method.threads import Load, ThreadsByLoad
+from shellgs_method.threads import Load, ThreadsByLoad, workers
 
 
 @pytest.fixture
@@ -55,6 +57,23 @@ def test_the_users_number_of_threads_is_kept(machine, monkeypatch):
     machine.append(Load(10.0, 0.0, 1.0))
     process.follow()
     assert torch.get_num_threads() == 4
+
+
+@pytest.mark.parametrize(("cores", "at_once", "each"), [(1, 1, 1), (2, 2, 1), (16, 4, 4)])
+def test_workers_share_the_threads(cores, at_once, each):
+    before, together = torch.get_num_threads(), threading.Barrier(at_once)
+
+    def threads_beside_the_others(_: int) -> int:
+        together.wait(timeout=60)
+        return torch.get_num_threads()
+
+    torch.set_num_threads(cores)
+    try:
+        with workers() as pool:
+            assert list(pool.map(threads_beside_the_others, range(at_once))) == [each] * at_once
+        assert torch.get_num_threads() == cores
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_the_load_of_this_machine_can_be_read():

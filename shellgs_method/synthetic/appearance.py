@@ -1,6 +1,6 @@
 """Materials and light: weakly textured plaster, glass that reflects the street, an overcast day with a little sun.
 
-All colours are linear; :func:`photograph` applies the display gamma last.
+All colours are linear; :func:`developed` applies the display gamma last.
 """
 
 from __future__ import annotations
@@ -128,10 +128,8 @@ class Daylight:
         return map_coordinates(self.lattice, np.stack([u, v]) / cell, order=1, mode="grid-wrap", prefilter=False)
 
 
-def photograph(
-    daylight: Daylight, camera: Camera, supersampling: int, rng: np.random.Generator
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Render an image: the mean of ``supersampling``² rays per pixel, gamma 2.2, a little sensor noise."""
+def exposed(daylight: Daylight, camera: Camera, supersampling: int) -> Float[np.ndarray, "height width 3"]:
+    """Render the radiance of the pixels, as the mean of ``supersampling``² rays each."""
     origin, directions = rays(camera)
     rotation, focal = camera.viewmat[:3, :3].numpy(), camera.K.diagonal().numpy()[:2]
     steps = (np.arange(supersampling) + 0.5) / supersampling - 0.5
@@ -139,7 +137,14 @@ def photograph(
     for offset in np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2):
         moved = directions + np.float32(offset / focal @ rotation[:2])
         image += daylight.radiance(origin, moved.reshape(-1, 3)).reshape(image.shape)
-    image = 255 * np.clip(image / supersampling**2, 0.0, 1.0) ** (1 / 2.2)
+    return image / supersampling**2
+
+
+def developed(
+    radiance: Float[np.ndarray, "height width 3"], rng: np.random.Generator
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Turn the radiance into a photograph: gamma 2.2, a little sensor noise."""
+    image = 255 * np.clip(radiance, 0.0, 1.0) ** (1 / 2.2)
     return np.clip(image + rng.normal(0.0, 1.5, image.shape), 0, 255).round().astype(np.uint8)
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from dataparsers.files import unfinished
 from shellgs_method.open3d import import_open3d
 from shellgs_method.shell import ALIGNMENT, Alignment
 from shellgs_method.shell.geometry.similarity import transformed
-from shellgs_method.synthetic.appearance import Daylight, photograph, rays
+from shellgs_method.synthetic.appearance import Daylight, developed, exposed, rays
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.frames import (
     SCENE_FROM_BUILDING,
@@ -33,6 +34,7 @@ from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.sfm import Points, features, triangulate
 from shellgs_method.synthetic.street import street
 from shellgs_method.synthetic.world import World
+from shellgs_method.threads import workers
 
 SHELL = "shell/facade.ply"
 RECORD = "facade.json"
@@ -148,13 +150,16 @@ def _write(scene: Path, config: FacadeConfig) -> None:
     # 50 % more than wanted: not every feature is visible in three views.
     found, per_view = [], -(-3 * config.points // (2 * config.views))
     sensor, sfm, network = _generators(config.seed + 1, 3)
-    for name, camera in track(list(zip(names, facade.cameras, strict=True)), "synthetic facade", transient=True):
-        image = photograph(facade.daylight, camera, config.supersampling, sensor)
-        Image.fromarray(image).save(scene / name)
-        found.append(features(facade.daylight.world, camera, image, per_view, sfm))
-        maps = facade.truth(camera)
-        truth.write(name, maps, scene_camera(camera))
-        np.save(scene / PREDICTIONS / f"{Path(name).stem}.npy", predicted_disparity(maps, network))
+    with workers() as pool:
+        exposures = pool.map(partial(exposed, facade.daylight, supersampling=config.supersampling), facade.cameras)
+        made = track(exposures, "synthetic facade", config.views, transient=True)
+        for name, camera, exposure in zip(names, facade.cameras, made, strict=True):
+            image = developed(exposure, sensor)
+            Image.fromarray(image).save(scene / name)
+            found.append(features(facade.daylight.world, camera, image, per_view, sfm))
+            maps = facade.truth(camera)
+            truth.write(name, maps, scene_camera(camera))
+            np.save(scene / PREDICTIONS / f"{Path(name).stem}.npy", predicted_disparity(maps, network))
     points = triangulate(facade.daylight.world, facade.cameras, found, config.points, sfm)
     _write_points(scene / "sparse_pc.ply", points)
     (scene / "transforms.json").write_text(json.dumps(_transforms(names, facade.cameras), indent=1) + "\n")

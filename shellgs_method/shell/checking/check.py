@@ -7,7 +7,6 @@ import shutil
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -32,6 +31,7 @@ from shellgs_method.shell.checking.contradiction import (
     sides,
     sweep,
 )
+from shellgs_method.threads import workers
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
@@ -97,9 +97,14 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
         training = _TrainingViews.of(
             [view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}"
         )
-        for view in track(missing, description="comparing the photographs"):
-            camera = cameras[view.name]
-            maps.write(view.name, training.compare(view, shell.require(view.name, camera)), camera)
+
+        def compare(view: View) -> CueMap:
+            return training.compare(view, shell.require(view.name, cameras[view.name]))
+
+        with workers() as pool:
+            made = track(pool.map(compare, missing), "comparing the photographs", len(missing))
+            for view, cue in zip(missing, made, strict=True):
+                maps.write(view.name, cue, cameras[view.name])
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
     records = [(shell.record(view.name), maps.record(view.name)) for view in views]
@@ -112,15 +117,11 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
 
 @dataclass(frozen=True)
 class _TrainingViews:
-    """The training views and their sweeps."""
+    """The training views, their sweeps, and the colours in front of the shell and on it."""
 
     views: dict[str, ShellView]
     sweeps: dict[str, Sweep]
-
-    @cached_property
-    def colours(self) -> ColourModel:
-        """Colours in front of the shell and on it."""
-        return ColourModel(self.views.values(), self.sweeps.values())
+    colours: ColourModel
 
     @classmethod
     def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
@@ -129,18 +130,22 @@ class _TrainingViews:
         shell_views = {
             view.name: _shell_view(view, shell.require(view.name, view.camera.shrunk(size))) for view in views
         }
-        sweeps = {}
-        for index, (name, view) in enumerate(track(shell_views.items(), "looking before the shell", len(views))):
-            file = unfinished / f"{index}.npy"
-            if not file.is_file():
-                found = sweep(view, [other for other in shell_views.values() if other is not view])
-                file.parent.mkdir(exist_ok=True)
+        files = {name: unfinished / f"{index}.npy" for index, name in enumerate(shell_views)}
+        missing = [name for name, file in files.items() if not file.is_file()]
+
+        def look(name: str) -> Sweep:
+            return sweep(shell_views[name], [view for other, view in shell_views.items() if other != name])
+
+        unfinished.mkdir(exist_ok=True)
+        with workers() as pool:
+            made = track(pool.map(look, missing), "looking before the shell", len(missing), disable=not missing)
+            for name, found in zip(missing, made, strict=True):
                 content = io.BytesIO()  # on a full disk, numpy's own writing raises an error that does not say so
                 np.save(content, torch.stack(found).numpy(), allow_pickle=False)
-                with atomic_write(file) as stream:
+                with atomic_write(files[name]) as stream:
                     stream.write(content.getvalue())
-            sweeps[name] = Sweep(*torch.from_numpy(np.load(file, allow_pickle=False)))
-        return cls(shell_views, sweeps)
+        sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
+        return cls(shell_views, sweeps, ColourModel(shell_views.values(), sweeps.values()))
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
