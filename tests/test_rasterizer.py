@@ -9,7 +9,7 @@ import pytest
 import torch
 from dense_reference import dense_rasterize
 from gsplat import DefaultStrategy
-from random_splats import NAMES, make_camera, make_splats, orbit
+from random_splats import NAMES, make_camera, make_discs, make_splats, orbit
 from torch import Tensor, nn
 
 from dataparsers.camera import Camera
@@ -211,10 +211,10 @@ def test_batching_of_tiles_changes_neither_render_nor_gradients(batches, monkeyp
     torch.testing.assert_close(differentiated(), expected)
 
 
-def test_a_few_deep_tiles_are_not_repacked_after_each_chunk(monkeypatch):
+def test_a_few_deep_tiles_need_few_calls_of_the_kernels(monkeypatch):
     """In real scenes a few tiles have hundreds of chunks more than the others."""
-    plans, plan = [], compositing._plan
-    monkeypatch.setattr(compositing, "_plan", lambda *args: plans.append(plan(*args)) or plans[-1])
+    plans, plan = [], compositing.Plan.of
+    monkeypatch.setattr(compositing.Plan, "of", lambda *args: plans.append(plan(*args)) or plans[-1])
     shallow, n_deep = make_splats(200, 3, seed=14), 400
     camera = make_camera(93, 78)
     centre = torch.linalg.inv(camera.viewmat)[:3] @ torch.tensor([0.0, 0.0, 2.0, 1.0]).double()
@@ -222,8 +222,32 @@ def test_a_few_deep_tiles_are_not_repacked_after_each_chunk(monkeypatch):
     deep = [centre.expand(n_deep, 3), torch.ones(n_deep, 4).double(), torch.full((n_deep, 3), 1e-3).double(), faint]
     splats = [torch.cat(pair) for pair in zip(shallow, [*deep, torch.ones(n_deep, 3).double()], strict=True)]
     rasterize(*splats, camera=camera)
-    assert max(len(each.ends) for each in plans) > 40
-    assert len(plans) <= 4
+    assert len(plans[0].ends) > 40
+    whole, measured, strips = (len(each.transmittances or each.ends) for each in plans)
+    assert whole + measured + strips < 20
+
+
+@pytest.mark.parametrize("n_densifying", [None, 3])
+@pytest.mark.parametrize(("primitive", "make"), [("3d", make_splats), ("2d", make_discs)])
+def test_cutting_tiles_into_strips_changes_neither_renders_nor_gradients(primitive, make, n_densifying, monkeypatch):
+    def differentiated() -> list[Tensor]:
+        splats = [splat.requires_grad_() for splat in make(700, 5, seed=3)]
+        camera = make_camera(61, 45)
+        composited, alpha, info = rasterize(*splats, camera=camera, primitive=primitive, n_densifying=n_densifying)
+        maps = [info[name] for name in ("inverse_depth", "median_depth", "distortion") if name in info]
+        renders = [composited, alpha, *maps]
+        slopes = [torch.rand(each.shape, generator=torch.Generator().manual_seed(1)).double() for each in renders]
+        return [*renders, *torch.autograd.grad(renders, [*splats, info["means2d"]], slopes)]
+
+    cuts, cut = [], compositing.Strips.cut
+    monkeypatch.setattr(compositing.Strips, "cut", lambda *args: cuts.append(cut(*args)) or cuts[-1])
+    monkeypatch.setattr(compositing, "CUT_CHUNKS", 1000)
+    expected = differentiated()
+    assert not cuts
+    monkeypatch.setattr(compositing, "CUT_CHUNKS", 2)
+    torch.testing.assert_close(differentiated(), expected)
+    assert all(int(strips.ranks.max()) >= 5 for strips in cuts)
+    assert cuts
 
 
 def test_cropping_equals_shifting_the_principal_point():

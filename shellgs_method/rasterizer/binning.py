@@ -66,8 +66,8 @@ def bin_splats(outlines: Float[Tensor, "N O 7"], width: int, height: int) -> Bin
         height: image height in pixels.
     """
     size = outlines.new_tensor([[width, height]])
-    splat, row = _count_up(*run_fused(_rows, outlines, size))
-    strip, tile = _count_up(*run_fused(_columns, outlines, splat, row, size))
+    splat, row = count_up(*run_fused(_rows, outlines, size))
+    strip, tile = count_up(*run_fused(_columns, outlines, splat, row, size))
     # The entries are front to back, and a stable sort keeps that order within a tile.
     strip = strip.index_select(0, stable_order(tile))
     splats = F.pad(splat.index_select(0, strip), (0, 1), value=len(outlines))
@@ -127,7 +127,7 @@ def _tiles_between(
     return first // TILE, n_tiles
 
 
-def _count_up(first: Int[Tensor, "n"], times: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
+def count_up(first: Int[Tensor, "n"], times: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
     """Repeat each index ``times`` times, and number the repetitions from ``first``."""
     item = torch.repeat_interleave(times)
     start = first - (times.cumsum(0, dtype=torch.int32) - times)

@@ -145,4 +145,4 @@ def _crosses_half(before: Tensor, behind: Tensor) -> Tensor:
     return (before > 0.5) & (behind <= 0.5)
 
 
-DISCS = Kernels(_NULL_SHAPE, _N_MAPS, _forward, _backward, _N_PROBED)
+DISCS = Kernels(_NULL_SHAPE, _N_MAPS, _forward, _backward, _N_PROBED, n_unweighted=1)

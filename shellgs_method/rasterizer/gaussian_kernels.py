@@ -92,4 +92,4 @@ def _exponent(splat: Float[Tensor, "G K 1 V"], x: Float[Tensor, "1 P 1"], y: Flo
     return (a * dx + b * dy) * dx + c * dy * dy + n
 
 
-GAUSSIANS = Kernels(_NULL_SHAPE, 0, _forward, _backward, n_probed=2)
+GAUSSIANS = Kernels(_NULL_SHAPE, 0, _forward, _backward, n_probed=2, n_unweighted=0)

@@ -46,6 +46,7 @@ class Kernels:
             and the arguments above. If the second list is not empty, the gradients of the first ``n_probed`` parameters
             due to the first list alone are appended as columns.
         n_probed: number of parameters, from u and v on, that depend on the splat's screen position.
+        n_unweighted: number of totals, at the end, that are no sums of weight times value.
     """
 
     null_shape: tuple[float, ...]
@@ -53,6 +54,7 @@ class Kernels:
     forward: Callable[..., tuple[Tensor, Tensor]]
     backward: Callable[..., None]
     n_probed: int
+    n_unweighted: int
 
     @property
     def n_shape(self) -> int:
