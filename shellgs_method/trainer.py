@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 import yaml
+from gsplat.strategy.ops import remove
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -26,6 +27,7 @@ from shellgs_method.config_file import guard_config_loading
 from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
 from shellgs_method.folders import held
 from shellgs_method.limits import check_settings
+from shellgs_method.rasterizer import shown
 
 if TYPE_CHECKING:
     from shellgs_method.pipeline import FacadePipeline
@@ -186,8 +188,26 @@ class FacadeTrainer(Trainer):
                     f"rates; the last good checkpoint is kept in {self.checkpoint_dir}"
                 )
 
+    def _remove_unseen_gaussians(self) -> None:
+        """Remove Gaussians that no training view shows: nothing has shaped them, and other views may show them.
+
+        A single one in front of a held-out camera displaced that view's depth by 15 cm.
+        """
+        model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
+        seen = shown(
+            *(model.means, model.quats, model.scales.exp(), model.opacities.sigmoid().squeeze(-1)),
+            cameras=map(dataset.camera, range(len(dataset))),
+            primitive=model.config.primitive,
+        )
+        if count := int((~seen).sum()):
+            with self.train_lock:  # the viewer renders
+                remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, ~seen)  # pyright: ignore[reportArgumentType]
+            CONSOLE.print(f"{count} Gaussians that no training view shows are removed.")
+
     def _after_train(self) -> None:
-        self.step = min(self.step, self._last_step)
+        if self.step >= self._last_step:
+            self.step = self._last_step
+            self._remove_unseen_gaussians()
         super()._after_train()
 
     def _load_checkpoint(self) -> None:

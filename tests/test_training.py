@@ -10,7 +10,7 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
-from runs import held_out, model_of, render, trainer_of
+from runs import data_of, held_out, model_of, render, trainer_of
 from scipy.spatial.transform import Rotation
 
 import benchmarks.step
@@ -244,6 +244,20 @@ def test_resuming_a_finished_run_changes_nothing(trained, pristine_scene, tmp_pa
     again = trainer_of(pristine_scene, tmp_path, iterations=60, load_dir=trained.checkpoint_dir)
     again.train()
     assert not again.checkpoint_dir.exists()
+
+
+def test_gaussians_that_no_training_view_shows_are_removed_at_the_end(trained, pristine_scene, tmp_path):
+    config = {"iterations": 62, "load_dir": trained.checkpoint_dir}
+    plain, planted = (trainer_of(pristine_scene, tmp_path / name, **config) for name in ("plain", "planted"))
+    camera = data_of(planted).train_dataset.camera(0)
+    moved = model_of(planted)
+    moved.means.data[0] = (camera.position - 10 * camera.viewmat[2, :3]).float()  # all cameras look at the facade
+    moved.scales.data[0] = -10.0
+    for trainer in (plain, planted):
+        trainer.train()
+    (saved,) = planted.checkpoint_dir.glob("*.ckpt")
+    count = len(torch.load(saved)["pipeline"]["_model.gauss_params.means"])
+    assert count == moved.num_points == model_of(plain).num_points - 1
 
 
 def test_a_failed_save_leaves_the_last_checkpoint(trained, monkeypatch):
