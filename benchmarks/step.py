@@ -116,7 +116,7 @@ def resumed(config_path: Path, folder: Path) -> FacadeTrainer:
 
 def step(trainer: FacadeTrainer) -> None:
     """Train one step, as nerfstudio's loop does."""
-    trainer.step = trainer._start_step
+    trainer.step = max(trainer.step + 1, trainer._start_step)
     for callback in trainer.callbacks:
         callback.run_callback_at_location(trainer.step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
     trainer.train_iteration(trainer.step)

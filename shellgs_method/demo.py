@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -12,8 +13,6 @@ from rich.console import Console
 
 from dataparsers.errors import SceneError
 from shellgs_method.compare.launch import BIN, CommandError, follow, launch_locally
-from shellgs_method.compare.results import compare
-from shellgs_method.compare.runs import grid
 from shellgs_method.synthetic import FacadeConfig, settings_of, write_scene
 
 METHODS = ("photo-gs", "shellgs-metric")
@@ -40,8 +39,15 @@ def run_demo(folder: Path, config: FacadeConfig, iterations: int, console: Conso
         console.print(f"A synthetic facade, {config.views} photographs of {size} pixels: {scene}", highlight=False)
         write_scene(scene, config)
     console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
+    with ThreadPoolExecutor() as pool:
+        cast = pool.submit(follow, [["shellgs", "cast", str(scene)]])
+        # Slow to import, so while the shell is cast; nerfstudio first, as its import takes longer from deep in others.
+        import nerfstudio.configs.method_configs  # noqa: F401
+
+        from shellgs_method.compare.results import compare
+        from shellgs_method.compare.runs import grid
     try:
-        follow([["shellgs", "cast", str(scene)]])
+        cast.result()
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
     runs = grid([scene], METHODS, [0], iterations, folder)

@@ -10,6 +10,7 @@ from gsplat.strategy import DefaultStrategy
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import (
     RGB2SH,
     SH2RGB,
@@ -162,6 +163,7 @@ class FacadeModel(SplatfactoModel):
         self._threads = ThreadsByLoad()
         self.metres_per_unit: float | None = self.kwargs["metadata"].get("metres_per_unit")
         self.step = 0
+        self.log_every = 1
         self.plan(PAPER_ITERATIONS)
 
     @property
@@ -263,6 +265,7 @@ class FacadeModel(SplatfactoModel):
         trainer = training_callback_attributes.trainer
         assert trainer is not None
         self.plan(trainer.config.max_num_iterations)
+        self.log_every = trainer.config.logging.steps_per_log
         return super().get_training_callbacks(training_callback_attributes)
 
     def step_post_backward(self, step: int) -> None:
@@ -289,6 +292,14 @@ class FacadeModel(SplatfactoModel):
             parameter.data = parameter.data.new_zeros(stored.shape)
         self.step = self.num_iterations
         return nn.Module.load_state_dict(self, dict, **kwargs)
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: Optional[OrientedBox] = None) -> dict[str, Tensor]:
+        """Render one camera outside training, within a crop box if given."""
+        self.set_crop(obb_box)
+        # The kernels compiled on a CPU for training serve here too; without gradients, they would be compiled again.
+        with torch.set_grad_enabled(self.device.type == "cpu"):
+            outputs = self.get_outputs(camera.to(self.device))
+        return {name: output.detach() for name, output in outputs.items()}
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         """Render one camera; geometry is skipped in training where no loss needs it."""
@@ -366,7 +377,9 @@ class FacadeModel(SplatfactoModel):
         return (spherical_harmonics(degree, directions, *coefficients) + 0.5).clamp_min(0)
 
     def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
-        """Metrics of a training view."""
+        """Metrics of a training view, in the steps in which they are logged."""
+        if self.training and self.step % self.log_every > 0:
+            return {}
         target = self._view_losses(batch, outputs["background"]).photometric.target
         error = (outputs["rgb"].detach() - target).square()
         psnr = -10 * weighted_mean(error, kept_pixels(batch, target)).log10()

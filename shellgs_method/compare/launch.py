@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from rich.console import Console
@@ -18,8 +19,10 @@ from rich.markup import escape
 from rich.progress import Progress, Task
 
 from shellgs_method.compare.in_turn import command_in_turn, heading
-from shellgs_method.compare.runs import Run
 from shellgs_method.fusion import nothing_compiled_yet
+
+if TYPE_CHECKING:
+    from shellgs_method.compare.runs import Run
 
 BIN = Path(sys.executable).parent
 LAST_LINES = 30

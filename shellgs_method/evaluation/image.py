@@ -12,7 +12,6 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import torch
-import torchvision
 from jaxtyping import Bool, Float
 from kornia.metrics import psnr, ssim
 from torch import Tensor
@@ -81,7 +80,9 @@ def lpips_network() -> Metric | str:
 
 def lpips_weights() -> tuple[str, str]:
     """URL of the weights of the LPIPS backbone, and the file that is tried first."""
-    url = torchvision.models.AlexNet_Weights.DEFAULT.url
+    from torchvision.models import AlexNet_Weights  # slow
+
+    url = AlexNet_Weights.DEFAULT.url
     return url, os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
 
 

@@ -28,10 +28,10 @@ class NccLoss:
         mask, ones = mask[..., 0], [1.0] * window
         y = target[..., 0].where(mask, 0.0)
         self._valid = F.pad(mask.to(y), self._around)
-        n = window_sums(self._valid, ones)
+        n, sums = window_sums([self._valid, F.pad(y, self._around)], ones)
         per_pixel = 1 / n.clamp_min(0.5)
         # Fill pixels outside the mask with values close to those inside, for patches centred there.
-        self._target = F.pad(y.where(mask, window_sums(F.pad(y, self._around), ones) * per_pixel), self._around)
+        self._target = F.pad(y.where(mask, sums * per_pixel), self._around)
         mean, _, variance, _ = _moments(self._target, self._target, self._valid, per_pixel, window)
         floor = (eps * mean).square()
         used = mask & (n > min_valid * window**2 - 0.5) & (variance > floor)
@@ -172,7 +172,7 @@ def _gradient(
     """Gradient from the outputs of :func:`_correlate`."""
     size = window.shape[2]
     x, y, valid = (shifted(shifted(each, size, 0)[size // 2], size, 1)[size // 2] for each in (x, y, valid))
-    a, a_mean_y, b, b_mean_x = (window_sums(each, [1.0] * size) for each in (a, a_mean_y, b, b_mean_x))
+    a, a_mean_y, b, b_mean_x = window_sums([a, a_mean_y, b, b_mean_x], [1.0] * size)
     return valid * (y * a - a_mean_y + x * b - b_mean_x)
 
 

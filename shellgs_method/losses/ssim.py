@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -47,8 +48,8 @@ class SsimTarget:
     def of(cls, photograph: Float[Tensor, "H W 3"]) -> SsimTarget:
         """Compute the moments."""
         padded = _reflected(photograph)
-        mean = _blur(padded)
-        return cls(padded, mean, _blur(padded.square()) - mean.square())
+        mean, mean_square = _blur(padded, padded.square())
+        return cls(padded, mean, mean_square - mean.square())
 
 
 def ssim(rgb: Float[Tensor, "H W 3"], target: SsimTarget) -> Float[Tensor, "H W 3"]:
@@ -83,7 +84,7 @@ def _similarity(
     variance_y: Float[Tensor, "H X"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """SSIM, and its derivatives w.r.t. the windows' means of x, x² and x y."""
-    mean_x, mean_xx, mean_xy = _blur(x), _blur(x * x), _blur(x * y)
+    mean_x, mean_xx, mean_xy = _blur(x, x * x, x * y)
     cross, squares = 2 * mean_x * mean_y + C1, mean_x * mean_x + mean_y * mean_y + C1
     covariance = 2 * (mean_xy - mean_x * mean_y) + C2
     variances = mean_xx - mean_x * mean_x + variance_y + C2
@@ -103,16 +104,17 @@ def _gradient(
     grad_xy: Float[Tensor, "H+20 X+60"],
 ) -> Float[Tensor, "H+10 X+30"]:
     """Gradient w.r.t. the padded image from those w.r.t. the windows' means, blurred by the same, symmetric window."""
-    return _blur(grad_x) + 2 * x * _blur(grad_xx) + y * _blur(grad_xy)
+    grad_x, grad_xx, grad_xy = _blur(grad_x, grad_xx, grad_xy)
+    return grad_x + 2 * x * grad_xx + y * grad_xy
 
 
-def _blur(image: Float[Tensor, "H+10 X+30"]) -> Float[Tensor, "H X"]:
-    """Gaussian means of the windows inside the image: one loop if compiled, else kornia's convolutions."""
+def _blur(*images: Float[Tensor, "H+10 X+30"]) -> Sequence[Float[Tensor, "H X"]]:
+    """Gaussian means of the windows inside images: one loop if compiled, else kornia's convolutions."""
     if torch.compiler.is_compiling():
-        return window_sums(image, TAPS, channels=3)
-    taps = image.new_tensor([TAPS])
-    blurred = filter2d_separable(image.unflatten(1, (-1, 3)).permute(2, 0, 1)[None], taps, taps, padding="valid")
-    return blurred[0].permute(1, 2, 0).flatten(1)
+        return window_sums(images, TAPS, channels=3)
+    taps = images[0].new_tensor([TAPS])
+    stacked = torch.stack(images).unflatten(2, (-1, 3)).permute(0, 3, 1, 2)
+    return filter2d_separable(stacked, taps, taps, padding="valid").permute(0, 2, 3, 1).flatten(2).unbind(0)
 
 
 def _reflected(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H+10 X+30"]:

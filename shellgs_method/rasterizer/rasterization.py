@@ -96,7 +96,6 @@ def rasterize(
     return composited, alpha, info
 
 
-@torch.no_grad()
 def shown(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
