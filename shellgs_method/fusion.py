@@ -25,17 +25,21 @@ _LONG = 5.0  # seconds
 _failed = False  # one failure to compile is enough for a process
 
 
-def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying: int = 1) -> Any:
+def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying: int = 1, strided: bool = False) -> Any:
     """Call a kernel, differentiable or not, fused if possible: in float32 on a CPU.
 
-    The first ``varying`` dimensions of each tensor may vary between calls, unless they are 1; the others may not.
+    The first ``varying`` dimensions of each tensor may vary between calls, unless they are 1; the others may not. With
+    ``strided``, the loop over splats is vectorised even though their coordinates are interleaved in memory; inductor
+    expects this to be slow, and by default leaves such loops as they are.
     """
     # Dynamo takes the shape of a parameter as constant, but densification changes it; a view is an ordinary tensor.
     args = tuple([_plain(each) for each in arg] if isinstance(arg, list) else _plain(arg) for arg in args)
-    return fused(kernel, *args, varying=varying)(*args)
+    return fused(kernel, *args, varying=varying, strided=strided)(*args)
 
 
-def fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying: int = 1) -> Callable[..., Any]:
+def fused(
+    kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying: int = 1, strided: bool = False
+) -> Callable[..., Any]:
     """The kernel that :func:`run_fused` runs for such arguments, which are no parameters.
 
     Finding it takes as long as running a small one: in a loop whose arguments differ in sizes greater than 1 only, find
@@ -53,7 +57,7 @@ def fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying: int
     key = tuple(
         (tuple(size > 1 for size in tensor.shape[:varying]), with_grad and tensor.requires_grad) for tensor in tensors
     )
-    return _compiled(kernel, key)
+    return _compiled(kernel, key, strided)
 
 
 def detached(tensor: Tensor) -> Tensor:
@@ -70,13 +74,14 @@ def nothing_compiled_yet() -> bool:
     return os.environ.get("SHELLGS_COMPILE") != "0" and not any(Path(cache_dir()).glob("*"))
 
 
-def _options() -> dict[str, Any]:
+def _options(strided: bool) -> dict[str, Any]:
     """Inductor's options, for the installed torch."""
     from torch._inductor import config  # slow
 
     # A switch in older versions of torch; on means the compiler's default, which is "fast" for GCC.
     contract = "fast" if isinstance(config.cpp.enable_floating_point_contract_flag, str) else True
-    return {
+    has_heuristics = hasattr(config.cpp, "enable_tiling_heuristics")  # not in older versions of torch
+    return ({"cpp.enable_tiling_heuristics": not strided} if has_heuristics else {}) | {
         "cpp.enable_floating_point_contract_flag": contract,
         # One loop for all splats of a chunk, whatever their number and the number of channels.
         "max_fusion_size": 4096,
@@ -91,7 +96,9 @@ def _options() -> dict[str, Any]:
 
 
 @functools.cache
-def _compiled(kernel: Callable[..., Any], key: tuple[tuple[tuple[bool, ...], bool], ...]) -> Callable[..., Any]:
+def _compiled(
+    kernel: Callable[..., Any], key: tuple[tuple[tuple[bool, ...], bool], ...], strided: bool
+) -> Callable[..., Any]:
     """Compile a kernel; ``key`` says which dimensions of each tensor vary, and whether it needs gradients."""
     assert isinstance(kernel, FunctionType)
     _keep_freed_memory()
@@ -108,7 +115,7 @@ def _compiled(kernel: Callable[..., Any], key: tuple[tuple[tuple[bool, ...], boo
             if compiled is not None:
                 return compiled(*args)
             start = time.perf_counter()
-            new = torch.compile(own, fullgraph=True, options=_options())
+            new = torch.compile(own, fullgraph=True, options=_options(strided))
             for tensor, (dynamic, _) in zip(_flatten(args), key, strict=True):
                 torch._dynamo.mark_dynamic(tensor, [dim for dim, each in enumerate(dynamic) if each])
             result = new(*args)

@@ -18,8 +18,7 @@ from torch import Tensor
 from dataparsers.camera import Camera
 from shellgs_method.depth_normals import normals_along_rays
 from shellgs_method.fusion import run_fused
-from shellgs_method.rasterizer import quats_to_rotations
-from shellgs_method.rasterizer.projection import rotate, to_camera
+from shellgs_method.rasterizer.projection import dot, rotate, rotated_axes, to_camera
 
 Primitive = Literal["3d", "2d"]
 DepthKind = Literal["expected", "median", "plane"]
@@ -78,7 +77,7 @@ def geometry_channels(
     centre), else the forward depth of the centre.
     """
     splats = (gaussians[name] for name in ("means", "quats", "scales"))
-    normals, along, depths = run_fused(_normals_and_depths, *splats, camera.viewmat[None])
+    normals, along, depths = run_fused(_normals_and_depths, *splats, camera.viewmat[None], strided=True)
     return normals, along if depth == "plane" else depths
 
 
@@ -95,13 +94,14 @@ def _normals_and_depths(
     viewmat: Float[Tensor, "1 4 4"],
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"], Float[Tensor, "N 1"]]:
     """Normals, n·m, and depths of the centres."""
-    centres = torch.stack(to_camera(means, viewmat), dim=-1)[0]
-    axes = torch.stack(rotate(quats_to_rotations(quats), viewmat), dim=-2)[0]
+    centres = to_camera(means, viewmat)
+    axes = [rotate(axis, viewmat) for axis in rotated_axes(quats)]
     x, y, z = scales.detach().unbind(-1)
     first, second = (x <= y) & (x <= z), y <= z
-    shortest = torch.where(first[:, None], axes[..., 0], torch.where(second[:, None], axes[..., 1], axes[..., 2]))
-    along = (shortest * centres).sum(dim=-1, keepdim=True)
-    return torch.where(along > 0, -shortest, shortest), -along.abs(), centres[:, 2:]
+    shortest = [torch.where(first, a, torch.where(second, b, c)) for a, b, c in zip(*axes, strict=True)]
+    along = dot(shortest, centres)
+    normals = torch.stack([torch.where(along > 0, -each, each) for each in shortest], dim=-1)
+    return normals[0], -along.abs()[0, :, None], centres[2][0, :, None]
 
 
 def rendered_geometry(

@@ -16,10 +16,12 @@ from shellgs_method.rasterizer.binning import touches
 from shellgs_method.rasterizer.projection import (
     NEAR_PLANE,
     Projection,
+    cross,
     cutoffs,
+    dot,
     halvings,
-    quats_to_rotations,
     rotate,
+    rotated_axes,
     stack_cameras,
     to_camera,
 )
@@ -47,14 +49,16 @@ def project_discs(
     is the full effect of moving the disc parallel to the screen: hence two kernels, with ``means2d`` between them.
     """
     views = stack_cameras(cameras)
-    means2d, depths, in_front = run_fused(_project_centres, means, *views)
-    shapes, outlines, covars2d, visible = run_fused(_project, means2d, depths, quats, scales, opacities, *views)
+    means2d, depths, in_front = run_fused(_project_centres, means, *views, strided=True)
+    shapes, outlines, covars2d, visible = run_fused(
+        _project, means2d, depths, quats, scales, opacities, *views, strided=True
+    )
     projection = Projection(means2d, shapes, depths.detach(), outlines, covars2d, visible & in_front)
     if not with_probe:
         return projection
     probe = detached(means2d).requires_grad_()
     fixed = (each.detach() for each in (quats, scales, opacities))
-    shapes = run_fused(_project, probe, detached(depths), *fixed, *views)[0]
+    shapes = run_fused(_project, probe, detached(depths), *fixed, *views, strided=True)[0]
     return replace(projection, probe=probe, probed=torch.cat([probe, shapes[..., :-1]], dim=-1))  # all but n
 
 
@@ -84,23 +88,24 @@ def _project(
     size: Float[Tensor, "1 2"],
 ) -> tuple[Tensor, ...]:
     fx, fy, cx, cy = intrinsics.unbind(1)
-    rays = torch.stack([(means2d[..., 0] - cx) / fx, (means2d[..., 1] - cy) / fy, torch.ones_like(z)], dim=-1)
-    axes = torch.stack(rotate(quats_to_rotations(quats), viewmats), dim=-2)
-    tangents_u, tangents_v, normals = axes.unbind(-1)
+    rays = [(means2d[..., 0] - cx) / fx, (means2d[..., 1] - cy) / fy, torch.ones_like(z)]
+    tangents_u, tangents_v, normals = (rotate(axis, viewmats) for axis in rotated_axes(quats))
 
-    facing = (normals * rays).sum(-1)
-    shows = facing.detach().abs() > EDGE_ON * rays.detach().norm(dim=-1)
+    facing = dot(normals, rays)
+    shows = facing.detach().abs() > EDGE_ON * dot(rays, rays).detach().sqrt()
     facing = torch.where(shows, facing, 1.0)
-    pixel = torch.stack([1 / fx, 1 / fy], dim=-1)
-    u = torch.linalg.cross(tangents_v, rays)[..., :2] * pixel / (scales[:, 0] * facing)[..., None]
-    v = torch.linalg.cross(rays, tangents_u)[..., :2] * pixel / (scales[:, 1] * facing)[..., None]
-    inverse_depth = torch.stack([facing, normals[..., 0] / fx, normals[..., 1] / fy], dim=-1) / (z * facing)[..., None]
+    u, v = cross(tangents_v, rays), cross(rays, tangents_u)
+    scale_u, scale_v = scales[:, 0], scales[:, 1]
     halves = math.sqrt(0.5 / math.log(2))  # exp(-u²/2) = 2^-(halves u)²
-    shapes = torch.cat([halves * u, halves * v, inverse_depth, halvings(opacities).expand_as(z)[..., None]], dim=-1)
+    shape_u, shape_v = halves / (scale_u * facing), halves / (scale_v * facing)
+    shapes = [shape_u * u[0] / fx, shape_u * u[1] / fy, shape_v * v[0] / fx, shape_v * v[1] / fy]
+    inverse_depth = [1 / z, normals[0] / (fx * z * facing), normals[1] / (fy * z * facing)]
+    shapes = torch.stack([*shapes, *inverse_depth, halvings(opacities).expand_as(z)], dim=-1)
 
-    half_axes = (axes[..., :2] * scales[:, None, :2]).detach()
+    axes = ((tangents_u, scale_u), (tangents_v, scale_v))
+    half_axes = [[(scale * each).detach() for each in axis] for axis, scale in axes]
     cutoff = cutoffs(opacities)
-    x, y, _ = (rays * z[..., None]).detach().unbind(-1)
+    x, y = ((z * each).detach() for each in rays[:2])
     outline, covars2d = _outlines(x, y, z.detach(), half_axes, cutoff.sqrt(), intrinsics, size)
     radius = (cutoff / 2).sqrt().expand_as(z)
     conic = [1 / radius.square(), torch.zeros_like(z), 1 / radius.square()]
@@ -129,7 +134,7 @@ def _outlines(
     x: Float[Tensor, "B N"],
     y: Float[Tensor, "B N"],
     z: Float[Tensor, "B N"],
-    half_axes: Float[Tensor, "B N 3 2"],
+    half_axes: Sequence[Sequence[Float[Tensor, "B N"]]],
     radius: Float[Tensor, "N"],
     intrinsics: Float[Tensor, "B 4 1"],
     size: Float[Tensor, "1 2"],
@@ -141,12 +146,12 @@ def _outlines(
     """
     fx, fy, cx, cy = intrinsics.unbind(1)
     # A disc's point (u, v) is at (across, down)·(u, v) / (z + along·(u, v)) from the projected centre.
-    along = half_axes[..., 2, :]
-    across = fx[..., None] * (half_axes[..., 0, :] - (x / z)[..., None] * along)
-    down = fy[..., None] * (half_axes[..., 1, :] - (y / z)[..., None] * along)
-    xx, xy, yy = (across * across).sum(-1), (across * down).sum(-1), (down * down).sum(-1)
-    x_along, y_along, along_squared = (across * along).sum(-1), (down * along).sum(-1), (along * along).sum(-1)
-    area = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
+    along = [axis[2] for axis in half_axes]
+    across = [fx * (axis[0] - x / z * axis[2]) for axis in half_axes]
+    down = [fy * (axis[1] - y / z * axis[2]) for axis in half_axes]
+    xx, xy, yy = dot(across, across), dot(across, down), dot(down, down)
+    x_along, y_along, along_squared = dot(across, along), dot(down, along), dot(along, along)
+    area = across[0] * down[1] - across[1] * down[0]
 
     in_front = radius * along_squared.sqrt() < 0.95 * z
     # The dual conic of the circle |(u, v)| = radius.
@@ -158,8 +163,8 @@ def _outlines(
     covar_yy = scale * yy + (scale * y_along).square() + slack
     determinant = (scale * area).square() * (1 + scale * along_squared) + slack * (covar_xx + covar_yy - slack)
 
-    reach = radius[:, None] * half_axes.norm(dim=-1)
-    nearest, farthest = (z - reach[..., 2]).clamp_min(NEAR_PLANE), z + reach[..., 2]
+    reach_x, reach_y, reach_z = (radius * dot(each, each).sqrt() for each in zip(*half_axes, strict=True))
+    nearest, farthest = (z - reach_z).clamp_min(NEAR_PLANE), z + reach_z
 
     def box(centre: Tensor, reach: Tensor, focal: Tensor, principal: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
         low, high = centre - reach, centre + reach
@@ -168,12 +173,13 @@ def _outlines(
         low, high = (torch.minimum(each.clamp_min(0), size) for each in (low, high))
         return (low + high) / 2, ((high - low) / 2).clamp_min(slack) * math.sqrt(2)
 
-    box_x, box_reach_x = box(x, reach[..., 0], fx, cx, size[:, :1])
-    box_y, box_reach_y = box(y, reach[..., 1], fy, cy, size[:, 1:])
+    box_x, box_reach_x = box(x, reach_x, fx, cx, size[:, :1])
+    box_y, box_reach_y = box(y, reach_y, fy, cy, size[:, 1:])
     conic = [covar_yy / determinant, -covar_xy / determinant, covar_xx / determinant]
-    exact = torch.stack([centre_x, centre_y, *conic, covar_xx.sqrt(), covar_yy.sqrt()], dim=-1)
+    exact = [centre_x, centre_y, *conic, covar_xx.sqrt(), covar_yy.sqrt()]
     conic = [1 / box_reach_x.square(), torch.zeros_like(z), 1 / box_reach_y.square()]
-    around_box = torch.stack([box_x, box_y, *conic, box_reach_x, box_reach_y], dim=-1)
+    around_box = [box_x, box_y, *conic, box_reach_x, box_reach_y]
+    outline = [torch.where(in_front, *each) for each in zip(exact, around_box, strict=True)]
     low_pass = 0.5
     covars2d = torch.stack([xx / z.square() + low_pass, xy / z.square(), yy / z.square() + low_pass], dim=-1)
-    return torch.where(in_front[..., None], exact, around_box), covars2d
+    return torch.stack(outline, dim=-1), covars2d

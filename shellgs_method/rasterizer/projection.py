@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -78,7 +78,7 @@ def project_gaussians(
     The shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`; none depends on the
     screen position of the centre.
     """
-    projected = run_fused(_project, means, quats, scales, opacities, *stack_cameras(cameras))
+    projected = run_fused(_project, means, quats, scales, opacities, *stack_cameras(cameras), strided=True)
     probe = projected[0].detach().requires_grad_() if with_probe else None
     return Projection(*projected, probe=probe, probed=probe)
 
@@ -104,13 +104,15 @@ def _project(
     width, height = size.unbind(-1)
     x = torch.minimum(torch.maximum(x, -(cx + 0.15 * width) / fx), (1.15 * width - cx) / fx)
     y = torch.minimum(torch.maximum(y, -(cy + 0.15 * height) / fy), (1.15 * height - cy) / fy)
-    axes = rotate(quats_to_rotations(quats) * scales[:, None, :], viewmats)  # columns: the Gaussian's half-axes
-    across = (fx / z)[..., None] * (axes[0] - x[..., None] * axes[2])
-    down = (fy / z)[..., None] * (axes[1] - y[..., None] * axes[2])
+    axes = zip(rotated_axes(quats), scales.unbind(1), strict=True)
+    half_axes = [rotate([scale * each for each in axis], viewmats) for axis, scale in axes]
+    across = [fx / z * (axis[0] - x * axis[2]) for axis in half_axes]
+    down = [fy / z * (axis[1] - y * axis[2]) for axis in half_axes]
 
-    xx, xy, yy = (across * across).sum(-1), (across * down).sum(-1), (down * down).sum(-1)
+    xx, xy, yy = dot(across, across), dot(across, down), dot(down, down)
     # xx yy - xy², by Lagrange's identity: no cancellation for a long and thin splat
-    determinant = torch.linalg.cross(across, down).square().sum(-1) + LOW_PASS * (xx + yy) + LOW_PASS**2
+    area = cross(across, down)
+    determinant = dot(area, area) + LOW_PASS * (xx + yy) + LOW_PASS**2
     xx, yy = xx + LOW_PASS, yy + LOW_PASS
     n = halvings(opacities).expand_as(depths)
     halving = math.log(2) * determinant
@@ -118,8 +120,8 @@ def _project(
 
     xx, xy, yy, determinant = xx.detach(), xy.detach(), yy.detach(), determinant.detach()
     cutoff = cutoffs(opacities)
-    area, reach = cutoff * determinant, [(cutoff * xx).sqrt(), (cutoff * yy).sqrt()]
-    outline = torch.stack([*means2d.detach().unbind(-1), yy / area, -xy / area, xx / area, *reach], dim=-1)
+    extent, reach = cutoff * determinant, [(cutoff * xx).sqrt(), (cutoff * yy).sqrt()]
+    outline = torch.stack([*means2d.detach().unbind(-1), yy / extent, -xy / extent, xx / extent, *reach], dim=-1)
     visible = in_front & (cutoff > 0) & touches(outline, size)
     return means2d, shapes, depths, outline[..., None, :], torch.stack([xx, xy, yy], dim=-1), visible
 
@@ -136,17 +138,26 @@ def stack_cameras(
 
 def to_camera(points: Float[Tensor, "N 3"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N"]]:
     """Transform points from the world to the camera frames."""
-    return [row + viewmats[:, i, 3, None] for i, row in enumerate(rotate(points, viewmats))]
+    return [row + viewmats[:, i, 3, None] for i, row in enumerate(rotate(points.unbind(1), viewmats))]
 
 
-def rotate(vectors: Float[Tensor, "N 3 *each"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N *each"]]:
-    """Rotate vectors (or the columns of matrices) from the world to the camera frames.
+def rotate(vectors: Sequence[Float[Tensor, "N"]], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N"]]:
+    """Rotate vectors, given and returned by their coordinates, from the world to the camera frames.
 
-    Unlike a matrix product, a sum of three products fuses with the operations around it.
+    Unlike a matrix product, a sum of three products fuses with the operations around it, and unlike coordinates in the
+    last dimension, splats in it are vectorised.
     """
-    shape = (-1, *[1] * (vectors.dim() - 1))
-    R = [[viewmats[:, i, j].view(shape) for j in range(3)] for i in range(3)]
-    return [sum((R[i][j] * vectors[:, j] for j in range(3)), start=torch.zeros(())) for i in range(3)]
+    return [dot([viewmats[:, i, j, None] for j in range(3)], vectors) for i in range(3)]
+
+
+def dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    """Scalar product of vectors given by their coordinates."""
+    return functools.reduce(torch.add, [x * y for x, y in zip(a, b, strict=True)])
+
+
+def cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
+    """Vector product of vectors given by their coordinates."""
+    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def halvings(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
@@ -163,10 +174,15 @@ def cutoffs(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
 
 def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z) of any norm."""
-    w, x, y, z = F.normalize(quats, dim=-1).unbind(-1)
-    entries = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    return torch.stack([torch.stack(axis, dim=-1) for axis in rotated_axes(quats)], dim=-1)
+
+
+def rotated_axes(quats: Float[Tensor, "N 4"]) -> list[list[Float[Tensor, "N"]]]:
+    """Columns of the rotation matrices, by their coordinates."""
+    w, x, y, z = quats.unbind(1)
+    double = 2 / (w * w + x * x + y * y + z * z).clamp_min(1e-24)
+    return [
+        [1 - double * (y * y + z * z), double * (x * y + w * z), double * (x * z - w * y)],
+        [double * (x * y - w * z), 1 - double * (x * x + z * z), double * (y * z + w * x)],
+        [double * (x * z + w * y), double * (y * z - w * x), 1 - double * (x * x + y * y)],
     ]
-    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
