@@ -372,9 +372,9 @@ class FacadeModel(SplatfactoModel):
         """View-dependent colours; one more degree of harmonics every ``sh_degree_interval`` iterations."""
         interval = self.config.sh_degree_interval * self.num_iterations / PAPER_ITERATIONS
         degree = min(int(self.step / interval), self.config.sh_degree)
-        directions = nn.functional.normalize(gaussians["means"] - camera.position, dim=-1)
         coefficients = gaussians["features_dc"][:, None], gaussians["features_rest"]
-        return (spherical_harmonics(degree, directions, *coefficients) + 0.5).clamp_min(0)
+        harmonics = spherical_harmonics(degree, gaussians["means"] - camera.position, *coefficients)
+        return (harmonics + 0.5).clamp_min(0)
 
     def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
         """Metrics of a training view, in the steps in which they are logged."""

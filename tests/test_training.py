@@ -54,6 +54,37 @@ def test_rendered_normals_are_unit_and_face_the_camera(trained):
     assert ((normal * rays).sum(dim=-1) < 0).float().mean() > 0.98
 
 
+def test_held_out_views_are_rendered_by_the_kernels_of_training(pristine_scene, tmp_path, monkeypatch):
+    used = set()
+
+    def record(kernel, key, strided):
+        used.add((kernel, key, strided))
+        return kernel
+
+    monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
+    monkeypatch.setattr("shellgs_method.fusion._failed", False)
+    monkeypatch.setattr("shellgs_method.fusion._compiled", record)
+    trainer = trainer_of(pristine_scene, tmp_path, iterations=2)
+    trainer.train()
+    trainer.pipeline.eval()
+    in_training = used.copy()
+    used.clear()
+    outputs = render(trainer)
+    assert len(used) > 3
+    assert used <= in_training
+    assert not any(output.requires_grad for output in outputs.values())
+
+
+def test_metrics_of_training_views_are_computed_in_the_steps_that_log_them(trained, monkeypatch):
+    model, (camera, batch) = model_of(trained), data_of(trained).next_train(0)
+    monkeypatch.setattr(model, "training", True)
+    outputs = model.get_outputs(camera)
+    assert model.log_every == trained.config.logging.steps_per_log == 10
+    for step, names in ((20, {"psnr", "gaussian_count"}), (21, set()), (29, set()), (30, {"psnr", "gaussian_count"})):
+        monkeypatch.setattr(model, "step", step)
+        assert set(model.get_metrics_dict(outputs, batch)) == names
+
+
 def test_losses_of_a_training_view_are_cached_while_there_is_room(trained, monkeypatch):
     model, (_, batch), outputs = model_of(trained), held_out(trained), render(trained)
     assert len(model._views) == 8  # of 10, two are held out
