@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, Optional, cast
+from typing import Any, Literal, NamedTuple, Optional, cast
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -318,8 +318,6 @@ class FacadeModel(SplatfactoModel):
         if with_geometry and self.config.extra.empty_space > 0:
             squares, origin = squared_depths(features[-1])
             features.append(squares)
-        # Only gradients of the colours densify, not those of the geometry.
-        n_densifying = 3 if with_geometry and self.training and self.config.densification == "default" else None
         composited, alpha, self.info = rasterize(
             gaussians["means"],
             gaussians["quats"],
@@ -328,7 +326,7 @@ class FacadeModel(SplatfactoModel):
             torch.cat(features, dim=-1),
             pinhole,
             self.config.primitive,
-            n_densifying=n_densifying,
+            n_densifying=self._n_densifying,
         )
         if self.training:
             self.strategy.step_pre_backward(
@@ -345,6 +343,31 @@ class FacadeModel(SplatfactoModel):
             outputs["depth"] = self.geometry.depth
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
         return outputs
+
+    def coverage(self, camera: Camera) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
+        """Area of a training view that each Gaussian covers, and whether it reaches into the view, occluded or not.
+
+        The area is the sum of its compositing weights over the pixels.
+        """
+        # As many features as in training, for which the kernels are compiled.
+        n_features = 3 + (4 if self._supervises_geometry else 0) + (self.config.extra.empty_space > 0)
+        features = self.means.new_zeros(self.num_points, n_features, requires_grad=True)
+        opacities = self.opacities.sigmoid().squeeze(-1)
+        composited, _, info = rasterize(
+            *(self.means, self.quats, self.scales.exp(), opacities, features, camera, self.config.primitive),
+            n_densifying=self._n_densifying,
+        )
+        (weights,) = torch.autograd.grad(composited[..., 0].sum(), features)
+        return weights[:, 0], self._in_view(info)
+
+    @property
+    def _n_densifying(self) -> int | None:
+        """Number of features whose gradients densify, the colours; None for all."""
+        with_geometry = self.training and self._supervises_geometry
+        return 3 if with_geometry and self.config.densification == "default" else None
+
+    def _in_view(self, info: dict[str, Any]) -> Bool[Tensor, "N"]:
+        return (info["radii"][0] > 0).view(self.num_points, -1).all(dim=-1)
 
     @property
     def _supervises_geometry(self) -> bool:
@@ -422,8 +445,9 @@ class FacadeModel(SplatfactoModel):
         """Losses on the opacities and scales of the Gaussians."""
         config, losses = self.config, {}
         if config.extra.flattening > 0:
-            visible = (self.info["radii"][0] > 0).view(self.num_points, -1).all(dim=-1)
-            losses["flattening"] = config.extra.flattening * flattening_loss(self.scales.exp(), visible)
+            losses["flattening"] = config.extra.flattening * flattening_loss(
+                self.scales.exp(), self._in_view(self.info)
+            )
         if config.densification == "mcmc":
             losses["opacity"] = config.mcmc.opacity * self.opacities.sigmoid().mean()
             losses["scale"] = config.mcmc.scale * self.scales.exp().mean()

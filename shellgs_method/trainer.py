@@ -27,7 +27,6 @@ from shellgs_method.config_file import guard_config_loading
 from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
 from shellgs_method.folders import held
 from shellgs_method.limits import check_settings
-from shellgs_method.rasterizer import shown
 
 if TYPE_CHECKING:
     from shellgs_method.pipeline import FacadePipeline
@@ -36,6 +35,8 @@ PARTIAL = "checkpoint-"
 """Prefix of the folder in which a checkpoint is written."""
 CHECK_EVERY = 100
 """Steps between two checks that all Gaussians are finite."""
+ONE_VIEW = 1.5
+"""Effective number of views that show a Gaussian, below which it counts as shown by one."""
 
 guard_config_loading()
 
@@ -188,26 +189,32 @@ class FacadeTrainer(Trainer):
                     f"rates; the last good checkpoint is kept in {self.checkpoint_dir}"
                 )
 
-    def _remove_unseen_gaussians(self) -> None:
-        """Remove Gaussians that no training view shows: nothing has shaped them, and other views may show them.
+    def _remove_unshaped_gaussians(self) -> None:
+        """Remove Gaussians that training views have not shaped, and that may spoil others.
 
-        A single one in front of a held-out camera displaced that view's depth by 15 cm.
+        No view shows them; or no more than one does, though they reach a camera: it sees the edge of something wide. A
+        single one of either kind, in front of a held-out camera, displaced the depth of that view by 15 cm.
         """
         model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
-        seen = shown(
-            *(model.means, model.quats, model.scales.exp(), model.opacities.sigmoid().squeeze(-1)),
-            cameras=map(dataset.camera, range(len(dataset))),
-            primitive=model.config.primitive,
-        )
-        if count := int((~seen).sum()):
+        areas = squares = model.means.new_zeros(model.num_points)
+        shown, distances = areas > 0, areas + torch.inf
+        for camera in map(dataset.camera, range(len(dataset))):
+            camera = camera.to(model.means.detach())
+            area, in_view = model.coverage(camera)
+            areas, squares, shown = areas + area, squares + area.square(), shown | in_view
+            distances = distances.minimum((model.means.detach() - camera.position).norm(dim=-1))
+        n_views = areas.square() / squares.clamp_min(1e-12)  # effective number of views, by area
+        reach = 2 * model.scales.detach().exp().amax(dim=-1)
+        unshaped = ~shown | (n_views < ONE_VIEW) & (reach > distances)
+        if count := int(unshaped.sum()):
             with self.train_lock:  # the viewer renders
-                remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, ~seen)  # pyright: ignore[reportArgumentType]
-            CONSOLE.print(f"{count} Gaussians that no training view shows are removed.")
+                remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, unshaped)  # pyright: ignore[reportArgumentType]
+            CONSOLE.print(f"{count} Gaussians that the training views have not shaped are removed.")
 
     def _after_train(self) -> None:
         if self.step >= self._last_step:
             self.step = self._last_step
-            self._remove_unseen_gaussians()
+            self._remove_unshaped_gaussians()
         super()._after_train()
 
     def _load_checkpoint(self) -> None:

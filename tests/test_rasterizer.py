@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from dataparsers.camera import Camera
 from shellgs_method import fusion
-from shellgs_method.rasterizer import compositing, rasterize, shown
+from shellgs_method.rasterizer import compositing, rasterize
 
 pytestmark = pytest.mark.usefixtures("eager")
 
@@ -248,21 +248,6 @@ def test_cutting_tiles_into_strips_changes_neither_renders_nor_gradients(primiti
     torch.testing.assert_close(differentiated(), expected)
     assert all(int(strips.ranks.max()) >= 5 for strips in cuts)
     assert cuts
-
-
-@pytest.mark.parametrize(("primitive", "make"), [("3d", make_splats), ("2d", make_discs)])
-def test_splats_that_some_camera_shows_are_those_whose_features_have_a_gradient(primitive, make):
-    *splats, features = make(300, 1, seed=5)
-    splats[0] = splats[0] * 3  # many beside the images
-    splats[3] = splats[3].clamp_max(0.3)  # none hides another
-    features.requires_grad_()
-    cameras = orbit(make_camera(31, 23), 3)
-    composited, *_ = rasterize(*splats, features=features, camera=cameras, primitive=primitive)
-    (gradient,) = torch.autograd.grad(composited.sum(), features)
-    found = shown(*splats, cameras=cameras, primitive=primitive)
-    assert 50 < int(found.sum()) < 250
-    assert not (gradient[:, 0] > 0)[~found].any()
-    assert (gradient[:, 0] > 0)[found].double().mean() > 0.9  # an outline may lie between pixel centres
 
 
 def test_cropping_equals_shifting_the_principal_point():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -277,18 +278,32 @@ def test_resuming_a_finished_run_changes_nothing(trained, pristine_scene, tmp_pa
     assert not again.checkpoint_dir.exists()
 
 
-def test_gaussians_that_no_training_view_shows_are_removed_at_the_end(trained, pristine_scene, tmp_path):
+def test_gaussians_that_training_views_have_not_shaped_are_removed_at_the_end(trained, pristine_scene, tmp_path):
     config = {"iterations": 62, "load_dir": trained.checkpoint_dir}
     plain, planted = (trainer_of(pristine_scene, tmp_path / name, **config) for name in ("plain", "planted"))
-    camera = data_of(planted).train_dataset.camera(0)
     moved = model_of(planted)
-    moved.means.data[0] = (camera.position - 10 * camera.viewmat[2, :3]).float()  # all cameras look at the facade
-    moved.scales.data[0] = -10.0
+    for index, distance, log_scale in (
+        (0, -10.0, -10.0),  # behind all cameras, as all look at the facade
+        (1, 0.02, math.log(0.02)),  # right in front of one of them
+        (2, 0.02, math.log(0.002)),  # the same, but too small to reach it
+    ):
+        camera = data_of(planted).train_dataset.camera(index)
+        moved.means.data[index] = (camera.position + distance * camera.viewmat[2, :3]).float()
+        moved.scales.data[index] = log_scale
     for trainer in (plain, planted):
         trainer.train()
     (saved,) = planted.checkpoint_dir.glob("*.ckpt")
     count = len(torch.load(saved)["pipeline"]["_model.gauss_params.means"])
-    assert count == moved.num_points == model_of(plain).num_points - 1
+    assert count == moved.num_points == model_of(plain).num_points - 2
+
+
+def test_what_gaussians_cover_of_a_training_view_adds_up_to_its_opacity(trained, monkeypatch):
+    model, (camera, _) = model_of(trained), data_of(trained).next_train(0)
+    monkeypatch.setattr(model, "training", True)
+    area, in_view = model.coverage(pinhole_camera(camera))
+    torch.testing.assert_close(area.sum(), model.get_outputs(camera)["accumulation"].sum().detach())
+    assert (area[in_view] > 0).float().mean() > 0.5
+    assert not area[~in_view].any()
 
 
 def test_a_failed_save_leaves_the_last_checkpoint(trained, monkeypatch):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from shellgs_method.rasterizer.projection import quats_to_rotations
-from shellgs_method.rasterizer.rasterization import rasterize, shown
+from shellgs_method.rasterizer.rasterization import rasterize
 from shellgs_method.rasterizer.spherical_harmonics import spherical_harmonics
 
-__all__ = ["quats_to_rotations", "rasterize", "shown", "spherical_harmonics"]
+__all__ = ["quats_to_rotations", "rasterize", "spherical_harmonics"]

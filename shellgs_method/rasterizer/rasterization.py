@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
 from typing import Any, Literal
@@ -94,25 +94,6 @@ def rasterize(
     if primitive == "2d":
         info |= {"gradient_2dgs": renders.means2d, **disc_maps(alpha, maps)}
     return composited, alpha, info
-
-
-def shown(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    cameras: Iterable[Camera],
-    primitive: Literal["3d", "2d"] = "3d",
-) -> Bool[Tensor, "N"]:
-    """Whether each splat reaches into the image of at least one camera, occluded or not.
-
-    Takes the arguments of :func:`rasterize`.
-    """
-    project = {"3d": project_gaussians, "2d": project_discs}[primitive]
-    any_shows = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    for camera in cameras:
-        any_shows |= project(means, quats, scales, opacities, [camera.to(means)]).visible[0]
-    return any_shows
 
 
 def _rasterize(
