@@ -309,25 +309,8 @@ class FacadeModel(SplatfactoModel):
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:
             return cast(dict[str, Tensor], self.get_empty_outputs(pinhole.width, pinhole.height, background))
-        with_geometry = not self.training or self._supervises_geometry
-        # Colours minus the background, so that the photometric gradient of alpha comes through the colours too.
-        features = [self._colours(gaussians, pinhole) - background]
-        if with_geometry:
-            features += geometry_channels(gaussians, pinhole, self.config.depth)
-        origin = None
-        if with_geometry and self.config.extra.empty_space > 0:
-            squares, origin = squared_depths(features[-1])
-            features.append(squares)
-        composited, alpha, self.info = rasterize(
-            gaussians["means"],
-            gaussians["quats"],
-            gaussians["scales"].exp(),
-            gaussians["opacities"].sigmoid().squeeze(-1),
-            torch.cat(features, dim=-1),
-            pinhole,
-            self.config.primitive,
-            n_densifying=self._n_densifying,
-        )
+        features, origin = self._features(gaussians, pinhole, background)
+        composited, alpha, self.info = self._rasterize(gaussians, features, pinhole)
         if self.training:
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
@@ -338,7 +321,7 @@ class FacadeModel(SplatfactoModel):
             "background": background if self.training else background.expand(pinhole.height, pinhole.width, 3),
         }
         self.geometry = None
-        if with_geometry:
+        if self._renders_geometry:
             self.geometry = rendered_geometry(composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin)
             outputs["depth"] = self.geometry.depth
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
@@ -349,22 +332,47 @@ class FacadeModel(SplatfactoModel):
 
         The area is the sum of its compositing weights over the pixels.
         """
+        gaussians = dict(self.gauss_params)
         # As many features as in training, for which the kernels are compiled.
-        n_features = 3 + (4 if self._supervises_geometry else 0) + (self.config.extra.empty_space > 0)
-        features = self.means.new_zeros(self.num_points, n_features, requires_grad=True)
-        opacities = self.opacities.sigmoid().squeeze(-1)
-        composited, _, info = rasterize(
-            *(self.means, self.quats, self.scales.exp(), opacities, features, camera, self.config.primitive),
-            n_densifying=self._n_densifying,
-        )
+        features, _ = self._features(gaussians, camera, self._get_background_color())
+        features = torch.zeros_like(features, requires_grad=True)
+        composited, _, info = self._rasterize(gaussians, features, camera)
         (weights,) = torch.autograd.grad(composited[..., 0].sum(), features)
         return weights[:, 0], self._in_view(info)
 
+    def _features(
+        self, gaussians: dict[str, Tensor], camera: Camera, background: Float[Tensor, "3"]
+    ) -> tuple[Float[Tensor, "N C"], Float[Tensor, ""] | None]:
+        """Features to composite, and the origin of the squared depths if these are among them."""
+        # Colours minus the background, so that the photometric gradient of alpha comes through the colours too.
+        features = [self._colours(gaussians, camera) - background]
+        origin = None
+        if self._renders_geometry:
+            features += geometry_channels(gaussians, camera, self.config.depth)
+            if self.config.extra.empty_space > 0:
+                squares, origin = squared_depths(features[-1])
+                features.append(squares)
+        return torch.cat(features, dim=-1), origin
+
+    def _rasterize(
+        self, gaussians: dict[str, Tensor], features: Float[Tensor, "N C"], camera: Camera
+    ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W 1"], dict[str, Any]]:
+        # Only gradients of the colours densify, not those of the geometry.
+        densifies_by_gradient = self.training and self.config.densification == "default"
+        return rasterize(
+            gaussians["means"],
+            gaussians["quats"],
+            gaussians["scales"].exp(),
+            gaussians["opacities"].sigmoid().squeeze(-1),
+            features,
+            camera,
+            self.config.primitive,
+            n_densifying=3 if self._renders_geometry and densifies_by_gradient else None,
+        )
+
     @property
-    def _n_densifying(self) -> int | None:
-        """Number of features whose gradients densify, the colours; None for all."""
-        with_geometry = self.training and self._supervises_geometry
-        return 3 if with_geometry and self.config.densification == "default" else None
+    def _renders_geometry(self) -> bool:
+        return not self.training or self._supervises_geometry
 
     def _in_view(self, info: dict[str, Any]) -> Bool[Tensor, "N"]:
         return (info["radii"][0] > 0).view(self.num_points, -1).all(dim=-1)

@@ -196,13 +196,14 @@ class FacadeTrainer(Trainer):
         single one of either kind, in front of a held-out camera, displaced the depth of that view by 15 cm.
         """
         model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
-        areas = squares = model.means.new_zeros(model.num_points)
+        means = model.means.detach()
+        areas = squares = means.new_zeros(len(means))
         shown, distances = areas > 0, areas + torch.inf
         for camera in map(dataset.camera, range(len(dataset))):
-            camera = camera.to(model.means.detach())
+            camera = camera.to(means)
             area, in_view = model.coverage(camera)
             areas, squares, shown = areas + area, squares + area.square(), shown | in_view
-            distances = distances.minimum((model.means.detach() - camera.position).norm(dim=-1))
+            distances = distances.minimum((means - camera.position).norm(dim=-1))
         n_views = areas.square() / squares.clamp_min(1e-12)  # effective number of views, by area
         reach = 2 * model.scales.detach().exp().amax(dim=-1)
         unshaped = ~shown | (n_views < ONE_VIEW) & (reach > distances)

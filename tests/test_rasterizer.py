@@ -250,6 +250,21 @@ def test_cutting_tiles_into_strips_changes_neither_renders_nor_gradients(primiti
     assert cuts
 
 
+@pytest.mark.parametrize(("primitive", "make"), [("3d", make_splats), ("2d", make_discs)])
+def test_splats_that_some_camera_shows_are_those_whose_features_have_a_gradient(primitive, make):
+    *splats, features = make(300, 1, seed=5)
+    splats[0] = splats[0] * 3  # many beside the images
+    splats[3] = splats[3].clamp_max(0.3)  # none hides another
+    features.requires_grad_()
+    cameras = orbit(make_camera(31, 23), 3)
+    composited, _, info = rasterize(*splats, features=features, camera=cameras, primitive=primitive)
+    (gradient,) = torch.autograd.grad(composited.sum(), features)
+    found = (info["radii"] > 0).view(3, 300, -1).all(dim=-1).any(dim=0)
+    assert 50 < int(found.sum()) < 250
+    assert not (gradient[:, 0] > 0)[~found].any()
+    assert (gradient[:, 0] > 0)[found].double().mean() > 0.9  # an outline may lie between pixel centres
+
+
 def test_cropping_equals_shifting_the_principal_point():
     *splats, features = make_splats(100, 3, seed=7)
     splats[0] *= (
