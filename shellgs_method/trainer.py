@@ -37,6 +37,8 @@ CHECK_EVERY = 100
 """Steps between two checks that all Gaussians are finite."""
 ONE_VIEW = 1.5
 """Effective number of views that show a Gaussian, below which it counts as shown by one."""
+BARELY = 0.001
+"""Share of an image below which a Gaussian of any size is barely visible in it."""
 
 guard_config_loading()
 
@@ -192,21 +194,22 @@ class FacadeTrainer(Trainer):
     def _remove_unshaped_gaussians(self) -> None:
         """Remove Gaussians that training views have not shaped, and that may spoil others.
 
-        No view shows them; or no more than one does, though they reach a camera: it sees the edge of something wide. A
-        single one of either kind, in front of a held-out camera, displaced the depth of that view by 15 cm.
+        No view shows them; or views show little of them, though they reach a camera: the edge of something wide. A
+        single one in front of a held-out camera displaced the depth of that view by 15 cm.
         """
         model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
         means = model.means.detach()
-        areas = squares = means.new_zeros(len(means))
-        shown, distances = areas > 0, areas + torch.inf
+        total = squares = largest = means.new_zeros(len(means))  # of the shares of images that they cover
+        shown, distance = total > 0, total + torch.inf
         for camera in map(dataset.camera, range(len(dataset))):
             camera = camera.to(means)
             area, in_view = model.coverage(camera)
-            areas, squares, shown = areas + area, squares + area.square(), shown | in_view
-            distances = distances.minimum((means - camera.position).norm(dim=-1))
-        n_views = areas.square() / squares.clamp_min(1e-12)  # effective number of views, by area
-        reach = 2 * model.scales.detach().exp().amax(dim=-1)
-        unshaped = ~shown | (n_views < ONE_VIEW) & (reach > distances)
+            share = area / (camera.width * camera.height)
+            total, squares, largest = total + share, squares + share.square(), largest.maximum(share)
+            shown, distance = shown | in_view, distance.minimum((means - camera.position).norm(dim=-1))
+        n_views = total.square() / squares.clamp_min(1e-30)  # effective number of views
+        deviations = distance / model.scales.detach().exp().amax(dim=-1)  # from the nearest camera
+        unshaped = ~shown | (deviations < 2) & (n_views < ONE_VIEW) | (deviations < 5) & (largest < BARELY)
         if count := int(unshaped.sum()):
             with self.train_lock:  # the viewer renders
                 remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, unshaped)  # pyright: ignore[reportArgumentType]
