@@ -64,6 +64,7 @@ shellgs_metric = _method(
     FacadeModelConfig(
         cues="shell",
         shell_counts="uncontradicted",
+        geometry_of="surface",
         ignore_transients=True,
         seeds="shell",
         init_opacity=0.5,

@@ -122,17 +122,21 @@ class Findings(NamedTuple):
     """The background: at its borders, the shell is larger than the building."""
     confirmed: Bool[np.ndarray, "H W"]
     """The shell."""
+    behind: Bool[np.ndarray, "H W"]
+    """Something behind the shell, which a window reflects or lets through."""
 
     @classmethod
     def of(cls, checked: CueMap, shell: CueMap) -> Findings:
         """Decode a view's checked map.
 
         Its mask is set where the view does not show the shell. There, its depth is the occluder's, which is at least
-        1.2 % less than the shell's; the shell's if it moved; and more for the background.
+        1.2 % less than the shell's; the shell's if it moved; and more for the background. Elsewhere it is 0, or the
+        shell's where confirmed, or at least 1.2 % more, the depth of what a window shows.
         """
         nearer, farther = checked.depth < 0.995 * shell.depth, checked.depth > 1.005 * shell.depth
         hidden = checked.mask
-        return cls(hidden & nearer, hidden & ~nearer & ~farther, hidden & farther, (checked.depth > 0) & ~hidden)
+        shown = ~hidden & (checked.depth > 0)
+        return cls(hidden & nearer, hidden & ~nearer & ~farther, hidden & farther, shown & ~farther, shown & farther)
 
 
 def resampled(cue: CueMap, camera: Camera) -> CueMap:

@@ -107,9 +107,9 @@ def photometric_pixels(
 
 def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
     """Pixels where photographs show something in front of the shell; none if they were not compared."""
-    if "nearer_depth" not in batch:
+    if "other_depth" not in batch:
         return torch.zeros(batch["shell_mask"].shape, dtype=torch.bool, device=device)
-    return batch["nearer_depth"].to(device) > 0
+    return ((batch["other_depth"] > 0) & (batch["other_depth"] < batch["shell_depth"])).to(device)
 
 
 def _beyond(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:

@@ -44,11 +44,11 @@ class FacadeDataset(InputDataset):
     """Photographs at the size of their cameras, with ``K``, ``{cue}_depth``, ``{cue}_normal`` and ``{cue}_mask``.
 
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
-    kind lacks that kind's keys. ``nearer_depth`` is the depth of what photographs show in front of the shell, else 0;
-    ``transient`` is true where only this one shows something in front of it, ``beyond`` where they show the background.
-    With ``bands``, masks keep only pixels whose wall lies in them. With ``seen_by``, ``seen`` is true where what a
-    pixel shows is visible in a training view. ``kinds`` are the maps to read, all if not set; with ``any_size`` they
-    are resampled where their size differs.
+    kind lacks that kind's keys. ``other_depth`` is the depth of what photographs show in front of the shell, or behind
+    it, in windows, else 0; ``transient`` is true where only this one shows something in front of it, ``beyond`` where
+    they show the background. With ``bands``, masks keep only pixels whose wall lies in them. With ``seen_by``,
+    ``seen`` is true where what a pixel shows is visible in a training view. ``kinds`` are the maps to read, all if not
+    set; with ``any_size`` they are resampled where their size differs.
     """
 
     bands: Bands | None = None
@@ -104,10 +104,10 @@ class FacadeDataset(InputDataset):
         maps = {}
         checked = self._dataparser_outputs.metadata["cues"].get("checked")
         if "shell" in cues and checked and (found := self._read(checked, view)):
-            occluder, maps["transient"], maps["beyond"], _ = (
+            occluder, maps["transient"], maps["beyond"], _, behind = (
                 torch.from_numpy(mask & inside)[..., None] for mask in Findings.of(found, cues["shell"])
             )
-            maps["nearer_depth"] = self._rescaled_depth(found).where(occluder, 0.0)
+            maps["other_depth"] = self._rescaled_depth(found).where(occluder | behind, 0.0)
         for kind, cue in cues.items():
             maps[f"{kind}_depth"] = self._rescaled_depth(cue)
             maps[f"{kind}_normal"] = torch.from_numpy(cue.normal)
@@ -259,10 +259,17 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             most: largest number of seeds; the spacing is increased where it would give more.
             everywhere: seed the shell even where photographs show something in front of it; else seed that instead.
         """
+        return self._seeds(lambda batch: self._seeded_view(batch, everywhere), spacing, most)
+
+    def seeds_behind_shell(self, spacing: float, most: int) -> Seeds:
+        """Seeds for what windows reflect or let through, where photographs show it behind the shell."""
+        return self._seeds(self._view_behind, spacing, most)
+
+    def _seeds(self, view: Callable[[dict], SeededView], spacing: float, most: int) -> Seeds:
         maps, views = self.train_dataset.cues["shell"], self.train_dataset.views
         batches = [batch for batch in self.cached_train if maps.record(views[batch["image_idx"]].name)]
         num_pixels = sum(batch["image"][..., 0].numel() for batch in batches)
-        return shell_seeds((self._seeded_view(batch, everywhere) for batch in batches), num_pixels, spacing, most)
+        return shell_seeds(map(view, batches), num_pixels, spacing, most)
 
     def skybox_seeds(self, count: int) -> Seeds:
         """Seeds all around the scene, in nerfstudio's rescaled world, coloured by what is not on the shell."""
@@ -282,16 +289,22 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         index, cpu, batch = batch["image_idx"], torch.device("cpu"), self._with_maps(batch)
         image = _colours(batch)
         camera, shell = self.train_dataset.camera(index), reference_maps(batch, "shell", cpu, everywhere)
-        if not everywhere and "nearer_depth" in batch:
-            nearer = batch["nearer_depth"].to(cpu)
-            towards_camera = -normalize(camera.rays().float(), dim=-1)
+        if not everywhere and "other_depth" in batch:
             before = contradicted(batch, cpu) & kept_pixels(batch, image)
             shell = Reference(
-                torch.where(before, nearer, shell.depth),
-                torch.where(before, towards_camera, shell.normal),
+                torch.where(before, batch["other_depth"].to(cpu), shell.depth),
+                torch.where(before, _towards(camera), shell.normal),
                 shell.mask | before,
             )
         return SeededView(camera, image, shell)
+
+    def _view_behind(self, batch: dict) -> SeededView:
+        cpu, batch = torch.device("cpu"), self._with_maps(batch)
+        image, camera = _colours(batch), self.train_dataset.camera(batch["image_idx"])
+        shell = reference_maps(batch, "shell", cpu)
+        depth = batch.get("other_depth", torch.zeros_like(batch["shell_depth"])).to(cpu)
+        behind = Reference(depth, _towards(camera), shell.mask & (depth > shell.depth) & kept_pixels(batch, image))
+        return SeededView(camera, image, behind)
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """The next training view, with its maps."""
@@ -319,6 +332,11 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         # self.device (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
         with refusals_end_the_program():
             return super()._load_images(split, cache_images_device if torch.cuda.is_available() else "gpu")
+
+
+def _towards(camera: Camera) -> Float[Tensor, "H W 3"]:
+    """Normals that face the camera."""
+    return -normalize(camera.rays().float(), dim=-1)
 
 
 def _colours(batch: dict) -> Float[Tensor, "H W 3"]:

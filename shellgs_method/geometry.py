@@ -41,7 +41,7 @@ class DepthMoments(NamedTuple):
     """Σ w (z - origin)²."""
 
     def about(self, depth: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "H W 1"]:
-        """Σ w (z - depth)², positive if splats of a pixel are off the depth even if their mean is not."""
+        """Σ w (z - depth)², positive if splats of a pixel are off the depth even if their mean is not; alpha is Σ w."""
         d = depth - self.origin
         return self.second - 2 * d * self.first + d.square() * alpha
 
@@ -61,6 +61,13 @@ class Geometry:
     """Spread of the splats along each ray; discs only."""
     moments: DepthMoments | None = None
     """Moments of the centres' depths, if requested."""
+    surface: Float[Tensor, "H W 1"] | None = None
+    """Accumulated opacity of what is not behind the shell, if only this makes up the geometry."""
+
+    @property
+    def solid(self) -> Float[Tensor, "H W 1"]:
+        """Accumulated opacity of what makes up depth and normals."""
+        return self.alpha if self.surface is None else self.surface
 
     @cached_property
     def depth_normal(self) -> Float[Tensor, "H W 3"]:
@@ -105,12 +112,13 @@ def _normals_and_depths(
 
 
 def rendered_geometry(
-    composited: Float[Tensor, "H W 4"],
+    composited: Float[Tensor, "H W C"],
     alpha: Float[Tensor, "H W 1"],
     info: Mapping[str, Any],
     camera: Camera,
     depth: DepthKind,
     origin: Float[Tensor, ""] | None = None,
+    weighted: bool = False,
 ) -> Geometry:
     """Depth and normals of a view from the composite of :func:`geometry_channels`.
 
@@ -119,15 +127,19 @@ def rendered_geometry(
     * ``plane``: Σ w n·m / (Σ w n · ray), the ray's intersection with the composited plane (PGSR, Chen et al. 2024).
 
     Args:
-        composited: normals and depth channel; with ``origin`` also the channel of :func:`squared_depths`.
+        composited: normals and depth channel; with ``origin`` also the channel of :func:`squared_depths`; with
+            ``weighted`` all of them times a weight of each Gaussian, and this weight.
         alpha: accumulated opacity.
         info: third output of the rasterizer.
         camera: camera of the view.
         depth: kind of depth, as given to :func:`geometry_channels`.
         origin: origin of the squared depths.
+        weighted: whether each Gaussian has a weight, of its share in depth and normals.
     """
     normal, channel = composited[..., :3], composited[..., 3:4]
-    solid = alpha.clamp_min(1e-6)
+    surface = composited[..., -1:] if weighted else None
+    weights = alpha if surface is None else surface
+    solid = weights.clamp_min(1e-6)
     if depth == "plane":
         facing = (normal * camera.rays()).sum(dim=-1, keepdim=True)
         z = channel / facing.minimum(-GRAZING * solid)
@@ -138,5 +150,7 @@ def rendered_geometry(
     else:
         z = channel / solid
     z = torch.where(alpha > 0, z, z.detach().max())
-    moments = None if origin is None else DepthMoments(origin, channel - origin * alpha, composited[..., 4:])
-    return Geometry(z, normal, alpha, camera, info.get("distortion"), moments)
+    moments = None if origin is None else DepthMoments(origin, channel - origin * weights, composited[..., 4:5])
+    if weighted:
+        normal = normal * (alpha / solid)
+    return Geometry(z, normal, alpha, camera, info.get("distortion"), moments, surface)

@@ -50,11 +50,14 @@ from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.seeding import Seeds
+from shellgs_method.shell_surface import ShellSurface
 from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
 from shellgs_method.threads import ThreadsByLoad
 
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two opacity resets: opacities recover no faster in a short run."""
+SURFACE_EVERY = 50
+"""Iterations between two searches for the Gaussians behind the shell."""
 MAX_KEPT_PIXELS = 3_000_000
 """Most pixels of training views whose losses are cached, at some 80 bytes each."""
 
@@ -86,6 +89,9 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Depth that is rendered and supervised: expected, median (discs only), or plane (of the composited plane)."""
     shell_counts: Literal["everywhere", "uncontradicted"] = "everywhere"
     """Where the shell supervises and is seeded: everywhere, or not where photographs show something in front of it."""
+    geometry_of: Literal["everything", "surface"] = "everything"
+    """Gaussians that make up depth and normals: all, or all but those behind the shell, which show what windows reflect
+    or let through. There are seeds for these where photographs show something behind the shell."""
     ignore_transients: bool = False
     """Leave out of the photometric loss what moved: what only one photograph shows in front of the shell."""
     densification: Literal["default", "mcmc"] = "default"
@@ -159,6 +165,8 @@ class FacadeModel(SplatfactoModel):
         )
         self.crop_box = None
         self.geometry: Geometry | None = None
+        self.shell: ShellSurface | None = None
+        self.register_buffer("surface", None)
         self._views: dict[int, ViewLosses] = {}
         self._threads = ThreadsByLoad()
         self.metres_per_unit: float | None = self.kwargs["metadata"].get("metres_per_unit")
@@ -169,7 +177,8 @@ class FacadeModel(SplatfactoModel):
     @property
     def training_cues(self) -> set[str]:
         """Kinds of maps that the training views need."""
-        return {self.config.cues, self.config.seeds} - {"none"}
+        of_surface = {"shell"} if self.config.geometry_of == "surface" else set()
+        return {self.config.cues, self.config.seeds} - {"none"} | of_surface
 
     def _check_settings(self) -> None:
         config = self.config
@@ -177,8 +186,12 @@ class FacadeModel(SplatfactoModel):
             raise SceneError("median depth and distortion need discs: set pipeline.model.primitive to 2d")
         if config.depth == "plane" and config.extra.empty_space > 0:
             raise SceneError("empty_space needs the depths of the centres: set pipeline.model.depth to expected")
-        if config.seeds == "shell" and "shell" not in self.kwargs["metadata"]["cues"]:
-            raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
+        uses_shell = config.seeds == "shell" or config.geometry_of == "surface"
+        if uses_shell and "shell" not in self.kwargs["metadata"]["cues"]:
+            raise SceneError(
+                "seeds on the shell, and geometry of the surface alone, need its maps, and there are none: "
+                "run `shellgs cast SCENE` first"
+            )
         if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
             method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
             raise SceneError(
@@ -290,8 +303,21 @@ class FacadeModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             stored = dict[f"gauss_params.{name}"]
             parameter.data = parameter.data.new_zeros(stored.shape)
+        if "surface" in dict:
+            self.surface = torch.empty_like(dict["surface"], device=self.device)
         self.step = self.num_iterations
         return nn.Module.load_state_dict(self, dict, **kwargs)
+
+    def update_surface(self) -> None:
+        """Find the Gaussians behind the shell if they have changed since."""
+        if self.shell is not None and (self.surface is None or len(self.surface) != self.num_points):
+            self.surface = self.shell.weights(self.means.detach())
+
+    @property
+    def _gaussians(self) -> dict[str, Tensor]:
+        """The parameters, and ``surface``, the weight of each Gaussian in depth and normals, if they differ in it."""
+        self.update_surface()
+        return dict(self.gauss_params) | ({} if self.surface is None else {"surface": self.surface})
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Optional[OrientedBox] = None) -> dict[str, Tensor]:
         """Render one camera outside training, within a crop box if given."""
@@ -306,6 +332,8 @@ class FacadeModel(SplatfactoModel):
         self._threads.follow()
         pinhole = pinhole_camera(camera)
         background = self._get_background_color()
+        if self.training and self.step % SURFACE_EVERY == 0:
+            self.surface = None
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:
             return cast(dict[str, Tensor], self.get_empty_outputs(pinhole.width, pinhole.height, background))
@@ -322,7 +350,10 @@ class FacadeModel(SplatfactoModel):
         }
         self.geometry = None
         if self._renders_geometry:
-            self.geometry = rendered_geometry(composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin)
+            weighted = "surface" in gaussians
+            self.geometry = rendered_geometry(
+                composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin, weighted
+            )
             outputs["depth"] = self.geometry.depth
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
         return outputs
@@ -332,7 +363,7 @@ class FacadeModel(SplatfactoModel):
 
         The area is the sum of its compositing weights over the pixels.
         """
-        gaussians = dict(self.gauss_params)
+        gaussians = self._gaussians
         # As many features as in training, for which the kernels are compiled.
         features, _ = self._features(gaussians, camera, self._get_background_color())
         features = torch.zeros_like(features, requires_grad=True)
@@ -345,14 +376,17 @@ class FacadeModel(SplatfactoModel):
     ) -> tuple[Float[Tensor, "N C"], Float[Tensor, ""] | None]:
         """Features to composite, and the origin of the squared depths if these are among them."""
         # Colours minus the background, so that the photometric gradient of alpha comes through the colours too.
-        features = [self._colours(gaussians, camera) - background]
-        origin = None
-        if self._renders_geometry:
-            features += geometry_channels(gaussians, camera, self.config.depth)
-            if self.config.extra.empty_space > 0:
-                squares, origin = squared_depths(features[-1])
-                features.append(squares)
-        return torch.cat(features, dim=-1), origin
+        colours, origin = self._colours(gaussians, camera) - background, None
+        if not self._renders_geometry:
+            return colours, origin
+        channels = [*geometry_channels(gaussians, camera, self.config.depth)]
+        if self.config.extra.empty_space > 0:
+            squares, origin = squared_depths(channels[-1])
+            channels.append(squares)
+        if "surface" in gaussians:
+            surface = gaussians["surface"]
+            channels = [*(channel * surface for channel in channels), surface]
+        return torch.cat([colours, *channels], dim=-1), origin
 
     def _rasterize(
         self, gaussians: dict[str, Tensor], features: Float[Tensor, "N C"], camera: Camera
@@ -395,9 +429,9 @@ class FacadeModel(SplatfactoModel):
     def _inside_crop(self) -> dict[str, Tensor]:
         """The Gaussians, or in the viewer those inside its crop box."""
         if self.crop_box is None or self.training:
-            return dict(self.gauss_params)
+            return self._gaussians
         inside = self.crop_box.within(self.means).squeeze(-1)
-        return {name: parameter[inside] for name, parameter in self.gauss_params.items()}
+        return {name: values[inside] for name, values in self._gaussians.items()}
 
     def _colours(self, gaussians: dict[str, Tensor], camera: Camera) -> Float[Tensor, "N 3"]:
         """View-dependent colours; one more degree of harmonics every ``sh_degree_interval`` iterations."""

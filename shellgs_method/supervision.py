@@ -26,6 +26,8 @@ from shellgs_method.losses import (
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.reference import Reference
 
+SOLID = 0.5
+"""Opacity that the shell must have where what is behind it may be seen through it."""
 TOLERANCES = (0.05, 0.15)
 """Smallest and largest tolerance in metres: with less, images of Herz-Jesu lost more than its surface gained."""
 
@@ -121,7 +123,7 @@ class CueLosses:
             "point_to_plane": (extra.point_to_plane, lambda: self._point_to_plane(geometry)(geometry.depth)),
             "empty_space": (
                 extra.empty_space if progress >= extra.empty_space_from / PAPER_ITERATIONS else 0.0,
-                lambda: self._point_to_plane(geometry).of_all(self._squares(geometry), geometry.alpha),
+                lambda: self._point_to_plane(geometry).of_all(self._squares(geometry), _opacity(geometry)),
             ),
         }
         return {name: weight * term() for name, (weight, term) in terms.items() if weight > 0}
@@ -154,7 +156,7 @@ class CueLosses:
 
     def _squares(self, geometry: Geometry) -> Tensor:
         assert geometry.moments is not None
-        return geometry.moments.about(self.cue.depth, geometry.alpha)
+        return geometry.moments.about(self.cue.depth, geometry.solid)
 
     def _point_to_plane(self, geometry: Geometry) -> PointToPlaneLoss:
         if self._from_plane is None:
@@ -206,6 +208,11 @@ def self_losses(
         assert geometry.distortion is not None
         losses["distortion"] = extra.distortion * weighted_mean(geometry.distortion, kept)
     return losses
+
+
+def _opacity(geometry: Geometry) -> Tensor:
+    """Opacity; 1 where windows let through what is behind them, but no more than they may."""
+    return geometry.alpha if geometry.surface is None else 1 - (SOLID - geometry.surface).relu()
 
 
 def _known(geometry: Geometry) -> Bool[Tensor, "H W 1"]:

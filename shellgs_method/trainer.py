@@ -251,6 +251,7 @@ class FacadeTrainer(Trainer):
         if self.local_rank != 0:
             return
         self._remove_broken_gaussians(step)
+        self.pipeline.model.update_surface()
         folder = self.checkpoint_dir
         try:
             folder.mkdir(parents=True, exist_ok=True)

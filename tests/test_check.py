@@ -33,6 +33,8 @@ from shellgs_method.shell.checking.contradiction import (
     CONTRADICTED,
     MOVES,
     OFFSETS,
+    OFFSETS_BEHIND,
+    REFLECTED,
     Agreement,
     ShellView,
     Sweep,
@@ -64,16 +66,16 @@ def painted(points: np.ndarray, seed: int) -> np.ndarray:
 
 
 def street(
-    cameras: list[Camera], post: float | None = None, mirror: bool = False
+    cameras: list[Camera], post: float | None = None, mirror: float | None = None
 ) -> list[tuple[ShellView, np.ndarray]]:
     """Views of a painted wall, optionally with a post in front of it or a mirror in it, and masks of the post."""
     views = []
     for camera in cameras:
         rays, position = camera.rays().numpy(), camera.position.numpy()
         image = painted(position + WALL * rays, 0)
-        if mirror:
+        if mirror is not None:
             pane = np.abs((position + WALL * rays)[..., 0]) < 1.5
-            image[pane] = painted(position + 2.5 * WALL * rays, 1)[pane]
+            image[pane] = painted(position + mirror * WALL * rays, 1)[pane]
         before = np.zeros(image.shape[:2], bool)
         if post is not None:
             place = position + post * rays
@@ -123,6 +125,16 @@ def test_a_post_in_front_of_the_wall_is_found_at_its_depth(depth: float):
     assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # one step of the offsets
 
 
+def test_what_a_mirror_shows_is_found_behind_the_wall():
+    views = [view for view, _ in street(CAMERAS, mirror=1 / 0.6)]
+    found = sweep(views[MIDDLE], views[:MIDDLE] + views[MIDDLE + 1 :], OFFSETS_BEHIND)
+    pane = np.abs(WALL * CAMERAS[MIDDLE].rays().numpy()[..., 0]) < 1.5
+    behind = found.score.numpy() > REFLECTED
+    assert behind[pane].mean() > 0.6
+    assert behind[~pane].mean() < 0.1
+    np.testing.assert_allclose(np.median(found.offset.numpy()[pane & behind]), -0.4, rtol=0.1)
+
+
 def test_a_wall_that_agrees_with_the_shell_is_confirmed():
     swept, score, _ = scores([view for view, _ in street(CAMERAS)])
     assert (score > CONTRADICTED).float().mean() < 0.002
@@ -130,7 +142,7 @@ def test_a_wall_that_agrees_with_the_shell_is_confirmed():
 
 
 def test_a_mirror_shows_farther_things_and_does_not_contradict_the_shell():
-    _, score, _ = scores([view for view, _ in street(CAMERAS, mirror=True)])
+    _, score, _ = scores([view for view, _ in street(CAMERAS, mirror=2.5)])
     assert (score > CONTRADICTED).float().mean() < 0.01
 
 
@@ -189,7 +201,7 @@ def test_another_exposure_is_not_something_that_moved():
 
 
 def test_where_other_photographs_differ_too_nothing_has_moved():
-    alone = agreed([view for view, _ in street(CAMERAS, mirror=True)])[1].alone
+    alone = agreed([view for view, _ in street(CAMERAS, mirror=2.5)])[1].alone
     assert (alone > ALONE).float().mean() < 0.02
 
 
@@ -254,9 +266,9 @@ def test_maps_are_made_once_and_again_only_if_missing(scene: Path):
 def test_photographs_larger_than_the_maps_are_compared_at_their_own_size(shellgs, scene: Path, monkeypatch):
     sizes, original = set(), checking.sweep
 
-    def noting(view, others):
+    def noting(view, others, *offsets):
         sizes.update(each.camera.width for each in (view, *others))
-        return original(view, others)
+        return original(view, others, *offsets)
 
     monkeypatch.setattr(checking, "sweep", noting)
     shellgs("cast", scene, "--max-image-size", 24)
@@ -290,11 +302,11 @@ def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
 
 
 def test_a_checked_map_says_what_a_pixel_shows():
-    shell = np.full((1, 5), 8, np.float32)
-    depth, hidden = np.array([[5, 8, 16, 8, 0]], np.float32), np.array([[True, True, True, False, False]])
-    normal = np.zeros((1, 5, 3), np.float16)
+    shell = np.full((1, 6), 8, np.float32)
+    depth, hidden = np.array([[5, 8, 16, 8, 16, 0]], np.float32), np.array([[True] * 3 + [False] * 3])
+    normal = np.zeros((1, 6, 3), np.float16)
     found = Findings.of(CueMap(depth, normal, hidden), CueMap(shell, normal, shell > 0))
-    assert [mask[0].tolist() for mask in found] == np.eye(4, 5, dtype=bool).tolist()
+    assert [mask[0].tolist() for mask in found] == np.eye(5, 6, dtype=bool).tolist()
 
 
 def test_a_full_disk_raises_an_error_that_says_so(scene: Path):
@@ -322,7 +334,7 @@ def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request(
     mask = torch.tensor([True] * 7 + [False]).view(1, 8, 1)
     nearer = torch.tensor([0.0, 1.5] + [0.0] * 6).view(1, 8, 1)
     batch = {"shell_depth": torch.full((1, 8, 1), 2.0), "shell_normal": torch.zeros(1, 8, 3), "shell_mask": mask}
-    batch |= {"nearer_depth": nearer, "seen": torch.ones(1, 8, 1, dtype=torch.bool)}
+    batch |= {"other_depth": nearer, "seen": torch.ones(1, 8, 1, dtype=torch.bool)}
     beyond = {"beyond": torch.arange(8).view(1, 8, 1) == 6}
     cpu = torch.device("cpu")
     assert reference_maps(batch, "shell", cpu).mask.view(-1).tolist() == [False] * 4 + [True] * 3 + [False]

@@ -69,6 +69,32 @@ def test_moments_are_those_of_the_splats_own_depths(eager, primitive):
     torch.testing.assert_close(geometry.moments.about(target, alpha), expected, rtol=1e-4, atol=1e-4)
 
 
+def test_what_is_behind_the_surface_does_not_move_its_depth_and_normals(eager):
+    """Half a wall's opacity and a second wall behind it, of another direction, look like the first wall alone."""
+    (front, normal), (back, _) = wall(0.0), wall(0.3)
+    back["means"] = back["means"] + torch.tensor([0.0, 0.0, 5.0])
+    both = {name: torch.cat([front[name], back[name]]) for name in front}
+    weights = torch.cat([torch.ones(len(front["means"]), 1), torch.full((len(back["means"]), 1), 1e-6)])
+    normals, depths = geometry_channels(both, CAMERA, "expected")
+    squares, origin = squared_depths(depths)
+    channels = torch.cat([normals * weights, depths * weights, squares * weights, weights], dim=-1)
+    means, quats, scales = (both[name] for name in ("means", "quats", "scales"))
+    opacities = torch.full((len(means),), 0.1)
+    composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, CAMERA)
+    geometry = rendered_geometry(composited, alpha, info, CAMERA, "expected", origin, weighted=True)
+    alone = render(front, "3d", "expected", 0.1)
+    assert geometry.surface is not None
+    assert geometry.moments is not None
+    torch.testing.assert_close(geometry.surface, alone.alpha, rtol=1e-3, atol=1e-4)
+    assert (geometry.alpha - geometry.surface).mean() > 0.1
+    seen = alone.alpha[..., 0] > 0.1
+    torch.testing.assert_close(geometry.depth[seen], alone.depth[seen], rtol=1e-4, atol=1e-4)
+    facing = torch.nn.functional.normalize(geometry.normal[seen], dim=-1)
+    torch.testing.assert_close(facing, normal.expand_as(facing), rtol=1e-4, atol=1e-4)
+    spread = geometry.moments.about(geometry.depth, geometry.solid)[seen]
+    assert spread.abs().max() < 1e-2
+
+
 def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:
     """Relative error of the wall's depth where it is opaque."""
     exact = 5 * normal[2] / (geometry.camera.rays() @ normal)[..., None]

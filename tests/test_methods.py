@@ -327,10 +327,10 @@ def test_empty_space_waits_for_its_first_iteration(untrained):
 def test_surfaces_continue_without_a_cue_and_not_where_something_is_in_front_of_the_shell(untrained):
     model, (camera, batch) = model_of(untrained), data_of(untrained).next_train(0)
     extra, cued = model.config.extra, torch.ones_like(batch["shell_mask"])
-    in_front = cued * batch["shell_depth"].clamp_min(1)
+    in_front = 0.9 * batch["shell_depth"].where(cued, 0.0)
 
     def consistency(cued: torch.Tensor) -> float:
-        changed = {**batch, "shell_mask": cued, "nearer_depth": in_front}
+        changed = {**batch, "shell_mask": cued, "other_depth": in_front}
         return float(model.get_loss_dict(model(camera), changed)["normal_consistency"])
 
     model.config.extra = ExtraLossConfig(

@@ -49,6 +49,8 @@ def supervision_panel(
 def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:
     """Plot what photographs show at the shell: occluders (red), what moved (blue), the background (yellow), it (green).
 
+    Magenta is what they show behind it, in windows.
+
     Args:
         views: photograph, map by :func:`~shellgs_method.shell.check_views` and shell map of each.
 
@@ -64,9 +66,10 @@ def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap
     for ax, (image, cue, shell) in zip(figure.axes, views, strict=False):
         shown = image / 255
         found = Findings.of(cue, shell)
-        for mask, colour, alpha in zip(found, "rbyg", (0.7, 0.7, 0.7, 0.25), strict=True):
+        for mask, colour, alpha in zip(found, "rbygm", (0.7, 0.7, 0.7, 0.25, 0.5), strict=True):
             shown[mask] = (1 - alpha) * shown[mask] + alpha * np.array(to_rgb(colour))
         ax.imshow(shown)
-        occluder, moved, beyond, confirmed = (f"{mask.mean():.1%}" for mask in found)
-        ax.set_title(f"occluders {occluder}, moved {moved}, background {beyond}, confirmed {confirmed} of the pixels")
+        names = "occluders", "moved", "background", "confirmed", "behind it"
+        shares = (f"{name} {mask.mean():.1%}" for name, mask in zip(names, found, strict=True))
+        ax.set_title(", ".join(shares))
     return figure

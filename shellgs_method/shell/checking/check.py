@@ -25,6 +25,8 @@ from shellgs_method.shell.checking.contradiction import (
     ALONE,
     CONFIRMED,
     CONTRADICTED,
+    OFFSETS_BEHIND,
+    REFLECTED,
     ShellView,
     Sweep,
     agreement,
@@ -37,7 +39,7 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 6
+VERSION = 7
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -164,10 +166,17 @@ class _TrainingViews:
         static, moved = _told_apart((score > CONTRADICTED) & ~beyond, (alone > ALONE) & ~beyond)
         hidden = static | moved | beyond
         confirmed = ~hidden & (_resized(found.score.float(), size).numpy() < CONFIRMED)
-        nearer = 1 / (1 + _nearest(found.offset.float(), size).numpy())
-        kinds, relative = [static, beyond, moved | confirmed], [nearer, np.full_like(nearer, 2), np.ones_like(nearer)]
-        depth = cue.depth * np.select(kinds, relative, 0.0)
+        score_behind, farther = self._behind(seen, size)
+        kinds = [static, beyond, moved, score_behind > REFLECTED, confirmed]
+        depth = cue.depth * np.select(kinds, [_relative_depth(found, size), 2.0, 1.0, farther, 1.0], 0.0)
         return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
+
+    def _behind(
+        self, seen: ShellView, size: tuple[int, ...]
+    ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+        """Score of the best depth behind the shell, and this depth relative to the shell's."""
+        found = sweep(seen, [view for view in self.views.values() if view is not seen], OFFSETS_BEHIND)
+        return _resized(found.score.float(), size).numpy(), _relative_depth(found, size)
 
     def _neighbours(self, seen: ShellView) -> list[str]:
         """Names of the nearest training views on either side that look in about the same direction."""
@@ -199,6 +208,10 @@ def _shell_view(view: View, cue: CueMap) -> ShellView:
     image = load_photograph(replace(view, camera=camera))[..., :3]
     depth = _nearest(torch.from_numpy(cue.depth), (camera.height, camera.width))
     return ShellView(camera, torch.from_numpy(image), depth)
+
+
+def _relative_depth(found: Sweep, size: tuple[int, ...]) -> Float[np.ndarray, "H W"]:
+    return 1 / (1 + _nearest(found.offset.float(), size).numpy())
 
 
 def _nearest(values: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tensor, "H W"]:

@@ -2,9 +2,9 @@
 
 A plane sweep between the shell and the cameras, per pixel of each view. Its costs are smoothed with the edges of the
 photograph preserved (cost-volume filtering, Hosni et al. 2013, with the guided filter of He et al. 2010); a second pass
-makes the views consistent. Reflections in glass appear farther away than the shell, never nearer, so only nearer
-depths are tried. The background behind the borders of a shell that reaches too far is found by its colours, and by the
-silhouettes of other views.
+makes the views consistent. Reflections in glass appear farther away than the shell, never nearer: another sweep, behind
+the shell, finds them. The background behind the borders of a shell that reaches too far is found by its colours, and
+by the silhouettes of other views.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ _NEAREST, _STEP = 0.0125, 1.4
 OFFSETS = tuple(_NEAREST * _STEP**k for k in range(15))
 """Tried depths, as the relative excess of their inverse over the shell's: from 10 cm in front of a wall that is 8 m
 away to a third of its depth."""
+OFFSETS_BEHIND = tuple(-_NEAREST * 2.0**k for k in range(7))
+"""The same behind the shell, to five times its depth: coarser, since what is found there need not be accurate."""
 MOVES = 5.5
 """Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and much more needs
 finer steps of depth than the offsets have."""
@@ -41,6 +43,8 @@ ALONE = 0.12
 """Difference from the colours that other photographs agree on above which a pixel shows something that moved."""
 CONFIRMED = -0.03
 """Score of the best nearer depth below which the shell is confirmed."""
+REFLECTED = 0.02
+"""Score of the best farther depth above which a pixel counts as a window that shows something behind the shell."""
 
 Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
 """Distances and indices of cameras on the left and on the right of a view."""
@@ -82,28 +86,28 @@ class ShellView:
 
 
 class Sweep(NamedTuple):
-    """The best depth in front of the shell, by one view and its neighbours."""
+    """The best depth in front of the shell, or behind it, by one view and its neighbours."""
 
     score: Float16[Tensor, "h w"]
     """How much better photographs agree at this depth than on the shell, relative to the worst disagreement; -1 where
     there is no shell."""
     offset: Float16[Tensor, "h w"]
-    """Relative excess of the inverse depth over the shell's, interpolated between the tried :data:`OFFSETS`."""
+    """Relative excess of the inverse depth over the shell's, interpolated between those that were tried."""
 
 
 def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
-    """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES`.
+    """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES` pixels.
 
     Args:
         view: the view's camera.
         others: cameras to choose from, by :func:`sides`.
         depth: typical depth of the shell in the view.
-        offset: one of :data:`OFFSETS`.
+        offset: one of :data:`OFFSETS` or :data:`OFFSETS_BEHIND`.
 
     Returns:
         Index and side of each camera: 0 on the left, 1 on the right.
     """
-    wanted = MOVES * depth / (offset * float(view.K[0, 0]))
+    wanted = MOVES * depth / (abs(offset) * float(view.K[0, 0]))
     found = [
         sorted(
             (max(baseline / wanted, wanted / baseline), index) for baseline, index in side if baseline > 1e-6 * depth
@@ -123,28 +127,33 @@ def sides(view: Camera, others: Sequence[Camera]) -> Sides:
     return found
 
 
-def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
+def sweep(view: ShellView, others: Sequence[ShellView], offsets: Sequence[float] = OFFSETS) -> Sweep:
     """Find the best depth in front of the shell, by the photographs of a view and its neighbours.
 
     Costs are averaged over the neighbours of a side; the side with the lower cost counts.
+
+    Args:
+        view: the view.
+        others: all other views.
+        offsets: a geometric sequence of depths to try; :data:`OFFSETS_BEHIND` for those behind the shell.
     """
     pixels, near = _Pixels(view), sides(view.camera, [other.camera for other in others])
     depth = float(pixels.surface.median())
     roles: dict[int, list[tuple[int, int]]] = {}
-    for step, offset in enumerate(OFFSETS):
+    for step, offset in enumerate(offsets):
         for index, side in neighbours(view.camera, near, depth, offset):
             roles.setdefault(index, []).append((step, side))
-    sums = torch.zeros(len(OFFSETS), 2, 3, *view.depth.shape)
+    sums = torch.zeros(len(offsets), 2, 3, *view.depth.shape)
     for index, asked in roles.items():
         neighbour = _Neighbour(pixels, others[index])
         for step, side in asked:
-            nearer = neighbour.disagreement(neighbour.look(pixels.surface / (1 + OFFSETS[step])))
+            nearer = neighbour.disagreement(neighbour.look(pixels.surface / (1 + offsets[step])))
             sums[step, side] += neighbour.visible * torch.stack([neighbour.visible, neighbour.on_shell, nearer])
     weight, on_shell, nearer = sums.unbind(dim=2)
     on_shell, nearer = ((each / weight).nan_to_num(1.0).amin(dim=1) for each in (on_shell, nearer))
     scores = _smooth(pixels, on_shell - nearer)
     score, best = scores.max(dim=0)
-    offset = _NEAREST * _STEP ** (best + _vertex(scores, best))
+    offset = offsets[0] * (offsets[1] / offsets[0]) ** (best + _vertex(scores, best))
     return Sweep(score.where(view.depth > 0, -1.0).half(), offset.half())
 
 
