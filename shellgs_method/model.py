@@ -188,10 +188,7 @@ class FacadeModel(SplatfactoModel):
             raise SceneError("empty_space needs the depths of the centres: set pipeline.model.depth to expected")
         uses_shell = config.seeds == "shell" or config.geometry_of == "surface"
         if uses_shell and "shell" not in self.kwargs["metadata"]["cues"]:
-            raise SceneError(
-                "seeds on the shell, and geometry of the surface alone, need its maps, and there are none: "
-                "run `shellgs cast SCENE` first"
-            )
+            raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
         if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
             method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
             raise SceneError(
