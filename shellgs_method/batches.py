@@ -107,9 +107,17 @@ def photometric_pixels(
 
 def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
     """Pixels where photographs show something in front of the shell; none if they were not compared."""
-    if "other_depth" not in batch:
-        return torch.zeros(batch["shell_mask"].shape, dtype=torch.bool, device=device)
-    return ((batch["other_depth"] > 0) & (batch["other_depth"] < batch["shell_depth"])).to(device)
+    other = _other_depth(batch)
+    return ((other > 0) & (other < batch["shell_depth"])).to(device)
+
+
+def seen_through(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
+    """Pixels where photographs show something behind the shell, in windows; none if they were not compared."""
+    return (_other_depth(batch) > batch["shell_depth"]).to(device)
+
+
+def _other_depth(batch: dict) -> Float[Tensor, "H W 1"]:
+    return batch.get("other_depth", torch.zeros_like(batch["shell_depth"]))
 
 
 def _beyond(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:

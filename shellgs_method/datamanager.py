@@ -24,7 +24,7 @@ from dataparsers.cue_maps import CueMap, CueMaps, Findings
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
-from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps
+from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps, seen_through
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.reference import Reference
 from shellgs_method.seeding import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
@@ -302,9 +302,9 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         cpu, batch = torch.device("cpu"), self._with_maps(batch)
         image, camera = _colours(batch), self.train_dataset.camera(batch["image_idx"])
         shell = reference_maps(batch, "shell", cpu)
-        depth = batch.get("other_depth", torch.zeros_like(batch["shell_depth"])).to(cpu)
-        behind = Reference(depth, _towards(camera), shell.mask & (depth > shell.depth) & kept_pixels(batch, image))
-        return SeededView(camera, image, behind)
+        behind = shell.mask & seen_through(batch, cpu) & kept_pixels(batch, image)
+        depth = batch["other_depth"].to(cpu) if "other_depth" in batch else shell.depth
+        return SeededView(camera, image, Reference(depth, _towards(camera), behind))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """The next training view, with its maps."""

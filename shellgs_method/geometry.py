@@ -118,7 +118,7 @@ def rendered_geometry(
     camera: Camera,
     depth: DepthKind,
     origin: Float[Tensor, ""] | None = None,
-    weighted: bool = False,
+    surface: Float[Tensor, "H W 1"] | None = None,
 ) -> Geometry:
     """Depth and normals of a view from the composite of :func:`geometry_channels`.
 
@@ -128,18 +128,17 @@ def rendered_geometry(
 
     Args:
         composited: normals and depth channel; with ``origin`` also the channel of :func:`squared_depths`; with
-            ``weighted`` all of them times a weight of each Gaussian, and this weight.
+            ``surface`` all of them times a weight of each Gaussian.
         alpha: accumulated opacity.
         info: third output of the rasterizer.
         camera: camera of the view.
         depth: kind of depth, as given to :func:`geometry_channels`.
         origin: origin of the squared depths.
-        weighted: whether each Gaussian has a weight, of its share in depth and normals.
+        surface: the composited weights, if Gaussians have any.
     """
     normal, channel = composited[..., :3], composited[..., 3:4]
-    surface = composited[..., -1:] if weighted else None
-    weights = alpha if surface is None else surface
-    solid = weights.clamp_min(1e-6)
+    weight = alpha if surface is None else surface
+    solid = weight.clamp_min(1e-6)
     if depth == "plane":
         facing = (normal * camera.rays()).sum(dim=-1, keepdim=True)
         z = channel / facing.minimum(-GRAZING * solid)
@@ -150,7 +149,7 @@ def rendered_geometry(
     else:
         z = channel / solid
     z = torch.where(alpha > 0, z, z.detach().max())
-    moments = None if origin is None else DepthMoments(origin, channel - origin * weights, composited[..., 4:5])
-    if weighted:
+    moments = None if origin is None else DepthMoments(origin, channel - origin * weight, composited[..., 4:5])
+    if surface is not None:
         normal = normal * (alpha / solid)
     return Geometry(z, normal, alpha, camera, info.get("distortion"), moments, surface)

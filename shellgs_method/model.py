@@ -177,8 +177,11 @@ class FacadeModel(SplatfactoModel):
     @property
     def training_cues(self) -> set[str]:
         """Kinds of maps that the training views need."""
-        of_surface = {"shell"} if self.config.geometry_of == "surface" else set()
-        return {self.config.cues, self.config.seeds} - {"none"} | of_surface
+        return {self.config.cues, "shell" if self._needs_points_of_shell else "none"} - {"none"}
+
+    @property
+    def _needs_points_of_shell(self) -> bool:
+        return self.config.seeds == "shell" or self.config.geometry_of == "surface"
 
     def _check_settings(self) -> None:
         config = self.config
@@ -186,8 +189,7 @@ class FacadeModel(SplatfactoModel):
             raise SceneError("median depth and distortion need discs: set pipeline.model.primitive to 2d")
         if config.depth == "plane" and config.extra.empty_space > 0:
             raise SceneError("empty_space needs the depths of the centres: set pipeline.model.depth to expected")
-        uses_shell = config.seeds == "shell" or config.geometry_of == "surface"
-        if uses_shell and "shell" not in self.kwargs["metadata"]["cues"]:
+        if self._needs_points_of_shell and "shell" not in self.kwargs["metadata"]["cues"]:
             raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
         if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
             method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
@@ -347,9 +349,9 @@ class FacadeModel(SplatfactoModel):
         }
         self.geometry = None
         if self._renders_geometry:
-            weighted = "surface" in gaussians
+            surface = composited[..., -1:] if "surface" in gaussians else None
             self.geometry = rendered_geometry(
-                composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin, weighted
+                composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin, surface
             )
             outputs["depth"] = self.geometry.depth
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))

@@ -290,10 +290,8 @@ def test_gaussians_that_training_views_have_not_shaped_are_removed_at_the_end(tr
         camera = data_of(planted).train_dataset.camera(index)
         moved.means.data[index] = (camera.position + distance * camera.viewmat[2, :3]).float()
         moved.scales.data[index] = log_scale
-    for index, length in (
-        (3, 0.5),
-        (4, 0.002),
-    ):  # needles that all views show, barely, of which the long one reaches cameras
+    # All views barely show these needles, of which the long one reaches cameras.
+    for index, length in ((3, 0.5), (4, 0.002)):
         moved.means.data[index] = moved.means.data.mean(dim=0)
         moved.scales.data[index] = torch.tensor([length, 1e-5, 1e-5]).log()
         moved.opacities.data[index] = math.log(0.01)

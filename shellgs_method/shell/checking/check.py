@@ -165,7 +165,7 @@ class _TrainingViews:
         beyond = _resized(agreed.beyond.float(), size).numpy() > 0.5
         static, moved = _told_apart((score > CONTRADICTED) & ~beyond, (alone > ALONE) & ~beyond)
         hidden = static | moved | beyond
-        confirmed = ~hidden & (_resized(found.score.float(), size).numpy() < CONFIRMED)
+        confirmed = _resized(found.score.float(), size).numpy() < CONFIRMED
         score_behind, farther = self._behind(seen, size)
         kinds = [static, beyond, moved, score_behind > REFLECTED, confirmed]
         depth = cue.depth * np.select(kinds, [_relative_depth(found, size), 2.0, 1.0, farther, 1.0], 0.0)
