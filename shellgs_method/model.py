@@ -50,14 +50,14 @@ from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.seeding import Seeds
-from shellgs_method.shell_surface import ShellSurface
 from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
+from shellgs_method.surface_weights import SurfaceWeights
 from shellgs_method.threads import ThreadsByLoad
 
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two opacity resets: opacities recover no faster in a short run."""
-SURFACE_EVERY = 50
-"""Iterations between two searches for the Gaussians behind the shell."""
+SURFACE_EVERY = 1000
+"""Iterations of a run of 30 000 between two searches for the Gaussians behind the shell."""
 MAX_KEPT_PIXELS = 3_000_000
 """Most pixels of training views whose losses are cached, at some 80 bytes each."""
 
@@ -165,7 +165,7 @@ class FacadeModel(SplatfactoModel):
         )
         self.crop_box = None
         self.geometry: Geometry | None = None
-        self.shell: ShellSurface | None = None
+        self.surface_weights: SurfaceWeights | None = None
         self.register_buffer("surface", None)
         self._views: dict[int, ViewLosses] = {}
         self._threads = ThreadsByLoad()
@@ -241,8 +241,9 @@ class FacadeModel(SplatfactoModel):
 
     def plan(self, num_iterations: int) -> None:
         """Scale every schedule to a run of ``num_iterations``."""
-        self.num_iterations = num_iterations
-        self.strategy = self._strategy(num_iterations / PAPER_ITERATIONS)
+        self.num_iterations, shrink = num_iterations, num_iterations / PAPER_ITERATIONS
+        self.surface_every = max(1, round(SURFACE_EVERY * shrink))
+        self.strategy = self._strategy(shrink)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def _strategy(self, shrink: float) -> DefaultStrategy | MCMCStrategy:
@@ -308,9 +309,9 @@ class FacadeModel(SplatfactoModel):
         return nn.Module.load_state_dict(self, dict, **kwargs)
 
     def update_surface(self) -> None:
-        """Find the Gaussians behind the shell if they have changed since."""
-        if self.shell is not None and (self.surface is None or len(self.surface) != self.num_points):
-            self.surface = self.shell.weights(self.means.detach())
+        """Find the Gaussians behind the shell, if others have been added or removed since."""
+        if self.surface_weights is not None and (self.surface is None or len(self.surface) != self.num_points):
+            self.surface = self.surface_weights(self.means.detach())
 
     @property
     def _gaussians(self) -> dict[str, Tensor]:
@@ -331,7 +332,7 @@ class FacadeModel(SplatfactoModel):
         self._threads.follow()
         pinhole = pinhole_camera(camera)
         background = self._get_background_color()
-        if self.training and self.step % SURFACE_EVERY == 0:
+        if self.training and self.step % self.surface_every == 0:
             self.surface = None
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:

@@ -20,7 +20,7 @@ from shellgs_method.checkpoints import check_gaussians, guard_checkpoint_loading
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.model import FacadeModel
-from shellgs_method.shell_surface import ShellSurface
+from shellgs_method.surface_weights import SurfaceWeights
 from shellgs_method.viewer import ContradictedShell
 
 
@@ -69,7 +69,7 @@ class FacadePipeline(VanillaPipeline):
             self.model.add_seeds(data.shell_seeds(config.seed_spacing, config.max_seeds, everywhere))
         if config.geometry_of == "surface" and config.primitive == "3d":
             shell = data.shell_seeds(config.seed_spacing, config.max_seeds, everywhere=True)
-            self.model.shell = ShellSurface(shell, self.model.metres_per_unit)
+            self.model.surface_weights = SurfaceWeights(shell, self.model.metres_per_unit)
             self.model.add_seeds(data.seeds_behind_shell(config.seed_spacing, config.max_seeds))
         if config.skybox_seeds > 0:
             self.model.add_seeds(data.skybox_seeds(config.skybox_seeds))

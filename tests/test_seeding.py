@@ -17,7 +17,7 @@ from shellgs_method.geometry import DISC_LOG_THICKNESS
 from shellgs_method.rasterizer import quats_to_rotations
 from shellgs_method.reference import Reference
 from shellgs_method.seeding import SKYBOX_RADIUS, SeededView, SkyView, shell_seeds, skybox_seeds
-from shellgs_method.shell_surface import WEIGHT_BEHIND, ShellSurface
+from shellgs_method.surface_weights import WEIGHT_BEHIND, SurfaceWeights
 
 FOCAL, WIDTH, HEIGHT = 60.0, 80, 60
 NORMAL = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
@@ -71,10 +71,10 @@ def test_a_seed_has_the_median_colour_of_the_views():
 
 def test_gaussians_behind_the_wall_hardly_count_for_its_geometry():
     seeds = seeds_of([view()])
-    surface = ShellSurface(seeds, metres_per_unit=0.5)
+    weights = SurfaceWeights(seeds, metres_per_unit=0.5)
     for metres, weight in ((-5.0, 1.0), (0.0, 1.0), (0.08, 1.0), (0.12, WEIGHT_BEHIND), (5.0, WEIGHT_BEHIND)):
         means = torch.from_numpy(seeds.points - seeds.normals * metres / 0.5)
-        assert (surface.weights(means) == weight).all()
+        assert (weights(means) == weight).all()
 
 
 def test_masked_and_grazing_pixels_give_no_seeds():

@@ -1,4 +1,4 @@
-"""Which Gaussians are behind the shell: those that show what its windows reflect, or let through."""
+"""Which Gaussians make up the surface: not those behind it, which show what windows reflect or let through."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ WEIGHT_BEHIND = 1e-3
 """Weight in depth and normals of those farther behind: not 0, so that views past the building have a depth too."""
 
 
-class ShellSurface:
-    """The shell as points with normals."""
+class SurfaceWeights:
+    """Weights of Gaussians in depth and normals, by the shell as points with normals."""
 
-    def __init__(self, points: Seeds, metres_per_unit: float | None):
-        self._points, self._normals = points.points, points.normals
-        self._tree = KDTree(points.points) if len(points.points) else None
+    def __init__(self, shell: Seeds, metres_per_unit: float | None):
+        self._points, self._normals = shell.points, shell.normals
+        self._tree = KDTree(shell.points) if len(shell.points) else None
         self._thickness = THICKNESS / (metres_per_unit or 1.0)
 
-    def weights(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1"]:
-        """Weights in depth and normals: 1, or :data:`WEIGHT_BEHIND` behind the tangent plane of the nearest point."""
+    def __call__(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1"]:
+        """1, or :data:`WEIGHT_BEHIND` for centres behind the tangent plane of the nearest point."""
         if self._tree is None:
             return means.new_ones(len(means), 1)
         positions = means.double().cpu().numpy()
