@@ -65,6 +65,7 @@ shellgs_metric = _method(
         cues="shell",
         shell_counts="uncontradicted",
         geometry_of="surface",
+        depth="mode",
         ignore_transients=True,
         seeds="shell",
         init_opacity=0.5,

@@ -21,10 +21,13 @@ from shellgs_method.fusion import run_fused
 from shellgs_method.rasterizer.projection import dot, rotate, rotated_axes, to_camera
 
 Primitive = Literal["3d", "2d"]
-DepthKind = Literal["expected", "median", "plane"]
+DepthKind = Literal["expected", "median", "plane", "mode"]
 
 DISC_LOG_THICKNESS = -20.0
 """Logarithm of a disc's third scale: negligible, so that splits stay in the plane, yet finite in an exported file."""
+
+MERGED = 0.01
+"""Spread of a pixel's depths, relative to the depth, at which its layers count half as separate, and less below."""
 
 GRAZING = 0.01
 """Smallest cosine of normal and ray for a plane depth: the ray meets a plane seen edge-on far away or not at all."""
@@ -94,6 +97,45 @@ def squared_depths(depths: Float[Tensor, "N 1"]) -> tuple[Float[Tensor, "N 1"], 
     return (depths - origin).square(), origin
 
 
+def depth_powers(
+    depths: Float[Tensor, "N 1"], weights: Float[Tensor, "N 1"] | None = None
+) -> tuple[Float[Tensor, "N 4"], Float[Tensor, ""]]:
+    """Powers 0 to 3 of t = z / (z + median), which is below 1 however far the sky is, times weights; and the median."""
+    median = depths.detach().median().clamp_min(1e-6)
+    z = depths.clamp_min(0)
+    t = z / (z + median) - 0.5  # about the median, for accuracy in float32
+    powers = torch.cat([torch.ones_like(t), t, t.square(), t**3], dim=-1)
+    return powers if weights is None else powers * weights, median
+
+
+def mode_of_depth(
+    expected: Float[Tensor, "H W 1"], powers: Float[Tensor, "H W 4"], median: Float[Tensor, ""]
+) -> Float[Tensor, "H W 1"]:
+    """Depth of the heavier of two layers, instead of a mean between them.
+
+    The two layers have the first moments of a pixel's splats, in t: mean m, variance σ² and skewness s. They are at
+    m + σ (s/2 ± √(1 + s²/4)), the nodes of Gauss quadrature (compare moment-based transparency, Münstermann et al.
+    2018), and the heavier one is the nearer to m. Since the splats of one surface are spread too, it counts by
+    σ² / (σ² + (z/100)²) only, with σ the spread of z. So a pixel at the edge of a wall has the depth of one side, and
+    haze in front of a wall does not displace it.
+
+    Args:
+        expected: mean depth.
+        powers: the composite of :func:`depth_powers`.
+        median: the second output of that.
+    """
+    total, *sums = powers.double().split(1, dim=-1)
+    mean, square, cube = (each / total.clamp_min(1e-9) for each in sums)
+    variance = (square - mean.square()).clamp_min(1e-12)
+    skewness = (cube - 3 * mean * square + 2 * mean**3) / variance**1.5
+    to_heavier = -skewness.sign() * variance.sqrt() * ((1 + skewness.square() / 4).sqrt() - skewness.abs() / 2)
+    t = (mean + to_heavier + 0.5).clamp(0, 0.999)
+    heavier = median * t / (1 - t)
+    spread = variance.sqrt() / ((0.5 + mean) * (0.5 - mean)).clamp_min(1e-6)  # of z, relative to z
+    separate = spread.square() / (spread.square() + MERGED**2)
+    return torch.lerp(expected.double(), heavier, separate.where(total > 0, 0.0)).to(expected)
+
+
 def _normals_and_depths(
     means: Float[Tensor, "N 3"],
     quats: Float[Tensor, "N 4"],
@@ -125,6 +167,7 @@ def rendered_geometry(
     * ``expected``: mean depth of the Gaussians' centres; for discs, alpha / Σ w/z of the ray's intersections.
     * ``median``: discs only, the intersection where the transmittance falls to 1/2; expected where it does not.
     * ``plane``: Σ w n·m / (Σ w n · ray), the ray's intersection with the composited plane (PGSR, Chen et al. 2024).
+    * ``mode``: expected, from which the caller makes :func:`mode_of_depth`.
 
     Args:
         composited: normals and depth channel; with ``origin`` also the channel of :func:`squared_depths`; with

@@ -42,7 +42,9 @@ from shellgs_method.geometry import (
     DepthKind,
     Geometry,
     Primitive,
+    depth_powers,
     geometry_channels,
+    mode_of_depth,
     rendered_geometry,
     squared_depths,
 )
@@ -86,7 +88,8 @@ class FacadeModelConfig(SplatfactoModelConfig):
     extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
     """Terms beyond the paper."""
     depth: DepthKind = "expected"
-    """Depth that is rendered and supervised: expected, median (discs only), or plane (of the composited plane)."""
+    """Depth that is rendered and supervised: expected, median (discs only), plane (of the composited plane), or mode
+    (of the heavier of two layers; expected in training)."""
     shell_counts: Literal["everywhere", "uncontradicted"] = "everywhere"
     """Where the shell supervises and is seeded: everywhere, or not where photographs show something in front of it."""
     geometry_of: Literal["everything", "surface"] = "everything"
@@ -355,8 +358,25 @@ class FacadeModel(SplatfactoModel):
                 composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin, surface
             )
             outputs["depth"] = self.geometry.depth
+            if self.config.depth == "mode" and not self.training:
+                outputs["depth"] = self._mode_of_depth(outputs["depth"], gaussians, features, pinhole)
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
         return outputs
+
+    def _mode_of_depth(
+        self,
+        expected: Float[Tensor, "H W 1"],
+        gaussians: dict[str, Tensor],
+        features: Float[Tensor, "N C"],
+        camera: Camera,
+    ) -> Float[Tensor, "H W 1"]:
+        """:func:`mode_of_depth` of a view, given its expected depth and the features that were composited."""
+        _, depths = geometry_channels(gaussians, camera, "expected")
+        powers, median = depth_powers(depths, gaussians.get("surface"))
+        # As many features as before, for which the kernels are compiled.
+        padded = torch.cat([powers, torch.zeros_like(features[:, powers.shape[1] :])], dim=-1)
+        composited, _, _ = self._rasterize(gaussians, padded, camera)
+        return mode_of_depth(expected, composited[..., : powers.shape[1]], median)
 
     def coverage(self, camera: Camera) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
         """Area of a training view that each Gaussian covers, and whether it reaches into the view, occluded or not.

@@ -14,7 +14,9 @@ from shellgs_method.geometry import (
     DepthKind,
     Geometry,
     Primitive,
+    depth_powers,
     geometry_channels,
+    mode_of_depth,
     rendered_geometry,
     squared_depths,
 )
@@ -67,6 +69,50 @@ def test_moments_are_those_of_the_splats_own_depths(eager, primitive):
     target = 8 + torch.rand(30, 40, 1, generator=random)
     expected = (composited[..., 5:] * (depths[:, 0] - target).square()).sum(dim=-1, keepdim=True)
     torch.testing.assert_close(geometry.moments.about(target, alpha), expected, rtol=1e-4, atol=1e-4)
+
+
+def mode_of(depths: list[float], weights: list[float]) -> float:
+    """Mode of splats with these depths and compositing weights."""
+    z, w = torch.tensor(depths)[:, None], torch.tensor(weights)[:, None]
+    powers, median = depth_powers(z)
+    mean = ((z * w).sum() / w.sum())[None, None, None]
+    return float(mode_of_depth(mean, (powers * w).sum(dim=0)[None, None], median))
+
+
+def test_the_mode_is_the_depth_of_the_heavier_of_two_layers():
+    assert mode_of([5.0, 10.0], [0.56, 0.14]) == pytest.approx(5, rel=1e-3)
+    assert mode_of([5.0, 10.0], [0.3, 0.7]) == pytest.approx(10, rel=1e-3)
+    assert mode_of([5.0, 5.05, 4.95, 10.0], [0.2, 0.2, 0.2, 0.2]) == pytest.approx(5, rel=5e-3)
+    assert mode_of([3.0, 12.0], [0.01, 0.99]) == pytest.approx(12, rel=1e-3)  # haze
+    assert mode_of([5.0, 5000.0], [0.9, 0.1]) < 5.2  # the sky
+    assert mode_of([5.0], [0.5]) == pytest.approx(5, rel=1e-5)
+
+
+def test_the_mode_of_one_thin_layer_is_close_to_its_mean():
+    random = torch.Generator().manual_seed(0)
+    for spread, limit in ((0.001, 0.0001), (0.003, 0.001)):
+        for _ in range(20):
+            depths = 8 * (1 + spread * torch.randn(12, generator=random))
+            weights = torch.rand(12, generator=random)
+            mean = float((depths * weights).sum() / weights.sum())
+            assert mode_of(depths.tolist(), weights.tolist()) == pytest.approx(mean, rel=limit)
+
+
+def test_no_pixel_has_a_mode_between_a_wall_and_what_is_in_front_of_it(eager):
+    back, _ = wall(0.0)
+    front = {name: values[back["means"][:, 0] < 0.1] for name, values in back.items()}
+    back["means"] = back["means"] + torch.tensor([0.0, 0.0, 3.0])
+    both = {name: torch.cat([front[name], back[name]]) for name in front}
+    _, depths = geometry_channels(both, CAMERA, "expected")
+    powers, median = depth_powers(depths)
+    expected = render(both, "3d", "expected")
+    means, quats, scales = (both[name] for name in ("means", "quats", "scales"))
+    opacities = torch.full((len(means),), 0.9)
+    composited, _, _ = rasterize(means, quats, scales.exp(), opacities, powers, CAMERA, "3d")
+    mode = mode_of_depth(expected.depth, composited, median)
+    between = [((depth > 5.3) & (depth < 7.7)).sum() for depth in (expected.depth, mode)]
+    assert between[0] > 40
+    assert between[1] == 0
 
 
 def test_what_is_behind_the_surface_does_not_move_its_depth_and_normals(eager):
