@@ -20,10 +20,11 @@ import method_configs
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.ablations import ABLATIONS
+from shellgs_method.batches import pinhole_camera
 from shellgs_method.compare.runs import PAPER
-from shellgs_method.geometry import DISC_LOG_THICKNESS
+from shellgs_method.geometry import DISC_LOG_THICKNESS, depth_powers, geometry_channels, mode_of_depth
 from shellgs_method.losses import ExponentialDecay
-from shellgs_method.rasterizer import quats_to_rotations
+from shellgs_method.rasterizer import quats_to_rotations, rasterize
 from shellgs_method.reference import Reference
 from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses
 
@@ -288,6 +289,28 @@ def test_normals_of_depth_have_a_depth_gradient_and_composited_ones_have_none(un
         geometry, cue, paper=GeometryLossConfig(OFF.depth, ExponentialDecay(1, 1), OFF.smoothness)
     ).values()
     assert torch.autograd.grad(only_n, geometry.depth, allow_unused=True) == (None,)
+
+
+def test_the_mode_is_rendered_and_the_losses_are_of_the_expected_depth(untrained, monkeypatch):
+    """With a weight of 0, what is behind the shell is in neither of the two layers."""
+    model, (camera, _) = model_of(untrained), held_out(untrained)
+    surface = torch.ones(model.num_points, 1)
+    surface[::2] = 0
+    monkeypatch.setattr(model, "surface", surface)
+    depths = {}
+    for kind in ("expected", "mode"):
+        monkeypatch.setattr(model.config, "depth", kind)
+        depths[kind] = render(untrained)["depth"]
+        assert model.geometry is not None
+        assert torch.equal(model.geometry.depth, depths["expected"])  # what losses are computed on
+    view, everything = pinhole_camera(camera), {name: each.detach() for name, each in model.gauss_params.items()}
+    powers, median = depth_powers(geometry_channels(everything, view, "expected")[1])
+    powers[::2] = 0
+    shape = everything["means"], everything["quats"], everything["scales"].exp()
+    composited, _, _ = rasterize(*shape, everything["opacities"].sigmoid()[:, 0], powers, view, "3d")
+    mode = mode_of_depth(depths["expected"], composited, median)
+    torch.testing.assert_close(depths["mode"], mode)
+    assert ((mode / depths["expected"] - 1).abs() > 0.05).sum() > 20
 
 
 def test_point_to_plane_is_in_metres(untrained):
