@@ -191,7 +191,9 @@ class FacadeModel(SplatfactoModel):
         if config.primitive == "3d" and (config.depth == "median" or config.extra.distortion > 0):
             raise SceneError("median depth and distortion need discs: set pipeline.model.primitive to 2d")
         if config.depth == "plane" and config.extra.empty_space > 0:
-            raise SceneError("empty_space needs the depths of the centres: set pipeline.model.depth to expected")
+            raise SceneError(
+                "empty_space needs the depths of the centres: set pipeline.model.depth to expected or mode"
+            )
         if self._needs_points_of_shell and "shell" not in self.kwargs["metadata"]["cues"]:
             raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
         if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
