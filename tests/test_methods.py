@@ -296,7 +296,7 @@ def test_the_mode_is_rendered_and_the_losses_are_of_the_expected_depth(untrained
     model, (camera, _) = model_of(untrained), held_out(untrained)
     surface = torch.ones(model.num_points, 1)
     surface[::2] = 0
-    monkeypatch.setattr(model, "surface", surface)
+    monkeypatch.setitem(model._buffers, "surface", surface)
     depths = {}
     for kind in ("expected", "mode"):
         monkeypatch.setattr(model.config, "depth", kind)
