@@ -246,9 +246,8 @@ class FacadeModel(SplatfactoModel):
 
     def plan(self, num_iterations: int) -> None:
         """Scale every schedule to a run of ``num_iterations``."""
-        self.num_iterations, shrink = num_iterations, num_iterations / PAPER_ITERATIONS
-        self.surface_every = max(1, round(SURFACE_EVERY * shrink))
-        self.strategy = self._strategy(shrink)
+        self.num_iterations = num_iterations
+        self.strategy = self._strategy(num_iterations / PAPER_ITERATIONS)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def _strategy(self, shrink: float) -> DefaultStrategy | MCMCStrategy:
@@ -337,7 +336,8 @@ class FacadeModel(SplatfactoModel):
         self._threads.follow()
         pinhole = pinhole_camera(camera)
         background = self._get_background_color()
-        if self.training and self.step % self.surface_every == 0:
+        surface_every = max(1, round(SURFACE_EVERY * self.num_iterations / PAPER_ITERATIONS))
+        if self.training and self.step % surface_every == 0:
             self.surface = None
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:
