@@ -347,9 +347,9 @@ def test_the_loss_of_all_splats_is_positive_even_if_their_mean_depth_is_right():
     loss = PointToPlaneLoss(target, normal, rays, torch.ones_like(target).bool(), metres_per_unit=2.0, tolerance=0.05)
     offset, alpha = 0.3 / (rays * normal).sum(-1, keepdim=True).abs(), torch.ones_like(target)
     assert float(loss(target)) == 0
-    assert float(loss.of_all(offset.square(), alpha)) == pytest.approx(math.log(1 + 0.6 - 0.05))
+    assert float(loss.of_all(offset.square(), alpha)) == pytest.approx(0.2 * math.log(1 + (0.6 - 0.05) / 0.2))
     # Half of the weight on the wall, the rest passing through: as if that were a metre behind.
-    assert float(loss.of_all(0 * target, alpha / 2)) == pytest.approx(math.log(1 + 0.5**0.5 - 0.05))
+    assert float(loss.of_all(0 * target, alpha / 2)) == pytest.approx(0.2 * math.log(1 + (0.5**0.5 - 0.05) / 0.2))
 
 
 def test_the_gradient_of_the_loss_of_all_splats_is_right_and_finite_on_the_wall(random):

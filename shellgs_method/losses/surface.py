@@ -11,6 +11,8 @@ from shellgs_method.losses.reduction import mean_weights
 
 BEHIND = 1.0
 """Distance behind the shell in metres at which the remaining transmittance is assumed to end."""
+REACH = 0.2
+"""Distance in metres at which the gradient of :meth:`PointToPlaneLoss.of_all` has fallen to half."""
 
 
 class PointToPlaneLoss:
@@ -35,9 +37,10 @@ class PointToPlaneLoss:
         return run_fused(_beyond, depth, self._target, self._slope, self._weights, self._tolerance, varying=2)
 
     def of_all(self, squares: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
-        """Loss of the root mean square distance of all splats of a pixel, instead of that of its mean depth.
+        """Loss of the root mean square distance e of all splats of a pixel, instead of that of its mean depth.
 
-        The remaining transmittance counts as if it ended a metre (:data:`BEHIND`) behind the shell.
+        It is log(1 + max(0, e - tolerance) / REACH) REACH, since what is in front of the shell counts more in e. The
+        remaining transmittance counts as if it ended a metre (:data:`BEHIND`) behind the shell.
 
         Args:
             squares: Σ w (z - target)², not divided by alpha.
@@ -91,4 +94,5 @@ def _all_beyond(
     tolerance: Float[Tensor, "1 1 1"],
 ) -> Float[Tensor, ""]:
     squares = slope * slope * squares + BEHIND**2 * (1 - alpha).relu()
-    return (weights * (squares.clamp_min(1e-8).sqrt() - tolerance).relu().log1p()).sum()
+    beyond = (squares.clamp_min(1e-8).sqrt() - tolerance).relu()
+    return (weights * (beyond / REACH).log1p() * REACH).sum()
