@@ -70,6 +70,7 @@ shellgs_metric = _method(
         seeds="shell",
         init_opacity=0.5,
         densify_grad_thresh=THRESHOLD_METRIC,
+        wide_gradient=4.0,  # with this threshold, what is beside the building would be a blur
         extra=ExtraLossConfig(
             empty_space=1.0,
             normal_consistency=0.1,  # continues walls beyond the shell

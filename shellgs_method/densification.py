@@ -1,4 +1,4 @@
-"""Densification by gradient that keeps large Gaussians far away, and MCMC densification, on any device.
+"""Densification by gradient, also of wide Gaussians and of those far away, and MCMC densification, on any device.
 
 gsplat's ``MCMCStrategy`` needs CUDA kernels for the relocation and for the covariances of the noise.
 """
@@ -17,13 +17,51 @@ from torch.optim import Optimizer
 
 from shellgs_method.rasterizer import quats_to_rotations
 
+WIDE = 0.05
+"""Radius in a view (three standard deviations), in units of its longer side, above which a Gaussian counts as wide."""
 MAX_COPIES = 51
 """Maximum number of Gaussians that one is divided into, as in the authors' code: more would make no visible change."""
 
 
 @dataclass
-class SkyboxStrategy(DefaultStrategy):
-    """gsplat's default densification, except that the size above which Gaussians are pruned grows with their distance.
+class GradientStrategy(DefaultStrategy):
+    """gsplat's default densification, except that the gradient of wide Gaussians can count more.
+
+    What such a Gaussian blurs pulls it in many directions, which cancel: its gradient is small although its error is
+    large (compare AbsGS, Ye et al. 2024).
+    """
+
+    wide_gradient: float = 1.0
+    """Factor on the gradient of Gaussians that were wide (:data:`WIDE`) in a view since the last refinement."""
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """Return gsplat's state, with the largest radius of each Gaussian."""
+        return super().initialize_state(scene_scale) | {"widest": None}
+
+    def _update_state(
+        self, params: nn.ParameterDict, state: dict[str, Any], info: dict[str, Any], packed: bool = False
+    ) -> None:
+        super()._update_state(params, state, info, packed)  # pyright: ignore[reportArgumentType]
+        radii = info["radii"]  # [B, N], or with later versions of gsplat [B, N, 2]
+        widest = radii.view(*radii.shape[:2], -1).amax(dim=(0, 2)) / max(info["width"], info["height"])
+        state["widest"] = widest if state["widest"] is None else widest.maximum(state["widest"])
+
+    @torch.no_grad()
+    def _grow_gs(
+        self,
+        params: nn.ParameterDict,
+        optimizers: dict[str, Optimizer],
+        state: dict[str, Any],
+        step: int,
+    ) -> tuple[int, int]:
+        state["grad2d"][state["widest"] > WIDE] *= self.wide_gradient
+        state["widest"].zero_()
+        return super()._grow_gs(params, optimizers, state, step)  # pyright: ignore[reportArgumentType]
+
+
+@dataclass
+class SkyboxStrategy(GradientStrategy):
+    """Densification by gradient, except that the size above which Gaussians are pruned grows with their distance.
 
     The cameras are within 1 of the origin. Farther away the limit is that at 1 times the distance, since the Gaussians
     of a skybox are large.

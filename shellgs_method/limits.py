@@ -52,6 +52,7 @@ LIMITS = {
     "reset_alpha_every": FROM_ONE,
     "densify_grad_thresh": WEIGHT,
     "densify_size_thresh": WEIGHT,
+    "wide_gradient": WEIGHT,
     "split_screen_size": WEIGHT,
     "cull_scale_thresh": WEIGHT,
     "cull_screen_size": WEIGHT,

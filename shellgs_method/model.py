@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Optional, cast
 
 import torch
-from gsplat.strategy import DefaultStrategy
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
@@ -35,7 +34,7 @@ from shellgs_method.batches import (
     reference_maps,
     references,
 )
-from shellgs_method.densification import MCMCConfig, MCMCStrategy, SkyboxStrategy
+from shellgs_method.densification import GradientStrategy, MCMCConfig, MCMCStrategy, SkyboxStrategy
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
 from shellgs_method.geometry import (
     DISC_LOG_THICKNESS,
@@ -101,6 +100,8 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """default: clone, split and prune by the gradient; mcmc: relocate and add by opacity, up to a cap."""
     mcmc: MCMCConfig = MCMCConfig()  # noqa: RUF009
     """Settings of mcmc."""
+    wide_gradient: float = 1.0
+    """Factor on the gradient that densifies Gaussians wider than a twentieth of the image; 1 in 3DGS."""
     seeds: Literal["none", "shell"] = "none"
     """Initial Gaussians besides those at the SfM points: none, or spread over the shell."""
     seed_spacing: float = 4.0
@@ -250,7 +251,7 @@ class FacadeModel(SplatfactoModel):
         self.strategy = self._strategy(num_iterations / PAPER_ITERATIONS)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
-    def _strategy(self, shrink: float) -> DefaultStrategy | MCMCStrategy:
+    def _strategy(self, shrink: float) -> GradientStrategy | MCMCStrategy:
         """Densification strategy of a run ``shrink`` times as long as the config's."""
         config = self.config
         start, stop = round(config.warmup_length * shrink), round(config.stop_split_at * shrink)
@@ -260,7 +261,7 @@ class FacadeModel(SplatfactoModel):
             return MCMCStrategy(config.mcmc.cap_max, start, stop, every, config.mcmc.noise)
         reset_every = config.reset_alpha_every * every
         reset_every = max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every))
-        strategy = SkyboxStrategy if config.skybox_seeds > 0 else DefaultStrategy
+        strategy = SkyboxStrategy if config.skybox_seeds > 0 else GradientStrategy
         return strategy(
             refine_start_iter=start,
             refine_stop_iter=stop,
@@ -275,6 +276,7 @@ class FacadeModel(SplatfactoModel):
             reset_every=reset_every,
             absgrad=config.use_absgrad,
             key_for_gradient="gradient_2dgs" if config.primitive == "2d" else "means2d",
+            wide_gradient=config.wide_gradient,
         )
 
     def get_training_callbacks(self, training_callback_attributes):
@@ -287,7 +289,7 @@ class FacadeModel(SplatfactoModel):
 
     def step_post_backward(self, step: int) -> None:
         """Densify and prune, except at step 0, where gsplat 1.4 would reset the opacities."""
-        if isinstance(self.strategy, DefaultStrategy):
+        if isinstance(self.strategy, GradientStrategy):
             self.strategy.pause_refine_after_reset = self._refinement_pause(step, self.strategy.reset_every)
         if step > 0:
             super().step_post_backward(step)

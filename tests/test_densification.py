@@ -1,4 +1,4 @@
-"""MCMC densification against its equation in float64, and that it preserves the image."""
+"""Densification of wide Gaussians; MCMC against its equation in float64, and that it preserves the image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from dataparsers.camera import Camera
-from shellgs_method.densification import MAX_COPIES, MCMCStrategy, relocated
+from shellgs_method.densification import MAX_COPIES, GradientStrategy, MCMCStrategy, relocated
 from shellgs_method.rasterizer import rasterize
 
 CASES = [(0.01, 2), (0.3, 3), (0.9, 7), (0.999, 20), (0.5, MAX_COPIES)]
@@ -158,3 +158,28 @@ def test_noise_has_the_shape_of_its_gaussian_and_spares_opaque_ones():
     expected = size * torch.tensor([0.25, 0.04, 0.01])
     torch.testing.assert_close((moved[1:] @ axes).std(dim=0), expected, rtol=0.03, atol=0)
     assert moved[0].abs().max() < 1e-6
+
+
+@pytest.mark.parametrize(("factor", "split"), [(1.0, [1]), (4.0, [1, 2])])
+def test_wide_gaussians_split_at_a_lower_gradient(factor, split):
+    """Gradients of 2, 12, 4 and 4 tenths of the limit, where all but the last were wide in one of two views."""
+    params = gaussians(4)
+    optimizers, means = stepped(params), params["means"].detach().clone()
+    strategy = GradientStrategy(grow_grad2d=1.0, grow_scale3d=0.0, wide_gradient=factor)
+    state = strategy.initialize_state()
+    for radii in [(9, 9, 9, 4), (1, 1, 1, 4)]:
+        means2d = torch.zeros(1, 4, 2, requires_grad=True)
+        means2d.grad = torch.tensor([[[0.2, 0], [1.2, 0], [0.4, 0], [0.4, 0]]]) / 50  # of half the image's width
+        info = {
+            "means2d": means2d,
+            "radii": torch.tensor([radii]),
+            "width": 100,
+            "height": 60,
+            "n_cameras": 1,
+            "gaussian_ids": None,
+        }
+        strategy._update_state(params, state, info)
+    assert strategy._grow_gs(params, optimizers, state, step=1) == (0, len(split))
+    kept = [i for i in range(4) if i not in split]
+    torch.testing.assert_close(params["means"][: len(kept)].detach(), means[kept])
+    assert len(state["widest"]) == len(params["means"])

@@ -34,11 +34,13 @@ PRIVATE = [
     ("shellgs_method/trainer.py", "nerfstudio.engine.trainer", "Trainer._after_train", "self"),
     ("shellgs_method/model.py", "nerfstudio.models.splatfacto", "SplatfactoModel._get_background_color", "self"),
     ("shellgs_method/viewer.py", "nerfstudio.viewer.viewer_elements", "ViewerControl._setup", "self viewer"),
-    (
-        "shellgs_method/densification.py",
-        "gsplat.strategy.default",
-        "DefaultStrategy._prune_gs",
-        "self params optimizers state step",
+    *(
+        ("shellgs_method/densification.py", "gsplat.strategy.default", f"DefaultStrategy.{name}", parameters)
+        for name, parameters in {
+            "_update_state": "self params state info packed",
+            "_grow_gs": "self params optimizers state step",
+            "_prune_gs": "self params optimizers state step",
+        }.items()
     ),
     ("shellgs_method/densification.py", "gsplat.strategy.ops", "_multinomial_sample", "weights n"),
     (
