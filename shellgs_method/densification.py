@@ -18,7 +18,7 @@ from torch.optim import Optimizer
 from shellgs_method.rasterizer import quats_to_rotations
 
 WIDE = 0.05
-"""Radius in a view (three standard deviations), in units of its longer side, above which a Gaussian counts as wide."""
+"""Radius in a view, as gsplat gives it, in units of its longer side, above which a Gaussian counts as wide."""
 MAX_COPIES = 51
 """Maximum number of Gaussians that one is divided into, as in the authors' code: more would make no visible change."""
 
@@ -41,7 +41,7 @@ class GradientStrategy(DefaultStrategy):
     def _update_state(
         self, params: nn.ParameterDict, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:
-        super()._update_state(params, state, info, packed)  # pyright: ignore[reportArgumentType]
+        super()._update_state(params, state, info, packed)
         radii = info["radii"]  # [B, N], or with later versions of gsplat [B, N, 2]
         widest = radii.view(*radii.shape[:2], -1).amax(dim=(0, 2)) / max(info["width"], info["height"])
         state["widest"] = widest if state["widest"] is None else widest.maximum(state["widest"])
@@ -56,7 +56,7 @@ class GradientStrategy(DefaultStrategy):
     ) -> tuple[int, int]:
         state["grad2d"][state["widest"] > WIDE] *= self.wide_gradient
         state["widest"].zero_()
-        return super()._grow_gs(params, optimizers, state, step)  # pyright: ignore[reportArgumentType]
+        return super()._grow_gs(params, optimizers, state, step)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from shellgs_method.losses.reduction import mean_weights
 BEHIND = 1.0
 """Distance behind the shell in metres at which the remaining transmittance is assumed to end."""
 REACH = 0.2
-"""Distance in metres at which the gradient of :meth:`PointToPlaneLoss.of_all` has fallen to half."""
+"""Distance beyond the tolerance in metres at which :meth:`PointToPlaneLoss.of_all` has half of its largest gradient."""
 
 
 class PointToPlaneLoss:
