@@ -68,6 +68,7 @@ shellgs_metric = _method(
         depth="mode",
         ignore_transients=True,
         seeds="shell",
+        skybox_seeds=2500,  # or the sky is painted in front of what is beside the building
         init_opacity=0.5,
         densify_grad_thresh=THRESHOLD_METRIC,
         wide_gradient=4.0,  # with this threshold, what is beside the building would be a blur

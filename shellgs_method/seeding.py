@@ -110,8 +110,9 @@ def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, mo
 def skybox_seeds(views: Iterable[SkyView], num_pixels: int, sfm_points: Float[ndarray, "P 3"], count: int) -> Seeds:
     """Make seeds all around the scene, for the sky and what is too far for SfM points.
 
-    They are spread evenly over a sphere around the cameras' centre, also in directions that no view shows, since a new
-    one may. The skybox is that of Hierarchical 3D Gaussians (Kerbl et al. 2024), with colours from the photographs.
+    They are spread evenly over a sphere around the cameras' centre; those that no training view shows are removed after
+    training, as all such Gaussians are. The skybox is that of Hierarchical 3D Gaussians (Kerbl et al. 2024), with
+    colours from the photographs.
 
     Args:
         views: training views.
