@@ -33,7 +33,7 @@ from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.layout import SceneLayout, ScenePaths
-from shellgs_method import cli
+from shellgs_method import batches, cli
 from shellgs_method.compare import cluster, launch
 from shellgs_method.compare.launch import CommandError, follow, launch_locally
 from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_metrics
@@ -139,6 +139,13 @@ def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
     fabricate(runs[0], truth_normal_deg=40.0)
     (truth,) = (table for table in tables(runs, {runs[0].scene: shell}) if table.name == "truth")
     assert list(truth.rows) == ["photo-gs", "the shell itself"]
+
+
+def test_the_shell_itself_is_measured_over_the_pixels_of_every_method(pristine_scene, monkeypatch):
+    """Also where photographs contradict it, since no method is excused from the truth there."""
+    shell = measure_shell(SceneLayout(data=pristine_scene))
+    monkeypatch.setattr(batches, "contradicted", lambda batch, device: torch.ones_like(batch["shell_mask"]))
+    assert measure_shell(SceneLayout(data=pristine_scene)) == pytest.approx(shell, nan_ok=True)
 
 
 def test_the_paths_of_a_scene_reach_every_run(pristine_scene, tmp_path):

@@ -26,7 +26,7 @@ from shellgs_method.batches import masked_image_errors, pinhole_camera, referenc
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
 from shellgs_method.depth_normals import normals_from_depth
-from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
+from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, mean_over_views
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.model import FacadeModel
 from shellgs_method.trained import load_run
@@ -124,21 +124,19 @@ def measure(config_path: Path, half: Half | None = None, renders: Path | None = 
 
 
 def measure_shell(layout: SceneLayout) -> dict[str, float]:
-    """Metrics of the shell itself against the truth, in held-out views where both exist; empty without a truth."""
+    """Metrics of the shell itself against the truth, over the pixels of every method; empty without a truth."""
     if not {"shell", "truth"} <= {*find_cues(layout.data)}:
         return {}
     dataparser, cpu = FacadeDataParserConfig(**vars(layout)), torch.device("cpu")
     datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=layout.data), None, cpu)
-    dataset, metrics = datamanager.eval_dataset, []
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
-    for index in range(len(dataset)):
-        batch = dataset.get_metadata({"image_idx": index})
+    metrics = []
+    for cameras, batch in datamanager.fixed_indices_eval_dataloader:
         if {"shell_depth", "truth_depth"} <= batch.keys():
-            shell, truth = (reference_maps(batch, kind, cpu) for kind in ("shell", "truth"))
-            both = truth._replace(mask=truth.mask & shell.mask)
+            shell = reference_maps(batch, "shell", cpu, everywhere=True)
             rendering = Rendering(shell.depth, shell.depth, shell.mask.float(), shell.normal)
-            metrics.append(geometry_errors(rendering, dataset.camera(index), both, metres_per_unit))
-    return {f"truth_{name}": value for name, value in mean_over_views(metrics).items()}
+            metrics.append(reference_errors(rendering, pinhole_camera(cameras), batch, metres_per_unit))
+    return {name: value for name, value in mean_over_views(metrics).items() if name.startswith("truth_")}
 
 
 def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDataManager:
