@@ -26,7 +26,7 @@ from shellgs_method.batches import masked_image_errors, pinhole_camera, referenc
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
 from shellgs_method.depth_normals import normals_from_depth
-from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, mean_over_views
+from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.model import FacadeModel
 from shellgs_method.trained import load_run
@@ -130,13 +130,15 @@ def measure_shell(layout: SceneLayout) -> dict[str, float]:
     dataparser, cpu = FacadeDataParserConfig(**vars(layout)), torch.device("cpu")
     datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=layout.data), None, cpu)
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
-    metrics = []
-    for cameras, batch in datamanager.fixed_indices_eval_dataloader:
+    dataset, metrics = datamanager.eval_dataset, []
+    dataset.seen_by = None  # only images are measured in what is seen
+    for index in range(len(dataset)):
+        batch = dataset.get_data(index)
         if {"shell_depth", "truth_depth"} <= batch.keys():
-            shell = reference_maps(batch, "shell", cpu, everywhere=True)
+            shell, truth = reference_maps(batch, "shell", cpu, everywhere=True), reference_maps(batch, "truth", cpu)
             rendering = Rendering(shell.depth, shell.depth, shell.mask.float(), shell.normal)
-            metrics.append(reference_errors(rendering, pinhole_camera(cameras), batch, metres_per_unit))
-    return {name: value for name, value in mean_over_views(metrics).items() if name.startswith("truth_")}
+            metrics.append(geometry_errors(rendering, dataset.camera(index), truth, metres_per_unit))
+    return {f"truth_{name}": value for name, value in mean_over_views(metrics).items()}
 
 
 def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDataManager:
