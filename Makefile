@@ -12,7 +12,7 @@ test: .venv/dev .venv/checked  ## install; format, lint, types, tests
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/pyright --pythonpath $(BIN)/python
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 docs: .venv/docs  ## the pages, in build/docs; broken links are errors
 	$(BIN)/sphinx-build -W --keep-going -q docs build/docs
