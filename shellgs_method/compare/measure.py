@@ -22,9 +22,9 @@ from dataparsers.errors import SceneError, check_output
 from dataparsers.facade import FacadeDataParserConfig
 from dataparsers.files import atomic_write
 from dataparsers.layout import SceneLayout
-from shellgs_method.batches import masked_image_errors, pinhole_camera, reference_errors, reference_maps
+from shellgs_method.batches import REFERENCES, masked_image_errors, pinhole_camera, reference_errors, reference_maps
 from shellgs_method.compare.runs import Half
-from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig
+from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig, FacadeDataset
 from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
 from shellgs_method.evaluation.view import OPAQUE
@@ -127,11 +127,10 @@ def measure_shell(layout: SceneLayout) -> dict[str, float]:
     """Metrics of the shell itself against the truth, over the pixels of every method; empty without a truth."""
     if not {"shell", "truth"} <= {*find_cues(layout.data)}:
         return {}
-    dataparser, cpu = FacadeDataParserConfig(**vars(layout)), torch.device("cpu")
-    datamanager = _held_out_views(FacadeDataManagerConfig(dataparser=dataparser, data=layout.data), None, cpu)
-    metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
-    dataset, metrics = datamanager.eval_dataset, []
-    dataset.seen_by = None  # only images are measured in what is seen
+    held_out = FacadeDataParserConfig(**vars(layout)).setup().get_dataparser_outputs("test")
+    dataset, metres_per_unit = FacadeDataset(held_out), held_out.metadata["metres_per_unit"]
+    dataset.any_size, dataset.kinds = True, tuple(REFERENCES)
+    cpu, metrics = torch.device("cpu"), []
     for index in range(len(dataset)):
         batch = dataset.get_data(index)
         if {"shell_depth", "truth_depth"} <= batch.keys():
