@@ -92,7 +92,7 @@ def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
         started = time.perf_counter()
         made = make()
         seconds = time.perf_counter() - started
-        ways = both_ways(made.surface, shell, shell, [photo.camera for photo in chapter.photos], 0.05)
+        ways = both_ways(made.surface, shell, shell, chapter.made.cameras, 0.05)
         errors = [f"{100 * ways[way].p95:.1f}" for way in ("to the collider", "from the collider")]
         share = f"{leaks(made.surface, shell, eyes):.2%}"
         table.add_row(name, str(len(made.parts)), f"{seconds:.1f}", f"{made.filled:.2f}", *errors, share)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tracemalloc
+import weakref
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -340,6 +343,32 @@ def test_the_texture_has_the_photographed_colours(wall):
     assert np.quantile(error, 0.95) < 12
 
 
+class Loading(Sequence):
+    """Photographs that are loaded when asked for, and how many there were at most at the same time."""
+
+    def __init__(self, cameras: Sequence[Camera]):
+        self.cameras, self.most, self.alive = cameras, 0, 0
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, index):
+        photo = photo_of(self.cameras[index])
+        weakref.finalize(photo.image, self._forget)
+        self.alive += 1
+        self.most = max(self.most, self.alive)
+        return photo
+
+    def _forget(self) -> None:
+        self.alive -= 1
+
+
+def test_a_texture_keeps_no_photographs_in_memory(wall):
+    photos = Loading([frontal(x) for x in np.linspace(-1, 1, 6)])
+    bake(wall, np.zeros((len(wall.vertices), 3)), photos)
+    assert photos.most <= 2  # one is loaded while the last one is still known
+
+
 def test_views_blend_into_each_other(wall):
     """Two views of different exposure: no step between neighbouring points is as large as that between the views."""
     photos = [photo_of(frontal(-1.2), 0.8), photo_of(frontal(1.2), 1.0)]
@@ -382,7 +411,7 @@ def shell_and_bump() -> tuple[Surface, Surface]:
 
 def test_a_deviation_has_the_right_position_and_size():
     flat, built = shell_and_bump()
-    found = find_deviations(flat, built, [("a.jpg", photo_of(frontal(-1.0))), ("b.jpg", photo_of(frontal(0.6)))], 0.05)
+    found = find_deviations(flat, built, [("a.jpg", frontal(-1.0)), ("b.jpg", frontal(0.6))], 0.05)
     assert [region.what for region in found.regions] == ["before"]
     (region,) = found.regions
     assert region.area == pytest.approx(0.4, rel=0.35)
@@ -391,9 +420,20 @@ def test_a_deviation_has_the_right_position_and_size():
     assert region.photograph == "b.jpg"
 
 
+def test_the_memory_of_deviations_does_not_grow_with_the_photographs():
+    flat, built = shell_and_bump()
+    peaks = []
+    for count in (4, 40):
+        tracemalloc.start()
+        find_deviations(flat, built, [(f"{x}.jpg", frontal(x)) for x in np.linspace(-1, 1, count)], 0.05)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+
+
 def test_distances_are_unknown_where_no_photograph_sees_the_shell(tmp_path):
     flat, built = shell_and_bump()
-    found = find_deviations(flat, built, [("a.jpg", photo_of(frontal(0.0)))], 0.05)
+    found = find_deviations(flat, built, [("a.jpg", frontal(0.0))], 0.05)
     behind = found.surface.centres[:, 1] > 2.9
     assert np.isnan(found.distance[behind]).all()
     found.write(tmp_path / "deviations.ply")
@@ -410,7 +450,7 @@ def test_photographs_take_precedence_over_the_reconstruction():
     def contradicted(points: np.ndarray) -> np.ndarray:
         return np.where(points[:, 0] < -1, -0.3, np.nan)
 
-    found = find_deviations(flat, built, [("a.jpg", photo_of(frontal(0.0, 6)))], 0.05, contradicted)
+    found = find_deviations(flat, built, [("a.jpg", frontal(0.0, 6))], 0.05, contradicted)
     assert {region.what for region in found.regions} == {"before", "behind"}
 
 

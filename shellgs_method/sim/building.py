@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
 
-from dataparsers.camera import positions
+from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import find_cues
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask, load_photograph
@@ -103,15 +103,22 @@ class Reconstruction:
         return transformed(positions(view.camera for view in self.views), np.linalg.inv(self.frame.to_scene))
 
     @property
-    def photos(self) -> Iterator[Photo]:
-        """Photographs with cameras in the simulation frame, and masks of the building."""
-        for view, hidden in zip(self.views, self.hidden, strict=True):
-            image, kept = np.ascontiguousarray(load_photograph(view)[..., :3]), load_mask(view)
-            rows, columns = (
-                np.arange(n) * m // n for n, m in zip(image.shape[:2], hidden.shape, strict=True)
-            )  # nearest
-            clear = ~hidden[np.ix_(rows, columns)]
-            yield Photo(image, self.frame.camera(view.camera), clear if kept is None else clear & kept)
+    def cameras(self) -> list[Camera]:
+        """Cameras of the views in the simulation frame."""
+        return [self.frame.camera(view.camera) for view in self.views]
+
+    @property
+    def photos(self) -> Sequence[Photo]:
+        """Photographs with cameras in the simulation frame and masks of the building, each loaded when asked for."""
+        return _Photos(self)
+
+    def photo(self, index: int) -> Photo:
+        """Load the photograph of a view."""
+        view, hidden = self.views[index], self.hidden[index]
+        image, kept = np.ascontiguousarray(load_photograph(view)[..., :3]), load_mask(view)
+        rows, columns = (np.arange(n) * m // n for n, m in zip(image.shape[:2], hidden.shape, strict=True))  # nearest
+        clear = ~hidden[np.ix_(rows, columns)]
+        return Photo(image, self.frame.camera(view.camera), clear if kept is None else clear & kept)
 
     def contradicted(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
         """Metres in front of points of the shell at which photographs contradict it; NaN where they do not.
@@ -131,6 +138,19 @@ class Reconstruction:
                 f"{self.scene} has no aligned shell: the frame is the scene's, rotated upright by the cameras' up "
                 "axes, its unit is unknown, and the collision geometry comes from the reconstruction alone."
             )
+
+
+@dataclass(frozen=True, eq=False)
+class _Photos(Sequence[Photo]):
+    """The photographs of a reconstruction, none of which is kept in memory."""
+
+    made: Reconstruction
+
+    def __len__(self) -> int:
+        return len(self.made.views)
+
+    def __getitem__(self, index: int) -> Photo:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.made.photo(range(len(self))[index])  # an index beyond the end must raise, or iteration never ends
 
 
 def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray]) -> Iterator[DepthView]:

@@ -10,11 +10,10 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from dataparsers.camera import project
+from dataparsers.camera import Camera, in_view
 from dataparsers.files import atomic_write
 from shellgs_method.sim.collider import connected
 from shellgs_method.sim.rays import Surface
-from shellgs_method.sim.texture import Photo
 
 EDGE = 0.15
 """Longest edge in metres of the triangles into which the shell is subdivided."""
@@ -77,7 +76,7 @@ class Deviations:
 def find_deviations(
     shell: Surface,
     fused: Surface,
-    photos: Sequence[tuple[str, Photo]],
+    views: Sequence[tuple[str, Camera]],
     threshold: float,
     contradicted: Contradicted | None = None,
     least: float = 0.05,
@@ -87,18 +86,18 @@ def find_deviations(
     Args:
         shell: shell, wound so that normals point outside.
         fused: reconstruction.
-        photos: photographs with their names.
+        views: names of the photographs, with their cameras.
         threshold: distance in metres above which they differ.
         contradicted: distances from the photographs themselves, used instead of the reconstruction where not NaN.
         least: minimum area of a region in square metres.
     """
     small = Surface(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
     centres = small.centres
-    views = [(name, photo.camera.position.double().numpy(), *project(photo.camera, centres)) for name, photo in photos]
     best, score = np.full(len(centres), -1), np.zeros(len(centres))
-    for number, ((_, eye, pixels, depth), (_, photo)) in enumerate(zip(views, photos, strict=True)):
-        size = np.array([photo.camera.width, photo.camera.height])
-        inside = np.flatnonzero((depth > 0.1) & ((pixels > 0) & (pixels < size)).all(axis=1))
+    for number, (_, camera) in enumerate(views):
+        eye = camera.position.double().numpy()
+        shown, _, depth = in_view(camera, centres)
+        inside = np.flatnonzero(shown)[depth > 0.1]
         away = eye - centres[inside]
         length = np.linalg.norm(away, axis=1)
         facing = np.einsum("nc,nc->n", away, small.normals[inside]) / length
@@ -115,7 +114,7 @@ def find_deviations(
     for what, chosen in (("before", flagged & (distance > 0)), ("behind", flagged & (distance < 0))):
         for group in connected(small.faces, np.flatnonzero(chosen)):
             if (area := small.areas[group].sum()) >= least:
-                regions.append(_region(what, float(area), group, centres, distance, best, [name for name, *_ in views]))
+                regions.append(_region(what, float(area), group, centres, distance, best, [name for name, _ in views]))
     return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
 
 

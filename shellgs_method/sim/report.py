@@ -21,7 +21,6 @@ from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.parts import joined
 from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.renders import overlaid, rendered, shown
-from shellgs_method.sim.texture import Photo
 from shellgs_method.sim.trials import throw, walk
 from shellgs_method.sim.world import Building
 
@@ -49,7 +48,6 @@ class Chapter:
         shell: shell, wound outwards; None if there is none.
         collider: collision geometry.
         facts: sizes of the visual mesh and its files.
-        photos: photographs in the order of the reconstruction's views.
         deviations: deviations from the shell; None if there is none.
         distances: distances between the collision geometry and other surfaces.
         truth: true geometry, if known.
@@ -60,7 +58,6 @@ class Chapter:
     shell: Surface | None
     collider: Collider
     facts: dict
-    photos: list[Photo]
     deviations: Deviations | None
     distances: Mapping[str, Mapping[str, Distances]]
     truth: Surface | None
@@ -200,7 +197,7 @@ def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterat
     """Photographs, MuJoCo's renders from the same cameras, and photographs with the edges of the collision geometry."""
     held_out = [k for k, view in enumerate(chapter.made.views) if view.name in chapter.made.held_out]
     chosen = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, IMAGES).round().astype(int))]
-    photos = [shown(chapter.photos[k]) for k in chosen]
+    photos = [shown(chapter.made.photo(k)) for k in chosen]
     try:
         drawn = rendered(world, [photo.camera for photo in photos])
     except SceneError as error:

@@ -109,26 +109,25 @@ def _building(
     fused, _ = outward(Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
     _report_gaps(collider, made.scene, log)
     write_parts(folder, collider.parts)
-    photos = list(made.photos)
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
-    textured = bake(fused, colours, photos, settings.texel)
+    textured = bake(fused, colours, made.photos, settings.texel)
     facts = write_visual(folder, textured, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
     with_splats = write_usd_layers(folder, textured, collider.parts, made.splats, 1.0 if made.frame.metric else None)
     deviations: Deviations | None = None
     if shell is not None:
-        named = list(zip([view.name for view in made.views], photos, strict=True))
-        deviations = find_deviations(shell, fused, named, ahead, made.contradicted)
+        views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]
+        deviations = find_deviations(shell, fused, views, ahead, made.contradicted)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
     surfaces = {"shell": shell, "fused surface": fused, "truth": truth}
     distances = {
-        name: both_ways(collider.surface, other, shell, [photo.camera for photo in photos], ahead)
+        name: both_ways(collider.surface, other, shell, made.cameras, ahead)
         for name, other in surfaces.items()
         if other is not None
     }
-    return Chapter(made, shell, collider, facts, photos, deviations, distances, truth, with_splats)
+    return Chapter(made, shell, collider, facts, deviations, distances, truth, with_splats)
 
 
 def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> None:

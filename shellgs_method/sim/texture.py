@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from PIL import Image
 from scipy.ndimage import distance_transform_edt, map_coordinates
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csc_array, hstack
 
 from dataparsers.camera import Camera, project
 from dataparsers.errors import SceneError
@@ -57,7 +57,7 @@ class TexturedMesh:
 
 
 def bake(
-    surface: Surface, colours: Float64[np.ndarray, "V 3"], photos: Iterable[Photo], texel: float | None = None
+    surface: Surface, colours: Float64[np.ndarray, "V 3"], photos: Sequence[Photo], texel: float | None = None
 ) -> TexturedMesh:
     """Unwrap a surface and texture it from photographs, or with its own colours where no photograph sees it.
 
@@ -67,15 +67,14 @@ def bake(
     Args:
         surface: mesh.
         colours: vertex colours in [0, 255].
-        photos: photographs with cameras in the mesh's frame.
+        photos: photographs with cameras in the mesh's frame; each is asked for twice, and not kept.
         texel: size of the texture's pixels, in metres; a little finer than the photographs' on the mesh if None.
     """
-    photos = list(photos)
-    weights = np.stack([_weights(surface, photo) for photo in photos], axis=1)
-    best = weights.max(axis=1)
+    # Sparse: a photograph of many sees a small part of the surface.
+    weights = csc_array(hstack([csc_array(_weights(surface, photo)[:, None]) for photo in photos]))
+    best = weights.max(axis=1).toarray().ravel()
     if texel is None:  # a weight is pixels per square metre
         texel = float(FINER / np.sqrt(np.median(best[best > 0]))) if (best > 0).any() else 0.02
-    sharp = (weights / np.maximum(best, 1e-12)[:, None]) ** SHARPNESS
     vertex, uv, faces, size = _atlas(surface, texel)
     pixels, corners, barycentric = _texels(uv, faces, size)
     at = vertex[faces[corners]]  # the mesh's vertices around each texel
@@ -84,7 +83,8 @@ def bake(
     total = np.full(len(points), own)
     blend = own * np.einsum("nk,nkc->nc", barycentric, colours[at])
     for number, photo in enumerate(photos):
-        weight = np.einsum("nk,nk->n", barycentric, sharp[at, number])
+        sharp = (weights[:, [number]].toarray().ravel() / np.maximum(best, 1e-12)) ** SHARPNESS
+        weight = np.einsum("nk,nk->n", barycentric, sharp[at])
         seeing = np.flatnonzero(weight > 1e-4)
         total[seeing] += weight[seeing]
         blend[seeing] += weight[seeing, None] * _sample(photo, points[seeing])
