@@ -380,6 +380,46 @@ def test_commands_share_a_process_up_to_the_first_that_fails(tmp_path, monkeypat
     assert log.read_text() == "$ count 1\n1\n$ count 2\n3\n$ fail\nout of counts\n"
 
 
+def test_a_log_is_written_while_the_command_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(launch, "BIN", tmp_path)
+    log = tmp_path / "log.txt"
+    write_script(
+        tmp_path / "wait",
+        "import time\nprint('begun')\n"
+        f"while 'begun' not in open({str(log)!r}).read():\n    time.sleep(0.01)\nprint('read')",
+    )
+    follow([["wait"]], log=log)
+    assert log.read_text() == "$ wait\nbegun\nread\n"
+
+
+@pytest.mark.parametrize(("visible", "expected"), [(None, ["0", "1", "0"]), ("2,GPU-5", ["2", "GPU-5", "2"])])
+def test_concurrent_runs_are_on_different_gpus(pristine_scene, tmp_path, monkeypatch, visible, expected):
+    """With more runs than GPUs, each GPU has as many as are necessary."""
+    monkeypatch.setattr(launch.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(launch.torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible or "")
+    if visible is None:
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    together = threading.Barrier(3)
+    given = []
+
+    def record(run, announce, step, device):
+        together.wait(timeout=10)
+        given.append(device)
+
+    monkeypatch.setattr(launch, "finish", record)
+    runs = fake_grid([pristine_scene], ["shellgs", "2dgs", "photo-gs"], tmp_path)
+    launch_locally(runs, 3, Console(quiet=True))
+    assert sorted(given) == sorted(expected)
+
+
+def test_a_command_sees_the_gpu_that_it_is_given(tmp_path, monkeypatch):
+    monkeypatch.setattr(launch, "BIN", tmp_path)
+    write_script(tmp_path / "see", "import os; print(os.environ['CUDA_VISIBLE_DEVICES'])")
+    follow([["see"]], log=tmp_path / "log.txt", device="GPU-5")
+    assert (tmp_path / "log.txt").read_text() == "$ see\nGPU-5\n"
+
+
 @pytest.mark.usefixtures("fake_commands")
 def test_a_changed_setting_is_refused_before_anything_starts(pristine_scene, tmp_path):
     finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))

@@ -22,9 +22,9 @@ def command_in_turn(commands: Sequence[Sequence[str]], scripts: Path) -> list[st
         commands: lists of words; the first one is the name of a Python script in ``scripts``.
         scripts: folder of the scripts.
     """
-    # Scripts do not import from the working folder; -c would.
+    # Scripts do not import from the working folder; -c would. -u: each line is read when it is printed.
     code = "import sys; sys.path[:] = filter(None, sys.path); from shellgs_method.compare.in_turn import _main; _main()"
-    return [sys.executable, "-c", code, str(scripts), json.dumps(commands)]
+    return [sys.executable, "-u", "-c", code, str(scripts), json.dumps(commands)]
 
 
 def heading(command: Sequence[str]) -> str:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 import torch
@@ -42,12 +45,13 @@ def launch_locally(runs: Iterable[Run], jobs: int, console: Console) -> dict[Run
     if runs and not torch.cuda.is_available() and nothing_compiled_yet():
         console.print("The first run compiles the kernels, which takes a minute or two; the others load them.")
     progress = Progress(console=console, transient=True)
+    devices = _devices(jobs)
     with (
         progress,
         progress_in_a_log(console, lambda: map(_status, progress.tasks)),
         ThreadPoolExecutor(max(jobs, 1)) as pool,
     ):
-        futures = {pool.submit(_finish_visibly, run, console, progress): run for run in runs}
+        futures = {pool.submit(_finish_visibly, run, console, progress, devices): run for run in runs}
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 run, outcome = futures[future], "finished"
@@ -66,19 +70,22 @@ def finish(
     run: Run,
     announce: Callable[[Sequence[str]], None] = lambda _: None,
     step: Callable[[int], None] = lambda _: None,
+    device: str | None = None,
 ) -> None:
-    """Run the remaining commands of a run; their output is appended to log.txt in its folder.
+    """Run the remaining commands of a run; their output is appended to log.txt in its folder as it is printed.
 
     Args:
         run: the run, settled.
         announce: called with each command when it starts.
         step: called with each iteration that nerfstudio reports.
+        device: the only GPU that the commands see, as CUDA_VISIBLE_DEVICES names it; all if None.
 
     Raises:
         CommandError: a command failed.
     """
     if commands := run.commands():
-        follow(commands, announce, step, run.folder / "log.txt")
+        run.folder.mkdir(parents=True, exist_ok=True)
+        follow(commands, announce, step, run.folder / "log.txt", device)
 
 
 def follow(
@@ -86,26 +93,40 @@ def follow(
     announce: Callable[[Sequence[str]], None] = lambda _: None,
     step: Callable[[int], None] = lambda _: None,
     log: Path | None = None,
+    device: str | None = None,
 ) -> None:
     """Run commands of this environment in turn, in one process, without showing their output.
+
+    Args:
+        commands: lists of words.
+        announce: called with each command when it starts.
+        step: called with each iteration that nerfstudio reports.
+        log: file that the output is appended to.
+        device: the only GPU that the commands see, as CUDA_VISIBLE_DEVICES names it; all if None.
 
     Raises:
         CommandError: a command failed.
     """
-    output: list[str] = []
+    output: deque[str] = deque(maxlen=LAST_LINES)
     waiting = list(commands)
     current = waiting[0]
-    with subprocess.Popen(
-        command_in_turn(commands, BIN),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-    ) as process:
+    with (
+        log.open("a", buffering=1) if log else nullcontext() as file,  # line by line: a run can take hours
+        subprocess.Popen(
+            command_in_turn(commands, BIN),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=None if device is None else os.environ | {"CUDA_VISIBLE_DEVICES": device},
+        ) as process,
+    ):
         assert process.stdout is not None
         try:
             for line in process.stdout:
                 output.append(line)
+                if file:
+                    file.write(line)
                 if waiting and line == heading(waiting[0]):
                     announce(current := waiting.pop(0))
                 elif match := _STEP.match(line):
@@ -113,12 +134,18 @@ def follow(
         except BaseException:
             process.terminate()
             raise
-        finally:
-            if log:
-                with log.open("a") as file:
-                    file.writelines(output)
     if process.returncode:
-        raise CommandError(f"{current[0]} failed:\n{''.join(output[-LAST_LINES:])}")
+        raise CommandError(f"{current[0]} failed:\n{''.join(output)}")
+
+
+def _devices(jobs: int) -> SimpleQueue[str | None]:
+    """The GPU that each of ``jobs`` concurrent runs may use, as many runs on each as are necessary."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(torch.cuda.device_count())))
+    gpus = named.split(",") if torch.cuda.is_available() else [None]
+    queue: SimpleQueue[str | None] = SimpleQueue()
+    for job in range(max(jobs, 1)):
+        queue.put(gpus[job % len(gpus)])
+    return queue
 
 
 @contextmanager
@@ -158,8 +185,8 @@ def _status(task: Task) -> str:
     return f"{task.description}: {at}, {minutes:.1f} min, at most about {left:.1f} min left"
 
 
-def _finish_visibly(run: Run, console: Console, progress: Progress) -> None:
-    task = progress.add_task(run.label, total=run.iterations)
+def _finish_visibly(run: Run, console: Console, progress: Progress, devices: SimpleQueue[str | None]) -> None:
+    device, task = devices.get(), progress.add_task(run.label, total=run.iterations)
 
     def announce(command: Sequence[str]) -> None:
         console.print(f"[bold]$ {escape(shlex.join(command))}", highlight=False, soft_wrap=True)
@@ -167,6 +194,7 @@ def _finish_visibly(run: Run, console: Console, progress: Progress) -> None:
             progress.update(task, completed=run.iterations)
 
     try:
-        finish(run, announce, lambda iteration: progress.update(task, completed=iteration))
+        finish(run, announce, lambda iteration: progress.update(task, completed=iteration), device)
     finally:
+        devices.put(device)
         progress.remove_task(task)
