@@ -13,6 +13,7 @@ import socket
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from functools import partial
@@ -483,6 +484,7 @@ def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pris
     words = ["compare", pristine_scene, "--methods", "photo-gs", "mono-gs", "shellgs", "--iterations", "20"]
     command = [fake_environment / "python", "-c", "from shellgs_method.cli import main; main()", *words]
     environment = os.environ | {"KILL_PARENT": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+    environment |= {"TMPDIR": str(tmp_path), "RAY_TMPDIR": tempfile.gettempdir()}  # a socket's path must be short
     done = subprocess.run(
         [str(word) for word in (*command, "--launcher", "ray", "--output", tmp_path / "out")],
         env=environment,
@@ -497,6 +499,7 @@ def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pris
     assert photo_gs.finished
     assert "--load-dir" in (photo_gs.checkpoints / "step-000000019.ckpt").read_text()
     assert shellgs.finished
+    assert not list((tmp_path / f"shellgs-{os.getuid()}").iterdir())  # the node keeps no copies
     assert "mono-gs needs maps" in (mono_gs.folder / "log.txt").read_text()
 
 

@@ -1,8 +1,9 @@
 """Runs on a Ray cluster: one task per run, which returns the run's folder.
 
-A scene is packed and put into Ray's object store; a node unpacks it once, into its own temporary folder. No file system
-needs to be shared, but the package must be installed on all nodes. A task whose worker is killed is retried: on the
-same node it resumes from its last checkpoint, on another from what the run's folder held at the start.
+A scene is packed and put into Ray's object store; a node unpacks it once, into its own temporary folder, which is
+removed when the comparison ends. No file system needs to be shared, but the package must be installed on all nodes. A
+task whose worker is killed is retried: on the same node it resumes from its last checkpoint, on another from what the
+run's folder held at the start.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import yaml
@@ -74,6 +76,7 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
             raise SceneError(f"Ray cannot start on this machine ({error})") from error
         raise SceneError(f"there is no Ray cluster at {address}: start one with `ray start --head`") from error
     failures: dict[Run, str] = {}
+    launch = uuid4().hex  # another comparison must not resume what this one leaves on a node
     try:
         resources = ray.cluster_resources()
         gpus = min(1, int(resources.get("GPU", 0)))  # every method trains on one GPU, if there is one
@@ -87,7 +90,7 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
                     scenes[run.scene] = content_hash(run.scene), _packed(run.scene, ray.put)
                 key = fingerprint(str(run.output), run.label, run.settings)
                 scene_key, scene = scenes[run.scene]
-                pending[task.remote(run, key, scene_key, scene, _packed(run.folder, ray.put))] = run
+                pending[task.remote(run, launch, key, scene_key, scene, _packed(run.folder, ray.put))] = run
                 if run.scene not in {later.scene for later in waiting}:
                     del scenes[run.scene]
             ended, _ = ray.wait(list(pending), timeout=PROGRESS_SECONDS)
@@ -107,6 +110,7 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
             left = len(pending) + len(waiting)
             console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
     finally:
+        _remove_copies(launch)
         ray.shutdown()
     return {run: failures[run] for run in runs if run in failures}
 
@@ -130,11 +134,27 @@ def _check_cluster(address: str) -> None:
         raise SceneError(refusal) from error
 
 
-def _finish_on_node(run: Run, key: str, scene_key: str, scene: Pieces, folder: Pieces) -> tuple[Archive, str | None]:
+def _remove_copies(launch: str) -> None:
+    """Remove what a comparison unpacked, on each node that answers."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    task = ray.remote(num_cpus=0)(lambda: shutil.rmtree(_own_folder() / launch, ignore_errors=True))
+    nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"]]
+    removals = [
+        task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote() for node in nodes
+    ]
+    ray.wait(removals, num_returns=len(removals), timeout=TIMEOUT)
+
+
+def _finish_on_node(
+    run: Run, launch: str, key: str, scene_key: str, scene: Pieces, folder: Pieces
+) -> tuple[Archive, str | None]:
     """The Ray task: finish a run; return its packed folder and, if a command failed, the end of its output.
 
     Args:
         run: the run, with the paths of the machine that submits it.
+        launch: identifies the comparison.
         key: identifies the run; the same for every retry.
         scene_key: identifies the scene's content.
         scene: the scene's folder, packed.
@@ -142,7 +162,7 @@ def _finish_on_node(run: Run, key: str, scene_key: str, scene: Pieces, folder: P
     """
     import ray
 
-    root = _own_folder()
+    root = _own_folder() / launch
     scenes = root / "scenes" / sha256(scene_key.encode()).hexdigest()
     local = replace(run, scene=scenes / run.scene.name, output=root / "runs" / key)
     if not local.scene.exists():
