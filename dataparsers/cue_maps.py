@@ -18,6 +18,7 @@ from importlib import metadata
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
+from dataparsers.bound_cameras import BoundCameras
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash, fingerprint, read_json, remove_leftovers
@@ -202,6 +203,11 @@ class CueMaps:
         if not any_size and (own.width, own.height) != (camera.width, camera.height):
             sizes = f"it is {own.width}x{own.height} pixels, the camera {camera.width}x{camera.height}"
             raise self._refusal(name, sizes, max(camera.width, camera.height))
+        if problem := self._aligned_to.camera_changed(name, camera):
+            raise SceneError(
+                f"the {self.kind} maps of {self.scene} are of a shell that was aligned to other cameras: {problem}; "
+                f"run `shellgs align {shlex.quote(str(self.scene))}` to validate it with these, then `{self.command}`"
+            )
         fitted = own.resized(camera.width, camera.height)
         if problem := self._stale or difference(record, fitted, camera, self.manifest.sources):
             raise self._refusal(name, problem)
@@ -268,6 +274,14 @@ class CueMaps:
             if known and sha256 not in (source_hash(path), content_hash(path)):
                 return f"{source} has changed since"
         return None
+
+    @cached_property
+    def _aligned_to(self) -> BoundCameras:
+        """Cameras that the shell's alignment, a source of the maps, was found for; none where that is unknown."""
+        for path in (self.scene / source for source in self.manifest.sources if source.endswith(".json")):
+            with suppress(OSError, KeyError, TypeError, ValueError):  # reported when the alignment is used
+                return BoundCameras.from_json(read_json(path)["cameras"])
+        return BoundCameras()
 
     @property
     def command(self) -> str:

@@ -6,6 +6,8 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +17,15 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from test_facade_dataparser import write_colmap
 
+from dataparsers.bound_cameras import BoundCameras
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, to_camera
 from dataparsers.sparse_points import SparsePoints
-from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
+from shellgs_method.export.runs import TrainedRun
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, cast_views, load_shell
 from shellgs_method.shell.geometry.raycast import ShellCaster
 from shellgs_method.shell.geometry.similarity import fit_similarity, transformed
 from shellgs_method.shell.geometry.surface import ShellSurface
@@ -695,6 +699,110 @@ def test_another_alignment_makes_the_maps_stale(scene, shellgs):
     view = read_views(FacadeDataParserConfig(data=scene))[0]
     with pytest.raises(SceneError, match=r"shell/alignment.json has changed since; run `shellgs cast"):
         CueMaps.open(scene, "shell").read(view.name, view.camera)
+
+
+def move_cameras(scene: Path, motion: np.ndarray, digits: int = 17) -> None:
+    """Apply a similarity to the scene's frame, as another run of structure from motion does."""
+    transforms = json.loads((scene / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        pose = motion @ np.array(frame["transform_matrix"])
+        pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
+        frame["transform_matrix"] = [[float(f"{x:.{digits}g}") for x in row] for row in pose.tolist()]
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    cloud = trimesh.load(scene / "sparse_pc.ply")
+    cloud.apply_transform(motion).export(scene / "sparse_pc.ply")
+
+
+def scene_views(scene: Path) -> list[View]:
+    return read_views(FacadeDataParserConfig(data=scene))
+
+
+ANOTHER_FRAME = displaced(2.0, 30.0, 0.5, seed=3)
+
+
+def test_an_alignment_is_not_cast_for_other_cameras(scene, shellgs):
+    move_cameras(scene, ANOTHER_FRAME)
+    before = (scene / ALIGNMENT).read_bytes()
+    refusal = shellgs("cast", scene, "--no-check")
+    assert "was found for other cameras" in refusal
+    assert f"run `shellgs align {scene}`" in refusal
+    assert (scene / ALIGNMENT).read_bytes() == before
+
+
+def test_maps_of_an_alignment_to_other_cameras_are_refused_even_if_they_are_of_these(scene):
+    """As training reads them."""
+    bound = (scene / ALIGNMENT).read_bytes()
+    move_cameras(scene, displaced(0.1, 1.0, 0.0, seed=3))
+    views = scene_views(scene)
+    cast_views(scene, views, replace(Alignment.load(scene / ALIGNMENT), cameras=BoundCameras()))
+    (scene / ALIGNMENT).write_bytes(bound)
+    maps = CueMaps.open(scene, "shell")
+    with pytest.raises(SceneError, match=r"aligned to other cameras: .* run `shellgs align .* then `shellgs cast"):
+        maps.check(views[0].name, views[0].camera)
+
+
+def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
+    move_cameras(scene, ANOTHER_FRAME)
+    views = scene_views(scene)
+    halves = [SimpleNamespace(views=views[:5]), SimpleNamespace(views=views[5:])]
+    config = SimpleNamespace(dataparser=SimpleNamespace(data=scene))
+    data: Any = SimpleNamespace(config=config, train_dataset=halves[0], eval_dataset=halves[1])
+    model: Any = None
+    with pytest.raises(SceneError, match="was found for other cameras"):
+        _ = TrainedRun(model, data).shell
+
+
+def test_an_alignment_that_fits_other_cameras_too_is_validated_for_them(scene, shellgs):
+    move_cameras(scene, displaced(0.02, 0.0, 0.0, seed=3))
+    output = shellgs("align", scene)
+    assert "It was found for other cameras than these" in output
+    assert "Written" in output
+    assert Alignment.load(scene / ALIGNMENT).cameras.changed(scene_views(scene)) is None
+
+
+def test_a_proposal_for_other_cameras_is_not_accepted(scene, shellgs):
+    (scene / ALIGNMENT).rename(scene / PROPOSAL)
+    move_cameras(scene, ANOTHER_FRAME)
+    assert "was proposed for other cameras" in shellgs("align", scene, "--accept")
+
+
+def test_photographs_come_and_go_without_harm_to_the_alignment(scene):
+    found = Alignment.load(scene / ALIGNMENT)
+    views = scene_views(scene)
+    added = replace(views[0], name="images/new.png", camera=replace(views[0].camera, width=7))
+    assert found.cameras.changed([*views[3:], added]) is None
+    assert "of their 10 photographs, 1 are in the scene" in (found.cameras.changed([views[0], added]) or "")
+
+
+@pytest.mark.parametrize("digits", [6, 8])
+def test_cameras_printed_again_are_the_same(scene, digits):
+    move_cameras(scene, np.eye(4), digits)
+    assert Alignment.load(scene / ALIGNMENT).cameras.changed(scene_views(scene)) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: replace(c, viewmat=c.viewmat + torch.tensor([0, 0, 0, 0.1])[:, None].T), "scene units away"),
+        (lambda c: replace(c, viewmat=torch.from_numpy(displaced(0, 1, 0, 3)) @ c.viewmat), "turned by 1°"),
+        (lambda c: replace(c, K=c.K * torch.tensor([1.01, 1.01, 1])[:, None]), "differ by"),
+    ],
+    ids=["position", "rotation", "intrinsics"],
+)
+def test_a_camera_that_changed_is_named(views, change, words):
+    before = BoundCameras.from_json(json.loads(json.dumps(BoundCameras.of(views).to_json())))
+    assert before.changed([replace(view, camera=view.camera.resized(48, 32)) for view in views]) is None
+    changed = [*views[:4], replace(views[4], camera=change(views[4].camera)), *views[5:]]
+    assert re.search(f"{views[4].name}.* {words}", before.changed(changed) or "")
+
+
+def test_an_alignment_of_an_older_version_is_cast_and_says_so(scene, shellgs):
+    fields = json.loads((scene / ALIGNMENT).read_text())
+    del fields["cameras"]
+    (scene / ALIGNMENT).write_text(json.dumps(fields))
+    assert "does not say which cameras it was found for" in shellgs("cast", scene, "--no-check")
+    assert "Written" in shellgs("align", scene)
+    assert "does not say" not in shellgs("cast", scene, "--no-check")
 
 
 @pytest.fixture

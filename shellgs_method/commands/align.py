@@ -58,6 +58,8 @@ def align(
     from shellgs_method.shell.registration.align import (
         PROPOSAL,
         Placement,
+        place_as_before,
+        place_as_proposed,
         place_by_guess,
         place_by_picks,
         place_by_positions,
@@ -73,8 +75,10 @@ def align(
     layout = paths.of(scene)
     views, points = read_views(layout), read_sparse_points(layout)
     name = relative_path(shell, scene) if shell else ""
-    if shell is None:
-        placement = Placement(Alignment.load(scene / (PROPOSAL if accept else ALIGNMENT)))
+    if accept:
+        placement = place_as_proposed(scene / PROPOSAL, scene, views)
+    elif shell is None:
+        placement = place_as_before(scene / ALIGNMENT, views)
     elif matrix:
         placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
     elif picks:

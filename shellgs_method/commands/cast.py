@@ -56,6 +56,9 @@ def cast(
         alignment = Alignment.from_matrix_file(matrix, relative_path(shell, scene), metres_per_shell_unit)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
+        if not alignment.cameras.cameras:
+            unbound = f"{scene / ALIGNMENT} does not say which cameras it was found for"
+            console.print(f"{unbound}: `shellgs align {scene}` records them.")
     aligned = alignment.meshed_by(mesher)
     if aligned != alignment and alignment.verdict:
         console.print(f"The alignment was validated with another mesher: run `shellgs align {scene}` again.")

@@ -77,6 +77,7 @@ class TrainedRun:
             return None
         alignment = Alignment.load(scene / ALIGNMENT)
         views = [view for dataset in self.datasets for view in dataset.views]
+        alignment.check_cameras(scene, views)
         return alignment, alignment.load_shell(scene, views)
 
     @cached_property

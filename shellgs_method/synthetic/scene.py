@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 from rich.progress import track
 
+from dataparsers.bound_cameras import BoundCameras
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
@@ -141,9 +142,10 @@ def settings_of(scene: Path) -> dict[str, int]:
 def _write(scene: Path, config: FacadeConfig) -> None:
     facade = Facade.build(config)
     (scene / RECORD).write_text(json.dumps(asdict(config), indent=1) + "\n")
-    _write_shell(scene, shell(facade.layout))
     truth = CueMaps.create(scene, "truth", command="shellgs demo", metres_per_unit=1 / UNITS_PER_METRE)
     names = [f"images/frame_{i + 1:05d}.png" for i in range(config.views)]
+    cameras = BoundCameras(dict(zip(names, map(scene_camera, facade.cameras), strict=True)))
+    _write_shell(scene, shell(facade.layout), cameras)
     (scene / "images").mkdir()
     (scene / PREDICTIONS).mkdir()
 
@@ -204,10 +206,11 @@ def write_scan(path: Path, mesh: Mesh) -> None:
     o3d.io.write_triangle_mesh(str(path), solid)
 
 
-def _write_shell(scene: Path, mesh: Mesh) -> None:
-    """Write the shell and its alignment."""
+def _write_shell(scene: Path, mesh: Mesh, cameras: BoundCameras) -> None:
+    """Write the shell and its alignment to the cameras."""
     path = scene / SHELL
     path.parent.mkdir(parents=True)
     write_scan(path, mesh)
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
-    Alignment(matrix, SHELL, 1.0, source="the synthetic facade's own frames").save(scene / ALIGNMENT)
+    alignment = Alignment(matrix, SHELL, source="the synthetic facade's own frames", cameras=cameras)
+    alignment.save(scene / ALIGNMENT)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 from rich.progress import track
 
+from dataparsers.bound_cameras import BoundCameras
 from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
@@ -75,11 +76,12 @@ def cast_views(
 
     Raises:
         FileNotFoundError: the shell is missing.
-        SceneError: the shell cannot be used, or no camera sees it.
+        SceneError: the alignment was found for other cameras, the shell cannot be used, or no camera sees it.
     """
     start = time.monotonic()
     if max_image_size is not None and max_image_size < 1:
         raise SceneError(f"the longer side of the maps must be at least 1 pixel, not {max_image_size}")
+    alignment.check_cameras(scene, views)
     shell = scene / alignment.shell
     cameras = [view.camera for view in views]
     mesh = alignment.load_shell(scene, views)
@@ -88,8 +90,9 @@ def cast_views(
     if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):
         raise SceneError(f"the masks of {scene} are black everywhere in every view: white is kept")
     saved = scene / ALIGNMENT
-    if not saved.is_file() or not Alignment.load(saved).places_like(alignment):  # else it keeps its verdict
-        alignment.save(saved)
+    known = Alignment.load(saved) if saved.is_file() else None
+    if known is None or not known.places_like(alignment) or known.cameras.changed(views):  # else it keeps its verdict
+        replace(alignment, cameras=BoundCameras.of(views)).save(saved)
     (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a source of the maps: a mask painted later makes them stale
     maps = CueMaps.create(
         scene,

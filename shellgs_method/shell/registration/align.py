@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dataparsers.bound_cameras import BoundCameras
 from dataparsers.camera import positions, upwards
 from dataparsers.cue_maps import CueMaps, source_hash
 from dataparsers.errors import SceneError
@@ -52,6 +54,34 @@ class Placement:
     history: Sequence[str] = ()
     correspondences: Sequence[Correspondence] = ()
     proposed: bool = False
+
+
+def place_as_before(path: Path, views: Sequence[View]) -> Placement:
+    """The alignment of a file, to be validated again, possibly with other cameras than it was found for.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is damaged.
+    """
+    alignment = Alignment.load(path)
+    changed = alignment.cameras.changed(views)
+    return Placement(alignment, [f"It was found for other cameras than these: {changed}."] if changed else [])
+
+
+def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placement:
+    """The proposal of a file, which the user accepts.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is damaged, or the proposal was made for other cameras than the user's.
+    """
+    alignment = Alignment.load(path)
+    if changed := alignment.cameras.changed(views):
+        raise SceneError(
+            f"{path} was proposed for other cameras than those of {scene}: {changed}; propose again, with "
+            f"`shellgs align {shlex.quote(str(scene))} {shlex.quote(alignment.shell)}`"
+        )
+    return Placement(alignment)
 
 
 def place_by_picks(path: Path, views: Sequence[View], shell: str, metres_per_shell_unit: float) -> Placement:
@@ -154,7 +184,12 @@ def validate_placement(
     write_report(scene / REPORT, mesh, validation, placement.history)
     if validation.verdict == "refused":
         return validation
-    validated = replace(placement.alignment, verdict=validation.verdict, metrics=validation.metrics())
+    validated = replace(
+        placement.alignment,
+        verdict=validation.verdict,
+        metrics=validation.metrics(),
+        cameras=BoundCameras.of(views),
+    )
     validated.save(target)
     with suppress(FileNotFoundError, SceneError):  # no maps, or damaged ones, which is reported when they are read
         maps = CueMaps.open(scene, "shell")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float64
 
+from dataparsers.bound_cameras import BoundCameras
 from dataparsers.camera import positions
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, read_json, remove_leftovers
@@ -35,6 +37,7 @@ class Alignment:
         verdict: verdict of the validation, "good" or "doubtful"; empty if not validated.
         metrics: main metrics behind the verdict.
         mesher: method that meshes a point cloud.
+        cameras: cameras it was found for, in whose frame alone it is valid; none in files of older versions.
 
     Raises:
         SceneError: the matrix is not a similarity, or mirrors, or the mesher is unknown.
@@ -47,6 +50,7 @@ class Alignment:
     verdict: str = ""
     metrics: Mapping[str, float | None] = field(default_factory=dict)
     mesher: Mesher = "planes"
+    cameras: BoundCameras = field(default_factory=BoundCameras)
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -97,6 +101,18 @@ class Alignment:
             and self.mesher == other.mesher
         )
 
+    def check_cameras(self, scene: Path, views: Sequence[View]) -> None:
+        """Refuse photographs whose cameras are not those that the alignment was found for.
+
+        Raises:
+            SceneError: they are others.
+        """
+        if changed := self.cameras.changed(views):
+            raise SceneError(
+                f"the alignment of {self.shell} was found for other cameras than those of {scene}: {changed}; run "
+                f"`shellgs align {shlex.quote(str(scene))}` to validate it with these, or align the shell to them again"
+            )
+
     def meshed_by(self, mesher: Mesher | None) -> Alignment:
         """Return the same alignment with another mesher, without a verdict; None keeps the mesher."""
         if mesher is None or mesher == self.mesher:
@@ -127,7 +143,8 @@ class Alignment:
         path.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(path.parent)
         with atomic_write(path) as file:
-            file.write((json.dumps(self._fields(), indent=1, ensure_ascii=False) + "\n").encode())
+            lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
+            file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
 
     @classmethod
     def load(cls, path: Path) -> Alignment:
@@ -148,7 +165,8 @@ class Alignment:
             verdict, mesher = str(fields.get("verdict", "")), fields.get("mesher", "planes")
             known = dict(fields.get("metrics", fields.get("figures", {})))  # older files say figures
             metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
-            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, metrics, mesher)
+            cameras = BoundCameras.from_json(fields.get("cameras", {}))
+            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, metrics, mesher, cameras)
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
         except SceneError as error:
@@ -187,7 +205,12 @@ class Alignment:
             raise SceneError(f"{path}: {error}") from error
 
     def _fields(self) -> dict:
-        return {**vars(self), "shell_to_scene": self.shell_to_scene.tolist()}
+        return {
+            **vars(self),
+            "shell_to_scene": self.shell_to_scene.tolist(),
+            "metrics": dict(self.metrics),
+            "cameras": self.cameras.to_json(),
+        }
 
 
 def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
