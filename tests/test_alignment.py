@@ -353,6 +353,48 @@ def test_an_invalid_line_of_a_picks_file_is_refused_with_its_number(rigged, tmp_
         read_picks(tmp_path / "picks.txt", rigged[0])
 
 
+@pytest.mark.parametrize(
+    "first",
+    [
+        "1,5 2 3 4 5 images/0.png a",
+        "1.5; 2 3 4 5 images/0.png a",
+        "1,2,3,4,5,images/0.png,a",
+        "x1 2 3 4 5 images/0.png a",
+    ],
+)
+def test_a_slip_in_the_first_line_of_a_picks_file_is_no_header(rigged, tmp_path, first):
+    (tmp_path / "picks.txt").write_text(f"{first}\n1 2 3 4 5 images/1.png a\n")
+    with pytest.raises(SceneError, match="line 1: expected X Y Z of the shell"):
+        read_picks(tmp_path / "picks.txt", rigged[0])
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "WGS84 UTM 32N",
+        "+proj=tmerc +lat_0=0 +towgs84=598.1,73.7,418.2 +units=m",
+        "X,Y,Z,x,y,image,name",
+        'PROJCS["ETRS89 / UTM 32N",GEOGCS["ETRS89"],PARAMETER["false_easting",500000]]',
+    ],
+)
+def test_a_header_of_a_picks_file_is_skipped(rigged, tmp_path, first):
+    (tmp_path / "picks.txt").write_text(f"{first}\n1 2 3 4 5 images/1.png a\n")
+    assert [pick.name for pick in read_picks(tmp_path / "picks.txt", rigged[0])] == ["a"]
+
+
+@pytest.mark.parametrize("header", ["EPSG:4326", "+proj=longlat +datum=WGS84", "lon,lat,z,x,y,image"])
+def test_a_header_of_degrees_is_refused(rigged, tmp_path, header):
+    (tmp_path / "picks.txt").write_text(f"{header}\n7.86 46.25 3 4 5 images/1.png a\n")
+    with pytest.raises(SceneError, match=r"picks.txt is in degrees \(.*\): convert it"):
+        read_picks(tmp_path / "picks.txt", rigged[0])
+
+
+@pytest.mark.parametrize("name", ["architect's-corner", "l'angle-d'en-haut", "5'-6\"", "p#1", "C:\\corner"])
+def test_signs_inside_a_name_are_part_of_it(rigged, tmp_path, name):
+    (tmp_path / "picks.txt").write_text(f"1 2 3 4 5 images/1.png {name}  # a comment, it's one\n")
+    assert [pick.name for pick in read_picks(tmp_path / "picks.txt", rigged[0])] == [name]
+
+
 def test_picks_are_pixels_of_the_photograph_on_disk(tmp_path):
     from nerfstudio.cameras.cameras import Cameras, CameraType
 
@@ -474,6 +516,8 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     ("line", "sentence"),
     [
         ("EPSG:4326", "is in degrees (EPSG:4326): convert it"),
+        ("#name,lat,lon,alt\nimages/0.png,1,2,3", "line 2: expected the image"),
+        ("images/0.png 1,5 2 3", "line 1: expected the image"),
         ("EPSG:25832\nimages/0.png 1 2", "line 2: expected the image, then X Y Z"),
         ("EPSG:25832\nimages/0.png 1 2 nan", "line 2: expected the image"),
         ("images/0.png 1 2 3\nimages/0.png 1 2 3", "line 2: images/0.png has a position already"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shlex
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -23,6 +23,9 @@ MAX_ERROR = 0.15
 from photographs) and of RTK positions (2 to 3 cm)."""
 LARGEST = 1e12
 """Largest coordinate, in any unit."""
+_WORD = re.compile(r"""(?P<comment>\#.*)|"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<bare>\S+)""")
+_DEGREES = {"epsg:4326", "epsg:4979", "epsg:4258", "epsg:4269", "+proj=longlat", "+proj=latlong"}
+_DEGREES |= {"lat", "lon", "latitude", "longitude"}
 _THIN = 0.02  # breadth over length below which points are on one line
 _MAX_TRIPLES = 2000
 
@@ -120,7 +123,8 @@ def worst_first(points: Sequence[Point]) -> list[Point]:
 def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
     """Yield the position, for messages, and the words of each line of a text file.
 
-    Comments after # are skipped. Words with spaces are quoted.
+    A header is skipped: a first line without numbers. So are comments after a # that begins a word. Words with spaces
+    are quoted; an apostrophe inside a word is part of it.
 
     Args:
         path: the file.
@@ -128,7 +132,7 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is not text, or a quote is not closed.
+        SceneError: the file is not text, its header says that it is in degrees, or a quote is not closed.
     """
     if not path.is_file():
         raise FileNotFoundError(f"the file of {contents} {path} does not exist")
@@ -136,14 +140,29 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
-    for number, line in enumerate(text.splitlines(), start=1):
-        where = f"{path}, line {number}"
-        try:
-            words = shlex.split(line, comments=True)
-        except ValueError as error:
-            raise SceneError(f"{where}: {error}") from error
-        if words:
-            yield where, words
+    lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
+    worded = [(where, words) for where, line in lines if (words := _words(line, where))]
+    if worded and _is_header(header := worded[0][1]):
+        if any(piece.lower() in _DEGREES for word in header for piece in re.split("[,;]", word)):
+            raise SceneError(f"{path} is in degrees ({' '.join(header)}): convert it to the shell's coordinates")
+        del worded[0]
+    yield from worded
+
+
+def _words(line: str, where: str) -> list[str]:
+    words = []
+    for word in _WORD.finditer(line):
+        if word["bare"] and word["bare"][0] in "\"'":
+            raise SceneError(f"{where}: the quote before {word['bare'][1:]} is not closed")
+        if not word["comment"]:
+            words.append(next(text for text in word.group("double", "single", "bare") if text is not None))
+    return words
+
+
+def _is_header(words: Sequence[str]) -> bool:
+    """Whether nothing is a number, also where commas separate them; definitions (+zone=32, WKT) may hold some."""
+    names = [word for word in words if "=" not in word and "[" not in word]
+    return not any(are_numbers([piece]) for word in names for piece in re.split("[,;]", word))
 
 
 def view_named(name: str, views: Sequence[View], where: str) -> View | None:

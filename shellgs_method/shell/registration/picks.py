@@ -3,8 +3,8 @@
 The file is a `gcp_list.txt` in OpenDroneMap's format, which several picking tools write: one line per point and
 photograph, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in the shell's file, x y the pixel (from
 the top left corner of the image). Lines with the same name, or without a name with the same X Y Z, are one point,
-which needs two photographs. A first line that does not start with a number (the projection) and comments after # are
-skipped; quote image names with spaces. Points whose name begins with "check" are not fitted, only measured.
+which needs two photographs. A first line without numbers (the projection) and comments after # are skipped; quote image
+names with spaces. Points whose name begins with "check" are not fitted, only measured.
 """
 
 from __future__ import annotations
@@ -72,13 +72,12 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: a line cannot be read, names an image that is not in the scene, or contradicts another line.
+        SceneError: the file is in degrees, or a line cannot be read, names an image that is not in the scene, or
+            contradicts another line.
     """
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
-    for number, (where, words) in enumerate(read_lines(path, "picks")):
-        if number == 0 and not are_numbers(words[:1]):
-            continue
+    for where, words in read_lines(path, "picks"):
         if len(words) < 6 or not are_numbers(words[:5]):
             raise SceneError(f"{where}: expected X Y Z of the shell, x y in the photograph, the image, and a name")
         point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))

@@ -1,7 +1,7 @@
 """Align the shell by surveyed camera positions (RTK or similar) in a text file.
 
-The file is a `geo.txt` in OpenDroneMap's format: the coordinate system in the first line, then one line per
-photograph, ``image X Y Z``; further columns (angles, accuracies) and comments after # are skipped. X Y Z are the
+The file is a `geo.txt` in OpenDroneMap's format: the coordinate system in a first line without numbers, then one line
+per photograph, ``image X Y Z``; further columns (angles, accuracies) and comments after # are skipped. X Y Z are the
 camera's coordinates in the shell's frame and units, not degrees. Quote image names with spaces.
 """
 
@@ -27,7 +27,6 @@ from shellgs_method.shell.registration.correspondences import (
     worst_first,
 )
 
-_DEGREES = ("epsg:4326", "epsg:4979", "+proj=longlat", "+proj=latlong")
 _REMEDY = "add photographs from higher or lower, nearer or farther, or pick points and use --picks"
 
 
@@ -55,13 +54,8 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
     """
     found: dict[str, tuple[View, list[float]]] = {}
     unknown: list[str] = []
-    for number, (where, words) in enumerate(read_lines(path, "camera positions")):
-        is_position = len(words) >= 4 and are_numbers(words[1:4])
-        if number == 0 and not is_position:
-            if any(word.lower() in _DEGREES for word in words):
-                raise SceneError(f"{path} is in degrees ({' '.join(words)}): convert it to the shell's coordinates")
-            continue
-        if not is_position:
+    for where, words in read_lines(path, "camera positions"):
+        if len(words) < 4 or not are_numbers(words[1:4]):
             raise SceneError(f"{where}: expected the image, then X Y Z in the shell's coordinates")
         view = view_named(words[0], views, where)
         if view is None:
