@@ -34,6 +34,7 @@ from shellgs_method.shell.registration.align import PROPOSAL, REPORT, place_by_g
 from shellgs_method.shell.registration.bays import facade_axes, scan_shifts
 from shellgs_method.shell.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.shell.registration.positions import SurveyedPositions, align_positions, read_positions
+from shellgs_method.shell.registration.proposal import _main_wall as main_wall
 from shellgs_method.shell.registration.refinement import refine
 from shellgs_method.shell.validation.report import shell_edges, write_report
 from shellgs_method.shell.validation.validation import LIMITS, Limit, validate
@@ -168,6 +169,17 @@ def test_a_proposal_is_right_for_a_shell_tilted_in_its_file(mesh, surface, views
     alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
     found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ turned)
     assert error(surface, found, survey_from_scene) < 0.02
+
+
+def test_the_main_wall_is_the_same_in_each_run():
+    """Of a wall as rough as Open3D's segment_plane finds another plane in each of ten runs or so."""
+    random = np.random.default_rng(0)
+    wall = np.stack([random.uniform(0, 20, 3000), random.normal(0, 0.25, 3000), random.uniform(0, 8, 3000)], axis=1)
+    ground = np.stack([random.uniform(0, 20, 2500), random.uniform(-9, 0, 2500), random.normal(0, 0.02, 2500)], axis=1)
+    cameras, up = np.array([[5.0, -10, 2], [15, -10, 2]]), np.array([0.0, 0, 1])
+    found = [main_wall(np.concatenate([ground, wall]), cameras, up) for _ in range(20)]
+    assert len({cloud.axes.tobytes() for cloud in found}) == 1
+    assert np.degrees(np.arccos(-found[0].axes[2, 1])) < 1
 
 
 def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
@@ -923,6 +935,24 @@ def test_chosen_folders_reach_every_command(scene, shellgs):
 )
 def test_starts_that_contradict_each_other_are_refused(scene, shellgs, words):
     assert "give a shell, alone or with one of --matrix" in shellgs("align", scene, *words)
+
+
+@pytest.mark.parametrize("words", [["--global-shift", 1, 2, 3], ["--metres-per-shell-unit", 0.001]])
+@pytest.mark.parametrize("command", ["align", "cast"])
+def test_settings_of_a_matrix_are_refused_without_it(scene, shellgs, command, words):
+    before = (scene / ALIGNMENT).read_bytes()
+    assert re.match(f"refused: .*{words[0]}.* (give|go with)", shellgs(command, scene, *words))
+    assert (scene / ALIGNMENT).read_bytes() == before
+
+
+def test_a_global_shift_is_cast(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    shift = np.eye(4)
+    shift[:3, 3] = [-412_000.0, -5_123_000.0, 0.0]
+    np.save(scene / "matrix.npy", true.shell_to_scene @ np.linalg.inv(shift))
+    words = ("--shell", scene / true.shell, "--matrix", scene / "matrix.npy", "--global-shift", *shift[:3, 3])
+    shellgs("cast", scene, *words, "--no-check")
+    np.testing.assert_allclose(Alignment.load(scene / ALIGNMENT).shell_to_scene, true.shell_to_scene, atol=1e-6)
 
 
 def test_an_alignment_without_a_verdict_is_read(tmp_path):

@@ -25,7 +25,7 @@ from dataparsers.sparse_points import SparsePoints, read_sparse_points
 from shellgs_method.cli import main
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 from shellgs_method.cues.disparity import REACH, DisparityFit, aligned_depth, as_disparity, fit_disparity
-from shellgs_method.cues.normals import Convention, disagreement, facing, gradient_normals, to_opencv
+from shellgs_method.cues.normals import Convention, decoded, disagreement, facing, gradient_normals, to_opencv
 from shellgs_method.cues.source import Prediction, Predictor
 from shellgs_method.datamanager import FacadeDataset
 
@@ -248,6 +248,51 @@ def test_resized_normals_are_those_of_the_wall_up_to_its_edge(tmp_path: Path):
     assert (known[:, 17:]).all()
     assert not known[:, :15].any()
     np.testing.assert_allclose(normal[known], np.broadcast_to(WALL, (known.sum(), 3)), atol=0.01)
+
+
+def varied_normals() -> np.ndarray:
+    """Unit normals in all directions that face the camera, in OpenCV's axes, and some pixels without."""
+    random = np.random.default_rng(0)
+    normal = random.normal(size=(48, 64, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal[..., 2] = -np.abs(normal[..., 2])
+    normal[:5] = 0
+    return normal
+
+
+@pytest.mark.parametrize(("white", "dtype"), [(1, np.float32), (255, np.float32), (255, np.uint8), (65535, np.uint16)])
+@pytest.mark.parametrize("none", [0.0, 0.5], ids=["black", "grey"])
+def test_normals_stored_as_colours_are_decoded(white: int, dtype: type, none: float):
+    normal = varied_normals()
+    colours = np.where(normal.any(axis=-1, keepdims=True), (normal + 1) / 2, none) * white
+    np.testing.assert_allclose(decoded((colours if white == 1 else colours.round()).astype(dtype)), normal, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "normal",
+    [
+        varied_normals(),
+        7 * varied_normals(),
+        np.abs(varied_normals()),
+        np.full((4, 4, 3), 3**-0.5),
+        np.zeros((4, 4, 3)),
+    ],
+    ids=["unit", "longer", "all positive", "one direction", "none"],
+)
+def test_normals_stored_as_vectors_are_left_as_they_are(normal: np.ndarray):
+    np.testing.assert_array_equal(decoded(normal), normal.astype(np.float32))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+def test_imported_colours_of_normals_are_their_normals(tmp_path: Path, dtype: type):
+    """A wall that lies obliquely: as vectors, its colours would be another one, which faces the camera too."""
+    white = 255 if dtype == np.uint8 else 1
+    colours = np.broadcast_to((to_opencv(WALL, "opengl") + 1) / 2 * white, (48, 64, 3))
+    np.savez(tmp_path / "a.npz", disparity=disparity_of(plane_depth()), normal=colours.astype(dtype))
+    prediction = predicted(tmp_path, view_of(), normals=tmp_path, convention="opengl")
+    assert prediction.normal is not None
+    normal = facing(prediction.normal, CAMERA)
+    np.testing.assert_allclose(normal, np.broadcast_to(WALL, normal.shape), atol=0.01)
 
 
 def test_a_distorted_photographs_map_is_undistorted_with_it(scene: Path, tmp_path: Path):

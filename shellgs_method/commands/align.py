@@ -72,6 +72,10 @@ def align(
         raise SceneError(
             "give a shell, alone or with one of --matrix, --picks and --positions, or none to validate what is there"
         )
+    if any(global_shift) and matrix is None:
+        raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")
+    if metres_per_shell_unit != 1 and shell is None:
+        raise SceneError("--metres-per-shell-unit belongs to a shell: give the shell and a start, to align it again")
     layout = paths.of(scene)
     views, points = read_views(layout), read_sparse_points(layout)
     name = relative_path(shell, scene) if shell else ""

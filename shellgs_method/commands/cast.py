@@ -20,6 +20,7 @@ def cast(
     scene: Scene,
     shell: Optional[Path] = None,
     matrix: Optional[Path] = None,
+    global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
     max_image_size: Optional[int] = None,
     mesher: Optional[Mesher] = None,
@@ -37,6 +38,7 @@ def cast(
         scene: Scene folder.
         shell: Mesh or point cloud of the shell, with --matrix. If not set: the one in scene/shell/alignment.json.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
+        global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size.
         mesher: How a point cloud is meshed: planes (ball pivoting between them), bpa (ball pivoting alone) or poisson
@@ -50,10 +52,13 @@ def cast(
 
     if (shell is None) != (matrix is None):
         raise SceneError("--shell and --matrix go together: give both or neither")
+    if matrix is None and (any(global_shift) or metres_per_shell_unit != 1):
+        raise SceneError("--global-shift and --metres-per-shell-unit go with --shell and --matrix")
     config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
     if shell is not None and matrix is not None:
-        alignment = Alignment.from_matrix_file(matrix, relative_path(shell, scene), metres_per_shell_unit)
+        name = relative_path(shell, scene)
+        alignment = Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
         if not alignment.cameras.cameras:

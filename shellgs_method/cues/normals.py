@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap
@@ -35,6 +35,34 @@ def facing(normal: Float[np.ndarray, "H W 3"], camera: Camera) -> Float[np.ndarr
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     away = np.einsum("hwc,hwc->hw", normal, camera.rays().cpu().numpy()) > 0
     return np.where(length < 1e-3, 0, normal / np.maximum(length, 1e-3)) * np.where(away, -1, 1)[..., None]
+
+
+def decoded(stored: Shaped[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    """Normals as vectors, which files may hold as colours, (n + 1) / 2: unsigned integers, or numbers up to 1 or 255.
+
+    Other numbers are told apart by their lengths: vectors are unit vectors, or else some are negative.
+
+    Returns:
+        Vectors of any length; zero where the file has none: where it is zero, NaN, black or grey.
+    """
+    values = np.nan_to_num(stored.astype(np.float32), posinf=0.0, neginf=0.0)
+    there = values.any(axis=-1, keepdims=True)
+    if stored.dtype.kind == "u":
+        white = float(np.iinfo(stored.dtype).max)
+    else:
+        white = 1.0 if values.max() <= 1 + 1e-3 else 255.0
+        unit = _unit(2 * values[there[..., 0]] / white - 1)
+        if values.min() < 0 or unit < max(0.5, _unit(values[there[..., 0]])):
+            return values
+    vectors = np.where(there, 2 * values / white - 1, 0.0)
+    grey = np.linalg.norm(vectors, axis=-1, keepdims=True) < 0.1
+    return np.where(grey, 0.0, vectors).astype(np.float32)
+
+
+def _unit(vectors: Float[np.ndarray, "N 3"]) -> float:
+    """Share of the vectors that are as good as unit vectors, among those that are not zero."""
+    length = np.linalg.norm(vectors, axis=-1)
+    return float((np.abs(length[length > 0.1] - 1) < 0.05).mean()) if (length > 0.1).any() else 0.0
 
 
 def to_opencv(normal: Float[np.ndarray, "H W 3"], convention: Convention) -> Float[np.ndarray, "H W 3"]:

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Literal, Optional
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from PIL import Image
 
 from dataparsers.errors import SceneError
@@ -34,7 +34,7 @@ class Precomputed:
     values: Literal["disparity", "inverse-depth", "depth"] = "disparity"
     """Meaning of the maps' values, in any unit: disparity (up to a shift), inverse depth, or z-depth."""
     normals: Optional[Path] = None
-    """Folder of normal maps with the same names; the same folder if an npz holds both."""
+    """Folder of normal maps with the same names, as vectors or colours; the same folder if an npz holds both."""
     convention: Literal["opencv", "opengl", "dsine", "stablenormal", "metric3d", "omnidata"] = "opencv"
     """Axes of the normals; their sign does not matter."""
 
@@ -53,7 +53,7 @@ class Precomputed:
             SceneError: a folder is missing or holds no map.
         """
         from shellgs_method.cues.disparity import as_disparity
-        from shellgs_method.cues.normals import to_opencv
+        from shellgs_method.cues.normals import decoded, to_opencv
         from shellgs_method.cues.source import Prediction, Predictor, hash_of
 
         maps = MapFolder(self.folder, (self.values.replace("-", "_"), "disparity", "inverse_depth", "depth", "arr_0"))
@@ -63,10 +63,10 @@ class Precomputed:
             values = maps.read(view, channels=1)
             if values is None:
                 return None
-            disparity = as_disparity(values[..., 0], self.values)
+            disparity = as_disparity(values[..., 0].astype(np.float32), self.values)
             normal = normals.read(view, channels=3) if normals else None
             if normal is not None:
-                normal = to_opencv(np.nan_to_num(normal, posinf=0.0, neginf=0.0), self.convention)
+                normal = to_opencv(decoded(normal), self.convention)
                 normal = _in_view(view, normal, np.abs(normal).sum(axis=-1) > 1e-3)
             return Prediction(_in_view(view, disparity[..., None], np.isfinite(disparity))[..., 0], normal)
 
@@ -100,8 +100,8 @@ class MapFolder:
             self._by_name.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
         self._taken: dict[Path, str] = {}
 
-    def read(self, view: View, channels: int) -> Float[np.ndarray, "H W channels"] | None:
-        """Read the stored map of a view; None if there is none. Colours are decoded to [-1, 1].
+    def read(self, view: View, channels: int) -> Shaped[np.ndarray, "H W channels"] | None:
+        """Read the stored map of a view, as it is stored; None if there is none.
 
         Raises:
             SceneError: the file is damaged or not such a map, or the view has several.
@@ -125,7 +125,7 @@ class MapFolder:
             raise SceneError(
                 f"the map {path} of view {view.name!r} is {array.dtype} {list(array.shape)}, not {wanted} per pixel"
             )
-        return array.astype(np.float32)
+        return array
 
     def _find(self, view: View) -> Path | None:
         """The file named like the view: its path in the scene or the end of this path, with or without suffix."""
@@ -150,8 +150,7 @@ class MapFolder:
             with Image.open(path) as image:
                 array = np.asarray(image)
             if array.ndim == 3:
-                colours = array[..., :3].astype(np.float32)
-                return np.where(colours.any(axis=-1, keepdims=True), colours / 127.5 - 1, 0)  # black means no normal
+                return array[..., :3]
             if array.dtype == np.uint8:
                 raise ValueError("its 8 bits are too few for depth; use 16-bit png, npy or npz")
             return array

@@ -14,6 +14,7 @@ from scipy.spatial import Delaunay, KDTree, QhullError
 from dataparsers.errors import SceneError
 from dataparsers.strays import sound
 from shellgs_method.open3d import import_open3d, reason
+from shellgs_method.shell.geometry.planes import largest_plane
 from shellgs_method.triangles import Triangles
 
 log = logging.getLogger(__name__)
@@ -27,9 +28,8 @@ CELLS = 1500  # cells along the cloud's extent in which points are merged: 2 cm 
 LONGEST_EDGE = 3.0  # this and the next two lengths are in units of the cloud's spacing
 NEIGHBOURHOOD = 2.5
 BALLS = 0.8, 1.6
-NORMAL_AGREEMENT = 0.85  # cosine
 NO_PLANE = -1
-HYPOTHESES, TESTED, FAILURES = 300, 4000, 6  # of RANSAC
+FAILURES = 6  # of RANSAC
 LEAST_POINTS = 150  # in a plane
 
 
@@ -194,30 +194,8 @@ def _planes(cloud: _Cloud) -> Iterator[_Part]:
 
 
 def _largest_plane(cloud: _Cloud, left: Int64[np.ndarray, " L"], rng: np.random.Generator) -> Bool[np.ndarray, " L"]:
-    """Find the points on the largest plane, by position and normal, with RANSAC and repeated least-squares fits.
-
-    A hypothesis is one point with its normal, tested on a sample of the others. Open3D's ``segment_plane`` ignores
-    normals and returns a different plane in each run.
-    """
-    points, normals = cloud.points[left], cloud.normals[left]
     tolerance = float(np.clip(4 * cloud.roughness, 0.1 * cloud.spacing, cloud.spacing))
-
-    def on(centres: np.ndarray, axes: np.ndarray, among: np.ndarray | slice) -> np.ndarray:
-        near = np.abs(points[among] @ axes.T - np.einsum("hc,hc->h", centres, axes)) <= tolerance
-        return near & (np.abs(normals[among] @ axes.T) > NORMAL_AGREEMENT)
-
-    hypotheses = rng.integers(len(points), size=HYPOTHESES)
-    tested = rng.permutation(len(points))[:TESTED]
-    best = hypotheses[on(points[hypotheses], normals[hypotheses], tested).sum(axis=0).argmax()]
-    members = on(points[[best]], normals[[best]], slice(None))[:, 0]
-    for _ in range(10):
-        centre = points[members].mean(0)
-        axis = np.linalg.eigh(np.cov(points[members].T, bias=True))[1][:, :1].T
-        grown = on(centre[None], axis, slice(None))[:, 0]
-        if grown.sum() <= members.sum():
-            break
-        members = grown
-    return members
+    return largest_plane(cloud.points[left], tolerance, rng, cloud.normals[left])
 
 
 def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:

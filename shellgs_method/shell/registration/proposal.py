@@ -18,7 +18,7 @@ from scipy.signal import fftconvolve
 from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
-from shellgs_method.open3d import import_open3d
+from shellgs_method.shell.geometry.planes import fitted_plane, largest_plane
 from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.shell.geometry.surface import ShellSurface
 from shellgs_method.shell.registration.bays import wall_axes
@@ -104,22 +104,21 @@ def propose(
 
 
 def _main_wall(points: np.ndarray, cameras: np.ndarray, up: np.ndarray) -> _Cloud:
-    o3d = import_open3d()
-    o3d.utility.random.seed(0)
+    rng = np.random.default_rng(0)
     size = float(np.linalg.norm(np.percentile(points, 90, axis=0) - np.percentile(points, 10, axis=0)))
     left = points
     for _ in range(5):
         if len(left) < 50:
             break
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(left))
-        plane, inliers = cloud.segment_plane(0.01 * size, 3, 1000)
-        out = plane[:3] / np.linalg.norm(plane[:3])
+        members = largest_plane(left, 0.01 * size, rng)
+        if not members.any():
+            break
+        centre, out = fitted_plane(left[members])
         if abs(out @ up) < 0.5:
-            centre = left[inliers].mean(0)
             out = out * np.sign((cameras.mean(0) - centre) @ out)
             near = np.abs((points - centre) @ out) < _FLAT * size
             return _Cloud(points, points[near], wall_axes(out, up))
-        left = np.delete(left, inliers, axis=0)
+        left = left[~members]
     raise SceneError("the SfM points have no upright wall to start from: pick points and use --picks")
 
 
