@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+
+log = logging.getLogger(__name__)
 
 
 class SceneError(ValueError):
     """The input cannot be used; the message says what is wrong, in which file or view, and what to do."""
+
+
+@cache
+def notice(sentence: str) -> None:
+    """Tell the user, once in a process, what is done with an input that can be used: a command reads it repeatedly."""
+    log.warning("%s", sentence)
 
 
 _DISK = {

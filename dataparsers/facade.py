@@ -198,7 +198,7 @@ def _pinhole_cameras(poses: torch.Tensor, views: Sequence[View]) -> Cameras:
 
 
 def _refuse_missing_images(shots: Sequence[Shot], scene: Path) -> None:
-    missing = [shot.image.name for shot in shots if not shot.image.is_file()]
+    missing = [shot.name for shot in shots if not shot.image.is_file()]
     if missing:
         shown = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
         raise FileNotFoundError(

@@ -8,7 +8,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Optional
 
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, notice
+from dataparsers.scene_files import photographs_in
 
 if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line needs only the paths
     from dataparsers.shots import Recording, Shot
@@ -24,7 +25,8 @@ class ScenePaths:
     images_path: Path = Path("images")
     """Folder of the photographs in a COLMAP scene, relative to the scene folder."""
     colmap_path: Optional[Path] = None
-    """COLMAP model, relative to the scene folder. If not set: colmap/sparse/0, sparse/0, colmap/sparse or sparse."""
+    """COLMAP model, relative to the scene folder. If not set: the largest of those numbered in colmap/sparse or sparse,
+    else the one there."""
     masks_path: Optional[Path] = None
     """Folder of masks (white is kept, black is ignored), relative to the scene folder. If not set: masks, if there."""
 
@@ -63,8 +65,37 @@ class SceneLayout(ScenePaths):
 
         folder = self.colmap_folder()
         if folder is None:
-            return transforms.read_recording(self.data)
-        return colmap_model.read_recording(self.data, folder, self.images_path)
+            recording, cameras = transforms.read_recording(self.data, self.images_path), transforms.NAME
+        else:
+            recording = colmap_model.read_recording(self.data, folder, self.images_path)
+            cameras = folder.as_posix()
+        self._tell_what_is_left_out(recording, cameras)
+        return recording
+
+    def _tell_what_is_left_out(self, recording: Recording, cameras: str) -> None:
+        """Count the photographs that have a camera and are in a split against those in their folders."""
+        used, masks = {shot.image for shot in recording.shots}, {shot.mask for shot in recording.shots}
+        whole = self.data / self.images_path
+        inner = whole if whole != self.data else None  # a scene's folder holds other images too
+        parents = {shot.image.parent for shot in recording.shots}
+        folders = {inner if inner and folder.is_relative_to(inner) else folder for folder in parents}
+        there = [
+            p for folder in sorted(folders) for p in photographs_in(folder, deep=folder == inner) if p not in masks
+        ]
+        without = [path.relative_to(self.data).as_posix() for path in there if path not in used]
+        if without:
+            shown = ", ".join(without[:3]) + (", …" if len(without) > 3 else "")
+            notice(
+                f"{len(without)} of {len(there)} photographs of {self.data} are not in {cameras}, and are left out: "
+                f"{shown}."
+            )
+        names = {shot.name for shot in recording.shots}
+        unlisted = names.difference(*recording.listed.values()) if recording.listed else set()
+        if unlisted:
+            notice(
+                f"{len(unlisted)} of {len(names)} photographs of {self.data} are in no list of its splits, and are "
+                f"left out: {min(unlisted)}, for example."
+            )
 
     def colmap_folder(self) -> Path | None:
         """Folder of the COLMAP model, relative to the scene; None where transforms.json holds the cameras.
@@ -78,14 +109,14 @@ class SceneLayout(ScenePaths):
             raise FileNotFoundError(f"{self.data} is not a folder; --data takes a scene folder.")
         if (self.data / transforms.NAME).is_file() and self.colmap_path is None:
             return None
-        candidates = [self.colmap_path] if self.colmap_path else list(map(Path, colmap_model.FOLDERS))
-        for folder in candidates:
-            if any((self.data / folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
-                return folder
-        raise FileNotFoundError(
-            f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "
-            f"{', '.join(map(str, candidates))}."
-        )
+        folder = colmap_model.find_folder(self.data, self.colmap_path)
+        if folder is None:
+            looked_in = [self.colmap_path] if self.colmap_path else colmap_model.PLACES
+            raise FileNotFoundError(
+                f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "
+                f"{', '.join(map(str, looked_in))}, or in numbered folders there."
+            )
+        return folder
 
     def masks(self, shots: Sequence[Shot]) -> dict[str, Path]:
         """Mask files by the names of their photographs: the one that the frame names, else the one in the folder.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+from dataparsers.scene_files import inside
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 MAX_PIXELS = 178_956_970
@@ -99,20 +100,6 @@ def shot(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(torch.from_numpy(np.linalg.inv(_rigid(pose, where))), K, int(width), int(height))
     return Shot(name, image, camera, distortion, kind)
-
-
-def inside(scene: Path, name: str, where: str) -> Path:
-    """Path of a file named in a scene's file, checked to lie in the scene.
-
-    Raises:
-        SceneError: the path leads out of the scene.
-    """
-    path = PurePosixPath(str(name))
-    for folder in (scene.absolute().as_posix(), scene.resolve().as_posix()):
-        path = path.relative_to(folder) if path.is_relative_to(folder) else path
-    if path.is_absolute() or ".." in path.parts or not path.parts or not str(path).isprintable():
-        raise SceneError(f"{where} names the file {str(name)!r}, which is not inside the scene: move it there")
-    return scene / path
 
 
 def in_order(shots: Sequence[Shot], where: str) -> list[Shot]:

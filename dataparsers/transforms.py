@@ -13,7 +13,8 @@ from jaxtyping import Float64, UInt8
 from dataparsers.errors import SceneError
 from dataparsers.files import read_json
 from dataparsers.headers import check_ply
-from dataparsers.shots import DISTORTION, Recording, Shot, in_order, inside, shot
+from dataparsers.scene_files import NamedFiles
+from dataparsers.shots import DISTORTION, Recording, Shot, in_order, shot
 
 NAME = "transforms.json"
 GREY = 128
@@ -24,8 +25,12 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *DISTORTION)
 
 
-def read_recording(scene: Path) -> Recording:
+def read_recording(scene: Path, images_path: Path) -> Recording:
     """Read the photographs listed in the scene's transforms.json.
+
+    Args:
+        scene: the scene's folder.
+        images_path: folder in it in which photographs are looked for that are not where the file says.
 
     Raises:
         SceneError: the file is damaged, or a camera is invalid.
@@ -35,9 +40,10 @@ def read_recording(scene: Path) -> Recording:
     frames = meta.get("frames")
     if not isinstance(frames, list):
         raise SceneError(f"{path} has no list of frames: make it again")
-    applied = _applied(meta, scene)
-    shots = [_shot(scene, frame, meta, applied, f"{path}, frame {k}") for k, frame in enumerate(frames, start=1)]
-    listed = {split: _names(meta[f"{split}_filenames"], path) for split in _SPLITS if f"{split}_filenames" in meta}
+    applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
+    shots = [_shot(files, frame, meta, applied, f"{path}, frame {k}") for k, frame in enumerate(frames, start=1)]
+    listed = {s: _names(meta[f"{s}_filenames"], files, path) for s in _SPLITS if f"{s}_filenames" in meta}
+    files.tell_what_is_elsewhere()
     orientation = meta.get("orientation_override")
     if orientation not in (None, "pca", "up", "vertical", "none"):
         raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
@@ -47,6 +53,16 @@ def read_recording(scene: Path) -> Recording:
 _SPLITS = ("train", "val", "test")
 
 
+def find_cloud(scene: Path) -> Path | None:
+    """Path of the point cloud named in transforms.json, which may not exist; None if it names none.
+
+    Raises:
+        SceneError: the path leads out of the scene.
+    """
+    name, where = read_json(scene / NAME).get("ply_file_path"), scene / NAME
+    return None if name is None else NamedFiles(scene, Path(), where).other(str(name), str(where))
+
+
 def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
     """Positions, in the scene's frame, and colours of the point cloud named in transforms.json; empty if it names none.
 
@@ -54,10 +70,9 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
         FileNotFoundError: the cloud is missing.
         SceneError: it is damaged.
     """
-    meta = read_json(scene / NAME)
-    if meta.get("ply_file_path") is None:
+    path = find_cloud(scene)
+    if path is None:
         return np.empty((0, 3)), np.empty((0, 3), np.uint8)
-    path = inside(scene, meta["ply_file_path"], str(scene / NAME))
     if not path.is_file():
         raise FileNotFoundError(f"{path}, the SfM points that {scene / NAME} names, does not exist")
     import trimesh
@@ -70,12 +85,12 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
     except Exception as error:  # trimesh raises errors of any kind for a damaged file
         reason = " ".join(str(error).split())
         raise SceneError(f"the SfM points {path} cannot be read ({reason}): make them again") from error
-    undo = np.linalg.inv(_applied(meta, scene))
+    undo = np.linalg.inv(_applied(read_json(scene / NAME), scene))
     colours = colours[:, :3] if len(colours) == len(positions) else np.full(positions.shape, GREY, np.uint8)
     return positions @ undo[:3, :3].T + undo[:3, 3], colours
 
 
-def _shot(scene: Path, frame: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Shot:
+def _shot(files: NamedFiles, frame: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Shot:
     if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
         raise SceneError(f"{where}: there is no file_path that names its photograph")
     try:
@@ -88,11 +103,11 @@ def _shot(scene: Path, frame: Any, meta: Mapping[str, Any], applied: np.ndarray,
     for key in DISTORTION if _has_distortion(meta) else ():  # as in nerfstudio, the file's own take precedence
         lens.pop(key, None)
     lens |= _distortion(meta if _has_distortion(meta) else frame, where)
-    path = inside(scene, frame["file_path"], where)
-    made = shot(scene, path.relative_to(scene).as_posix(), np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
+    name = files.photograph(frame["file_path"], where).relative_to(files.scene).as_posix()
+    made = shot(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
     if frame.get("mask_path") is None:
         return made
-    return replace(made, mask=inside(scene, frame["mask_path"], where))
+    return replace(made, mask=files.other(str(frame["mask_path"]), where))
 
 
 def _has_distortion(meta: Mapping[str, Any]) -> bool:
@@ -121,7 +136,7 @@ def _applied(meta: Mapping[str, Any], scene: Path) -> Float64[np.ndarray, "4 4"]
     return np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
 
 
-def _names(listed: Any, path: Path) -> set[str]:
+def _names(listed: Any, files: NamedFiles, path: Path) -> set[str]:
     if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
         raise SceneError(f"{path}: a list of filenames holds something other than names")
-    return {Path(name).as_posix() for name in listed}
+    return {files.photograph(name, f"{path}, a list").relative_to(files.scene).as_posix() for name in listed}

@@ -210,6 +210,22 @@ BAD_MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut cameras": (binary("cameras", struct.pack("<QiiQQ", 1, 1, 1, 48, 32)), "cameras.bin is damaged"),
     "many cameras": (binary("cameras", MANY), "it claims 1152921504606846976 entries in 8 bytes"),
     "a camera of no model": (binary("cameras", struct.pack("<QiiQQ4d", 1, 1, 99, 48, 32, 1, 1, 1, 1)), "number 99"),
+    "a camera of a newer model": (
+        binary("cameras", struct.pack("<QiiQQ5d", 1, 1, 13, 48, 32, *[1] * 5)),
+        "DIVISION camera model is not supported yet; undistort the photographs first",
+    ),
+    "panoramas": (
+        binary("cameras", struct.pack("<QiiQQ2d", 1, 1, 17, 48, 32, 48, 32)),
+        "EQUIRECTANGULAR camera model is not supported yet; render perspective photographs",
+    ),
+    "more than it says": (
+        binary(
+            "cameras", struct.pack("<QiiQQ4diiQQ4d", 1, *[1, 1, 48, 32, 40, 40, 24, 16], *[2, 1, 48, 32, 1, 1, 1, 1])
+        ),
+        "it goes on for 56 bytes after its last entry",
+    ),
+    "one image twice": (edit("images.txt", "\n2 ", "\n1 "), "two images have the number 1"),
+    "a name less": (edit("images.txt", " frame_00001.png", ""), "images.txt is damaged"),
     "many images": (binary("images", MANY), "images.bin is damaged"),
     "many features": (
         binary("images", struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0" + MANY),

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+import unicodedata
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -19,6 +22,7 @@ from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, load_photograph
+from dataparsers.sparse_points import read_sparse_points
 from shellgs_method.datamanager import FacadeDataset
 
 
@@ -236,6 +240,182 @@ def test_a_list_of_photographs_that_is_not_text_is_refused_by_name(scene):
     (scene / "test_list.txt").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match=r"test_list.txt is not a text file"):
         read_views(FacadeDataParserConfig(data=scene))
+
+
+# Models: all photographs are read, and what is not is said
+
+
+def without_blank(lines: list[str]) -> list[str]:
+    return [line for line in lines if line]
+
+
+def with_keypoints(lines: list[str]) -> list[str]:
+    """Keypoints of every second image only, with comments between; blank lines are gone."""
+    images = without_blank(lines)
+    several = [[image, "1.5 2.5 -1 3 4 7", "# the next"] if k % 2 else [image] for k, image in enumerate(images)]
+    return [line for lines in several for line in lines]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without_blank,
+        with_keypoints,
+        lambda lines: [each for line in lines for each in (line, "")],
+        lambda lines: ["\ufeff# made elsewhere", *lines],
+        lambda lines: [line.replace("frame_00001.png", "fasade 1 2.png") for line in without_blank(lines)],
+        lambda lines: [line.replace("frame_00001.png", "1 2 3") for line in without_blank(lines)],
+    ],
+    ids=["no blank lines", "some keypoints", "doubled", "byte-order mark", "blanks in a name", "a name of numbers"],
+)
+def test_all_images_of_a_text_model_are_read_whatever_became_of_its_empty_lines(scene, change):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    path = scene / "sparse" / "0" / "images.txt"
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n", "utf-8")
+    for name in ("fasade 1 2.png", "1 2 3"):
+        if name in path.read_text("utf-8"):
+            (scene / "images" / "frame_00001.png").rename(scene / "images" / name)
+    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+
+
+def split_model(scene: Path, place: str, counts: dict[str, int]) -> None:
+    """Models of the first photographs of a scene, in numbered folders."""
+    views = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, views, list(range(1, len(views) + 1)))
+    whole = (scene / "sparse" / "0").rename(scene / "whole")
+    lines = (whole / "images.txt").read_text().splitlines()
+    for number, count in counts.items():
+        folder = Path(shutil.copytree(whole, scene / place / number))
+        (folder / "images.txt").write_text("\n".join(lines[: 2 * count]) + "\n")
+    shutil.rmtree(whole)
+
+
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
+@pytest.mark.parametrize("counts", [{"0": 2, "1": 7}, {"1": 3, "2": 7, "10": 7}, {"3": 7}])
+def test_of_several_colmap_models_the_largest_is_read_and_named(scene, caplog, place, counts):
+    split_model(scene, place, counts)
+    largest = next(number for number, count in counts.items() if count == 7)
+    assert len(read_views(FacadeDataParserConfig(data=scene))) == 7
+    assert (f"{place}/{largest}, the largest, is used, with 7 photographs" in caplog.text) == (len(counts) > 1)
+    assert FacadeDataParserConfig(data=scene, colmap_path=Path(place)).colmap_folder() == Path(place, largest)
+
+
+def test_a_chosen_colmap_model_is_read_though_another_is_larger(scene):
+    split_model(scene, "sparse", {"0": 2, "1": 7})
+    assert len(read_views(FacadeDataParserConfig(data=scene, colmap_path=Path("sparse/0")))) == 2
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
+def test_photographs_without_a_camera_are_counted(scene, caplog, kind):
+    views = read_views(FacadeDataParserConfig(data=scene))
+    assert "left out" not in caplog.text
+    if kind == "transforms.json":
+        transforms = json.loads((scene / "transforms.json").read_text())
+        transforms["frames"] = transforms["frames"][:7]
+        (scene / "transforms.json").write_text(json.dumps(transforms))
+    else:
+        write_colmap(scene, views[:7], list(range(1, 8)))
+    (scene / "images" / "more").mkdir()
+    shutil.copy(views[0].image, scene / "images" / "more" / "IMG_1.JPG")
+    (scene / "images" / "notes.txt").touch()
+    read_views(FacadeDataParserConfig(data=scene))
+    assert "4 of 11 photographs of" in caplog.text
+    assert "left out: images/frame_00008.png, images/frame_00009.png, images/frame_00010.png, …" in caplog.text
+
+
+def test_photographs_in_no_list_of_the_splits_are_counted(scene, caplog):
+    transforms = json.loads((scene / "transforms.json").read_text())
+    frames = [frame["file_path"] for frame in transforms["frames"]]
+    transforms |= {"train_filenames": frames[:6], "test_filenames": frames[6:8]}
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    assert len(names(parse(scene))) == 6
+    assert "2 of 10 photographs of" in caplog.text
+    assert "in no list of its splits" in caplog.text
+
+
+# Paths as other systems, programs and machines write them
+
+
+def respell(scene: Path, spell: Callable[[str], str]) -> None:
+    transforms = json.loads((scene / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame["file_path"] = spell(frame["file_path"])
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+
+
+SPELLINGS: dict[str, Callable[[str], str]] = {
+    "dot": lambda path: f"./{path}",
+    "backslash": lambda path: path.replace("/", "\\"),
+    "windows": lambda path: "D:\\shoot\\" + path.replace("/", "\\"),
+    "network": lambda path: "\\\\server\\share\\" + path.replace("/", "\\"),
+    "other machine": lambda path: f"/home/ann/shoot/{path}",
+    "other folder": lambda path: path.replace("images/", "input/"),
+    "no suffix": lambda path: path.removesuffix(".png"),
+    "only the name": lambda path: path.removeprefix("images/"),
+    "case": lambda path: path.replace("images", "Images").replace(".png", ".PNG"),
+    "all": lambda path: "c:\\" + path.upper().replace("/", "\\").removesuffix(".PNG"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_photographs_are_found_however_their_paths_are_written(scene, spelling):
+    before = read_views(FacadeDataParserConfig(data=scene))
+    respell(scene, SPELLINGS[spelling])
+    after = read_views(FacadeDataParserConfig(data=scene))
+    assert [(view.name, view.image) for view in after] == [(view.name, view.image) for view in before]
+
+
+def test_paths_of_which_letters_are_composed_otherwise_are_found(scene):
+    name = unicodedata.normalize("NFD", "façade.png")  # as macOS writes it
+    (scene / "images" / "frame_00001.png").rename(scene / "images" / name)
+    respell(scene, lambda path: path.replace("frame_00001", "façade"))
+    assert read_views(FacadeDataParserConfig(data=scene))[0].image.name == name
+
+
+def test_photographs_found_elsewhere_are_told(scene, caplog):
+    respell(scene, SPELLINGS["other machine"])
+    read_views(FacadeDataParserConfig(data=scene))
+    assert "10 of the files that" in caplog.text
+    assert "/home/ann/shoot/images/frame_00001.png is images/frame_00001.png" in caplog.text
+
+
+def test_a_path_that_fits_two_photographs_is_refused(scene):
+    respell(scene, SPELLINGS["no suffix"])
+    shutil.copy(scene / "images" / "frame_00004.png", scene / "images" / "frame_00004.jpg")
+    with pytest.raises(
+        SceneError, match=r"frame 4 names the file 'images/frame_00004', which may be .*4.jpg or .*4.png"
+    ):
+        read_views(FacadeDataParserConfig(data=scene))
+
+
+def test_a_deleted_photograph_is_not_taken_from_another_folder(scene):
+    (scene / "images" / "left").mkdir()
+    shutil.copy(scene / "images" / "frame_00001.png", scene / "images" / "left" / "a.png")
+    respell(scene, lambda path: path.replace("images/frame_00001", "images/left/frame_00002"))
+    with pytest.raises(FileNotFoundError, match=r"1 of 10 images .*\(images/left/frame_00002.png\)"):
+        read_views(FacadeDataParserConfig(data=scene))
+
+
+def test_masks_and_points_are_found_however_their_paths_are_written(scene):
+    Image.new("L", (48, 32), 255).save(scene / "mask.png")
+    transforms = json.loads((scene / "transforms.json").read_text())
+    transforms["ply_file_path"] = "D:\\shoot\\sparse_pc.ply"
+    for frame in transforms["frames"]:
+        frame["mask_path"] = ".\\MASK.PNG"
+    before = parse(scene).metadata["points3D_xyz"]
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    torch.testing.assert_close(parse(scene).metadata["points3D_xyz"], before)
+    assert read_views(FacadeDataParserConfig(data=scene))[0].mask == scene / "mask.png"
+
+
+def test_colmap_names_that_begin_with_the_folder_of_the_photographs_keep_their_points(scene):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    path = scene / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace(" frame_", " images/frame_"))
+    assert read_views(FacadeDataParserConfig(data=scene))[0].name == "images/frame_00001.png"
+    observed = read_sparse_points(FacadeDataParserConfig(data=scene)).observed
+    assert observed is not None
+    assert len(observed["images/frame_00001.png"]) == 39
 
 
 def test_a_folder_without_cameras_is_refused(tmp_path):

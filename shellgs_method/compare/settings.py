@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -21,6 +20,7 @@ from dataparsers.cue_maps import CueMaps, find_cues
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.files import content_hash, fingerprint
+from dataparsers.transforms import find_cloud
 
 _IRRELEVANT = re.compile(
     r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"
@@ -106,8 +106,8 @@ def _camera_files(dataparser: FacadeDataParserConfig) -> list[Path]:
     if colmap is not None:
         return sorted((scene / colmap).glob("*.*"))
     cameras = scene / "transforms.json"
-    cloud = json.loads(cameras.read_text()).get("ply_file_path")
-    return [cameras] if cloud is None or not (scene / cloud).is_file() else [cameras, scene / cloud]
+    cloud = find_cloud(scene)
+    return [cameras] if cloud is None or not cloud.is_file() else [cameras, cloud]
 
 
 def _hash(path: Path) -> str:
