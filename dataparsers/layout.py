@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Optional
 
 from dataparsers.errors import SceneError, notice
-from dataparsers.scene_files import photographs_in
+from dataparsers.scene_files import mask_names, photographs_in, tell_of_masks
 
 if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line needs only the paths
     from dataparsers.shots import Recording, Shot
@@ -129,14 +129,17 @@ class SceneLayout(ScenePaths):
         if self.masks_path is not None and not folder.is_dir():
             raise FileNotFoundError(f"{folder} is not a folder of masks.")
         if folder.is_dir():
+            there = set(photographs_in(folder, deep=True))
             candidates = {shot.name: list(self._candidates(folder, shot.name)) for shot in shots}
-            masks = {name: next((p for p in paths if p.is_file()), None) for name, paths in candidates.items()}
-            if any(folder.iterdir()) and not any(masks.values()) and not any(shot.mask for shot in shots):
+            masks = {name: next((p for p in paths if p in there), None) for name, paths in candidates.items()}
+            named = {shot.mask for shot in shots}
+            if any(folder.iterdir()) and not any(masks.values()) and not any(named):
                 first = next(iter(candidates.values()))[0]
                 raise SceneError(
                     f"no photograph has a mask in {folder}: the first one's would be {first}; rename the masks, or "
                     "move the folder away"
                 )
+            tell_of_masks(masks, there - named, folder)
         else:
             masks = {}
         masks |= {shot.name: shot.mask for shot in shots if shot.mask}
@@ -146,9 +149,8 @@ class SceneLayout(ScenePaths):
         return {name: path for name, path in masks.items() if path}
 
     def _candidates(self, folder: Path, name: str) -> Iterator[Path]:
-        """Possible paths of a photograph's mask: its name with or without its suffix, as in nerfstudio."""
+        """Possible paths of a photograph's mask, in the folder as in that of the photographs or in the scene."""
         path = Path(name)
         inner = path.relative_to(self.images_path) if path.is_relative_to(self.images_path) else path
         for relative in dict.fromkeys((inner, path)):
-            yield folder / f"{relative}.png"
-            yield folder / relative.with_suffix(".png")
+            yield from (folder / name for name in mask_names(relative))

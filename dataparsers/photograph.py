@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +14,8 @@ from PIL import Image, ImageOps
 
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
+from dataparsers.masks import OPAQUE, kept_pixels
+from dataparsers.scene_files import DEVELOP, RAW
 from dataparsers.shots import MAX_PIXELS
 
 if TYPE_CHECKING:
@@ -37,24 +41,29 @@ class View:
     mask: Path | None = None
 
 
-def load_photograph(view: View) -> UInt8[np.ndarray, "H W C"]:
-    """The photograph as 8-bit RGB or RGBA: upright, undistorted, at the size of its camera.
+def load_photograph(view: View) -> UInt8[np.ndarray, "H W 3"]:
+    """The photograph as 8-bit RGB: upright, undistorted, at the size of its camera; black where it is transparent.
 
     Raises:
-        SceneError: the image cannot be read, or its aspect ratio is not the camera's.
+        SceneError: the image cannot be read, its aspect ratio is not the camera's, or it is transparent everywhere.
     """
-    return _undistorted(view, read_image(view.image), view.image)
+    return _pixels(view)[..., :3]
 
 
 def load_mask(view: View) -> Bool[np.ndarray, "H W"] | None:
-    """The user's mask of the photograph, true where a pixel is kept; None where there is none.
+    """Pixels of the photograph that are kept: by the user's mask, and opaque; None where there is nothing to mask.
 
     Raises:
-        SceneError: the image cannot be read, or its aspect ratio is not the camera's.
+        SceneError: an image cannot be read, its aspect ratio is not the camera's, the mask is not black and white, or
+            the photograph is transparent everywhere.
     """
-    if view.mask is None:
-        return None
-    return _undistorted(view, read_image(view.mask).convert("RGB"), view.mask)[..., 0] > 127
+    masks = []
+    if view.mask is not None:
+        masks.append(_undistorted(view, read_mask(view.mask).convert("RGB"), view.mask)[..., 0] > 127)
+    if has_alpha(view.image) and (pixels := _pixels(view)).shape[-1] == 4:
+        opaque = pixels[..., 3] > OPAQUE
+        masks += [] if opaque.all() else [opaque]
+    return np.logical_and.reduce(masks) if masks else None
 
 
 def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "3 3"], np.ndarray]:
@@ -105,26 +114,88 @@ def read_image(path: Path) -> Image.Image:
     Raises:
         SceneError: the image cannot be read, or holds floating-point numbers.
     """
-    try:
-        with Image.open(path) as image:
-            if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
-                raise ValueError(f"it claims {image.width}x{image.height} pixels")
-            image.load()
+    with opened(path) as image:
         exif = image.getexif()
+        if image.mode.startswith("I"):  # 16 bits
+            image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
+        image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+    image.info["exif"] = exif.tobytes()
+    return image
+
+
+def read_mask(path: Path) -> Image.Image:
+    """Read a mask as 8-bit grey, white where it keeps a pixel, else black; EXIF data are kept, as of photographs.
+
+    Raises:
+        SceneError: the image cannot be read, or is not black and white.
+    """
+    with opened(path) as image:
+        exif = image.getexif()
+        mask = Image.fromarray(np.where(kept_pixels(image, path), 255, 0).astype(np.uint8))
+    mask.info["exif"] = exif.tobytes()
+    return mask
+
+
+def without_hidden(image: Image.Image) -> Image.Image:
+    """The image, black where it is transparent: the colours that are stored there are nobody's."""
+    return image.convert("RGBa").convert("RGBA") if image.mode == "RGBA" else image
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether a photograph has an alpha channel or a transparent colour, by its header.
+
+    Raises:
+        SceneError: the image cannot be read.
+    """
+    with opened(path, whole=False) as image:
+        return image.has_transparency_data
+
+
+@contextmanager
+def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
+    """Open an image file, decoded unless ``whole`` is false.
+
+    Raises:
+        SceneError: the image cannot be read, is raw, or holds floating-point numbers.
+    """
+    if path.suffix.lower() in RAW:
+        raise SceneError(f"{path} is raw, of which only a thumbnail can be read: {DEVELOP}")
+    try:
+        image = Image.open(path)
+        if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
+            raise ValueError(f"it claims {image.width}x{image.height} pixels")
+        if whole:
+            image.load()
     except Exception as error:  # each decoder raises its own errors for a damaged file
         reason = " ".join(str(error).split())
         raise SceneError(f"{path} cannot be read as an image ({reason}): put the whole file back") from error
-    if image.mode == "F":
-        broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""
+    with image:
+        if whole and image.mode == "F":
+            broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""
+            raise SceneError(
+                f"{path} holds floating-point numbers{broken}, whose white is undefined: save it with 8 or 16 bits"
+            )
+        yield image
+
+
+def _pixels(view: View) -> UInt8[np.ndarray, "H W C"]:
+    """The photograph as 8-bit RGB or RGBA, upright, undistorted, at the size of its camera.
+
+    What transparent pixels hide is neither shown nor mixed into the colours of others.
+    """
+    image = read_image(view.image)
+    if image.mode == "RGB":
+        return _undistorted(view, image, view.image)
+    if image.getchannel("A").getextrema() == (0, 0):
         raise SceneError(
-            f"{path} holds floating-point numbers{broken}, whose white is undefined: save it with 8 or 16 bits"
+            f"{view.image} is transparent everywhere: remove its alpha channel, or leave the photograph out"
         )
-    if image.mode.startswith("I"):  # 16 bits
-        image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
-    transparent = "A" in image.getbands() or "transparency" in image.info
-    image = image.convert("RGBA" if transparent else "RGB")
-    image.info["exif"] = exif.tobytes()
-    return image
+    premultiplied = _undistorted(view, image.convert("RGBa"), view.image)
+    return np.array(_image(premultiplied, "RGBa").convert("RGBA"))
+
+
+def _image(pixels: UInt8[np.ndarray, "H W C"], mode: str) -> Image.Image:
+    return Image.frombytes(mode, (pixels.shape[1], pixels.shape[0]), np.ascontiguousarray(pixels).tobytes())
 
 
 def _undistorted(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray, "H W C"]:
@@ -132,7 +203,7 @@ def _undistorted(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray
     if view.lens is not None:
         if upright.size != _calibrated_size(view):
             upright = upright.resize(_calibrated_size(view), Image.Resampling.BOX)
-        upright = Image.fromarray(undistort(view.lens, np.asarray(upright))[1])
+        upright = _image(undistort(view.lens, np.asarray(upright))[1], upright.mode)
     size = (view.camera.width, view.camera.height)
     return np.array(upright if upright.size == size else upright.resize(size, Image.Resampling.BOX))
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable, Sequence
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
+
+from pi_heif import register_heif_opener
 
 from dataparsers.errors import SceneError, notice
+
+register_heif_opener()  # Pillow reads those of phones (.heic) from here on
 
 PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".hif", ".avif"))
 """Suffixes of photographs, in lower case."""
@@ -17,7 +21,8 @@ RAW = frozenset(
         *("nef", "nrw", "orf", "pef", "raf", "raw", "rw2", "rwl", "sr2", "srf", "srw", "x3f"),
     )
 )
-"""Suffixes of what sensors recorded, in lower case: cameras and Pillow show its thumbnail."""
+"""Suffixes of what sensors recorded, in lower case: Pillow reads a thumbnail of some, and nothing of others."""
+DEVELOP = "export it as JPEG, or as PNG or TIFF of 8 or 16 bits, with the program that develops it"
 
 
 def inside(scene: Path, name: str, where: str) -> Path:
@@ -118,6 +123,23 @@ def _alike(one: str, other: str) -> bool:
 
 def _folded(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def mask_names(photograph: PurePath) -> list[PurePath]:
+    """Names that the mask of a photograph may have, the usual ones first: its own, with and without its suffix."""
+    stems = [f"{name}{end}" for name in (photograph.name, photograph.stem) for end in ("", "_mask", ".mask")]
+    suffixes = (".png", *sorted(PHOTOGRAPHS - {".png"}))
+    return [photograph.with_name(stem + suffix) for suffix in suffixes for stem in stems]
+
+
+def tell_of_masks(masks: Mapping[str, Path | None], there: Collection[Path], folder: Path) -> None:
+    """Tell the user which photographs have no mask, if some have one, and which files of the folder are no masks."""
+    without = sorted(name for name, path in masks.items() if path is None)
+    strays = sorted(path for path in there if path not in masks.values() and not path.name.startswith("."))
+    if strays or 0 < len(without) < len(masks):
+        stray = f"; {len(strays)} files there belong to no photograph, {strays[0].name} for example" if strays else ""
+        kept = f", {without[0]} for example, and are kept whole" if without else ""
+        notice(f"{len(without)} of {len(masks)} photographs have no mask in {folder}{kept}{stray}.")
 
 
 def photographs_in(folder: Path, *, deep: bool) -> list[Path]:

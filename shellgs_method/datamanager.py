@@ -71,7 +71,7 @@ class FacadeDataset(InputDataset):
         return self._dataparser_outputs.metadata["views"]
 
     def get_numpy_image(self, image_idx: int) -> UInt8[np.ndarray, "H W C"]:
-        """The photograph as 8-bit RGB or RGBA."""
+        """The photograph as 8-bit RGB."""
         return load_photograph(self.views[image_idx])
 
     def get_data(self, image_idx: int, image_type="float32") -> dict:
@@ -81,7 +81,8 @@ class FacadeDataset(InputDataset):
         mask = load_mask(self.views[image_idx])
         if mask is not None and not mask.any():
             view = self.views[image_idx]
-            raise SceneError(f"the mask {view.mask} is black everywhere: white is kept; leave {view.name} out instead")
+            by = f"the mask {view.mask}" if view.mask else f"the mask of {view.name}"
+            raise SceneError(f"{by} is black everywhere: white is kept; leave {view.name} out instead")
         if mask is not None:
             data["mask"] = torch.from_numpy(mask)[..., None]
         if self.held:

@@ -21,12 +21,21 @@ from dataparsers.photograph import load_mask, load_photograph
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.frames import extract_frames, sharpest
 from shellgs_method.capture.pairs import choose_matching, image_pairs
-from shellgs_method.capture.photographs import add_mask, add_photograph, find_masks, find_photographs, group_by_lens
+from shellgs_method.capture.photographs import (
+    add_mask,
+    add_photograph,
+    find_masks,
+    find_photographs,
+    group_by_lens,
+    has_transparency,
+)
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 QUIET = Progress(disable=True)
+PHONE = Path(__file__).with_name("phone.heic")
+"""48 x 32 pixels, red in the upper left corner."""
 
 
 def photograph(width: int = 64, height: int = 48, seed: int = 0) -> Image.Image:
@@ -140,6 +149,42 @@ def test_photographs_that_would_share_a_name_are_refused(tmp_path):
         find_photographs(tmp_path)
 
 
+def test_photographs_of_a_phone_are_read_in_any_case_of_their_suffix(tmp_path):
+    for name in ("IMG_1.HEIC", "img_2.heif", "IMG_3.hif"):
+        shutil.copy(PHONE, tmp_path / name)
+    found = find_photographs(tmp_path)
+    assert list(found) == ["IMG_1.png", "IMG_3.png", "img_2.png"]
+    add_photograph(found["IMG_1.png"], tmp_path / "work" / "IMG_1.png")
+    with Image.open(tmp_path / "work" / "IMG_1.png") as image:
+        assert image.size == (48, 32)
+        assert is_red(image, 4, 4)
+        assert image.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] == 26
+
+
+@pytest.mark.parametrize("name", ["a.NEF", "b/c.dng", "IMG_1.CR3", "x.arw"])
+def test_raw_photographs_are_refused_at_once(tmp_path, name):
+    photograph().save(tmp_path / "developed.jpg")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    with pytest.raises(SceneError, match=rf"1 files of .* are raw photographs, {Path(name).name} .*export it as JPEG"):
+        find_photographs(tmp_path)
+
+
+def test_what_is_no_photograph_is_counted_but_not_a_developed_raw(tmp_path, caplog):
+    photograph().save(tmp_path / "IMG_1.JPG")
+    for name in ("IMG_1.CR2", "IMG_1.MOV", "notes.txt", ".hidden"):
+        (tmp_path / name).touch()
+    assert list(find_photographs(tmp_path)) == ["IMG_1.JPG"]
+    assert "3 files of" in caplog.text
+    assert "(1 .cr2, 1 .mov, 1 .txt)" in caplog.text
+
+
+def test_a_folder_of_videos_is_refused_with_what_it_holds(tmp_path):
+    (tmp_path / "a.MP4").touch()
+    with pytest.raises(SceneError, match=r"no photographs in .*, but 1 \.mp4; of videos, give one file"):
+        find_photographs(tmp_path)
+
+
 def test_an_ordinary_photograph_is_kept_byte_for_byte(tmp_path):
     photograph().save(tmp_path / "a.jpg")
     add_photograph(tmp_path / "a.jpg", tmp_path / "copy" / "a.jpg")
@@ -205,6 +250,42 @@ def test_photographs_of_two_sizes_cannot_share_a_camera(tmp_path):
 
 
 # Masks
+
+
+def test_what_is_transparent_in_a_photograph_is_masked_and_black(tmp_path):
+    pixels = np.array(photograph().convert("RGBA"))
+    pixels[:12] = (255, 0, 255, 0)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert has_transparency(tmp_path / "a.png")
+    add_photograph(tmp_path / "a.png", tmp_path / "work.png")
+    add_mask(None, tmp_path / "a.png", tmp_path / "work.png", tmp_path / "kept.png")
+    with Image.open(tmp_path / "work.png") as image, Image.open(tmp_path / "kept.png") as kept:
+        assert image.mode == "RGB"
+        assert np.asarray(image)[:12].max() == 0
+        np.testing.assert_array_equal(np.asarray(image)[12:], pixels[12:, :, :3])
+        np.testing.assert_array_equal(np.asarray(kept), pixels[..., 3])
+
+
+def test_a_mask_of_a_capture_may_hold_ones_or_be_transparent(tmp_path):
+    keep = np.zeros((48, 64), np.uint8)
+    keep[:12] = 1
+    for mask in (
+        Image.fromarray(keep),
+        Image.merge("LA", [Image.new("L", (64, 48), 255), Image.fromarray(255 * keep)]),
+    ):
+        np.testing.assert_array_equal(np.asarray(masked(tmp_path, mask)), 255 * keep)
+
+
+def test_the_usual_names_of_masks_are_found_and_others_counted(tmp_path, caplog):
+    photographs = {name: tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg", "d.jpg")}
+    (tmp_path / "masks").mkdir()
+    names = ["a.jpg.png", "b_mask.png", "c.jpg", "dd.png"]
+    for name in names:
+        (tmp_path / "masks" / name).touch()
+    found = find_masks(photographs, tmp_path, tmp_path / "masks")
+    assert found == {f"{name[0]}.jpg": tmp_path / "masks" / name for name in names[:3]}
+    assert "1 of 4 photographs have no mask" in caplog.text
+    assert "dd.png for example" in caplog.text
 
 
 def masked(tmp_path: Path, mask: Image.Image) -> Image.Image:

@@ -14,6 +14,7 @@ import trimesh
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
 from runs import data_of, model_of, small_disk, trainer_of
+from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 from viser import SceneApi
 
@@ -123,6 +124,24 @@ def test_a_post_in_front_of_the_wall_is_found_at_its_depth(depth: float):
     assert both / contradicted.sum() > 0.8
     inverse = WALL / np.median(found.numpy()[before & contradicted]) - 1
     assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # one step of the offsets
+
+
+@pytest.mark.parametrize("colour", [[255, 0, 255], [0, 0, 0]])
+def test_what_photographs_do_not_count_for_is_found_nowhere(colour: list[int]):
+    """A strip of the wall that is ignored in every photograph, and painted over, is neither contradicted nor beyond."""
+    ignored = np.zeros((HEIGHT, WIDTH), bool)
+    ignored[:, :20], ignored[20:40, 60:90] = True, True
+    counts = torch.from_numpy(~ignored)
+    whole = [view for view, _ in street(CAMERAS, post=5.0)]
+    views = [replace(image_with(v, ignored, colour), depth=v.depth.where(counts, 0.0), kept=counts) for v in whole]
+    found, both = agreed(views)
+    assert (found.score[ignored] == -1).all()
+    assert (both.score[ignored] == -1).all()
+    assert not both.beyond[ignored].any()
+    spread = np.asarray(binary_dilation(ignored, iterations=6))  # the window of the filter that smooths scores
+    _, unspoilt = agreed(whole)
+    agree = (both.score > CONTRADICTED) == (unspoilt.score > CONTRADICTED)
+    assert agree.numpy()[~spread].mean() > 0.97
 
 
 def test_what_a_mirror_shows_is_found_behind_the_wall():

@@ -215,6 +215,22 @@ def test_any_photograph_becomes_8_bit_rgb_of_its_cameras_size(scene, kind):
     np.testing.assert_allclose(loaded[..., :3], np.repeat(picture[..., None], 3, axis=2), atol=1)
 
 
+def test_photographs_of_a_phone_are_read(scene):
+    (scene / "images" / "frame_00002.png").unlink()
+    shutil.copy(Path(__file__).with_name("phone.heic"), scene / "images" / "frame_00002.HEIC")
+    respell(scene, lambda path: path.replace("00002.png", "00002.HEIC"))
+    assert (load_photograph(parse(scene).metadata["views"][0])[4, 4] > [200, -1, -1]).all()
+
+
+@pytest.mark.parametrize("suffix", ["NEF", "dng", "CR3"])
+def test_a_raw_photograph_is_refused_by_its_suffix(scene, suffix):
+    """Pillow reads the thumbnail of many, which has the same shape."""
+    (scene / "images" / "frame_00002.png").rename(scene / "images" / f"frame_00002.{suffix}")
+    respell(scene, lambda path: path.replace("00002.png", f"00002.{suffix}"))
+    with pytest.raises(SceneError, match=rf"frame_00002.{suffix} is raw, .*: export it as JPEG"):
+        load_photograph(parse(scene).metadata["views"][0])
+
+
 def test_a_photograph_of_another_shape_is_refused_by_name(scene):
     view = parse(scene).metadata["views"][0]
     Image.new("RGB", (30, 30)).save(view.image)

@@ -32,7 +32,8 @@ class CaptureConfig:
     quality: Literal["fast", "high"] = "fast"
     """Image size for features: 1600 pixels (fast), or 3200 and the doubled image (high), several times slower."""
     masks: Optional[Path] = None
-    """Folder of masks, named like the photographs with .png added (0001.jpg.png); black is ignored."""
+    """Folder of masks, named like the photographs with .png added (0001.jpg.png); black is ignored, and so is what is
+    transparent, in masks and photographs."""
 
     def __post_init__(self) -> None:
         """Refuse settings that no scene can be made with."""

@@ -5,17 +5,21 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, notice
+from dataparsers.scene_files import DEVELOP, PHOTOGRAPHS, RAW, mask_names, photographs_in, tell_of_masks
 from shellgs_method.capture.config import Cameras
 
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif"}
+VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv"}
+"""Suffixes of videos, in lower case."""
 _FORMATS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}  # these keep their format, others become PNG
 _LENS_TAGS = (
     ExifTags.Base.Make,
@@ -27,25 +31,40 @@ _LENS_TAGS = (
 
 
 def find_photographs(folder: Path) -> dict[str, Path]:
-    """The photographs in a folder and its sub-folders, by their names in the scene.
+    """The photographs in a folder and its sub-folders, by their names in the scene; other files are told.
 
     Raises:
-        SceneError: there are none, or two would get the same name.
+        SceneError: there are none, some are raw without a developed one beside, or two would get the same name.
     """
     found: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
+    photographs = photographs_in(folder, deep=True)
+    _tell_what_is_left_out(folder, photographs)
+    for path in photographs:
         relative = path.relative_to(folder)
-        if path.suffix.lower() not in _SUFFIXES or any(part.startswith(".") for part in relative.parts):
-            continue
         kept = relative if path.suffix.lower() in _FORMATS else relative.with_suffix(".png")
         # COLMAP's lists of pairs are split at blanks, and # starts a comment.
         name = re.sub(r"[\s#]", "_", kept.as_posix())
         if name in found:
             raise SceneError(f"{found[name]} and {path} would both become {name} in the scene: rename one of them")
         found[name] = path
-    if not found:
-        raise SceneError(f"there are no photographs in {folder} ({', '.join(sorted(_SUFFIXES))})")
     return found
+
+
+def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
+    """Tell the user how many files of a folder are no photographs, and refuse what should be some."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+    developed = {path.with_suffix("") for path in photographs}
+    raw = [path for path in files if path.suffix.lower() in RAW and path.with_suffix("") not in developed]
+    if raw:
+        raise SceneError(f"{len(raw)} files of {folder} are raw photographs, {raw[0].name} for example: {DEVELOP}")
+    others = Counter(path.suffix.lower() or path.name for path in files if path.suffix.lower() not in PHOTOGRAPHS)
+    counted = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
+    if not photographs:
+        videos = "; of videos, give one file" if VIDEOS & others.keys() else ""
+        there = f", but {counted}" if counted else ""
+        raise SceneError(f"there are no photographs in {folder} ({', '.join(sorted(PHOTOGRAPHS))}){there}{videos}")
+    if counted:
+        notice(f"{others.total()} files of {folder} are no photographs, and are left out ({counted}).")
 
 
 def add_photograph(source: Path, target: Path) -> None:
@@ -54,15 +73,16 @@ def add_photograph(source: Path, target: Path) -> None:
     Raises:
         SceneError: it is not a readable image.
     """
-    from dataparsers.photograph import read_image  # imports torch, which is slow
+    from dataparsers.photograph import read_image, without_hidden  # imports torch, which is slow
 
     target.parent.mkdir(parents=True, exist_ok=True)
     wanted = _FORMATS[target.suffix.lower()]
     image = read_image(source)
     with Image.open(source) as stored:
-        is_usable = stored.format == wanted and stored.mode in ("L", "RGB") and _orientation(stored) == 1
+        is_plain = stored.mode in ("L", "RGB") and not stored.has_transparency_data
+        is_usable = stored.format == wanted and is_plain and _orientation(stored) == 1
     if not is_usable:
-        upright = ImageOps.exif_transpose(image).convert("RGB")
+        upright = ImageOps.exif_transpose(without_hidden(image)).convert("RGB")
         upright.save(target, wanted, quality=95, subsampling=0, exif=upright.getexif())
         return
     try:
@@ -71,11 +91,20 @@ def add_photograph(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def add_mask(mask: Path, source: Path, photograph: Path, target: Path) -> None:
-    """Put a photograph's mask into the work folder, upright, 255 where the photograph is kept.
+def has_transparency(photograph: Path) -> bool:
+    """Whether a photograph may have transparent pixels, by its header; a damaged one is refused when it is read."""
+    if photograph.suffix.lower() in (".jpg", ".jpeg"):
+        return False
+    with suppress(Exception), Image.open(photograph) as image:
+        return image.has_transparency_data
+    return False
+
+
+def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) -> None:
+    """Put a photograph's mask into the work folder, upright, 255 where the photograph is kept and opaque.
 
     Args:
-        mask: the mask, of the size of the stored or of the upright photograph.
+        mask: the mask, of the size of the stored or of the upright photograph; None if it has none but transparency.
         source: the original photograph, possibly with an EXIF orientation.
         photograph: the upright photograph in the work folder.
         target: png to write.
@@ -83,11 +112,25 @@ def add_mask(mask: Path, source: Path, photograph: Path, target: Path) -> None:
     Raises:
         SceneError: the mask is not a readable image, or has another size.
     """
-    from dataparsers.photograph import read_image
+    from dataparsers.masks import OPAQUE
+    from dataparsers.photograph import read_image, read_mask
 
     with Image.open(source) as stored, Image.open(photograph) as upright:
         stored_size, upright_size, exif = stored.size, upright.size, stored.getexif()
-    image = ImageOps.exif_transpose(read_image(mask)).convert("L")
+        transparent = stored.has_transparency_data
+    kept = np.ones(upright_size[::-1], bool)
+    if mask is not None:
+        kept &= np.asarray(_upright_mask(read_mask(mask), mask, stored_size, upright_size, exif)) > 0
+    if transparent:
+        kept &= np.asarray(ImageOps.exif_transpose(read_image(source)).convert("RGBA"))[..., 3] > OPAQUE
+    target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.where(kept, 255, 0).astype(np.uint8)).save(target)
+
+
+def _upright_mask(
+    image: Image.Image, mask: Path, stored_size: tuple[int, int], upright_size: tuple[int, int], exif: Image.Exif
+) -> Image.Image:
+    image = ImageOps.exif_transpose(image)
     if image.size == stored_size != upright_size:
         image.info["exif"] = exif.tobytes()
         image = ImageOps.exif_transpose(image)
@@ -96,22 +139,25 @@ def add_mask(mask: Path, source: Path, photograph: Path, target: Path) -> None:
             f"the mask {mask} is {image.width}x{image.height} pixels, its photograph "
             f"{upright_size[0]}x{upright_size[1]}: make it again at the photograph's size"
         )
-    target.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.where(np.asarray(image) > 127, 255, 0).astype(np.uint8)).save(target)
+    return image
 
 
 def find_masks(photographs: Mapping[str, Path], folder: Path, masks: Path) -> dict[str, Path]:
-    """The masks (``<masks>/<photograph's path in its folder>.png``) of the photographs that have one, by name.
+    """The masks of the photographs that have one, by name: one of :func:`~dataparsers.scene_files.mask_names`.
 
     Raises:
         SceneError: no photograph has one.
     """
     if not masks.is_dir():
         raise FileNotFoundError(f"{masks} is not a folder of masks.")
-    paths = {name: masks / f"{source.relative_to(folder).as_posix()}.png" for name, source in photographs.items()}
-    found = {name: path for name, path in paths.items() if path.is_file()}
+    there = set(photographs_in(masks, deep=True))
+    paths = {name: [masks / p for p in mask_names(source.relative_to(folder))] for name, source in photographs.items()}
+    chosen = {name: next((path for path in each if path in there), None) for name, each in paths.items()}
+    found = {name: path for name, path in chosen.items() if path}
     if not found:
-        raise SceneError(f"no photograph has a mask in {masks}: the first one's would be {next(iter(paths.values()))}")
+        first = next(iter(paths.values()))[0]
+        raise SceneError(f"no photograph has a mask in {masks}: the first one's would be {first}; rename the masks")
+    tell_of_masks(chosen, there, masks)
     return found
 
 

@@ -20,7 +20,14 @@ from dataparsers.errors import SceneError
 from dataparsers.files import fingerprint, read_json
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
 from shellgs_method.capture.pairs import choose_matching, image_pairs
-from shellgs_method.capture.photographs import add_mask, add_photograph, find_masks, find_photographs, group_by_lens
+from shellgs_method.capture.photographs import (
+    add_mask,
+    add_photograph,
+    find_masks,
+    find_photographs,
+    group_by_lens,
+    has_transparency,
+)
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work, listing
 
@@ -104,9 +111,15 @@ class _Capture:
             )
         if config.masks:
             self.masks = find_masks(self.photographs, source, config.masks)
+        # Photographs with transparent pixels have a mask without a file.
+        self.transparent = (
+            [] if self.is_video else [n for n, path in self.photographs.items() if has_transparency(path)]
+        )
+        self.masked = [name for name in self.photographs if name in self.masks or name in self.transparent]
         # Keys of all that each stage depends on; a stage depends on all earlier ones.
         self.photographs_key = fingerprint(listing(self.photographs), config.frames if self.is_video else None)
-        self.masks_key = fingerprint(self.photographs_key, listing(self.masks))
+        alpha = [self.transparent] if self.transparent else []
+        self.masks_key = fingerprint(self.photographs_key, listing(self.masks), *alpha)
         self.features_key = fingerprint(self.masks_key, config.cameras, config.quality)
         self.model_key = fingerprint(self.features_key, config.matching, config.overlap)
 
@@ -125,7 +138,7 @@ class _Capture:
         """Refuse a scene whose photographs or cameras are not those of this capture."""
         if (self.scene / WORK).is_dir() and Work(self.scene / WORK).has("undistorted", self.model_key):
             return
-        for name in ("transforms.json", "colmap", "sparse", "images", *(["masks"] if self.masks else [])):
+        for name in ("transforms.json", "colmap", "sparse", "images", *(["masks"] if self.masked else [])):
             if (self.scene / name).exists():
                 raise SceneError(
                     f"{self.scene / name} already exists and is not from these photographs and settings: give another "
@@ -140,16 +153,16 @@ class _Capture:
 
                     extract_frames(self.source, folder, self.config.frames, self.progress)
                 else:
-                    for name, path in self._tracked(self.photographs, "reading photographs"):
+                    for name, path in self.progress.track(self.photographs.items(), description="reading photographs"):
                         add_photograph(path, folder / name)
         self.folder = self.work.folder / "photographs"
         self.names = sorted(p.relative_to(self.folder).as_posix() for p in self.folder.rglob("*") if p.is_file())
         if len(self.names) < LEAST_REGISTERED:
             raise SceneError(f"a scene needs at least {LEAST_REGISTERED} photographs, not {len(self.names)}")
-        if self.masks and not self.work.has("masks", self.masks_key):
+        if self.masked and not self.work.has("masks", self.masks_key):
             with self.work.making("masks", self.masks_key) as folder:
-                for name, mask in self._tracked(self.masks, "reading masks"):
-                    add_mask(mask, self.photographs[name], self.folder / name, folder / f"{name}.png")
+                for name in self.progress.track(self.masked, description="reading masks"):
+                    add_mask(self.masks.get(name), self.photographs[name], self.folder / name, folder / f"{name}.png")
 
     def _features(self) -> Path:
         """Extract features; return the database."""
@@ -163,7 +176,7 @@ class _Capture:
             database=str(database),
             photographs=str(self.folder),
             lenses=[asdict(lens) for lens in lenses],
-            masks=str(self.work.folder / "masks") if self.masks else None,
+            masks=str(self.work.folder / "masks") if self.masked else None,
             sift=_SIFT[self.config.quality],
         )
         _tidy(database)
@@ -213,7 +226,7 @@ class _Capture:
     def _missing_parts(self) -> list[str]:
         """Parts of the scene that are neither in place nor ready to be moved there."""
         ready = self.work.folder / "undistorted"
-        names = ["images", *(["masks"] if self.masks else []), "colmap"]
+        names = ["images", *(["masks"] if self.masked else []), "colmap"]
         return [name for name in names if not (self.scene / name).exists() and not (ready / name).exists()]
 
     def _undistorted(self, summary: Summary) -> None:
@@ -234,7 +247,7 @@ class _Capture:
                 lambda: sum(path.is_file() for path in (folder / "images").rglob("*")),
                 model=str(self.work.folder / "model"),
                 photographs=str(self.folder),
-                masks=str(self.work.folder / "masks") if self.masks else None,
+                masks=str(self.work.folder / "masks") if self.masked else None,
                 output=str(folder),
             )
             (folder / "colmap" / "sparse").mkdir(parents=True)
@@ -252,9 +265,6 @@ class _Capture:
         return run_step(
             step, arguments, log=log, progress=self.progress, description=description, total=total, count=count
         )
-
-    def _tracked(self, files: dict[str, Path], description: str):
-        return self.progress.track(files.items(), description=description)
 
 
 def _rows(database: Path, table: str) -> int:

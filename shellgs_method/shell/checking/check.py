@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.files import atomic_write, content_hash, fingerprint
-from dataparsers.photograph import View, load_photograph
+from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.shell.checking.colours import ColourModel
 from shellgs_method.shell.checking.contradiction import (
     ALONE,
@@ -39,7 +39,7 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 7
+VERSION = 8
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -160,7 +160,10 @@ class _TrainingViews:
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
         agreed = agreement(seen, found, others, found_there)
         coloured = agreed.score + _COLOUR * (self.colours.log_ratio(seen.image) - _NEUTRAL)
-        size, hit = cue.depth.shape, cue.depth > 0
+        size = cue.depth.shape
+        hit = cue.depth > 0
+        if seen.kept is not None:
+            hit = hit & (_nearest(seen.kept.float(), size).numpy() > 0)
         score, alone = (_resized(scores, size).numpy() for scores in (coloured, agreed.alone))
         beyond = _resized(agreed.beyond.float(), size).numpy() > 0.5
         static, moved = _told_apart((score > CONTRADICTED) & ~beyond, (alone > ALONE) & ~beyond)
@@ -169,7 +172,7 @@ class _TrainingViews:
         score_behind, farther = self._behind(seen, size)
         kinds = [static, beyond, moved, score_behind > REFLECTED, confirmed]
         depth = cue.depth * np.select(kinds, [_relative_depth(found, size), 2.0, 1.0, farther, 1.0], 0.0)
-        return CueMap(depth.astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
+        return CueMap(np.where(hit, depth, 0).astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
 
     def _behind(
         self, seen: ShellView, size: tuple[int, ...]
@@ -207,7 +210,12 @@ def _shell_view(view: View, cue: CueMap) -> ShellView:
     camera = view.camera.shrunk(MAX_SIZE)
     image = load_photograph(replace(view, camera=camera))[..., :3]
     depth = _nearest(torch.from_numpy(cue.depth), (camera.height, camera.width))
-    return ShellView(camera, torch.from_numpy(image), depth)
+    kept = load_mask(replace(view, camera=camera))
+    if kept is None:
+        return ShellView(camera, torch.from_numpy(image), depth)
+    # Without the borders of what is ignored, whose gradients and interpolated colours are not of the photograph.
+    counts = torch.from_numpy(cv2.erode(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+    return ShellView(camera, torch.from_numpy(image), depth.where(counts, 0.0), counts)
 
 
 def _relative_depth(found: Sweep, size: tuple[int, ...]) -> Float[np.ndarray, "H W"]:

@@ -65,12 +65,14 @@ class ShellView:
     Attributes:
         camera: camera at the size at which views are compared.
         image: photograph at that size.
-        depth: z-depth of the shell in scene units, 0 where there is none.
+        depth: z-depth of the shell in scene units, 0 where there is none, or where the photograph does not count.
+        kept: pixels of the photograph that count; None for all.
     """
 
     camera: Camera
     image: UInt8[Tensor, "h w 3"]
     depth: Float[Tensor, "h w"]
+    kept: Bool[Tensor, "h w"] | None = None
 
     @cached_property
     def silhouette(self) -> Bool[Tensor, "h w"]:
@@ -79,7 +81,8 @@ class ShellView:
         The mask of the shell, without its holes, is feathered with the photograph as guide (He et al., Guided Image
         Filtering, 2010): a pixel is outside if those of its colour around it are. Repeated for wider strips.
         """
-        pixels, inside = _Pixels(self), torch.from_numpy(binary_fill_holes((self.depth > 0).numpy()))
+        known = self.depth > 0 if self.kept is None else (self.depth > 0) | ~self.kept
+        pixels, inside = _Pixels(self), torch.from_numpy(binary_fill_holes(known.numpy()))
         for _ in range(_FEATHERED):
             inside &= _smooth(pixels, inside.float()[None])[0] > 0.5
         return inside
@@ -147,8 +150,9 @@ def sweep(view: ShellView, others: Sequence[ShellView], offsets: Sequence[float]
     for index, asked in roles.items():
         neighbour = _Neighbour(pixels, others[index])
         for step, side in asked:
-            nearer = neighbour.disagreement(neighbour.look(pixels.surface / (1 + offsets[step])))
-            sums[step, side] += neighbour.visible * torch.stack([neighbour.visible, neighbour.on_shell, nearer])
+            look = neighbour.look(pixels.surface / (1 + offsets[step]))
+            nearer, counts = neighbour.disagreement(look), neighbour.visible * neighbour.kept(look)
+            sums[step, side] += counts * torch.stack([neighbour.visible, neighbour.on_shell, nearer])
     weight, on_shell, nearer = sums.unbind(dim=2)
     on_shell, nearer = ((each / weight).nan_to_num(1.0).amin(dim=1) for each in (on_shell, nearer))
     scores = _smooth(pixels, on_shell - nearer)
@@ -185,7 +189,7 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
     for other, sweep_there in zip(others, found_there, strict=True):
         neighbour = _Neighbour(pixels, other)
         look = neighbour.look(pixels.surface / (1 + found.offset.float()))
-        hidden = (neighbour.visible == 0) | ~look.inside
+        hidden = (neighbour.visible == 0) | ~look.inside | (neighbour.kept(look) == 0)
         probability = torch.sigmoid((sweep_there.score.float() - 0.4 * CONTRADICTED) / 0.02)
         of_shell = _sampled(probability, neighbour.shell.grid)
         of_nearer = _sampled(probability, look.grid)
@@ -247,8 +251,9 @@ class _Neighbour:
         """Position of the pixels if they lie on the shell."""
         surface = _sampled(other.depth, self.shell.grid, "nearest")
         hidden = ~self.shell.inside | ((surface > 0) & (self.shell.z > 1.01 * surface))
-        self.visible = (~hidden).float()
-        """1 where the shell is visible in the other view: inside its image, not behind another part of the shell."""
+        self._kept = None if other.kept is None else other.kept.float()
+        self.visible = (~hidden).float() * self.kept(self.shell)
+        """1 where the shell is visible in the other view: inside what counts of its image, not behind other parts."""
         self.shown = self._at(self.shell)
         """The other photograph's features on the shell."""
         self.on_shell = self._disagreement(self.shown)
@@ -260,6 +265,10 @@ class _Neighbour:
         near = z.clamp_min(1e-9)
         u, v = (2 / size * along / near - 1 for size, along in zip(self._size, (x, y), strict=True))
         return _Look(torch.stack([u, v], dim=-1)[None], z, (z > 0) & (u.abs() < 1) & (v.abs() < 1))
+
+    def kept(self, look: _Look) -> Float[Tensor, "h w"] | float:
+        """1 where the other photograph counts at these positions."""
+        return 1.0 if self._kept is None else _sampled(self._kept, look.grid, "nearest")
 
     def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
         """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
