@@ -10,19 +10,23 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
+_Parameters, _Result = ParamSpec("_Parameters"), TypeVar("_Result")
+
 _LONG = 5.0  # seconds
-_failed = False  # one failure to compile is enough for a process
+_COMPILER = ("torch._dynamo", "torch._inductor", "torch._functorch", "torch._subclasses", "torch.fx")
+_failed: set[str] = set()  # kernels that could not be compiled
 
 
 def run_fused(kernel: Callable[..., Any], *args: Tensor | list[Tensor], varying: int = 1, strided: bool = False) -> Any:
@@ -51,13 +55,16 @@ def fused(
         and tensors[0].device.type == "cpu"
         and all(tensor.numel() for tensor in tensors)
     )
-    if _failed or not fusible or os.environ.get("SHELLGS_COMPILE") == "0":
+    if not fusible or os.environ.get("SHELLGS_COMPILE") == "0" or not _compiler_works():
         return kernel
     with_grad = torch.is_grad_enabled()
-    key = tuple(
+    shapes = tuple(
         (tuple(size > 1 for size in tensor.shape[:varying]), with_grad and tensor.requires_grad) for tensor in tensors
     )
-    return _compiled(kernel, key, strided)
+    # Where dynamo's guards cannot be chosen, it compiles again for another number of threads, up to eight times for
+    # one kernel.
+    threads = None if _chooses_guards() else torch.get_num_threads()
+    return _compiled(kernel, (shapes, threads), strided)
 
 
 def detached(tensor: Tensor) -> Tensor:
@@ -65,6 +72,27 @@ def detached(tensor: Tensor) -> Tensor:
     leaf = tensor.detach()
     torch._dynamo.maybe_mark_dynamic(leaf, 1)
     return leaf
+
+
+def uninterrupted(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """Make a function run without the trace hook of its thread, by which nerfstudio's viewer interrupts a render.
+
+    The hook raises at any line, which torch's compiler takes for an error of its own or drops, and is called at each
+    of its millions of lines. The viewer's interrupt comes after the call instead.
+    """
+
+    @functools.wraps(function)
+    def call(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+        hook = sys.gettrace()
+        if hook is None:
+            return function(*args, **kwargs)
+        sys.settrace(None)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            sys.settrace(hook)
+
+    return call
 
 
 def nothing_compiled_yet() -> bool:
@@ -81,7 +109,7 @@ def _options(strided: bool) -> dict[str, Any]:
     # A switch in older versions of torch; on means the compiler's default, which is "fast" for GCC.
     contract = "fast" if isinstance(config.cpp.enable_floating_point_contract_flag, str) else True
     has_heuristics = hasattr(config.cpp, "enable_tiling_heuristics")  # not in older versions of torch
-    return ({"cpp.enable_tiling_heuristics": not strided} if has_heuristics else {}) | {
+    options: dict[str, Any] = {
         "cpp.enable_floating_point_contract_flag": contract,
         # One loop for all splats of a chunk, whatever their number and the number of channels.
         "max_fusion_size": 4096,
@@ -93,47 +121,109 @@ def _options(strided: bool) -> dict[str, Any]:
         # as fast and compile in a half to a third of the time.
         "realize_opcount_threshold": 10,
     }
+    if has_heuristics:
+        options["cpp.enable_tiling_heuristics"] = not strided
+    if _chooses_guards():
+        options["guard_filter_fn"] = _guards
+    return options
+
+
+def _chooses_guards() -> bool:
+    """Whether this torch lets us choose dynamo's guards; the helpers for that came with the option."""
+    return hasattr(torch.compiler, "keep_tensor_guards_unsafe")
+
+
+def _guards(guards: Sequence[Any]) -> list[bool]:
+    """All guards but that of torch's global state, such as the number of threads, by which no kernel differs."""
+    return [guard.guard_type != "GLOBAL_STATE" for guard in guards]
 
 
 @functools.cache
 def _compiled(
-    kernel: Callable[..., Any], key: tuple[tuple[tuple[bool, ...], bool], ...], strided: bool
+    kernel: Callable[..., Any], key: tuple[tuple[tuple[tuple[bool, ...], bool], ...], int | None], strided: bool
 ) -> Callable[..., Any]:
-    """Compile a kernel; ``key`` says which dimensions of each tensor vary, and whether it needs gradients."""
+    """Compile a kernel.
+
+    ``key`` says which dimensions of each tensor vary, whether it needs gradients, and for how many threads it is.
+    """
     assert isinstance(kernel, FunctionType)
     _keep_freed_memory()
     # Dynamo limits the compilations per code object: each key gets its own.
     own = FunctionType(kernel.__code__.replace(), kernel.__globals__, kernel.__name__)
+    shapes, _ = key
     compiled = None
 
-    def call(*args: Tensor | list[Tensor]) -> Any:
-        global _failed
-        nonlocal compiled
-        if _failed:
-            return kernel(*args)
+    @uninterrupted
+    def prepared(*args: Tensor | list[Tensor]) -> Callable[..., Any] | None:
         try:
-            if compiled is not None:
-                return compiled(*args)
-            start = time.perf_counter()
             new = torch.compile(own, fullgraph=True, options=_options(strided))
-            for tensor, (dynamic, _) in zip(_flatten(args), key, strict=True):
+            for tensor, (dynamic, _) in zip(_flatten(args), shapes, strict=True):
                 torch._dynamo.mark_dynamic(tensor, [dim for dim, each in enumerate(dynamic) if each])
+        except Exception as error:  # of an import, of a folder for the results, of an option, …: nothing has run
+            _explain(kernel, error)
+            return None
+        return uninterrupted(new)
+
+    def call(*args: Tensor | list[Tensor]) -> Any:
+        nonlocal compiled
+        start = time.perf_counter()
+        new = compiled or prepared(*args) or kernel
+        try:
             result = new(*args)
-        except Exception as error:  # missing compiler, missing headers, full disk, a torch that compiles differently, …
-            _failed = True
-            reason = next(iter(str(error).strip().splitlines()), "")
-            logger.warning(
-                "Rasterizer and losses run without torch.compile, slower: %s: %s", type(error).__name__, reason
+        except Exception as error:
+            if not _of_compiler(error):
+                raise
+            _explain(kernel, error)
+            new, result = kernel, kernel(*args)
+        if compiled is None and new is not kernel:
+            seconds = time.perf_counter() - start
+            level = logging.WARNING if seconds > _LONG else logging.INFO  # explain a long wait
+            logger.log(
+                level, "%s: %.1f s to compile or load; compiled kernels are kept on disk", _name(kernel), seconds
             )
-            return kernel(*args)
         compiled = new
-        seconds = time.perf_counter() - start
-        level = logging.WARNING if seconds > _LONG else logging.INFO  # explain a long wait
-        name = f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}"
-        logger.log(level, "%s: %.1f s to compile or load; compiled kernels are kept on disk", name, seconds)
         return result
 
     return call
+
+
+def _of_compiler(error: Exception) -> bool:
+    """Whether an error is of torch's compiler, which raises it before the kernel has written anything."""
+    return any(base.__module__.startswith(_COMPILER) for base in type(error).__mro__)
+
+
+@functools.cache
+@uninterrupted
+def _compiler_works() -> bool:
+    """Whether there is a C++ compiler; without one, each kernel would take seconds to find that out."""
+    from torch._inductor.cpp_builder import get_cpp_compiler  # slow
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler as error:
+        _warn_once(f"Rasterizer and losses run without torch.compile, slower: {_reason(error)}")
+        return False
+    return True
+
+
+def _explain(kernel: Callable[..., Any], error: Exception) -> None:
+    """Log why a kernel runs without torch.compile; a reason that many have in common, once."""
+    _failed.add(_name(kernel))
+    _warn_once(f"Some kernels of rasterizer or losses run without torch.compile, slower: {_reason(error)}")
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {next(iter(str(error).strip().splitlines()), '')}"
+
+
+@functools.cache
+def _warn_once(message: str) -> None:
+    logger.warning(message)
+
+
+def _name(kernel: Callable[..., Any]) -> str:
+    return f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}"
 
 
 @functools.cache

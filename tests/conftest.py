@@ -56,7 +56,7 @@ def compiler(monkeypatch) -> None:
     except InvalidCxxCompiler as error:
         pytest.skip(f"no C++ compiler: {error}")
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
-    monkeypatch.setattr(fusion, "_failed", False)
+    monkeypatch.setattr(fusion, "_failed", set())
 
 
 @pytest.fixture

@@ -51,6 +51,7 @@ PRIVATE = [
     ),
     ("shellgs_method/fusion.py", "torch._dynamo", "mark_dynamic", "t index"),
     ("shellgs_method/fusion.py", "torch._dynamo", "maybe_mark_dynamic", "t index"),
+    ("shellgs_method/fusion.py", "torch._inductor.cpp_builder", "get_cpp_compiler", ""),
     ("shellgs_method/fusion.py", "torch._inductor.runtime.cache_dir_utils", "cache_dir", ""),
 ]
 

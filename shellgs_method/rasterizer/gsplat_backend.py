@@ -25,6 +25,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from shellgs_method.fusion import uninterrupted
 from shellgs_method.rasterizer.discs import EDGE_ON
 from shellgs_method.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs
 from shellgs_method.rasterizer.renders import Renders
@@ -278,6 +279,7 @@ def _stack(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "B 4 4"], Float[Ten
 
 
 @functools.cache
+@uninterrupted
 def _kernels_fault() -> str | None:
     """Why gsplat's kernels do not load, None if they do; the first call may compile them, which takes minutes."""
     try:
