@@ -21,6 +21,18 @@ class GuardedOptimizers(Optimizers):
     skipped = False
     """Whether the last step was skipped."""
 
+    @property
+    def parameters(self) -> dict[str, list[nn.Parameter]]:
+        """The parameters of each group. Nerfstudio's own list keeps those that densification has replaced since."""
+        return {
+            name: [parameter for group in optimizer.param_groups for parameter in group["params"]]
+            for name, optimizer in self.optimizers.items()
+        }
+
+    @parameters.setter
+    def parameters(self, _: dict[str, list[nn.Parameter]]) -> None:
+        """Nerfstudio sets up its list, which is not needed."""
+
     def optimizer_scaler_step_some(self, grad_scaler, param_groups) -> None:
         """Step all groups or none. An enabled gradient scaler does this by itself."""
         self.skipped = not grad_scaler.is_enabled() and not self._gradients_are_finite()
@@ -51,13 +63,12 @@ def forget_gradients(info: dict[str, Any]) -> None:
 def remove_broken(
     gaussians: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any]
 ) -> int:
-    """Remove Gaussians with a parameter that is not finite, unless all are such; return their number."""
+    """Remove Gaussians with a parameter that is not finite; return their number."""
     if all(bool(parameter.detach().sum().isfinite()) for parameter in gaussians.values()):
         return 0
     broken: Tensor = sum(  # pyright: ignore[reportAssignmentType]
         (~parameter.detach().flatten(1).isfinite().all(dim=1)).long() for parameter in gaussians.values()
     )
     broken = broken > 0
-    if not broken.all():
-        remove(gaussians, optimizers, state, broken)  # pyright: ignore[reportArgumentType]
+    remove(gaussians, optimizers, state, broken)  # pyright: ignore[reportArgumentType]
     return int(broken.sum())

@@ -31,6 +31,8 @@ class Limits(NamedTuple):
 
 
 TINY = 1e-30
+MIN_POINTS = 4
+"""Fewest points to start from: a point and its three neighbours, whose distance is its scale."""
 COUNT, FROM_ONE = Limits(0, 1e9, int), Limits(1, 1e9, int)
 WEIGHT, SHARE, LENGTH, RATE = Limits(0, 1e6), Limits(0, 1), Limits(TINY, 1e6), Limits(TINY, 1e3)
 
@@ -64,7 +66,7 @@ LIMITS = {
     "max_seeds": FROM_ONE,
     "skybox_seeds": Limits(0, 1e6, int),
     "init_opacity": Limits(0.01, 0.99),
-    "cap_max": FROM_ONE,
+    "cap_max": Limits(MIN_POINTS, 1e9, int),
     "noise": Limits(0, 1e12),
     "ncc_window": Limits(3, 101, int, odd=True),
     "ncc_eps": Limits(TINY, 1),

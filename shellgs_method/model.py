@@ -47,6 +47,7 @@ from shellgs_method.geometry import (
     rendered_geometry,
     squared_depths,
 )
+from shellgs_method.limits import MIN_POINTS
 from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
@@ -159,7 +160,7 @@ class FacadeModel(SplatfactoModel):
         """Create Gaussians at the SfM points."""
         self._check_settings()
         points, colours = self._seed_points()
-        spacing = KDTree(points.numpy()).query(points.numpy(), k=min(4, len(points)))[0][:, 1:].mean(axis=1)
+        spacing = KDTree(points.numpy()).query(points.numpy(), k=MIN_POINTS)[0][:, 1:].mean(axis=1)
         scales = torch.from_numpy(spacing).float()[:, None].repeat(1, 3)
         self.gauss_params = nn.ParameterDict()
         self._add_gaussians(points, colours, scales, random_quat_tensor(len(points)))
@@ -205,13 +206,29 @@ class FacadeModel(SplatfactoModel):
             )
 
     def _seed_points(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-        if self.seed_points is None or len(self.seed_points[0]) < 4:
+        if self.seed_points is None or len(self.seed_points[0]) < MIN_POINTS:
             raise SceneError("The scene has no SfM points to start from: its COLMAP model or ply_file_path is empty.")
         points, colours = self.seed_points[0].float(), self.seed_points[1].float() / 255
         if self.config.densification == "mcmc":
             kept = torch.randperm(len(points))[: self.config.mcmc.cap_max]
             points, colours = points[kept], colours[kept]
         return points, colours
+
+    def room_for(self, most: int) -> int:
+        """Number of seeds, at most ``most``, that the cap of ``mcmc`` leaves.
+
+        Raises:
+            SceneError: it leaves none.
+        """
+        if self.config.densification != "mcmc":
+            return most
+        cap = self.config.mcmc.cap_max
+        if cap <= self.num_points:
+            raise SceneError(
+                f"--pipeline.model.mcmc.cap-max {cap} is used up by the first {self.num_points} Gaussians, and leaves "
+                "no room for the seeds on the shell or of the skybox: raise it, or switch them off"
+            )
+        return min(most, cap - self.num_points)
 
     def add_seeds(self, seeds: Seeds) -> None:
         """Add flat initial Gaussians at seeds."""

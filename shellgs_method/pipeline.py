@@ -63,16 +63,17 @@ class FacadePipeline(VanillaPipeline):
                 self._add_seeds()
 
     def _add_seeds(self) -> None:
-        config, data = self.model.config, self.datamanager
+        model, data = self.model, self.datamanager
+        config = model.config
         if config.seeds == "shell":
             everywhere = config.shell_counts == "everywhere"
-            self.model.add_seeds(data.shell_seeds(config.seed_spacing, config.max_seeds, everywhere))
+            model.add_seeds(data.shell_seeds(config.seed_spacing, model.room_for(config.max_seeds), everywhere))
         if config.geometry_of == "surface" and config.primitive == "3d":
             shell = data.shell_seeds(config.seed_spacing, config.max_seeds, everywhere=True)
-            self.model.surface_weights = SurfaceWeights(shell, self.model.metres_per_unit)
-            self.model.add_seeds(data.seeds_behind_shell(config.seed_spacing, config.max_seeds))
+            model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
+            model.add_seeds(data.seeds_behind_shell(config.seed_spacing, model.room_for(config.max_seeds)))
         if config.skybox_seeds > 0:
-            self.model.add_seeds(data.skybox_seeds(config.skybox_seeds))
+            model.add_seeds(data.skybox_seeds(model.room_for(config.skybox_seeds)))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's Gaussians.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 import yaml
 from gsplat.strategy.ops import remove
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -39,6 +40,11 @@ ONE_VIEW = 1.5
 """Effective number of views that show a Gaussian, below which it counts as shown by one."""
 BARELY = 0.001
 """Share of an image below which a Gaussian of any size is barely visible in it."""
+PRUNED = (
+    "densification pruned all: lower the learning rates or --pipeline.model.cull-alpha-thresh, "
+    "or raise --pipeline.model.cull-scale-thresh"
+)
+"""Why a step may leave no Gaussian."""
 
 guard_config_loading()
 
@@ -127,6 +133,8 @@ class FacadeTrainer(Trainer):
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
             _remove_leftovers(self.base_dir)
             super().setup(test_mode)
+        after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        self.callbacks.append(TrainingCallback(after_step, self._check_any_left, kwargs={"why": PRUNED}))
         self._faults = 0
         self._last_step = self.config.max_num_iterations - 1  # later versions of nerfstudio change the setting
 
@@ -176,20 +184,27 @@ class FacadeTrainer(Trainer):
         if self._faults > MAX_FAULTS:
             raise SceneError(
                 f"training stopped at step {step} after more than {MAX_FAULTS} steps whose loss or gradient is not "
-                f"finite, the last one with {view}: look at its photograph and maps, then resume with "
-                f"--load-dir {self.checkpoint_dir}, where the last good checkpoint is kept"
+                f"finite, the last one with {view}: look at its photograph and maps, or lower the learning rates; "
+                f"{self._last_good}"
             )
+
+    @property
+    def _last_good(self) -> str:
+        """How a run that must stop can go on."""
+        if any(self.checkpoint_dir.glob("*.ckpt")):
+            return f"the last good checkpoint is kept in {self.checkpoint_dir}: resume from it with --load-dir"
+        return "no checkpoint was saved before"
 
     def _remove_broken_gaussians(self, step: int) -> None:
         model = self.pipeline.model
         count = remove_broken(model.gauss_params, self.optimizers.optimizers, model.strategy_state)
         if count:
             CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were not finite, and are removed.")
-            if count == model.num_points:
-                raise SceneError(
-                    f"training stopped at step {step} because no Gaussian is finite: lower the learning "
-                    f"rates; the last good checkpoint is kept in {self.checkpoint_dir}"
-                )
+        self._check_any_left(step, "none was finite: lower the learning rates")
+
+    def _check_any_left(self, step: int, why: str) -> None:
+        if self.pipeline.model.num_points == 0:
+            raise SceneError(f"training stopped at step {step} with no Gaussian left, because {why}; {self._last_good}")
 
     def _remove_unshaped_gaussians(self) -> None:
         """Remove Gaussians that training views have not shaped, and that may spoil others.
@@ -211,14 +226,16 @@ class FacadeTrainer(Trainer):
         deviations = distance / model.scales.detach().exp().amax(dim=-1)  # from the nearest camera
         unshaped = ~shown | (deviations < 2) & (n_views < ONE_VIEW) | (deviations < 5) & (largest < BARELY)
         if count := int(unshaped.sum()):
-            with self.train_lock:  # the viewer renders
-                remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, unshaped)  # pyright: ignore[reportArgumentType]
+            remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, unshaped)  # pyright: ignore[reportArgumentType]
             CONSOLE.print(f"{count} Gaussians that the training views have not shaped are removed.")
+        self._check_any_left(self.step, "training views show none of them: lower the learning rates")
 
     def _after_train(self) -> None:
         if self.step >= self._last_step:
             self.step = self._last_step
-            self._remove_unshaped_gaussians()
+            with self.train_lock:  # the viewer renders
+                self._remove_broken_gaussians(self.step)
+                self._remove_unshaped_gaussians()
         super()._after_train()
 
     def _load_checkpoint(self) -> None:
@@ -250,8 +267,9 @@ class FacadeTrainer(Trainer):
         """
         if self.local_rank != 0:
             return
-        self._remove_broken_gaussians(step)
-        self.pipeline.model.update_surface()
+        with self.train_lock:  # the viewer renders
+            self._remove_broken_gaussians(step)
+            self.pipeline.model.update_surface()
         folder = self.checkpoint_dir
         try:
             folder.mkdir(parents=True, exist_ok=True)

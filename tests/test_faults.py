@@ -10,6 +10,7 @@ import pytest
 import torch
 import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer
 from runs import data_of, model_of, render, small_disk, trainer_of
 
@@ -56,6 +57,12 @@ def spoil_gradient(trainer: FacadeTrainer, views: slice) -> str:
     return names[views.start]
 
 
+def densifying_once(config) -> None:
+    """Densify at step 4 of 20, and never again."""
+    model = config.pipeline.model
+    model.warmup_length, model.refine_every, model.stop_split_at = 0, 4, 7500
+
+
 SPOILED = {"a map": spoil_map, "a photograph": spoil_photograph, "a gradient": spoil_gradient}
 
 
@@ -69,6 +76,37 @@ def test_a_view_that_is_not_finite_is_named_and_skipped_and_harms_nothing_else(p
     assert all_finite(trainer)
     assert render(trainer)["rgb"].isfinite().all()
     assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000008.ckpt"]
+
+
+@pytest.mark.parametrize("what", SPOILED)
+def test_the_guard_also_works_after_a_densification(pristine_scene, tmp_path, capsys, what):
+    """Then the parameters are others than those that nerfstudio's optimizers list."""
+    trainer = trainer_of(pristine_scene, tmp_path, "shellgs", iterations=20, change=densifying_once)
+    first = model_of(trainer).means
+
+    def spoil(step: int) -> None:
+        if step == 5:
+            assert model_of(trainer).means is not first
+            SPOILED[what](trainer, slice(0, 4))  # half of the views
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], spoil))
+    trainer.train()
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"is not finite (1 of at most {MAX_FAULTS})" in said
+    assert "were not finite" not in said  # no Gaussian
+    assert all_finite(trainer)
+
+
+def test_gradients_are_clipped_after_a_densification_too(pristine_scene, tmp_path):
+    """By ``max_norm``, which nerfstudio applies to its list."""
+
+    def clipped(config):
+        densifying_once(config)
+        config.optimizers["means"]["optimizer"].max_norm = 1e-12
+
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=20, change=clipped)
+    trainer.train()
+    assert 0 < model_of(trainer).means.grad.norm() < 1.1e-12
 
 
 @pytest.mark.parametrize("what", ["a map", "a gradient"])
@@ -108,11 +146,69 @@ def test_a_gaussian_that_is_not_finite_is_removed(pristine_scene, tmp_path, caps
     assert render(trainer)["rgb"].isfinite().all()
 
 
-def test_a_run_without_a_finite_gaussian_ends(pristine_scene, tmp_path):
-    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=3)
+def test_a_run_goes_on_with_the_half_of_its_gaussians_that_is_finite(pristine_scene, tmp_path):
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=2)
+    model, half = model_of(trainer), model_of(trainer).num_points // 2
+    model.scales.data[half:] = torch.nan
+    trainer.train()
+    assert model.num_points == half
+
+
+def lost_to_nan(trainer: FacadeTrainer) -> None:
     model_of(trainer).scales.data[:] = torch.nan
-    with pytest.raises(SystemExit, match=r"^shellgs: training stopped at step 0 because no Gaussian is finite"):
+
+
+def lost_to_pruning(trainer: FacadeTrainer) -> None:
+    model_of(trainer).opacities.data[:] = -20.0
+
+
+def lost_from_sight(trainer: FacadeTrainer) -> None:
+    model_of(trainer).means.data[:, 2] += 1e6  # above
+
+
+LOST = {"no finite one": lost_to_nan, "all pruned": lost_to_pruning, "none in sight": lost_from_sight}
+
+
+@pytest.mark.parametrize("how", LOST)
+def test_a_run_left_without_gaussians_ends_with_one_sentence_and_saves_none(pristine_scene, tmp_path, how):
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=20, change=densifying_once)
+    LOST[how](trainer)
+    with pytest.raises(SystemExit, match=r"^shellgs: training stopped .*no Gaussian left.*no checkpoint was saved"):
         trainer.train()
+    assert not list(trainer.base_dir.rglob("*.ckpt"))
+
+
+def test_a_run_that_loses_its_gaussians_keeps_the_checkpoint_before(pristine_scene, tmp_path):
+    def save_often(config):
+        densifying_once(config)
+        config.steps_per_save = 2
+
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=20, change=save_often)
+
+    def lose(step: int) -> None:
+        if step == 4:
+            lost_to_pruning(trainer)
+
+    trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], lose))
+    with pytest.raises(SystemExit, match=r"pruned all.*the last good checkpoint is kept in .*--load-dir"):
+        trainer.train()
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000002.ckpt"]
+
+
+def test_gaussians_are_removed_only_while_the_viewer_does_not_render(pristine_scene, tmp_path, monkeypatch):
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", iterations=2)
+    locked = []
+    for name in ("_remove_broken_gaussians", "_remove_unshaped_gaussians"):
+        remove = getattr(trainer, name)
+
+        def watched(*args, remove=remove) -> None:
+            locked.append(trainer.train_lock.locked())
+            remove(*args)
+
+        monkeypatch.setattr(trainer, name, watched)
+    trainer.train()
+    assert len(locked) > 2
+    assert all(locked)
 
 
 # settings
@@ -137,7 +233,7 @@ def test_a_run_without_a_finite_gaussian_ends(pristine_scene, tmp_path):
         ("pipeline.model.ssim-lambda", "-0.2"),
         ("pipeline.model.seed-spacing", "0"),
         ("pipeline.model.init-opacity", "1"),
-        ("pipeline.model.mcmc.cap-max", "0"),
+        ("pipeline.model.mcmc.cap-max", "1"),
         ("pipeline.model.geometry.ncc-window", "8"),
         ("pipeline.model.geometry.ncc-window", "1"),
         ("pipeline.model.geometry.ncc-window", "100001"),

@@ -459,6 +459,25 @@ def test_mcmc_never_has_more_gaussians_than_its_cap(pristine_scene, tmp_path):
     assert model_of(trainer).num_points == 100
 
 
+def seeded(cap: int):
+    def change(config):
+        mcmc(cap)(config)
+        config.pipeline.model.seeds, config.pipeline.model.skybox_seeds = "shell", 20
+
+    return change
+
+
+def test_the_seeds_count_towards_the_cap(pristine_scene, tmp_path):
+    points = model_of(trainer_of(pristine_scene, tmp_path, "photo_gs")).num_points
+    seeded_model = model_of(trainer_of(pristine_scene, tmp_path, "shellgs", change=seeded(points + 60)))
+    assert points + 30 < seeded_model.num_points <= points + 60
+
+
+def test_a_cap_without_room_for_the_seeds_is_refused(pristine_scene, tmp_path):
+    with pytest.raises(SystemExit, match=r"^shellgs: --pipeline.model.mcmc.cap-max 50 is used up .* raise it"):
+        trainer_of(pristine_scene, tmp_path, "shellgs", change=seeded(50))
+
+
 def test_mcmc_adds_its_regularisers(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=mcmc(1000))
     trainer.pipeline.eval()
