@@ -20,7 +20,6 @@ from typing import Annotated
 import numpy as np
 import torch
 import tyro
-import yaml
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import profiler, writer
@@ -31,6 +30,7 @@ from benchmarks.scenes import Scene
 from dataparsers.camera import Camera
 from shellgs_method import model as model_module
 from shellgs_method.batches import pinhole_camera
+from shellgs_method.config_file import load_config
 from shellgs_method.model import FacadeModel
 from shellgs_method.rasterizer import rasterize
 from shellgs_method.trainer import FacadeTrainer, FacadeTrainerConfig
@@ -101,7 +101,7 @@ def main(benchmark: Benchmark) -> None:
 
 def resumed(config_path: Path, folder: Path) -> FacadeTrainer:
     """A trainer that resumes from the last checkpoint of a run, and writes into another folder."""
-    config = yaml.load(config_path.read_text(), Loader=yaml.Loader)
+    config = load_config(config_path)
     assert isinstance(config, FacadeTrainerConfig)
     config.output_dir, config.vis, config.load_dir = folder, "tensorboard", config_path.parent / "nerfstudio_models"
     config.max_num_iterations *= 2  # past all densification, as the checkpoint is

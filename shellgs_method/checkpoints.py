@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dataparsers.errors import SceneError, refusals_end_the_program
+from shellgs_method.run_folder import check_scene
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -37,8 +38,8 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
     if not steps or step not in (None, *steps):
         which = "" if step is None else f" of step {step}"
         raise SceneError(
-            f"{folder} holds no checkpoint{which} (step-*.ckpt): --load-dir takes the nerfstudio_models of a run, and "
-            "a run that was stopped before its first save has none"
+            f"{folder} holds no checkpoint{which} (step-*.ckpt): those of a run lie in nerfstudio_models beside its "
+            "config.yml, which --load-dir takes, and a run that was stopped before its first save has none"
         )
     return folder / f"step-{max(steps) if step is None else step:09d}.ckpt"
 
@@ -97,6 +98,7 @@ def guard_checkpoint_loading() -> None:
         with refusals_end_the_program():
             path = find_checkpoint(config.load_dir, config.load_step)
             state = load_checkpoint(path)
+            check_scene(config, pipeline)
             load_into(pipeline, path, state)
         return path, state["step"]
 

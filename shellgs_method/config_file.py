@@ -16,7 +16,7 @@ from typing import Any, get_args, get_origin
 import yaml
 from nerfstudio.engine.trainer import TrainerConfig
 
-from dataparsers.errors import SceneError, refusals_end_the_program
+from dataparsers.errors import SceneError
 
 MAX_BYTES = 1 << 20
 """Largest config.yml; those of nerfstudio's methods have a hundredth of it."""
@@ -169,24 +169,3 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_constructor("tag:yaml.org,2002:python/tuple", _tuple)
 for _tag, _construct in _CONSTRUCTORS.items():
     _Loader.add_multi_constructor(f"tag:yaml.org,2002:python/{_tag}", _construct)
-
-
-def guard_config_loading() -> None:
-    """Make nerfstudio's own commands build from a config.yml only what :func:`load_config` does.
-
-    They read it with ``yaml.Loader``, which calls whatever a file names, in two places that refer to the loader by
-    name; so the loader itself is changed, in processes that import our methods.
-    """
-
-    def guarded(construct: Callable[[Any, str, yaml.Node], Any]) -> Callable[[Any, str, yaml.Node], Any]:
-        def build(loader: Any, path: str, node: yaml.Node) -> Any:
-            with refusals_end_the_program():
-                try:
-                    return construct(loader, path, node)
-                except SceneError as error:
-                    raise SceneError(f"{loader.name} is not the config.yml of a run: {error}") from error
-
-        return build
-
-    for tag, construct in _CONSTRUCTORS.items():
-        yaml.Loader.add_multi_constructor(f"tag:yaml.org,2002:python/{tag}", guarded(construct))

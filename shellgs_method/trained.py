@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import Pipeline
 
-from dataparsers.errors import SceneError
 from shellgs_method.checkpoints import find_checkpoint, load_checkpoint, load_into
-from shellgs_method.config_file import load_config
+from shellgs_method.run_folder import check_scene, open_run
 
 
 def load_run(config_path: Path, test_mode: Literal["test", "inference"]) -> tuple[TrainerConfig, Pipeline, Path]:
@@ -22,17 +20,14 @@ def load_run(config_path: Path, test_mode: Literal["test", "inference"]) -> tupl
 
     Raises:
         FileNotFoundError: there is no such file.
-        SceneError: it is not the config of a registered method, or its checkpoint cannot be used.
+        SceneError: it is not the config of a registered method, or its checkpoint or its scene cannot be used.
     """
-    config = load_config(config_path)
-    if config.method_name not in all_methods:
-        raise SceneError(f"{config_path} is of the method {config.method_name}, which is not installed")
-    folder = config.get_checkpoint_dir()
-    beside = config_path.parent / config.relative_model_dir  # where the run lies if its folder was moved
-    checkpoint = find_checkpoint(folder if folder.is_dir() else beside)
+    config = open_run(config_path)
+    checkpoint = find_checkpoint(config.get_checkpoint_dir())
     state = load_checkpoint(checkpoint)
     config.load_dir = checkpoint.parent
     pipeline = config.pipeline.setup(device="cuda" if torch.cuda.is_available() else "cpu", test_mode=test_mode)
     pipeline.eval()
+    check_scene(config, pipeline)
     load_into(pipeline, checkpoint, state)
     return config, pipeline, checkpoint

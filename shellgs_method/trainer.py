@@ -12,7 +12,6 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
 import torch
-import yaml
 from gsplat.strategy.ops import remove
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -24,10 +23,10 @@ from torch.optim.lr_scheduler import LambdaLR
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.files import atomic_write
 from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
-from shellgs_method.config_file import guard_config_loading
 from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
 from shellgs_method.folders import held
 from shellgs_method.limits import check_settings
+from shellgs_method.run_folder import check_method, guard_nerfstudio, written_config
 
 if TYPE_CHECKING:
     from shellgs_method.pipeline import FacadePipeline
@@ -46,7 +45,7 @@ PRUNED = (
 )
 """Why a step may leave no Gaussian."""
 
-guard_config_loading()
+guard_nerfstudio()
 
 
 @contextmanager
@@ -113,7 +112,7 @@ class FacadeTrainerConfig(TrainerConfig):
             folder = self.get_base_dir()
             folder.mkdir(parents=True, exist_ok=True)
             with atomic_write(folder / "config.yml") as file:
-                file.write(yaml.dump(self).encode())
+                file.write(written_config(self).encode())
 
 
 class FacadeTrainer(Trainer):
@@ -246,6 +245,7 @@ class FacadeTrainer(Trainer):
             _remove_leftovers(self.config.load_dir.parent)
         if path is None:
             return
+        check_method(path, self.config.method_name)
         state = load_checkpoint(path)
         try:
             self.pipeline.load_pipeline(state["pipeline"], state["step"])

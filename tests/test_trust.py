@@ -20,12 +20,11 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
 from nerfstudio.utils.eval_utils import eval_setup
-from runs import small_disk, trainer_of
+from runs import Method, small_disk, trainer_of
 
 from dataparsers.errors import SceneError
 from shellgs_method import cli
 from shellgs_method.config_file import RENAMED, load_config
-from shellgs_method.trained import load_run
 
 LAST = "nerfstudio_models/step-000000001.ckpt"
 
@@ -102,7 +101,7 @@ def test_a_program_in_config_yml_is_not_run_by_nerfstudios_commands(tmp_path, re
     again = copy.deepcopy(all_methods["photo-gs"])
     again.load_config = path
     read = {"ns-eval": partial(eval_setup, path), "ns-train": partial(train.main, again)}[reader]
-    with pytest.raises(SystemExit, match=r"^shellgs: .* is not the config.yml of a run"):
+    with pytest.raises(SystemExit, match=r"^shellgs: [^\n]* cannot be read as the config.yml of a run"):
         read()
     assert list(tmp_path.iterdir()) == [path]
 
@@ -261,14 +260,29 @@ def test_a_checkpoint_without_an_optimizer_is_not_resumed(run, pristine_scene, t
         trainer_of(pristine_scene, tmp_path / "resumed", "photo_gs", load_dir=(run / LAST).parent)
 
 
-def test_a_run_whose_folder_was_moved_is_found_beside_its_config(run, tmp_path):
-    moved = Path(shutil.move(run, tmp_path / "elsewhere"))
-    _, _, checkpoint = load_run(moved / "config.yml", "inference")
-    assert checkpoint == moved / LAST
+METHODS: dict[str, Method] = {"shellgs-metric": "shellgs_metric", "2dgs": "two_dgs"}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_checkpoint_of_another_method_is_not_resumed(run, pristine_scene, tmp_path, method):
+    with pytest.raises(SystemExit, match=rf"^shellgs: .*{LAST} is a checkpoint of photo-gs, not of {method}: "):
+        trainer_of(pristine_scene, tmp_path / "resumed", METHODS[method], load_dir=(run / LAST).parent)
+
+
+def test_a_checkpoint_of_another_method_is_not_resumed_by_its_path(run, pristine_scene, tmp_path):
+    (run / "config.yml").write_text(yaml.dump(all_methods["splatfacto"]))
+
+    def resume(config):
+        config.load_checkpoint = run / LAST
+
+    with pytest.raises(SystemExit, match=r"is a checkpoint of splatfacto, not of photo-gs: "):
+        trainer_of(pristine_scene, tmp_path / "resumed", "photo_gs", change=resume)
 
 
 def test_a_missing_config_is_named(tmp_path, monkeypatch):
     assert "does not exist" in refusal(monkeypatch, "evaluate", tmp_path / "config.yml")
+    with pytest.raises(SystemExit, match=r"^shellgs: [^\n]*config.yml does not exist"):
+        eval_setup(tmp_path / "config.yml")
 
 
 # outputs
