@@ -45,6 +45,10 @@ class Camera:
         height = max(1, round(self.height * max_image_size / longest))
         return self.resized(width, height)
 
+    def scaled(self, factor: float) -> Camera:
+        """Camera of the photograph whose sides are multiplied by ``factor``, to whole pixels."""
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
     def resized(self, width: int, height: int) -> Camera:
         """Camera of the photograph resized to ``width`` x ``height`` pixels."""
         if (width, height) == (self.width, self.height):

@@ -75,7 +75,7 @@ class FacadeDataParser(DataParser):
         masks = [view.mask for view in views if view.mask is not None]
         return DataparserOutputs(
             image_filenames=[view.image for view in views],
-            cameras=_pinhole_cameras(poses[chosen], views),
+            cameras=pinhole_cameras(poses[chosen], views),
             scene_box=SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]])),
             mask_filenames=masks if len(masks) == len(views) else None,  # nerfstudio takes masks for all or none
             dataparser_scale=scale,
@@ -183,7 +183,7 @@ def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) 
     return [k for k in range(len(names)) if (k % interval == 0) != (split == "train")]
 
 
-def _pinhole_cameras(poses: torch.Tensor, views: Sequence[View]) -> Cameras:
+def pinhole_cameras(poses: torch.Tensor, views: Sequence[View]) -> Cameras:
     """Cameras with the given poses, and the intrinsics and image sizes of the views."""
     Ks = torch.stack([view.camera.K for view in views]).float()
     return Cameras(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -22,6 +23,7 @@ from torch.nn.functional import normalize
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMap, CueMaps, Findings
 from dataparsers.errors import SceneError, refusals_end_the_program
+from dataparsers.facade import pinhole_cameras
 from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
 from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps, seen_through
@@ -34,6 +36,8 @@ logger = logging.getLogger(__name__)
 COLOUR_BYTES = 3
 MAP_BYTES = 11
 """Bytes of a pixel: depth float32, normal float16, mask."""
+MIN_SIDE = 11
+"""Least side of a photograph in pixels: the size of SSIM's window."""
 MIN_REPORTED_BYTES = 1e9
 """Bytes in memory from which their sum is reported."""
 MAX_MEMORY_SHARE = 0.6
@@ -48,7 +52,7 @@ class FacadeDataset(InputDataset):
     it, in windows, else 0; ``transient`` is true where only this one shows something in front of it, ``beyond`` where
     they show the background. With ``bands``, masks keep only pixels whose wall lies in them. With ``seen_by``,
     ``seen`` is true where what a pixel shows is visible in a training view. ``kinds`` are the maps to read, all if not
-    set; with ``any_size`` they are resampled where their size differs.
+    set; with ``any_size`` they are resampled where their size differs, as they are if ``scale_factor`` is not 1.
     """
 
     bands: Bands | None = None
@@ -57,6 +61,18 @@ class FacadeDataset(InputDataset):
     any_size: bool = False
     held: bool = True
     """Whether maps stay in memory with the photographs; else they are read when needed."""
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0):
+        # Nerfstudio scales the intrinsics by the factor, but the photographs to whole pixels.
+        super().__init__(_scaled(dataparser_outputs, scale_factor))
+        self.any_size = scale_factor != 1
+        for view in self.views:
+            width, height = view.camera.width, view.camera.height
+            if min(width, height) < MIN_SIDE:
+                raise SceneError(
+                    f"{view.name} is used at {width}x{height} pixels, and SSIM needs {MIN_SIDE}: raise max_image_size "
+                    "or camera_res_scale_factor, or cast larger maps"
+                )
 
     @property
     def cues(self) -> dict[str, CueMaps]:
@@ -333,6 +349,13 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         # self.device (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
         with refusals_end_the_program():
             return super()._load_images(split, cache_images_device if torch.cuda.is_available() else "gpu")
+
+
+def _scaled(outputs: DataparserOutputs, factor: float) -> DataparserOutputs:
+    """The same views, with photographs whose sides are multiplied by ``factor``."""
+    views = [replace(view, camera=view.camera.scaled(factor)) for view in outputs.metadata["views"]]
+    cameras = pinhole_cameras(outputs.cameras.camera_to_worlds, views)
+    return replace(outputs, cameras=cameras, metadata=outputs.metadata | {"views": views})
 
 
 def _towards(camera: Camera) -> Float[Tensor, "H W 3"]:

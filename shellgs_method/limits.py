@@ -47,6 +47,7 @@ LIMITS = {
     "lr_final": RATE,
     "eps": RATE,
     "band_width": LENGTH,
+    "camera_res_scale_factor": Limits(TINY, 1),
     "warmup_length": COUNT,
     "stop_split_at": COUNT,
     "stop_screen_size_at": COUNT,

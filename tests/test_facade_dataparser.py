@@ -153,6 +153,25 @@ def test_images_and_cameras_shrink_together(pristine_scene):
     assert (views[0].camera.width, views[0].camera.height) == (24, 16)
 
 
+@pytest.mark.parametrize(("factor", "width", "height"), [(0.5, 24, 16), (0.4, 19, 13)])
+def test_a_scaled_dataset_has_photographs_maps_and_cameras_of_one_size(pristine_scene, factor, width, height):
+    dataset, whole = FacadeDataset(parse(pristine_scene), factor), FacadeDataset(parse(pristine_scene))
+    for index in range(len(dataset)):
+        camera, data = dataset.camera(index), dataset.get_data(index)
+        assert (camera.width, camera.height) == (width, height)
+        assert {tuple(data[name].shape[:2]) for name in ("image", "shell_depth", "shell_mask")} == {(height, width)}
+        stretch = torch.tensor([width / 48, height / 32, 1.0])[:, None]
+        torch.testing.assert_close(data["K"], stretch * whole.get_data(index)["K"])
+        torch.testing.assert_close(camera.K, data["K"])
+        assert dataset.views[index].camera.width == width
+
+
+@pytest.mark.parametrize(("size", "factor"), [(None, 0.1), (8, 1.0)])
+def test_photographs_smaller_than_the_window_of_ssim_are_refused(pristine_scene, size, factor):
+    with pytest.raises(SceneError, match=r"frame_00002.png is used at \d+x\d+ pixels, and SSIM needs 11: raise"):
+        FacadeDataset(parse(pristine_scene, max_image_size=size), factor)
+
+
 def test_maps_of_another_size_are_refused_with_the_command_that_makes_them_again(pristine_scene):
     dataset = FacadeDataset(parse(pristine_scene, max_image_size=24))
     with pytest.raises(SceneError, match=r"frame_00002.*48x32.*24x16.*shellgs cast"):

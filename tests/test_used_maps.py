@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 from pathlib import Path
@@ -10,13 +11,16 @@ import numpy as np
 import psutil
 import pytest
 import torch
-from runs import data_of, model_of, trainer_of
+from runs import data_of, model_of, render, trainer_of
 
+import method_configs
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.map_files import resampled
 from shellgs_method import cli
+from shellgs_method.datamanager import FacadeDataManagerConfig
+from shellgs_method.limits import check_settings
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
 
 pytestmark = pytest.mark.usefixtures("eager")
@@ -58,6 +62,27 @@ def test_a_cast_at_another_size_does_not_stop_metrics_against_the_truth(scene, t
     trainer.train()
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert {"normal_deg", "truth_normal_deg", "truth_chamfer_m"} <= metrics.keys()
+
+
+@pytest.mark.parametrize("method", ["shellgs", "shellgs_metric"])
+def test_a_run_at_half_the_resolution_uses_maps_of_full_size(pristine_scene, tmp_path, method):
+    def halve(config):
+        config.pipeline.datamanager.camera_res_scale_factor = 0.5
+
+    trainer = trainer_of(pristine_scene, tmp_path, method, iterations=2, change=halve)
+    trainer.train()
+    assert data_of(trainer).cached_train[0]["shell_depth"].shape == (16, 24, 1)
+    assert render(trainer)["rgb"].shape == (16, 24, 3)
+    assert {"psnr", "normal_deg", "truth_chamfer_m"} <= trainer.pipeline.get_average_eval_image_metrics().keys()
+
+
+@pytest.mark.parametrize("factor", [0.0, -0.5, 2.0, float("nan")])
+def test_a_scale_of_the_resolution_beyond_its_limits_is_refused(factor):
+    config = copy.deepcopy(method_configs.photo_gs.config)
+    assert isinstance(config.pipeline.datamanager, FacadeDataManagerConfig)
+    config.pipeline.datamanager.camera_res_scale_factor = factor
+    with pytest.raises(SceneError, match=r"camera_res_scale_factor cannot be .*: give a number above 0 to 1"):
+        check_settings(config)
 
 
 @pytest.mark.parametrize("size", [(24, 16), (36, 24), (96, 64)])

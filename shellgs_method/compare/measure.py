@@ -145,7 +145,12 @@ def _held_out_views(config, half: Half | None, device: torch.device) -> FacadeDa
     if not isinstance(config, FacadeDataManagerConfig):
         if not isinstance(config.dataparser, FacadeDataParserConfig):
             raise SceneError("the run was not trained on a facade: end its ns-train command with `facade-data`")
-        config = FacadeDataManagerConfig(dataparser=config.dataparser, data=config.data, cache_images_type="uint8")
+        config = FacadeDataManagerConfig(
+            dataparser=config.dataparser,
+            data=config.data,
+            cache_images_type="uint8",
+            camera_res_scale_factor=getattr(config, "camera_res_scale_factor", 1.0),
+        )
     if half:
         config = replace(config, holdout=half)
     return config.setup(device=device, test_mode="test", world_size=1, local_rank=0)
