@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy, Strategy
-from gsplat.strategy.ops import _multinomial_sample, _update_param_with_optimizer
+from gsplat.strategy.ops import _multinomial_sample, _update_param_with_optimizer, reset_opa
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -18,7 +18,7 @@ from torch.optim import Optimizer
 from shellgs_method.rasterizer import quats_to_rotations
 
 WIDE = 0.05
-"""Radius in a view, as gsplat gives it, in units of its longer side, above which a Gaussian counts as wide."""
+"""Radius in a view, in units of its longer side, above which a Gaussian counts as wide."""
 MAX_COPIES = 51
 """Maximum number of Gaussians that one is divided into, as in the authors' code: more would make no visible change."""
 
@@ -29,22 +29,60 @@ class GradientStrategy(DefaultStrategy):
 
     What such a Gaussian blurs pulls it in many directions, which cancel: its gradient is small although its error is
     large (compare AbsGS, Ye et al. 2024).
+
+    When to densify, and when to reset the opacities, is decided here, and so is what is gathered of a view: gsplat 1.4
+    resets the opacities at step 0 (its pull request #735), 1.5.3 never does (#776), and each expects radii of its own
+    (#629).
     """
 
     wide_gradient: float = 1.0
     """Factor on the gradient of Gaussians that were wide (:data:`WIDE`) in a view since the last refinement."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """Return gsplat's state, with the largest radius of each Gaussian."""
-        return super().initialize_state(scene_scale) | {"widest": None}
+        """Return what is gathered from one refinement to the next.
 
-    def _update_state(
-        self, params: nn.ParameterDict, state: dict[str, Any], info: dict[str, Any], packed: bool = False
+        ``grad2d`` and ``count``: sum of the gradients' norms, and number of views, that show a Gaussian; ``radii``: its
+        largest radius in a view, in units of the longer side.
+        """
+        return {"grad2d": None, "count": None, "radii": None, "scene_scale": scene_scale}
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: nn.ParameterDict,
+        optimizers: dict[str, Optimizer],
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        packed: bool = False,
     ) -> None:
-        super()._update_state(params, state, info, packed)
-        radii = info["radii"]  # [B, N], or with later versions of gsplat [B, N, 2]
-        widest = radii.view(*radii.shape[:2], -1).amax(dim=(0, 2)) / max(info["width"], info["height"])
-        state["widest"] = widest if state["widest"] is None else widest.maximum(state["widest"])
+        """Gather gradients and radii, refine and reset the opacities when it is time, after the optimizers' step."""
+        del packed
+        if step >= self.refine_stop_iter:
+            return
+        self._gather(params, state, info)
+        settled = step % self.reset_every >= self.pause_refine_after_reset
+        if step > self.refine_start_iter and step % self.refine_every == 0 and settled:
+            self._grow_gs(params, optimizers, state, step)
+            self._prune_gs(params, optimizers, state, step)
+            for gathered in ("grad2d", "count", "radii"):
+                state[gathered].zero_()
+            torch.cuda.empty_cache()  # tensors of other sizes follow
+        if step > 0 and step % self.reset_every == 0:
+            reset_opa(params, optimizers, state, value=2 * self.prune_opa)
+
+    @torch.no_grad()
+    def _gather(self, params: nn.ParameterDict, state: dict[str, Any], info: dict[str, Any]) -> None:
+        """Add gradients, in units of half the image, and radii of a rendering by our rasterizer to the state."""
+        centres, radii = info[self.key_for_gradient], info["radii"]
+        size = radii.new_tensor([info["width"], info["height"]])
+        gradients = (centres.absgrad if self.absgrad else centres.grad) * size / 2 * len(radii)
+        for gathered in ("grad2d", "count", "radii"):
+            if state[gathered] is None:
+                state[gathered] = gradients.new_zeros(len(params["means"]))
+        state["grad2d"] += torch.where(radii > 0, gradients.norm(dim=-1), 0.0).sum(dim=0)
+        state["count"] += (radii > 0).sum(dim=0)
+        state["radii"] = state["radii"].maximum(radii.amax(dim=0) / size.amax())
 
     @torch.no_grad()
     def _grow_gs(
@@ -54,8 +92,7 @@ class GradientStrategy(DefaultStrategy):
         state: dict[str, Any],
         step: int,
     ) -> tuple[int, int]:
-        state["grad2d"][state["widest"] > WIDE] *= self.wide_gradient
-        state["widest"].zero_()
+        state["grad2d"][state["radii"] > WIDE] *= self.wide_gradient
         return super()._grow_gs(params, optimizers, state, step)
 
 
@@ -172,19 +209,22 @@ class MCMCStrategy(Strategy):
         sources: Int[Tensor, "M"],
         places: Int[Tensor, "M"],
     ) -> None:
-        """Divide each source into itself and its copies, which replace the Gaussians at ``places``."""
+        """Divide each source into itself and its copies, which replace the Gaussians at ``places``.
+
+        As in gsplat's operations, new tensors of parameters say that these are no longer the same Gaussians.
+        """
         copies = torch.bincount(sources)[sources] + 1
         opacities = params["opacities"][sources].sigmoid()
         opacity, shrink = relocated(opacities.flatten(), copies.clamp_max(MAX_COPIES))
         eps = torch.finfo(opacity.dtype).eps
         params["opacities"][sources] = opacity.clamp(self.min_opacity, 1 - eps).logit().view_as(opacities)
         params["scales"][sources] += shrink.log()[:, None]
-        touched = torch.cat([sources, places])
-        for name, parameter in params.items():
-            parameter[places] = parameter[sources]
-            for moment in optimizers[name].state[parameter].values():
-                if moment.dim() > 0:  # not the step count
-                    moment[touched] = 0
+        _update_param_with_optimizer(
+            lambda _, p: nn.Parameter(p.index_copy(0, places, p[sources])),
+            lambda _, v: v.index_fill(0, torch.cat([sources, places]), 0.0),
+            params,
+            optimizers,
+        )
 
 
 def relocated(opacities: Float[Tensor, "M"], copies: Int[Tensor, "M"]) -> tuple[Float[Tensor, "M"], Float[Tensor, "M"]]:

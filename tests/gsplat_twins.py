@@ -11,6 +11,7 @@ from torch import Tensor
 
 
 def fully_fused_projection(means, covars, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, packed):
+    assert len(means), "gsplat 1.5 would divide by zero"
     assert covars is None
     assert not packed
     half = _torch_impl._quat_scale_to_matrix(quats, scales)
@@ -21,13 +22,16 @@ def fully_fused_projection(means, covars, quats, scales, viewmats, Ks, width, he
 
 
 def fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane):
+    assert len(means), "gsplat 1.5 would divide by zero"
     scales = torch.cat([scales[:, :2], torch.ones_like(scales[:, 2:])], dim=1)  # the kernel has no third scale
     splats = _torch_impl_2dgs._fully_fused_projection_2dgs(
         means, quats, scales, viewmats, Ks, width, height, near_plane
     )
     radii, means2d, depths, transforms, normals = splats  # pyright: ignore[reportAssignmentType]
-    radii = torch.where(depths < near_plane, 0, radii.clamp_min(1))
-    return radii, *(_uninitialise(splat, radii) for splat in (means2d, depths, transforms.mT, normals))
+    if radii.dim() == 2:  # gsplat 1.4, whose twin returns them transposed
+        transforms = transforms.mT
+    radii = torch.where((depths < near_plane).view(*depths.shape, *[1] * (radii.dim() - 2)), 0, radii.clamp_min(1))
+    return radii, *(_uninitialise(splat, radii) for splat in (means2d, depths, transforms, normals))
 
 
 def isect_tiles(means2d, radii, depths, tile_size, columns, rows):
@@ -80,7 +84,8 @@ def rasterize_to_pixels_2dgs(
 
 
 def _uninitialise(splat: Tensor, radii: Tensor) -> Tensor:
-    return torch.where((radii > 0).view(*radii.shape, *[1] * (splat.dim() - 2)), splat, torch.nan)
+    kept = radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)
+    return torch.where(kept.view(*kept.shape, *[1] * (splat.dim() - 2)), splat, torch.nan)
 
 
 def _weights(opacities: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from dataparsers.camera import Camera
-from shellgs_method.densification import MAX_COPIES, GradientStrategy, MCMCStrategy, relocated
+from shellgs_method.densification import MAX_COPIES, GradientStrategy, MCMCStrategy, SkyboxStrategy, relocated
 from shellgs_method.rasterizer import rasterize
 
 CASES = [(0.01, 2), (0.3, 3), (0.9, 7), (0.999, 20), (0.5, MAX_COPIES)]
@@ -160,6 +160,74 @@ def test_noise_has_the_shape_of_its_gaussian_and_spares_opaque_ones():
     assert moved[0].abs().max() < 1e-6
 
 
+def test_relocated_gaussians_are_new_tensors_that_start_without_momentum():
+    """Who keeps something for each Gaussian sees by the tensor that these are others, though no fewer and no more."""
+    params = gaussians(100)
+    with torch.no_grad():
+        params["opacities"][:10] = -10.0
+    optimizers, before = stepped(params), dict(params)
+    step(strategy(cap=100), params, optimizers)
+    assert all(params[name] is not before[name] for name in params)
+    assert not optimizers["means"].state[params["means"]]["exp_avg"][:10].any()
+    assert optimizers["means"].state[params["means"]]["exp_avg"].any()
+
+
+def rendering(n: int, radii: tuple[int, ...] = (), gradient: tuple[float, float] = (0.0, 0.0)) -> dict:
+    """What the rasterizer tells of a view of 100 x 60 pixels."""
+    means2d = torch.zeros(1, n, 2, requires_grad=True)
+    means2d.grad = torch.tensor(gradient).expand(1, n, 2).clone()
+    radii_of = torch.tensor([radii]) if radii else torch.full((1, n), 4)
+    return {"means2d": means2d, "radii": radii_of, "width": 100, "height": 60, "n_cameras": 1, "gaussian_ids": None}
+
+
+def test_opacities_are_reset_at_every_reset_step_and_not_at_the_first():
+    """Those of gsplat 1.4 are reset at step 0 too, of 1.5.3 never."""
+    params = gaussians(5)
+    optimizers = stepped(params)
+    strategy = GradientStrategy(refine_start_iter=0, refine_every=50, reset_every=20, refine_stop_iter=45)
+    state, reset = strategy.initialize_state(), []
+    for at in range(61):
+        with torch.no_grad():
+            params["opacities"].fill_(1.0)
+        strategy.step_post_backward(params, optimizers, state, at, rendering(5))
+        if params["opacities"].max() < 0:
+            reset.append(at)
+            assert params["opacities"].sigmoid().max().item() == pytest.approx(2 * strategy.prune_opa)
+    assert reset == [20, 40]
+
+
+def test_gaussians_that_are_wide_in_a_view_split_and_are_pruned_by_their_radius():
+    """Radii of 4, 6 and 20 % of the view's longer side, where above 5 % splits and above 15 % is pruned."""
+    params = gaussians(3)
+    optimizers = stepped(params)
+    strategy = GradientStrategy(
+        refine_start_iter=0, refine_every=10, reset_every=5, refine_scale2d_stop_iter=100, prune_scale3d=1e9
+    )
+    state = strategy.initialize_state()
+    strategy.step_post_backward(params, optimizers, state, 9, rendering(3, radii=(4, 6, 20)))
+    assert len(params["means"]) == 3
+    strategy.step_post_backward(params, optimizers, state, 10, rendering(3, radii=(1, 1, 1)))
+    assert len(params["means"]) == 3  # one, and two of the second; the two of the third are pruned
+    assert not state["radii"].any()
+
+
+@pytest.mark.parametrize("kind", [GradientStrategy, SkyboxStrategy])
+def test_without_gaussians_densification_has_nothing_to_do(kind):
+    params = gaussians(0)
+    optimizers = stepped(params)
+    strategy = kind(refine_start_iter=0, refine_every=2, reset_every=4, refine_scale2d_stop_iter=100)
+    state = strategy.initialize_state()
+    for at in range(9):
+        strategy.step_post_backward(params, optimizers, state, at, rendering(0))
+    assert len(params["means"]) == 0
+
+
+def test_without_gaussians_mcmc_has_nothing_to_do():
+    params = gaussians(0)
+    step(strategy(), params, stepped(params))
+    assert len(params["means"]) == 0
+
+
 @pytest.mark.parametrize(("factor", "split"), [(1.0, [1]), (4.0, [1, 2])])
 def test_wide_gaussians_split_at_a_lower_gradient(factor, split):
     """Gradients of 2, 12, 4 and 4 tenths of the limit, where all but the last were wide in one of two views."""
@@ -168,18 +236,10 @@ def test_wide_gaussians_split_at_a_lower_gradient(factor, split):
     strategy = GradientStrategy(grow_grad2d=1.0, grow_scale3d=0.0, wide_gradient=factor)
     state = strategy.initialize_state()
     for radii in [(9, 9, 9, 4), (1, 1, 1, 4)]:
-        means2d = torch.zeros(1, 4, 2, requires_grad=True)
-        means2d.grad = torch.tensor([[[0.2, 0], [1.2, 0], [0.4, 0], [0.4, 0]]]) / 50  # of half the image's width
-        info = {
-            "means2d": means2d,
-            "radii": torch.tensor([radii]),
-            "width": 100,
-            "height": 60,
-            "n_cameras": 1,
-            "gaussian_ids": None,
-        }
-        strategy._update_state(params, state, info)
+        info = rendering(4, radii)
+        info["means2d"].grad = torch.tensor([[[0.2, 0], [1.2, 0], [0.4, 0], [0.4, 0]]]) / 50  # of half its width
+        strategy._gather(params, state, info)
     assert strategy._grow_gs(params, optimizers, state, step=1) == (0, len(split))
     kept = [i for i in range(4) if i not in split]
     torch.testing.assert_close(params["means"][: len(kept)].detach(), means[kept])
-    assert len(state["widest"]) == len(params["means"])
+    assert len(state["radii"]) == len(params["means"])

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace
 
+import gsplat
 import gsplat_twins
 import pytest
 import torch
@@ -15,9 +16,12 @@ from torch import Tensor
 from dataparsers.camera import Camera
 from shellgs_method.rasterizer import gsplat_backend, rasterize
 from shellgs_method.rasterizer.gsplat_backend import runs_on_gsplat
+from shellgs_method.rasterizer.projection import three_sigmas
 
 DISC_MAPS = ("inverse_depth", "median_depth", "distortion")
-ON_CUDA = SimpleNamespace(device=torch.device("cuda", 0), dtype=torch.float32)  # all that runs_on_gsplat looks at
+ON_CUDA = SimpleNamespace(
+    device=torch.device("cuda", 0), dtype=torch.float32, shape=(1, 3)
+)  # all that runs_on_gsplat looks at
 
 
 @pytest.fixture
@@ -75,6 +79,41 @@ def test_gsplat_gives_the_render_and_gradients_of_the_torch_backend(primitive, m
 
 
 @pytest.mark.usefixtures("_twins")
+@pytest.mark.parametrize(("primitive", "make"), [("3d", make_splats), ("2d", make_discs), ("2d", steep_discs)])
+def test_gsplat_densifies_by_the_radii_of_the_torch_backend(primitive, make):
+    """Of the same splats, but for some whose box, rounded up, touches the image, or that gsplat 1.4 culls."""
+    splats, cameras = make(400, 1, seed=5), orbit(make_camera(31, 23), 2)
+    splats[0] = splats[0] * torch.tensor([3.0, 3.0, 1.0])  # many beside the images
+    torch_radii, gsplat_radii = (
+        rasterize(*splats, camera=cameras, primitive=primitive, backend=backend)[2]["radii"]
+        for backend in ("torch", "gsplat")
+    )
+    seen, kept = torch_radii > 0, gsplat_radii > 0
+    assert 50 < int(seen.sum()) < 600
+    assert int((seen != kept).sum()) <= 5
+    assert set((gsplat_radii - torch_radii)[seen & kept].tolist()) <= {0, 1}
+
+
+@pytest.mark.parametrize("axes", ["one radius, of 1.4", "two radii, of 1.5"])
+def test_sizes_are_those_of_gsplats_radii_also_of_needles_and_of_undefined_memory(axes):
+    generator = torch.Generator().manual_seed(0)
+    turn = torch.rand(500, generator=generator) * torch.pi
+    long = 0.6 + 1000 * torch.rand(500, generator=generator) ** 4
+    cos, sin, wide, thin = turn.cos(), turn.sin(), long.square(), torch.full((500,), 0.3)
+    xx, xy, yy = wide * cos**2 + thin * sin**2, (wide - thin) * cos * sin, wide * sin**2 + thin * cos**2
+    conics = torch.stack([yy, -xy, xx], dim=-1)[None] / (xx * yy - xy * xy)[:, None]  # as rounded as the kernels'
+    if axes == "one radius, of 1.4":
+        radii = (3 * long).ceil().int()[None]
+    else:
+        radii = (3.33 * torch.stack([xx, yy], dim=-1).sqrt()).ceil().int()[None]
+    radii[:, 7], conics[:, 7], long[7] = 0, torch.nan, 0
+    covars2d = gsplat_backend._covariances(radii, conics)
+    found = three_sigmas(covars2d, gsplat_backend._kept(radii))[0]
+    assert ((found - 3 * long >= -0.01) & (found - 3 * long < 2.5)).all()
+
+
+@pytest.mark.usefixtures("_twins")
+@pytest.mark.skipif(not gsplat.__version__.startswith("1.4"), reason="mended in gsplat 1.5")
 def test_gsplat_culls_a_splat_beside_the_image_beyond_three_standard_deviations():
     # A standard deviation is 10 pixels, the centre 31.5 from the pixel: alpha is 0.999 exp(-31.5² / 200.6) = 0.0071.
     K = torch.tensor([[1000.0, 0.0, -31.0], [0.0, 1000.0, 0.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -110,3 +149,9 @@ def test_auto_is_gsplat_on_cuda_if_its_kernels_load(kernels, monkeypatch):
     monkeypatch.setattr(kernels, "_C", object())
     assert runs_on_gsplat("auto", ON_CUDA)  # type: ignore[arg-type]
     assert not runs_on_gsplat("torch", ON_CUDA)  # type: ignore[arg-type]
+
+
+def test_no_gaussians_never_reach_gsplat_which_would_divide_by_their_number(kernels, monkeypatch):
+    monkeypatch.setattr(kernels, "_C", object())
+    none = SimpleNamespace(device=ON_CUDA.device, dtype=torch.float32, shape=(0, 3))
+    assert not any(runs_on_gsplat(backend, none) for backend in ("auto", "gsplat"))  # type: ignore[arg-type]

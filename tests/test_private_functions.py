@@ -37,7 +37,6 @@ PRIVATE = [
     *(
         ("shellgs_method/densification.py", "gsplat.strategy.default", f"DefaultStrategy.{name}", parameters)
         for name, parameters in {
-            "_update_state": "self params state info packed",
             "_grow_gs": "self params optimizers state step",
             "_prune_gs": "self params optimizers state step",
         }.items()

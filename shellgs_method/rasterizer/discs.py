@@ -26,6 +26,7 @@ from shellgs_method.rasterizer.projection import (
     to_camera,
 )
 
+LOW_PASS = 0.5  # variance in px² of the least that a disc is wide
 EDGE_ON = 1e-6  # cosine of normal and ray below which rounding decides which side of a disc shows; it is culled
 MAPPING_NEAR, MAPPING_FAR = 0.2, 100.0  # depth range of the distortion, as in 2DGS
 
@@ -180,6 +181,5 @@ def _outlines(
     conic = [1 / box_reach_x.square(), torch.zeros_like(z), 1 / box_reach_y.square()]
     around_box = [box_x, box_y, *conic, box_reach_x, box_reach_y]
     outline = [torch.where(in_front, *each) for each in zip(exact, around_box, strict=True)]
-    low_pass = 0.5
-    covars2d = torch.stack([xx / z.square() + low_pass, xy / z.square(), yy / z.square() + low_pass], dim=-1)
+    covars2d = torch.stack([xx / z.square() + LOW_PASS, xy / z.square(), yy / z.square() + LOW_PASS], dim=-1)
     return torch.stack(outline, dim=-1), covars2d

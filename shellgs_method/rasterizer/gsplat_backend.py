@@ -1,6 +1,10 @@
 """Rasterization of 3D Gaussians and 2DGS discs with the CUDA kernels of the installed gsplat, 1.4 or 1.5.
 
 gsplat can be imported everywhere; its kernels are loaded, and if need be compiled, on first use.
+
+A splat has one radius in gsplat 1.4: three standard deviations along its longest axis, the sides of a square. From 1.5
+it has two: 3.33 standard deviations along x and along y, the sides of a box. Here they say which splats gsplat culled
+and how large the others are; tiles are found, and densification measures, by covariances that are the same for both.
 """
 
 from __future__ import annotations
@@ -21,13 +25,13 @@ from gsplat import (
     rasterize_to_pixels,
     rasterize_to_pixels_2dgs,
 )
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dataparsers.camera import Camera
 from shellgs_method.fusion import uninterrupted
-from shellgs_method.rasterizer.discs import EDGE_ON
-from shellgs_method.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs
+from shellgs_method.rasterizer import discs as disc_projection
+from shellgs_method.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs, three_sigmas
 from shellgs_method.rasterizer.renders import Renders
 
 logger = logging.getLogger(__name__)
@@ -39,6 +43,8 @@ TILE = 16  # pixels along the side of a tile; gsplat tests no other size
 
 def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
     """Whether to rasterize with gsplat's kernels; if they cannot run on a CUDA device, log the reason once.
+
+    No Gaussians are rasterized without them: gsplat 1.5 divides by their number, which ends the process.
 
     Raises:
         ValueError: If ``backend`` is ``gsplat`` and it cannot run.
@@ -54,7 +60,7 @@ def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
         raise ValueError(f'backend="gsplat" cannot run here; use "auto" or "torch": {fault}.')
     if on_cuda and fault:
         _warn_once(f"The rasterizer runs on {means.device} in plain torch, slower than gsplat: {fault}.")
-    return fault is None
+    return fault is None and means.shape[0] > 0
 
 
 def rasterize_3d(
@@ -68,17 +74,19 @@ def rasterize_3d(
 ) -> Renders:
     """Rasterize Gaussians for cameras of one size; all tensors are float32 on a CUDA device.
 
-    The render equals that of the torch backend, except that gsplat culls splats beside the image that reach into it
+    The render equals that of the torch backend, except that gsplat 1.4 culls splats beside the image that reach into it
     only beyond three standard deviations, where alpha is below 0.012.
     """
     viewmats, Ks, width, height = _stack(cameras)
     radii, means2d, depths, conics, _ = fully_fused_projection(
         means, None, quats, scales, viewmats, Ks, width, height, eps2d=LOW_PASS, near_plane=NEAR_PLANE, packed=False
     )
-    # gsplat's radii are three standard deviations. Bin a splat to all tiles where its alpha counts: farther out, to
-    # avoid visible tile borders; less far for a faint splat, to save time.
-    reach = (cutoffs(opacities).sqrt() / 3).view(-1, *[1] * (radii.dim() - 2))
-    bins = _bin(means2d, radii * reach, depths, width, height)
+    covars2d = _covariances(radii, conics)
+    # A splat is binned to all tiles where its alpha counts: farther out than gsplat does, to avoid visible tile
+    # borders; less far if it is faint, to save time.
+    reach = (cutoffs(opacities)[:, None] * covars2d[..., ::2]).sqrt()
+    visible = _kept(radii) & _touches(means2d, reach, width, height)
+    bins = _bin(means2d, _tile_radii(reach, visible, radii), depths, width, height)
     probe, groups = _probed(means2d, features, n_densifying)
     renders = [
         rasterize_to_pixels(
@@ -88,7 +96,7 @@ def rasterize_3d(
         for centres, group in groups
     ]
     composited, alpha = torch.cat([render for render, _ in renders], dim=-1), renders[-1][1]
-    return Renders(composited, alpha, composited[..., :0], probe, radii)
+    return Renders(composited, alpha, composited[..., :0], probe, three_sigmas(covars2d, visible))
 
 
 def rasterize_2d(
@@ -106,7 +114,7 @@ def rasterize_2d(
     1/z = q · ray with a constant q of the disc, see :class:`_Discs`: compositing the vectors q gives the exact sum of
     weight over z, and compositing q qᵀ that of weight over z².
 
-    The render equals that of the torch backend, except that gsplat culls by boxes of three standard deviations, and
+    The render equals that of the torch backend, except that gsplat culls by its radii, and
     that all of a nearly edge-on disc has the depth of its centre in the maps.
     """
     discs = _project_discs(means, quats, scales, opacities, cameras)
@@ -123,6 +131,44 @@ def rasterize_2d(
 
 
 RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
+
+
+def _kept(radii: Int[Tensor, "B N ..."]) -> Bool[Tensor, "B N"]:
+    """Which splats gsplat has not culled."""
+    return radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)
+
+
+@torch.no_grad()
+def _covariances(radii: Int[Tensor, "B N ..."], conics: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
+    """Covariances (xx, xy, yy) in px² of Gaussians on the screen, from gsplat's radii and inverse covariances.
+
+    The inverse of a conic (a, b, c) is a multiple of (c, -b, a). Its determinant, lost to rounding for a long and thin
+    splat, is not needed: the radii give the size. They are rounded up, and so is the result.
+    """
+    a, b, c = conics.unbind(-1)
+    if radii.dim() == 2:
+        longest = (a + c) / 2 + (((a - c) / 2).square() + b.square()).sqrt()
+        size = (radii / 3).square() / longest
+    else:
+        size = (radii / 3.33).square().sum(dim=-1) / (a + c)
+    return size[..., None] * torch.stack([c, -b, a], dim=-1)
+
+
+@torch.no_grad()
+def _touches(
+    means2d: Float[Tensor, "B N 2"], reach: Float[Tensor, "B N 2"], width: int, height: int
+) -> Bool[Tensor, "B N"]:
+    """Whether the box that reaches so far around a splat, if it is not too faint to have one, touches the image."""
+    size = means2d.new_tensor([width, height])
+    return ((reach > 0) & (means2d + reach > 0) & (means2d - reach < size)).all(dim=-1)
+
+
+def _tile_radii(
+    reach: Float[Tensor, "B N 2"], visible: Bool[Tensor, "B N"], radii: Int[Tensor, "B N ..."]
+) -> Float[Tensor, "B N ..."]:
+    """Radii to bin splats by, as many as gsplat has for each: 0 for those not visible, whose reach may be undefined."""
+    reach = torch.where(visible[..., None], reach, 0.0)
+    return reach.amax(dim=-1) if radii.dim() == 2 else reach
 
 
 def _probed(
@@ -155,14 +201,14 @@ class _Discs:
         ray_transforms: K [s_u t_u | s_v t_v | centre] in the camera frame; equation 8 of 2DGS.
         inverse_planes: q = normal / (normal · centre), so that q · ray = 1/z where a ray meets the plane;
             a steep disc is treated as facing the camera.
-        radii: gsplat's radii, 0 for a culled disc.
-        tile_radii: half sides of the boxes around the means2d outside of which alpha does not count.
+        radii: see :class:`Renders`.
+        tile_radii: half sides of the boxes, or squares, around the means2d outside of which alpha does not count.
     """
 
     means2d: Float[Tensor, "B N 2"]
     ray_transforms: Float[Tensor, "B N 3 3"]
     inverse_planes: Float[Tensor, "B N 3"]
-    radii: Int[Tensor, "B N ..."]
+    radii: Int[Tensor, "B N"]
     tile_radii: Float[Tensor, "B N ..."]
 
 
@@ -177,7 +223,7 @@ def _project_discs(
     splats = fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane=NEAR_PLANE)
     radii, _, _, ray_transforms, normals = splats  # pyright: ignore[reportAssignmentType]
     # gsplat leaves the memory of culled discs uninitialised; none of it may reach a gradient, as 0 times NaN.
-    visible = radii.view(*normals.shape[:2], -1).amin(-1) > 0
+    visible = _kept(radii)
     normals = torch.where(visible[..., None], normals, normals.new_tensor([0.0, 0.0, -1.0]))
     ray_transforms = torch.where(visible[..., None, None], ray_transforms, torch.eye(3).to(means))
 
@@ -189,7 +235,7 @@ def _project_discs(
 
     centres = ray_transforms[..., 2] @ torch.linalg.inv(Ks).mT
     planes = (normals * centres).sum(-1, keepdim=True)
-    shows = visible & (planes[..., 0].detach().abs() > EDGE_ON * centres.detach().norm(dim=-1))
+    shows = planes[..., 0].detach().abs() > disc_projection.EDGE_ON * centres.detach().norm(dim=-1)
     # The low-pass shows a steep disc even where the ray meets its plane behind the camera. The centre's depth is right
     # there; with one q per disc, it must also serve where a ray meets the plane in front.
     cutoff = cutoffs(opacities)
@@ -199,8 +245,21 @@ def _project_discs(
     inverse_planes = torch.where(steep[..., None], facing, normals / torch.where(steep[..., None], 1.0, planes))
 
     reach = _reach_of_discs(means2d, ray_transforms, cutoff, max(width, height))
-    tile_radii = reach.amax(-1) * shows if radii.dim() == 2 else reach * shows[..., None]
-    return _Discs(means2d, ray_transforms, inverse_planes, radii, tile_radii)
+    visible = visible & shows & (cutoff > 0) & _touches(means2d, reach, width, height)
+    sizes = three_sigmas(_covariances_of_discs(means2d, ray_transforms), visible)
+    return _Discs(means2d, ray_transforms, inverse_planes, sizes, _tile_radii(reach, visible, radii))
+
+
+@torch.no_grad()
+def _covariances_of_discs(
+    means2d: Float[Tensor, "B N 2"], ray_transforms: Float[Tensor, "B N 3 3"]
+) -> Float[Tensor, "B N 3"]:
+    """Covariances (xx, xy, yy) in px² of discs on the screen as if seen from afar."""
+    w = ray_transforms[..., 2:, :]
+    half_axes = (ray_transforms[..., :2, :2] - means2d[..., None] * w[..., :2]) / w[..., 2:]
+    across, down = half_axes.unbind(dim=-2)
+    xx, xy, yy = ((u * v).sum(dim=-1) for u, v in ((across, across), (across, down), (down, down)))
+    return torch.stack([xx + disc_projection.LOW_PASS, xy, yy + disc_projection.LOW_PASS], dim=-1)
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dataparsers.camera import Camera
@@ -124,6 +124,13 @@ def _project(
     outline = torch.stack([*means2d.detach().unbind(-1), yy / extent, -xy / extent, xx / extent, *reach], dim=-1)
     visible = in_front & (cutoff > 0) & touches(outline, size)
     return means2d, shapes, depths, outline[..., None, :], torch.stack([xx, xy, yy], dim=-1), visible
+
+
+def three_sigmas(covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Int[Tensor, "B N"]:
+    """Radii of splats, see :class:`~.renders.Renders`, from their covariances (xx, xy, yy) in px²."""
+    xx, xy, yy = covars2d.unbind(-1)
+    variance = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
+    return torch.where(visible, (3 * variance.sqrt()).ceil(), 0).int()
 
 
 def stack_cameras(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib.metadata import version
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from dataparsers.camera import Camera
@@ -20,7 +19,7 @@ from shellgs_method.rasterizer.disc_kernels import DISCS
 from shellgs_method.rasterizer.discs import disc_maps, project_discs
 from shellgs_method.rasterizer.gaussian_kernels import GAUSSIANS
 from shellgs_method.rasterizer.kernels import Kernels
-from shellgs_method.rasterizer.projection import Projection, View, project_gaussians
+from shellgs_method.rasterizer.projection import Projection, View, project_gaussians, three_sigmas
 from shellgs_method.rasterizer.renders import Renders
 
 
@@ -58,8 +57,8 @@ def rasterize(
 
     Returns:
         Sums of weight times feature (not divided by alpha, no background), sums of the weights, and the ``info`` of
-        gsplat's densification strategies: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained, ``radii``,
-        …. The renders of a sequence of cameras are stacked.
+        gsplat's densification strategies: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained, ``radii``
+        [B, N] as in :class:`Renders` with every backend, …. The renders of a sequence of cameras are stacked.
 
         For discs, ``info`` also has differentiable maps ``[*B, H, W, 1]``: ``inverse_depth``, the sum of weight over z
         of the ray's intersection, so that alpha / inverse_depth is the expected depth (1/z is averaged because it is
@@ -111,7 +110,7 @@ def _rasterize(
     projection = project(means, quats, scales, opacities, cameras, with_probe=n_densifying is not None)
     views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
     composited, alpha, maps = torch.stack(views).split([features.shape[1], 1, kernels.n_maps], dim=-1)
-    radii = run_fused(_RADII, projection.outlines, projection.covars2d, projection.visible)
+    radii = run_fused(three_sigmas, projection.covars2d, projection.visible)
     centres = projection.means2d if projection.probe is None else projection.probe
     return Renders(composited, alpha, maps, centres, radii)
 
@@ -133,18 +132,3 @@ def _render(
     order = visible.index_select(0, stable_order(depths))
     bins = bin_splats(view.outlines.index_select(0, order), camera.width, camera.height)
     return composite(view.means2d, view.shapes, features, order, bins, kernels, view.probed, n_densifying)
-
-
-def _three_sigmas(outlines: Tensor, covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Tensor:
-    """Radii of gsplat 1.4: three standard deviations."""
-    xx, xy, yy = covars2d.unbind(-1)
-    variance = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
-    return torch.where(visible, (3 * variance.sqrt()).ceil(), 0).int()
-
-
-def _boxes(outlines: Float[Tensor, "B N O 7"], covars2d: Tensor, visible: Bool[Tensor, "B N"]) -> Tensor:
-    """Radii of gsplat from 1.5: in x and y, up to where alpha counts."""
-    return torch.where(visible[..., None], outlines[..., 5:].amax(-2).ceil(), 0).int()
-
-
-_RADII = _boxes if tuple(map(int, version("gsplat").split(".")[:2])) >= (1, 5) else _three_sigmas

@@ -18,11 +18,12 @@ class Renders:
         maps: for discs, sums of weight over z and over z², and the median depth; none for Gaussians.
         means2d: projected centres in pixels, in the graph; if only some features drive densification, a leaf that gets
             the gradient of these alone.
-        radii: radii in pixels, as in the installed gsplat: one, or from 1.5 two, along x and y; 0 where invisible.
+        radii: three standard deviations along the longest axis in pixels, rounded up, whatever the opacity, as in 3DGS
+            and in gsplat before 1.5; 0 where invisible.
     """
 
     composited: Float[Tensor, "B height width C"]
     alpha: Float[Tensor, "B height width 1"]
     maps: Float[Tensor, "B height width maps"]
     means2d: Float[Tensor, "B N 2"]
-    radii: Int[Tensor, "B N ..."]
+    radii: Int[Tensor, "B N"]
