@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from shellgs_method.nearest import point_tree
 
 MAX_SIZE = 320
 """Longer side in pixels at which visibility is computed."""
@@ -60,7 +60,7 @@ class SeenBy:
         if not inside.any():
             return rays.new_full((*rays.shape[:2], 1), 1e6)
         wanted = (rays @ camera.K.T)[..., :2].reshape(-1, 2)
-        nearest = KDTree(pixels[inside].cpu().numpy()).query(wanted.cpu().numpy(), workers=-1)[1]
+        nearest = point_tree(pixels[inside].cpu().numpy()).query(wanted.cpu().numpy(), workers=-1)[1]
         return z[inside][torch.as_tensor(nearest, device=z.device)].view(*rays.shape[:2], 1)
 
 

@@ -19,7 +19,6 @@ from nerfstudio.models.splatfacto import (
     random_quat_tensor,
 )
 from nerfstudio.utils.colors import get_color
-from scipy.spatial import KDTree
 from torch import Tensor, nn
 from tyro.conf import Suppress
 
@@ -50,6 +49,7 @@ from shellgs_method.geometry import (
 from shellgs_method.limits import MIN_POINTS
 from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
 from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.nearest import point_tree
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.seeding import Seeds
 from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
@@ -58,8 +58,9 @@ from shellgs_method.threads import ThreadsByLoad
 
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two opacity resets: opacities recover no faster in a short run."""
-SURFACE_EVERY = 1000
-"""Iterations of a run of 30 000 between two searches for the Gaussians behind the shell."""
+SURFACE_EVERY = 500
+"""Most iterations of a run of 30 000 between two searches for the Gaussians behind the shell. A centre moves by at most
+its learning rate in each: once densification is over, by centimetres in between."""
 MAX_KEPT_PIXELS = 3_000_000
 """Most pixels of training views whose losses are cached, at some 80 bytes each."""
 
@@ -160,7 +161,7 @@ class FacadeModel(SplatfactoModel):
         """Create Gaussians at the SfM points."""
         self._check_settings()
         points, colours = self._seed_points()
-        spacing = KDTree(points.numpy()).query(points.numpy(), k=MIN_POINTS)[0][:, 1:].mean(axis=1)
+        spacing = point_tree(points.numpy()).query(points.numpy(), k=MIN_POINTS)[0][:, 1:].mean(axis=1)
         scales = torch.from_numpy(spacing).float()[:, None].repeat(1, 3)
         self.gauss_params = nn.ParameterDict()
         self._add_gaussians(points, colours, scales, random_quat_tensor(len(points)))
@@ -305,11 +306,10 @@ class FacadeModel(SplatfactoModel):
         return super().get_training_callbacks(training_callback_attributes)
 
     def step_post_backward(self, step: int) -> None:
-        """Densify and prune, except at step 0, where gsplat 1.4 would reset the opacities."""
+        """Densify and prune."""
         if isinstance(self.strategy, GradientStrategy):
             self.strategy.pause_refine_after_reset = self._refinement_pause(step, self.strategy.reset_every)
-        if step > 0:
-            super().step_post_backward(step)
+        super().step_post_backward(step)
         if self.config.primitive == "2d":  # a split divides all scales
             self.scales.data[:, 2] = DISC_LOG_THICKNESS
 
@@ -326,15 +326,15 @@ class FacadeModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             stored = dict[f"gauss_params.{name}"]
             parameter.data = parameter.data.new_zeros(stored.shape)
-        if "surface" in dict:
-            self.surface = torch.empty_like(dict["surface"], device=self.device)
+        self.surface = torch.empty_like(dict["surface"], device=self.device) if "surface" in dict else None
         self.step = self.num_iterations
         return nn.Module.load_state_dict(self, dict, **kwargs)
 
     def update_surface(self) -> None:
-        """Find the Gaussians behind the shell, if others have been added or removed since."""
-        if self.surface_weights is not None and (self.surface is None or len(self.surface) != self.num_points):
-            self.surface = self.surface_weights(self.means.detach())
+        """Find the Gaussians behind the shell, if any was added, removed or relocated since."""
+        weights = self.surface_weights
+        if weights is not None and (self.surface is None or not weights.hold_for(self.means)):
+            self.surface = weights(self.means)
 
     @property
     def _gaussians(self) -> dict[str, Tensor]:
@@ -450,7 +450,7 @@ class FacadeModel(SplatfactoModel):
         return not self.training or self._supervises_geometry
 
     def _in_view(self, info: dict[str, Any]) -> Bool[Tensor, "N"]:
-        return (info["radii"][0] > 0).view(self.num_points, -1).all(dim=-1)
+        return info["radii"][0] > 0
 
     @property
     def _supervises_geometry(self) -> bool:

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from dataparsers.camera import Camera, positions
+from shellgs_method.nearest import point_tree
 from shellgs_method.reference import Reference
 from shellgs_method.voxels import cell_means, voxel_cells
 
@@ -99,7 +99,7 @@ def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, mo
         if len(points) <= most:
             break
         spacing *= 1.05 * (len(points) / most) ** 0.5
-    distance, nearest = map(np.asarray, KDTree(points).query(samples.points, workers=-1))
+    distance, nearest = map(np.asarray, point_tree(points).query(samples.points, workers=-1))
     near = distance < apart[nearest]
     by_view, pairs = np.unique(nearest[near] * (samples.view.max() + 1) + samples.view[near], return_inverse=True)
     shown = by_view // (samples.view.max() + 1)  # the seed of each (seed, view) pair
@@ -137,7 +137,7 @@ def skybox_seeds(views: Iterable[SkyView], num_pixels: int, sfm_points: Float[nd
     centre, towards = positions(cameras).mean(axis=0), _fibonacci_sphere(count)
     radius = SKYBOX_RADIUS * np.percentile(np.linalg.norm(sfm_points - centre, axis=1), 99)
     k = min(PIXELS_PER_COLOUR, len(directions))
-    _, nearest = KDTree(directions).query(towards, k, workers=-1)
+    _, nearest = point_tree(directions).query(towards, k, workers=-1)
     spacing = np.full(count, SKYBOX_OVERLAP * radius * np.sqrt(4 * np.pi / count))
     return Seeds(centre + radius * towards, -towards, np.median(colours[nearest.reshape(count, k)], axis=1), spacing)
 
@@ -176,7 +176,7 @@ def _thinned(
         voxel = finest * 2.0**level
         new = samples.select(levels == level)
         if len(points):
-            new = new.select(KDTree(points).query(new.points, distance_upper_bound=voxel, workers=-1)[0] == np.inf)
+            new = new.select(point_tree(points).query(new.points, distance_upper_bound=voxel, workers=-1)[0] == np.inf)
         means = cell_means(np.concatenate([new.points, new.normals], axis=1), voxel_cells(new.points, voxel))
         points, normals = np.concatenate([points, means[:, :3]]), np.concatenate([normals, means[:, 3:]])
         apart = np.concatenate([apart, np.full(len(means), voxel)])

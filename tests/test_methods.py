@@ -12,6 +12,7 @@ import pytest
 import torch
 import tyro
 import yaml
+from gsplat.strategy.ops import duplicate, remove
 from nerfstudio.scripts.exporter import ExportGaussianSplat
 from runs import data_of, held_out, model_of, render, trainer_of
 from torch.nn.functional import normalize
@@ -22,11 +23,14 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.ablations import ABLATIONS
 from shellgs_method.batches import pinhole_camera
 from shellgs_method.compare.runs import PAPER
+from shellgs_method.densification import MCMCStrategy
 from shellgs_method.geometry import DISC_LOG_THICKNESS, depth_powers, geometry_channels, mode_of_depth
 from shellgs_method.losses import ExponentialDecay
 from shellgs_method.rasterizer import quats_to_rotations, rasterize
 from shellgs_method.reference import Reference
+from shellgs_method.seeding import Seeds
 from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses
+from shellgs_method.surface_weights import SurfaceWeights
 
 pytestmark = pytest.mark.usefixtures("eager")
 
@@ -290,6 +294,47 @@ def test_normals_of_depth_have_a_depth_gradient_and_composited_ones_have_none(un
         geometry, cue, paper=GeometryLossConfig(OFF.depth, ExponentialDecay(1, 1), OFF.smoothness)
     ).values()
     assert torch.autograd.grad(only_n, geometry.depth, allow_unused=True) == (None,)
+
+
+def relocate(params, optimizers) -> None:
+    """Relocate a tenth of the Gaussians, at the cap of MCMC."""
+    strategy = MCMCStrategy(len(params["means"]), refine_start_iter=0, refine_stop_iter=2, refine_every=1, noise=0)
+    with torch.no_grad():
+        params["opacities"][::10] = -10
+    strategy.step_post_backward(params, optimizers, {}, 1, {})
+
+
+def exchange(params, optimizers) -> None:
+    """Add as many Gaussians as are removed."""
+    first = torch.zeros(len(params["means"]), dtype=torch.bool)
+    first[: len(first) // 10] = True
+    duplicate(params, optimizers, {}, first)
+    remove(params, optimizers, {}, torch.cat([first, torch.zeros(int(first.sum()), dtype=torch.bool)]))
+
+
+@pytest.mark.parametrize("change", [relocate, exchange])
+def test_whether_gaussians_are_behind_the_shell_is_found_anew_when_these_are_others(untrained, monkeypatch, change):
+    model = model_of(untrained)
+    params = copy.deepcopy(model.gauss_params)
+    optimizers = {name: torch.optim.Adam([parameter]) for name, parameter in params.items()}
+    middle, x = params["means"].detach().median(dim=0).values[None].numpy(), np.array([[1.0, 0.0, 0.0]])
+    weights = SurfaceWeights(Seeds(middle, -x, x, np.ones(1)), metres_per_unit=None)
+    monkeypatch.setitem(model._modules, "gauss_params", params)
+    monkeypatch.setitem(model._buffers, "surface", None)
+    monkeypatch.setattr(model, "surface_weights", weights)
+    model.update_surface()
+    before = model.surface
+    assert before is not None
+    assert before.min() < before.max()
+    model.update_surface()
+    assert model.surface is before
+    change(params, optimizers)
+    model.update_surface()
+    after = model.surface
+    assert after is not None
+    assert after.shape == before.shape
+    assert not torch.equal(after, before)
+    assert torch.equal(after, weights(params["means"]))
 
 
 def test_the_mode_is_rendered_and_the_losses_are_of_the_expected_depth(untrained, monkeypatch):

@@ -12,7 +12,6 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from scipy.spatial import KDTree
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dataparsers.camera import upwards
@@ -22,6 +21,7 @@ from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
+from shellgs_method.nearest import point_tree
 from shellgs_method.voxels import voxel_means
 
 CURVES = tuple(
@@ -87,7 +87,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
     seen = next(iter(shots.values()))
     unit, voxel = _resolution(seen[0])
     reference = voxel_means(np.concatenate([_world(shot, shot.shell_depth) for shot in seen]), voxel)
-    tree, centre, frame = KDTree(reference), np.median(reference, axis=0), _facade_frame(seen)
+    tree, centre, frame = point_tree(reference), np.median(reference, axis=0), _facade_frame(seen)
     pixel = np.linalg.norm(np.percentile(reference, 99, axis=0) - np.percentile(reference, 1, axis=0)) / PANEL[1]
     figure = Figure(figsize=(3.4 * len(shots) + 0.8, 2.2 * len(AZIMUTHS)), layout="constrained")
     axes = figure.subplots(len(AZIMUTHS), len(shots), squeeze=False)

@@ -9,10 +9,11 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial import Delaunay, KDTree, QhullError
+from scipy.spatial import Delaunay, QhullError
 
 from dataparsers.errors import SceneError
 from dataparsers.strays import sound
+from shellgs_method.nearest import point_tree
 from shellgs_method.open3d import import_open3d, reason
 from shellgs_method.shell.geometry.planes import largest_plane
 from shellgs_method.triangles import Triangles
@@ -156,7 +157,7 @@ class _Cloud:
             raise SceneError(f"the point cloud makes no surface: it {what}")
         # On a surface with ρ points per unit of area, the k-th neighbour is √(k / π ρ) away.
         k = min(6, len(points) - 1)
-        nearest = KDTree(points).query(points, k + 1)[0][:, k]
+        nearest = point_tree(points).query(points, k + 1)[0][:, k]
         spacing = float(np.median(nearest) * np.sqrt(np.pi / k))
         legacy = _legacy(points)
         search = import_open3d().geometry.KDTreeSearchParamHybrid(NEIGHBOURHOOD * spacing, 30)
@@ -168,7 +169,7 @@ class _Cloud:
 
 def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray) -> np.ndarray:
     if len(viewpoints):
-        towards = viewpoints[KDTree(viewpoints).query(points)[1]] - points
+        towards = viewpoints[point_tree(viewpoints).query(points)[1]] - points
         return np.where(np.einsum("nc,nc->n", normals, towards)[:, None] < 0, -normals, normals)
     legacy = _legacy(points, normals)
     legacy.orient_normals_consistent_tangent_plane(min(10, len(points) - 1))
@@ -215,7 +216,7 @@ def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
 
 def _mesh_seams(cloud: _Cloud, plane: Int64[np.ndarray, " N"]) -> _Part:
     """Mesh the points between planes, and those on no plane, by ball pivoting."""
-    neighbours = KDTree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
+    neighbours = point_tree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
     seam = (plane == NO_PLANE) | (plane[neighbours] != plane[:, None]).any(axis=1)
     near = seam[neighbours].any(axis=1)
     part = _balls(cloud.points[near], cloud.normals[near], cloud.spacing)
@@ -244,7 +245,7 @@ def _poisson(cloud: _Cloud) -> Iterator[_Part]:
         _legacy(cloud.points, cloud.normals), depth=depth
     )
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64)
-    near = KDTree(cloud.points).query(vertices)[0] <= 1.5 * cloud.spacing
+    near = point_tree(cloud.points).query(vertices)[0] <= 1.5 * cloud.spacing
     yield _Part(vertices, faces[near[faces].all(axis=1)])
 
 

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
-from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
+from shellgs_method.nearest import point_tree
 from shellgs_method.shell.geometry.planes import fitted_plane, largest_plane
 from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.shell.geometry.surface import ShellSurface
@@ -225,7 +225,7 @@ def _refined(
 def _score(surface: ShellSurface, spread: np.ndarray, cloud: _Cloud, similarity: np.ndarray, fit: float) -> float:
     placed = transformed(cloud.wall, similarity)
     precision = float((surface.distance(placed) < fit).mean())
-    recall = float(np.isfinite(KDTree(placed).query(spread, distance_upper_bound=_BESIDE)[0]).mean())
+    recall = float(np.isfinite(point_tree(placed).query(spread, distance_upper_bound=_BESIDE)[0]).mean())
     return 2 * precision * recall / max(precision + recall, 1e-9)
 
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import KDTree
 
 from dataparsers.camera import positions, upwards
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
+from shellgs_method.nearest import point_tree
 from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.raycast import ShellCaster
 from shellgs_method.shell.geometry.similarity import transformed
@@ -230,7 +230,7 @@ def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.nd
 def _signed_distances(surface: ShellSurface, points: np.ndarray, cameras: np.ndarray) -> np.ndarray:
     """Distance of each point from the shell, positive on the side of the nearest camera."""
     closest = surface.closest(points)
-    towards = cameras[KDTree(cameras).query(closest.point)[1]] - closest.point
+    towards = cameras[point_tree(cameras).query(closest.point)[1]] - closest.point
     normal = closest.normal * np.sign(np.einsum("nd,nd->n", closest.normal, towards))[:, None]
     offset = points - closest.point
     side = np.where(np.einsum("nd,nd->n", normal, offset) < 0, -1.0, 1.0)
