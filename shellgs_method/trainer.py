@@ -6,10 +6,10 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Optional
 
 import torch
 from gsplat.strategy.ops import remove
@@ -19,13 +19,14 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.optim.lr_scheduler import LambdaLR
+from tyro.conf import Suppress
 
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.files import atomic_write
 from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
 from shellgs_method.folders import held
-from shellgs_method.limits import check_settings
+from shellgs_method.limits import check_settings, check_training
 from shellgs_method.run_folder import check_method, guard_nerfstudio, written_config
 
 if TYPE_CHECKING:
@@ -71,8 +72,7 @@ def wandb_refusals() -> Iterator[None]:
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam whose step is one loop over the parameters, on the CPU too."""
 
-    fused: bool = True
-    """Use one kernel; off: torch's default."""
+    fused: Suppress[bool] = True
 
 
 @dataclass
@@ -82,7 +82,7 @@ class RunLengthDecayConfig(SchedulerConfig):
     _target: type = field(default_factory=lambda: RunLengthDecay)
     lr_final: float = 1.6e-6
     """Learning rate at the end of the run."""
-    max_steps: int = 30_000
+    max_steps: Suppress[int] = 30_000
     """Length of the run; the trainer sets it to its number of iterations."""
 
 
@@ -102,13 +102,16 @@ class FacadeTrainerConfig(TrainerConfig):
     """Trainer of the facade methods."""
 
     _target: type = field(default_factory=lambda: FacadeTrainer)
+    method_name: Suppress[Optional[str]] = None
+    """Name of the method; ns-eval looks it up."""
 
     def __post_init__(self) -> None:
         check_settings(self)
 
     def save_config(self) -> None:
-        """Save the config to the run's folder, whole or not at all."""
+        """Save the config to the run's folder, whole or not at all; ns-train does it before anything else."""
         with refusals_end_the_program():
+            check_training(self)
             folder = self.get_base_dir()
             folder.mkdir(parents=True, exist_ok=True)
             with atomic_write(folder / "config.yml") as file:
@@ -130,6 +133,7 @@ class FacadeTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up everything that training needs."""
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
+            check_training(self.config)
             _remove_leftovers(self.base_dir)
             super().setup(test_mode)
         after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
@@ -139,10 +143,11 @@ class FacadeTrainer(Trainer):
 
     def setup_optimizers(self) -> GuardedOptimizers:
         """Optimizers whose learning rates decay over the run."""
-        for group in self.config.optimizers.values():
+        groups = {name: dict(group) for name, group in self.config.optimizers.items()}
+        for group in groups.values():
             if isinstance(group["scheduler"], RunLengthDecayConfig):
-                group["scheduler"].max_steps = self.config.max_num_iterations
-        return GuardedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+                group["scheduler"] = replace(group["scheduler"], max_steps=self.config.max_num_iterations)
+        return GuardedOptimizers(groups, self.pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train up to ``max_num_iterations``, including those of a loaded checkpoint."""
