@@ -18,7 +18,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps, find_cues
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.layout import SceneLayout
 from dataparsers.photograph import View, undistort
 from dataparsers.shots import Recording, Shot
@@ -42,6 +42,18 @@ class FacadeDataParserConfig(SceneLayout, DataParserConfig):
     """How to orient the scene for the viewer."""
     center_method: Literal["poses", "focus", "none"] = "poses"
     """How to centre the scene for the viewer. Coordinates too large for float32 are always centred."""
+
+    @property
+    def downscale_factor(self) -> None:
+        """Set by `ns-render dataset --downscale-factor` alone, which other parsers follow; here it is refused."""
+
+    @downscale_factor.setter
+    def downscale_factor(self, factor: float) -> None:
+        with refusals_end_the_program():
+            raise SceneError(
+                f"--downscale-factor {factor:g} cannot be followed: views are rendered at the size of their "
+                "photographs in training, which facade-data --max-image-size sets"
+            )
 
 
 class FacadeDataParser(DataParser):
@@ -194,6 +206,7 @@ def pinhole_cameras(poses: torch.Tensor, views: Sequence[View]) -> Cameras:
         cy=Ks[:, 1, 2],
         width=torch.tensor([view.camera.width for view in views]),
         height=torch.tensor([view.camera.height for view in views]),
+        metadata={},  # ns-export cameras wants some
     )
 
 

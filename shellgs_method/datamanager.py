@@ -16,6 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -28,6 +29,7 @@ from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
 from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps, seen_through
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
+from shellgs_method.host import NO_RAYS, Refused
 from shellgs_method.reference import Reference
 from shellgs_method.seeding import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
 
@@ -183,6 +185,12 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     """Full images with cue maps, cached on any machine."""
 
     config: FacadeDataManagerConfig
+    train_pixel_sampler = Refused(NO_RAYS)
+
+    @cached_property
+    def eval_dataloader(self) -> FixedIndicesEvalDataloader:
+        """Held-out views, from the first of which ns-render starts a spiral."""
+        return FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
 
     def create_train_dataset(self) -> FacadeDataset:
         """Training views, whose maps leave out the held-out bands."""

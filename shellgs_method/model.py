@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Optional, cast
+from typing import Any, Literal, NamedTuple, NoReturn, Optional
 
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.model_components import renderers
 from nerfstudio.models.splatfacto import (
     RGB2SH,
     SH2RGB,
@@ -46,10 +47,12 @@ from shellgs_method.geometry import (
     rendered_geometry,
     squared_depths,
 )
+from shellgs_method.host import NO_FIELD, NO_RAYS, NO_RGBA, Refused, refuse
 from shellgs_method.limits import MIN_POINTS
 from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.nearest import point_tree
+from shellgs_method.panorama import is_pinhole, render_around
 from shellgs_method.rasterizer import rasterize, spherical_harmonics
 from shellgs_method.seeding import Seeds
 from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
@@ -142,6 +145,8 @@ class FacadeModelConfig(SplatfactoModelConfig):
     loss_coefficients: Suppress[dict[str, float]] = field(default_factory=dict)
     eval_num_rays_per_chunk: Suppress[int] = 4096
     prompt: Suppress[Optional[str]] = None
+
+    sdf_field = Refused(NO_FIELD)
 
 
 class FacadeModel(SplatfactoModel):
@@ -343,15 +348,27 @@ class FacadeModel(SplatfactoModel):
         return dict(self.gauss_params) | ({} if self.surface is None else {"surface": self.surface})
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Optional[OrientedBox] = None) -> dict[str, Tensor]:
-        """Render one camera outside training, within a crop box if given."""
+        """Render one camera outside training, within a crop box if given.
+
+        In a panorama or through a fisheye lens, ``depth`` is the distance from the camera.
+
+        Raises:
+            SceneError: the camera is of a type that cannot be rendered.
+        """
         self.set_crop(obb_box)
+        camera = camera.to(self.device)
+        return self._outside_training(camera) if is_pinhole(camera) else render_around(camera, self._outside_training)
+
+    def _outside_training(self, camera: Cameras) -> dict[str, Tensor]:
         # The kernels compiled on a CPU for training serve here too; without gradients, they would be compiled again.
         with torch.set_grad_enabled(self.device.type == "cpu"):
-            outputs = self.get_outputs(camera.to(self.device))
+            outputs = self.get_outputs(camera)
         return {name: output.detach() for name, output in outputs.items()}
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
-        """Render one camera; geometry is skipped in training where no loss needs it."""
+        """Render one pinhole camera; geometry is skipped in training where no loss needs it."""
+        if not isinstance(camera, Cameras):
+            refuse(NO_RAYS)
         self._threads.follow()
         pinhole = pinhole_camera(camera)
         background = self._get_background_color()
@@ -360,7 +377,7 @@ class FacadeModel(SplatfactoModel):
             self.surface = None
         gaussians = self._inside_crop()
         if len(gaussians["means"]) == 0:
-            return cast(dict[str, Tensor], self.get_empty_outputs(pinhole.width, pinhole.height, background))
+            return _nothing(pinhole, background)
         features, origin = self._features(gaussians, pinhole, background)
         composited, alpha, self.info = self._rasterize(gaussians, features, pinhole)
         if self.training:
@@ -383,6 +400,14 @@ class FacadeModel(SplatfactoModel):
                 outputs["depth"] = self._mode_of_depth(outputs["depth"], gaussians, features, pinhole)
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
         return outputs
+
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: object) -> NoReturn:
+        """Refuse what commands for radiance fields ask for."""
+        refuse(NO_RAYS)
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> NoReturn:
+        """Refuse an output of ns-render that mixes two."""
+        refuse(NO_RGBA)
 
     def _mode_of_depth(
         self,
@@ -466,6 +491,11 @@ class FacadeModel(SplatfactoModel):
     def shs_0(self) -> Float[Tensor, "N 3"]:
         """First coefficient of the harmonics, as ns-export writes it."""
         return self.features_dc
+
+    def _get_background_color(self) -> Float[Tensor, "3"]:
+        """Colour behind the Gaussians: the setting's, or of a cropped image outside training that of the crop."""
+        of_crop = renderers.BACKGROUND_COLOR_OVERRIDE  # a context of ns-render and the viewer
+        return super()._get_background_color() if of_crop is None or self.training else of_crop.to(self.device)
 
     def _inside_crop(self) -> dict[str, Tensor]:
         """The Gaussians, or in the viewer those inside its crop box."""
@@ -555,3 +585,11 @@ class FacadeModel(SplatfactoModel):
         for prefix, reference in references(batch, self.device).items():
             images |= {prefix + name: image for name, image in geometry_images(rendering, reference).items()}
         return metrics, images
+
+
+def _nothing(camera: Camera, background: Float[Tensor, "3"]) -> dict[str, Tensor]:
+    """Outputs of a view of no Gaussian, as where none is in the crop box."""
+    black = background.new_zeros(camera.height, camera.width, 3)
+    image, nowhere = background.expand_as(black), black[..., :1]
+    normal = normals_to_colours(black)
+    return {"rgb": image, "accumulation": nowhere, "background": image, "depth": nowhere, "normal": normal}

@@ -19,6 +19,7 @@ from dataparsers.errors import SceneError, refusals_end_the_program
 from shellgs_method.checkpoints import check_gaussians, guard_checkpoint_loading
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.evaluation import mean_over_views
+from shellgs_method.host import mend_commands
 from shellgs_method.model import FacadeModel
 from shellgs_method.surface_weights import SurfaceWeights
 from shellgs_method.viewer import ContradictedShell
@@ -52,6 +53,7 @@ class FacadePipeline(VanillaPipeline):
 
     def __init__(self, config: FacadePipelineConfig, *args, **kwargs):
         guard_checkpoint_loading()
+        mend_commands()
         with refusals_end_the_program():
             super().__init__(config, *args, **kwargs)
             model, datamanager = self.model, self.datamanager
