@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from dataparsers.errors import SceneError
 from shellgs_method import cli
 from shellgs_method.batches import pinhole_camera
 from shellgs_method.environment import examine
@@ -182,3 +183,9 @@ def test_the_doctor_reports_where_it_looks_for_lpips_weights(tmp_path, monkeypat
     weights.parent.mkdir(parents=True)
     weights.touch()
     assert next(finding for finding in examine() if finding.subject == "LPIPS weights").works
+
+
+@pytest.mark.parametrize("name", ["scene.glb", "scene.spz", "scene.splat", "scene"])
+def test_splats_are_not_written_as_a_ply_under_another_name(tmp_path, name):
+    with pytest.raises(SceneError, match=f"{name}: splats are written as ply: name a file that ends in .ply"):
+        cli.splats(tmp_path / "config.yml", tmp_path / name)

@@ -20,6 +20,7 @@ from shellgs_method.export import Box, DepthView, Frame, decimate, fuse, scene_f
 from shellgs_method.export.runs import TrainedRun, mesh_errors
 from shellgs_method.shell import Alignment, ShellCaster, ShellMesh, load_shell
 from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.sim.building import Reconstruction
 from shellgs_method.synthetic.building import Layout, building
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 
@@ -172,6 +173,18 @@ def test_usd_is_a_static_collider_of_the_triangles_in_metres(sphere, tmp_path, s
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.parametrize("suffix", [".usda", ".glb"])
+def test_a_mesh_of_unknown_unit_is_in_metres_where_its_format_states_one_and_says_so(sphere, tmp_path, suffix):
+    """USD that states none is read in centimetres; glTF is in metres by its specification."""
+    write_mesh(tmp_path / f"mesh{suffix}", sphere, scene_frame())
+    about = json.loads((tmp_path / "mesh.json").read_text())
+    assert (about["unit"], about["unit_in_file"]) == ("unknown", "metre")
+    if suffix == ".usda":
+        header = (tmp_path / "mesh.usda").read_text().split("def Mesh")[0]
+        assert "metersPerUnit = 1\n" in header
+        assert "The unit is unknown" in header
+
+
 @pytest.fixture(scope="module")
 def run(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedRun:
     """A run that renders the true building instead of its Gaussians."""
@@ -227,6 +240,25 @@ def test_surfaces_far_from_the_shell_are_not_part_of_the_facade(run, facade):
     np.testing.assert_array_equal(kept.bounds, kept.bounds.clip(*facade.bounds))
     with pytest.raises(SceneError, match=r"within 0\.5 m of the shell"):
         run.facade(lifted, 0.5)
+
+
+def test_the_resolution_is_a_pixel_on_the_facade_in_the_nearest_view(run):
+    pixels = [
+        np.median(view.depth[view.depth > 0]) / view.camera.K[0, 0].item() for view in run.views() if view.depth.any()
+    ]
+    assert run.resolution(run.box(0.5)) == pytest.approx(min(pixels), rel=0.2)
+
+
+def test_voxels_finer_than_half_of_what_the_photographs_resolve_are_refused(run):
+    resolved = run.resolution(run.box(0.5))
+    with pytest.raises(SceneError, match=rf"finer than the photographs resolve, whose pixels are {resolved:.2g} m"):
+        run.surface(0.5, 0.49 * resolved)
+    assert len(run.surface(0.5, 0.55 * resolved, list(run.views())[:4]).faces) > 1000
+
+
+def test_simulations_refuse_such_voxels_too(run):
+    with pytest.raises(SceneError, match="finer than the photographs resolve"):
+        Reconstruction.of(run, 1000, 0.003, None, None)
 
 
 def test_a_scene_without_alignment_is_meshed_in_its_own_frame(run, pristine_scene, monkeypatch):

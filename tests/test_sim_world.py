@@ -70,12 +70,12 @@ def some_splats(count: int = 5) -> Splats:
     return Splats(*(torch.randn(count, *shape, generator=generator) for shape in shapes))
 
 
-def write_building(folder: Path, collider: Collider, name: str = "facade", place: str = "") -> Building:
+def write_building(folder: Path, collider: Collider, name: str = "facade", place: str = "", metric=True) -> Building:
     (folder / place).mkdir(parents=True, exist_ok=True)
     write_parts(folder / place, collider.parts)
     look = painted(collider.surface)
     write_visual(folder / place, look, 30)
-    write_usd_layers(folder / place, look, collider.parts, some_splats(), 1.0)
+    write_usd_layers(folder / place, look, collider.parts, some_splats(), metric)
     return Building(name, place, len(collider.parts))
 
 
@@ -84,7 +84,7 @@ def world(collider, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("world")
     building = write_building(folder, collider)
     write_worlds(folder, [building])
-    write_usd_world(folder / "facade.usda", [building], 1.0, True)
+    write_usd_world(folder / "facade.usda", [building], metric=True, with_splats=True)
     return folder
 
 
@@ -213,6 +213,19 @@ def test_the_sdf_is_a_static_world(world, collider):
     assert len(models[1].findall("link/collision")) == len(collider.parts)
 
 
+def test_usd_of_an_unknown_unit_states_the_metre_in_every_layer(collider, tmp_path):
+    pxr = import_pxr()
+    building = write_building(tmp_path, collider, metric=False)
+    write_usd_world(tmp_path / "facade.usda", [building], metric=False, with_splats=True)
+    layers = [tmp_path / "facade.usda", *(tmp_path / "usd").iterdir()]
+    assert len(layers) == 4
+    for layer in layers:
+        stage = pxr.Usd.Stage.Open(str(layer))
+        assert stage.HasAuthoredMetadata("metersPerUnit")
+        assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 1
+        assert "unit is unknown" in stage.GetRootLayer().comment
+
+
 @pytest.mark.parametrize("look", ["mesh", "splats"])
 def test_the_usd_is_compliant(world, look):
     pxr = import_pxr()
@@ -283,7 +296,7 @@ def test_two_buildings_are_one_world(collider, tmp_path):
     )
     buildings = [write_building(tmp_path, one, name, name) for one, name in ((collider, "left"), (away, "right"))]
     write_worlds(tmp_path, buildings)
-    write_usd_world(tmp_path / "facade.usda", buildings, 1.0, True)
+    write_usd_world(tmp_path / "facade.usda", buildings, metric=True, with_splats=True)
     model = load(tmp_path / "facade.xml")
     assert {model.body(k).name for k in range(1, model.nbody)} == {"left", "right"}
     assert yourdfpy.URDF.load(str(tmp_path / "facade.urdf")).validate()

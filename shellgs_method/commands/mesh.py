@@ -26,13 +26,14 @@ def mesh(
     Args:
         config: The run's config.yml.
         output: Mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
-        voxel: Voxel size in metres. If not set: the size of a pixel on the facade.
+        voxel: Voxel size in metres, at least half of what the photographs resolve. If not set: the size of a pixel on
+            the facade.
         faces: Number of triangles that the mesh is decimated to.
         margin: Distance from the shell, in metres, beyond which geometry is left out.
         up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
-    from shellgs_method.export import check_mesh_format, decimate, fuse, write_mesh
+    from shellgs_method.export import METRE_FORMATS, check_mesh_format, decimate, write_mesh
     from shellgs_method.export.runs import TrainedRun, mesh_errors
 
     output = output or config.with_name("mesh.ply")
@@ -40,12 +41,14 @@ def mesh(
     if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
         raise SceneError("--faces must be at least 4, --voxel above 0 and --margin at least 0")
     run = TrainedRun.load(config, up)
-    made = decimate(run.facade(fuse(run.views(), run.box(margin), voxel), margin), faces)
+    made = decimate(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, made)
     write_mesh(output, made, run.frame, metrics)
     truth = {name.removeprefix("truth_"): value for name, value in metrics.items() if name.startswith("truth_")}
     rows = {name: row for name, row in (("shell", metrics), ("truth", truth)) if "rendered" in row}
     console.print(f"{output}: {len(made.faces)} triangles, voxels of {made.metadata['voxel']:.3g}. {place(run.frame)}")
+    if not run.frame.metric and output.suffix.lower() in METRE_FORMATS:
+        console.print(f"A {output.suffix} file is in metres, so programs take this unit for the metre: scale it there.")
     if rows:
         console.print(rich_table(rows, SURFACE_COLUMNS, "Mesh in the held-out views, against"))
     if "area_near_shell" in metrics:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Optional
 
-from dataparsers.errors import check_output
 from shellgs_method.commands.common import RunConfig, UpAxis, console, place
 
 
@@ -23,11 +22,11 @@ def splats(
         output: Output ply. If not set: splats.ply beside the config.
         up: Axis of the shell's frame that points up, written to the json. If not set: y for a glTF shell, else z.
     """
-    from shellgs_method.export import write_splats
+    from shellgs_method.export import check_splats_format, write_splats
     from shellgs_method.export.runs import TrainedRun
 
     output = output or config.with_name("splats.ply")
-    check_output(output)
+    check_splats_format(output)
     run = TrainedRun.load(config, up)
     count = write_splats(output, run.splats())
     run.frame.describe(output, {"splats": count})

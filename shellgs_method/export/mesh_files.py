@@ -19,6 +19,8 @@ USD_FORMATS = (".usd", ".usda", ".usdc")
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turns z-up coordinates into y-up ones."""
 MESH_FORMATS = (".ply", ".obj", ".glb", *USD_FORMATS)
+METRE_FORMATS = (".glb", *USD_FORMATS)
+"""Formats whose unit is the metre, even if it is unknown: glTF by its specification, USD by :func:`set_unit`."""
 
 
 def check_mesh_format(path: Path) -> None:
@@ -37,8 +39,8 @@ def check_mesh_format(path: Path) -> None:
 def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | None = None) -> None:
     """Write a mesh, and beside it (``.json``) its frame, the offset of georeferenced coordinates, and ``facts``.
 
-    glTF is y-up by its specification, so coordinates are rotated for it; USD states its up axis and unit; ply and obj
-    state neither. Coordinates in the files are float32, which is why the frame is near the facade.
+    glTF is y-up and in metres by its specification, so coordinates are rotated for it; USD states its up axis and unit;
+    ply and obj state neither. Coordinates in the files are float32, which is why the frame is near the facade.
     """
     check_mesh_format(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -51,7 +53,18 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
         with atomic_write(path) as file:
             file.write(content.encode() if isinstance(content, str) else content)
     about = {"up_in_file": "y" if turned else frame.up, "faces": len(mesh.faces)}
+    about |= {"unit_in_file": "metre"} if format in METRE_FORMATS else {}
     frame.describe(path, about | mesh.metadata | (facts or {}))
+
+
+def set_unit(UsdGeom: Any, stage: Any, metric: bool) -> None:
+    """State the metre as the unit of a USD stage, and in its comment whether it is unknown.
+
+    Every reader takes a stage that states none for centimetres.
+    """
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    if not metric:
+        stage.GetRootLayer().comment = "The unit is unknown: metersPerUnit is 1 because a stage must state it."
 
 
 def _usd_modules(path: Path) -> tuple[Any, ...]:
@@ -72,8 +85,7 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
     try:
         stage = Usd.Stage.CreateNew(str(temporary))
         UsdGeom.SetStageUpAxis(stage, frame.up.upper())
-        if frame.metric:
-            UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        set_unit(UsdGeom, stage, frame.metric)
         prim = UsdGeom.Mesh.Define(stage, "/facade")
         stage.SetDefaultPrim(prim.GetPrim())
         points = np.ascontiguousarray(mesh.vertices, dtype=np.float32)

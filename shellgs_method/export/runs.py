@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32, Float64
 from rich.progress import track
 
-from dataparsers.camera import positions
+from dataparsers.camera import in_view, positions
 from dataparsers.errors import SceneError
 from dataparsers.photograph import load_mask
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
@@ -21,7 +21,7 @@ from shellgs_method.evaluation import Rendering, mean_over_views
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.export.frame import Box, Frame, UpAxis, scene_frame, shell_frame
 from shellgs_method.export.splats import Splats
-from shellgs_method.export.tsdf import DepthView
+from shellgs_method.export.tsdf import DepthView, fuse
 from shellgs_method.model import FacadeModel, reference_errors
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
 from shellgs_method.shell.geometry.files import up_axis
@@ -37,6 +37,8 @@ SCENE_MARGIN = 0.05
 """Margin around the SfM points as a share of their box, if there is no shell to bound the facade."""
 SCENE_TRIM = 0.02
 """Share of the SfM points beyond each face of that box, before the margin is added."""
+RESOLVED_BY = 10
+"""SfM points on the facade that a view must show to say what it resolves there."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +111,44 @@ class TrainedRun:
         """The facade's box: the shell's, wider by ``margin`` metres, or else that of most SfM points."""
         if self.shell is not None:
             return Box.around(self.shell_in_frame.vertices, margin)
-        assert self.model.seed_points is not None
-        to_frame = np.linalg.inv(self.frame.to_scene) @ self.model_to_scene
-        points = transformed(self.model.seed_points[0].double().cpu().numpy(), to_frame)
-        box = Box.around(points, 0.0, SCENE_TRIM)
+        box = Box.around(self.sfm_points, 0.0, SCENE_TRIM)
         widened = SCENE_MARGIN * box.size
         return replace(box, low=box.low - widened, high=box.high + widened)
+
+    @cached_property
+    def sfm_points(self) -> Float64[np.ndarray, "N 3"]:
+        """The SfM points in the frame."""
+        assert self.model.seed_points is not None
+        to_frame = np.linalg.inv(self.frame.to_scene) @ self.model_to_scene
+        return transformed(self.model.seed_points[0].double().cpu().numpy(), to_frame)
+
+    def resolution(self, box: Box) -> float:
+        """What the photographs resolve inside a box: a pixel's size at the SfM points there, in the nearest view.
+
+        In the frame's unit; 0 if no view shows enough points.
+        """
+        points = self.sfm_points[box.contains(self.sfm_points)]
+        cameras = [self.frame.camera(view.camera) for dataset in self.datasets for view in dataset.views]
+        depths = [(in_view(camera, points)[2], float(camera.K[0, 0])) for camera in cameras]
+        return min((np.median(depth) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY), default=0.0)
+
+    def surface(
+        self, margin: float, voxel: float | None = None, views: Iterable[DepthView] | None = None
+    ) -> trimesh.Trimesh:
+        """Fuse the views, or those given, into a mesh of the facade; see :func:`fuse` and :meth:`facade`.
+
+        Raises:
+            SceneError: nothing is rendered there, or the voxels are finer than half of what the photographs resolve:
+                between their pixels no voxel is seen, and the mesh falls into crumbs.
+        """
+        box = self.box(margin)
+        if voxel is not None and voxel > 0 and voxel < (resolved := self.resolution(box)) / 2:
+            unit = " m" if self.frame.metric else ""
+            raise SceneError(
+                f"voxels of {voxel:g}{unit} are finer than the photographs resolve, whose pixels are {resolved:.2g}"
+                f"{unit} on the facade: give a --voxel of at least half of that, or leave it out"
+            )
+        return self.facade(fuse(self.views() if views is None else views, box, voxel), margin)
 
     def facade(self, mesh: trimesh.Trimesh, margin: float) -> trimesh.Trimesh:
         """The part of a mesh within ``margin`` metres of the shell; all of it if there is no shell.

@@ -12,6 +12,7 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from dataparsers.errors import SceneError, check_output
 from dataparsers.files import atomic_write
 from shellgs_method.rasterizer import spherical_harmonics
 from shellgs_method.shell.geometry.similarity import scale_of
@@ -64,6 +65,17 @@ def harmonics_rotation(rotation: Float64[Tensor, "3 3"], degree: int) -> Float64
     each = torch.eye(count, dtype=torch.float64).expand(len(directions), count, count)
     turned = spherical_harmonics(degree, directions @ rotation, each)
     return torch.linalg.lstsq(spherical_harmonics(degree, directions, each), turned).solution
+
+
+def check_splats_format(path: Path) -> None:
+    """Refuse an output that cannot be written, before hours of work.
+
+    Raises:
+        SceneError: it is not named as a ply, or the path is not writable.
+    """
+    if path.suffix.lower() != ".ply":
+        raise SceneError(f"{path}: splats are written as ply: name a file that ends in .ply")
+    check_output(path)
 
 
 def write_splats(path: Path, splats: Splats) -> int:

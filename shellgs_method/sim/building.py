@@ -15,7 +15,7 @@ from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import find_cues
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask, load_photograph
-from shellgs_method.export import DepthView, decimate, fuse
+from shellgs_method.export import DepthView, decimate
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
 from shellgs_method.shell import ShellCaster, shell_verdicts
@@ -74,7 +74,7 @@ class Reconstruction:
         """
         views = [view for dataset in run.datasets for view in dataset.views]
         hidden: list[np.ndarray] = []
-        fused = decimate(run.facade(fuse(_views_and_occlusions(run, hidden), run.box(MARGIN), voxel), MARGIN), faces)
+        fused = decimate(run.surface(MARGIN, voxel, _views_and_occlusions(run, hidden)), faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
         frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground)
         folder = Path(run.datamanager.config.dataparser.data)
@@ -136,7 +136,8 @@ class Reconstruction:
         if self.shell is None:
             log(
                 f"{self.scene} has no aligned shell: the frame is the scene's, rotated upright by the cameras' up "
-                "axes, its unit is unknown, and the collision geometry comes from the reconstruction alone."
+                "axes, its unit is unknown, so that simulators take it for the metre, and the collision geometry comes "
+                "from the reconstruction alone."
             )
 
 

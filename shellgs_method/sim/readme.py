@@ -67,7 +67,7 @@ def write_readme(out: Path, buildings: Sequence[Building], frame: SimFrame, metr
     where = (
         "Coordinates are metres along the shell's axes; the origin is on the ground in front of the facade."
         if frame.metric
-        else "The scene has no aligned shell: the unit of length is unknown."
+        else "The scene has no aligned shell: the unit of length is unknown, and the files state the metre."
     )
     several = len(buildings) > 1
     text = _TEXT.format(

@@ -15,7 +15,8 @@ class SimSettings:
     faces: int = 50_000
     """Number of triangles to decimate the reconstruction to."""
     voxel: Optional[float] = None
-    """Voxel size in metres for fusing the views. If not set: a pixel's size on the facade."""
+    """Voxel size in metres for fusing the views, at least half of what the photographs resolve. If not set: a pixel's
+    size on the facade."""
     texel: Optional[float] = None
     """Size of a texture pixel in metres. If not set: a little finer than the photographs."""
     megabytes: float = 30.0

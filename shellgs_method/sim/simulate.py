@@ -78,8 +78,7 @@ def simulate(
         buildings.append(Building(names[-1], folder, len(chapter.collider.parts)))
     assert home is not None
     write_worlds(out, buildings)
-    unit = 1.0 if home.metric else None
-    write_usd_world(out / "facade.usda", buildings, unit, all(chapter.with_splats for chapter in chapters))
+    write_usd_world(out / "facade.usda", buildings, home.metric, all(chapter.with_splats for chapter in chapters))
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
     metrics = write_report(out, buildings, chapters, log)
     write_readme(out, buildings, home, metrics)
@@ -113,7 +112,7 @@ def _building(
     textured = bake(fused, colours, made.photos, settings.texel)
     facts = write_visual(folder, textured, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
-    with_splats = write_usd_layers(folder, textured, collider.parts, made.splats, 1.0 if made.frame.metric else None)
+    with_splats = write_usd_layers(folder, textured, collider.parts, made.splats, made.frame.metric)
     deviations: Deviations | None = None
     if shell is not None:
         views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]

@@ -13,6 +13,7 @@ import torch
 
 from dataparsers.errors import SceneError
 from dataparsers.files import unfinished
+from shellgs_method.export.mesh_files import set_unit
 from shellgs_method.export.splats import Splats
 from shellgs_method.sim.parts import Part
 from shellgs_method.sim.texture import TexturedMesh
@@ -23,9 +24,7 @@ LAYERS = "usd"
 """Folder of the binary layers that ``facade.usda`` refers to, beside the building's other files."""
 
 
-def write_usd_layers(
-    folder: Path, mesh: TexturedMesh, parts: Sequence[Part], splats: Splats, unit: float | None
-) -> bool:
+def write_usd_layers(folder: Path, mesh: TexturedMesh, parts: Sequence[Part], splats: Splats, metric: bool) -> bool:
     """Write visual mesh, colliders and splats of a building, each as a layer.
 
     Args:
@@ -33,31 +32,31 @@ def write_usd_layers(
         mesh: visual mesh, with one texture coordinate for each vertex.
         parts: convex parts.
         splats: Gaussians in the frame of the mesh.
-        unit: metres per unit of the frame; None if unknown.
+        metric: whether the frame's unit is the metre; otherwise it is unknown.
 
     Returns:
         Whether this USD supports splats: their schema is standard since 26.03.
     """
     pxr = import_pxr()
     (folder / LAYERS).mkdir(exist_ok=True)
-    with _Stage(pxr, folder / LAYERS / "visual.usdc", unit) as stage:
+    with _Stage(pxr, folder / LAYERS / "visual.usdc", metric) as stage:
         _visual(pxr, stage, mesh)
-    with _Stage(pxr, folder / LAYERS / "collision.usdc", unit) as stage:
+    with _Stage(pxr, folder / LAYERS / "collision.usdc", metric) as stage:
         _colliders(pxr, stage, parts)
     if not hasattr(pxr.UsdVol, "ParticleField3DGaussianSplat"):
         return False
-    with _Stage(pxr, folder / LAYERS / "splats.usdc", unit) as stage:
+    with _Stage(pxr, folder / LAYERS / "splats.usdc", metric) as stage:
         _particles(pxr, stage, splats)
     return True
 
 
-def write_usd_world(path: Path, buildings: Sequence[Building], unit: float | None, with_splats: bool) -> None:
+def write_usd_world(path: Path, buildings: Sequence[Building], metric: bool, with_splats: bool) -> None:
     """Write the stage that places the buildings' layers on level ground, with gravity.
 
     Mesh and splats show the same surface: a variant set ``look`` of each building selects one of them.
     """
     pxr = import_pxr()
-    with _Stage(pxr, path, unit, root="World") as stage:
+    with _Stage(pxr, path, metric, root="World") as stage:
         scene = pxr.UsdPhysics.Scene.Define(stage, "/World/physics")
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0, 0, -1))
         scene.CreateGravityMagnitudeAttr(9.81)
@@ -101,12 +100,11 @@ def _refer(pxr: SimpleNamespace, stage, prim, building: Building, child: str) ->
 class _Stage:
     """A z-up stage with its unit; the file gets its name once it is complete."""
 
-    def __init__(self, pxr: SimpleNamespace, path: Path, unit: float | None, root: str = "") -> None:
+    def __init__(self, pxr: SimpleNamespace, path: Path, metric: bool, root: str = "") -> None:
         self._path, self._temporary = path, unfinished(path, path.suffix)
         self._stage = pxr.Usd.Stage.CreateNew(str(self._temporary))
         pxr.UsdGeom.SetStageUpAxis(self._stage, "Z")
-        if unit is not None:
-            pxr.UsdGeom.SetStageMetersPerUnit(self._stage, unit)
+        set_unit(pxr.UsdGeom, self._stage, metric)
         if root:
             self._stage.SetDefaultPrim(pxr.UsdGeom.Xform.Define(self._stage, f"/{root}").GetPrim())
 
