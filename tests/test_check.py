@@ -138,7 +138,7 @@ def test_what_photographs_do_not_count_for_is_found_nowhere(colour: list[int]):
     assert (found.score[ignored] == -1).all()
     assert (both.score[ignored] == -1).all()
     assert not both.beyond[ignored].any()
-    spread = np.asarray(binary_dilation(ignored, iterations=6))  # the window of the filter that smooths scores
+    spread = np.asarray(binary_dilation(ignored, iterations=6), bool)  # the window of the filter that smooths scores
     _, unspoilt = agreed(whole)
     agree = (both.score > CONTRADICTED) == (unspoilt.score > CONTRADICTED)
     assert agree.numpy()[~spread].mean() > 0.97

@@ -130,7 +130,9 @@ class TrainedRun:
         points = self.sfm_points[box.contains(self.sfm_points)]
         cameras = [self.frame.camera(view.camera) for dataset in self.datasets for view in dataset.views]
         depths = [(in_view(camera, points)[2], float(camera.K[0, 0])) for camera in cameras]
-        return min((np.median(depth) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY), default=0.0)
+        return min(
+            (float(np.median(depth)) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY), default=0.0
+        )
 
     def surface(
         self, margin: float, voxel: float | None = None, views: Iterable[DepthView] | None = None
