@@ -20,6 +20,7 @@ from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps, find_cues
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.layout import SceneLayout
+from dataparsers.orientation import oriented
 from dataparsers.photograph import View, undistort
 from dataparsers.shots import Recording, Shot
 from dataparsers.sparse_points import find_sparse_points
@@ -130,7 +131,7 @@ def _views(shots: Sequence[Shot], layout: SceneLayout) -> list[View]:
                 pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K).double(), image.shape[1], image.shape[0])
             camera = replace(pinholes[key], viewmat=camera.viewmat)
         views.append(View(shot.name, shot.image, camera, lens, masks.get(shot.name)))
-    return views
+    return oriented(views, layout)
 
 
 def _lens(shot: Shot) -> Cameras:

@@ -32,6 +32,7 @@ class View:
         camera: the undistorted camera of the photograph, in the scene's own frame and units.
         lens: the calibrated camera, if it has lens distortion.
         mask: the user's mask file (white is kept), if there is one.
+        turned: whether the camera is of the photograph turned by its EXIF orientation, though the shape does not tell.
     """
 
     name: str
@@ -39,6 +40,7 @@ class View:
     camera: Camera
     lens: Cameras | None = None
     mask: Path | None = None
+    turned: bool = False
 
 
 def load_photograph(view: View) -> UInt8[np.ndarray, "H W 3"]:
@@ -80,8 +82,8 @@ def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[n
 def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
     """Map pixels of the photograph's file to the view's undistorted camera.
 
-    Where the EXIF orientation rotates the image, and the camera's shape shows that SfM rotated it too, they are pixels
-    of the rotated image, which is what an image viewer shows.
+    Where the EXIF orientation rotates the image, and the camera is of the rotated one, they are pixels of that, which
+    is what an image viewer shows.
 
     Raises:
         SceneError: the image cannot be read, or its aspect ratio is not the camera's.
@@ -214,9 +216,10 @@ def _calibrated_size(view: View) -> tuple[int, int]:
 
 
 def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:
-    """Apply the EXIF orientation if SfM did, which the shape of its camera shows."""
+    """Apply the EXIF orientation if SfM did, which the shape of its camera shows, or what is known of the view."""
     width, height = _calibrated_size(view)
-    for candidate in (image, ImageOps.exif_transpose(image)):
+    turned = ImageOps.exif_transpose(image)
+    for candidate in (turned, image) if view.turned else (image, turned):
         aspect = candidate.width / candidate.height
         rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which matters in thumbnails
         if abs(width - height * aspect) < max(0.01 * width, rounding):

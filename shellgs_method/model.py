@@ -212,8 +212,12 @@ class FacadeModel(SplatfactoModel):
             )
 
     def _seed_points(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-        if self.seed_points is None or len(self.seed_points[0]) < MIN_POINTS:
-            raise SceneError("The scene has no SfM points to start from: its COLMAP model or ply_file_path is empty.")
+        count = 0 if self.seed_points is None else len(self.seed_points[0])
+        if self.seed_points is None or count < MIN_POINTS:
+            raise SceneError(
+                f"the scene has {count or 'no'} SfM points to start from, of at least {MIN_POINTS}: its COLMAP model "
+                "or ply_file_path has too few"
+            )
         points, colours = self.seed_points[0].float(), self.seed_points[1].float() / 255
         if self.config.densification == "mcmc":
             kept = torch.randperm(len(points))[: self.config.mcmc.cap_max]

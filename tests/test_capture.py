@@ -11,6 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from av.stream import Disposition
 from PIL import ExifTags, Image, ImageFilter
 from rich.progress import Progress
 from scipy.ndimage import gaussian_filter
@@ -119,6 +120,54 @@ def test_frames_of_a_rotated_video_are_upright(tmp_path):
     with Image.open(next((tmp_path / "frames").iterdir())) as frame:
         assert frame.size == (48, 64)
         assert is_red(frame, 44, 4)
+
+
+def add_streams(path: Path, *streams: tuple[tuple[int, int], int, dict[str, object]]) -> None:
+    """A file of several video streams: size, number of frames and properties of each; blue but for the last, red."""
+    with av.open(str(path), "w") as container:
+        made = []
+        for size, count, properties in streams:
+            is_cover = "disposition" in properties
+            stream = container.add_stream("mjpeg" if is_cover else "mpeg4", rate=5)
+            stream.width, stream.height, stream.pix_fmt = *size, "yuvj420p" if is_cover else "yuv420p"
+            for name, value in properties.items():
+                setattr(stream if name == "disposition" else stream.codec_context, name, value)
+            made.append((stream, size, count))
+        for stream, size, count in made:
+            colour = "red" if stream is made[-1][0] else "blue"
+            for _ in range(count):
+                container.mux(stream.encode(av.VideoFrame.from_image(Image.new("RGB", size, colour))))
+            container.mux(stream.encode())
+
+
+@pytest.mark.parametrize(
+    "first",
+    [((32, 24), 5, {}), ((128, 96), 1, {}), ((128, 96), 1, {"disposition": Disposition.attached_pic})],
+    ids=["proxy", "picture", "cover"],
+)
+def test_frames_are_of_the_largest_video_not_of_a_proxy_or_cover(tmp_path, caplog, first):
+    add_streams(tmp_path / "walk.mp4", first, ((64, 48), 5, {}))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 3, QUIET)
+    with Image.open(next((tmp_path / "frames").iterdir())) as frame:
+        assert frame.size == (64, 48)
+        assert is_red(frame, 30, 30)
+    assert ("holds 2 videos of 32x24, 64x48 pixels: 64x48 is used" in caplog.text) == (first[0] == (32, 24))
+
+
+def test_a_file_of_a_cover_alone_is_refused(tmp_path):
+    add_streams(tmp_path / "song.mp4", ((64, 48), 1, {}))
+    with pytest.raises(SceneError, match=r"song.mp4 holds no video, but 1 pictures"):
+        extract_frames(tmp_path / "song.mp4", tmp_path, 3, QUIET)
+
+
+@pytest.mark.parametrize(("characteristic", "name"), [(18, "HLG"), (16, "PQ"), (1, None)])
+def test_the_flat_colours_of_an_hdr_video_are_told(tmp_path, caplog, characteristic, name):
+    add_streams(tmp_path / "walk.mkv", ((64, 48), 5, {"color_trc": characteristic}))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mkv", tmp_path / "frames", 3, QUIET)
+    assert ("without tone mapping" in caplog.text) == (name is not None)
+    assert f"is HDR ({name})" in caplog.text or name is None
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no video" * 100])

@@ -141,7 +141,7 @@ def test_what_photographs_do_not_count_for_is_found_nowhere(colour: list[int]):
     spread = np.asarray(binary_dilation(ignored, iterations=6), bool)  # the window of the filter that smooths scores
     _, unspoilt = agreed(whole)
     agree = (both.score > CONTRADICTED) == (unspoilt.score > CONTRADICTED)
-    assert agree.numpy()[~spread].mean() > 0.97
+    assert agree.numpy()[np.logical_not(spread)].mean() > 0.97
 
 
 def test_what_a_mirror_shows_is_found_behind_the_wall():

@@ -234,6 +234,95 @@ def test_any_photograph_becomes_8_bit_rgb_of_its_cameras_size(scene, kind):
     np.testing.assert_allclose(loaded[..., :3], np.repeat(picture[..., None], 3, axis=2), atol=1)
 
 
+# EXIF orientations that do not change the shape of a photograph
+
+STORED = {2: np.fliplr, 3: lambda pixels: np.rot90(pixels, 2), 4: np.flipud, 6: np.rot90}
+"""How the upright photograph is stored, by orientation."""
+
+
+def store_turned(scene: Path, orientation: int, which: slice = slice(None)) -> dict[str, np.ndarray]:
+    """Store photographs turned, with their orientation in EXIF; returns the upright ones."""
+    upright = {}
+    for path in sorted((scene / "images").iterdir())[which]:
+        with Image.open(path) as image:
+            upright[path.stem] = np.asarray(image.convert("RGB"))
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        stored = Image.fromarray(np.ascontiguousarray(STORED[orientation](upright[path.stem])))
+        stored.save(path.with_suffix(".jpg"), exif=exif, quality=97, subsampling=0)
+        path.unlink()
+    respell(scene, lambda path: path.replace(".png", ".jpg") if Path(path).stem in upright else path)
+    return upright
+
+
+def turn_cameras(scene: Path) -> None:
+    """Make the cameras those of photographs that are stored turned by half a turn."""
+    transforms = json.loads((scene / "transforms.json").read_text())
+    transforms |= {"cx": transforms["w"] - transforms["cx"], "cy": transforms["h"] - transforms["cy"]}
+    for frame in transforms["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, -1, 1, 1])).tolist()
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+
+
+def without_colours(scene: Path) -> None:
+    lines = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {axis}" for axis in "xyz"), "end_header"]
+    (scene / "sparse_pc.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "0 0 1"]) + "\n")
+
+
+def differences(scene: Path, upright: dict[str, np.ndarray]) -> list[float]:
+    views = [view for view in read_views(FacadeDataParserConfig(data=scene)) if view.image.stem in upright]
+    return [np.abs(load_photograph(view).astype(float) - upright[view.image.stem]).mean() for view in views]
+
+
+@pytest.mark.parametrize("orientation", [2, 3, 4])
+def test_photographs_stored_turned_are_upright_for_upright_cameras(scene, caplog, orientation):
+    upright = store_turned(scene, orientation)
+    assert max(differences(scene, upright)) < 4
+    assert "10 photographs of" in caplog.text
+    assert "their cameras are of them upright, by the colours of the SfM points" in caplog.text
+
+
+def test_photographs_stored_turned_stay_so_for_cameras_of_what_is_stored(scene, caplog):
+    upright = store_turned(scene, 3)
+    turn_cameras(scene)
+    assert max(differences(scene, {stem: np.rot90(pixels, 2) for stem, pixels in upright.items()})) < 4
+    assert "their cameras are of them as stored, by the colours" in caplog.text
+
+
+@pytest.mark.parametrize("applied", [True, False])
+def test_without_coloured_points_photographs_stored_turned_are_judged_by_their_neighbours_cameras(
+    scene, caplog, applied
+):
+    upright = store_turned(scene, 3, slice(0, 10, 2))
+    without_colours(scene)
+    if not applied:
+        transforms = json.loads((scene / "transforms.json").read_text())
+        turn_cameras(scene)
+        turned = json.loads((scene / "transforms.json").read_text())
+        transforms["frames"][::2] = turned["frames"][::2]
+        (scene / "transforms.json").write_text(json.dumps(transforms))
+    expected = {stem: pixels if applied else np.rot90(pixels, 2) for stem, pixels in upright.items()}
+    assert max(differences(scene, expected)) < 4
+    assert f"are of them {'upright' if applied else 'as stored'}, by the cameras' up axes" in caplog.text
+
+
+def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, caplog):
+    store_turned(scene, 3)
+    without_colours(scene)
+    read_views(FacadeDataParserConfig(data=scene))
+    assert "nothing tells whether their cameras are of the upright ones" in caplog.text
+
+
+def test_a_square_photograph_is_turned_for_an_upright_camera(scene):
+    for path in (scene / "images").iterdir():
+        with Image.open(path) as image:
+            image.crop((8, 0, 40, 32)).save(path)
+    transforms = json.loads((scene / "transforms.json").read_text())
+    transforms |= {"w": 32, "cx": transforms["cx"] - 8}
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    assert max(differences(scene, store_turned(scene, 6))) < 4
+
+
 def test_photographs_of_a_phone_are_read(scene):
     (scene / "images" / "frame_00002.png").unlink()
     shutil.copy(Path(__file__).with_name("phone.heic"), scene / "images" / "frame_00002.HEIC")

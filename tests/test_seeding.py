@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from runs import data_of, model_of, trainer_of
 from scipy.spatial import KDTree
 
 from dataparsers.camera import Camera
+from dataparsers.errors import SceneError
 from shellgs_method.densification import SkyboxStrategy
 from shellgs_method.geometry import DISC_LOG_THICKNESS
+from shellgs_method.model import FacadeModel
 from shellgs_method.rasterizer import quats_to_rotations
 from shellgs_method.reference import Reference
 from shellgs_method.seeding import SKYBOX_RADIUS, SeededView, SkyView, shell_seeds, skybox_seeds
@@ -112,6 +115,13 @@ def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(eager,
     assert (scales[:, 2] < 0.11 * scales[:, :2].amin(dim=-1)).all()
     assert primitive == "3d" or (model.scales[:, 2] == DISC_LOG_THICKNESS).all()
     torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+
+
+@pytest.mark.parametrize(("count", "said"), [(3, "has 3 SfM points"), (0, "has no SfM points")])
+def test_too_few_sfm_points_are_counted(count, said):
+    model = SimpleNamespace(seed_points=(torch.zeros(count, 3), torch.zeros(count, 3)))
+    with pytest.raises(SceneError, match=f"{said} to start from, of at least 4"):
+        FacadeModel._seed_points(model)  # pyright: ignore[reportArgumentType]
 
 
 def test_without_shell_maps_in_any_training_view_there_are_no_seeds():

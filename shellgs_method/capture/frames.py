@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,28 +10,32 @@ import av
 import av.container
 import av.error
 import numpy as np
+from av.stream import Disposition
+from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
 from rich.progress import Progress
 from scipy.ndimage import laplace, median_filter
 
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, notice
 
 FRAMES_PER_SECOND = 5
 """Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
 
+_PICTURES = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
+_HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics (ITU-T H.273)
 _NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
 
 
 def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> None:
     """Write the sharpest frame of each of at most ``count`` equal segments of a video, upright, as JPEG.
 
-    Files are numbered by their frames in the video.
+    Files are numbered by their frames in the video. Of several videos in a file, the largest is used, and told.
 
     Raises:
         SceneError: the file cannot be read as a video, or holds no frame.
     """
-    with _opened(video) as container:
-        stream = container.streams.video[0]
+    with _opened(video) as (container, stream):
+        _tell_of_hdr(video, stream)
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         sharpnesses, times = [], []
         for frame in container.decode(stream):
@@ -43,8 +47,8 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
             raise SceneError(f"{video} holds no frames: is it a complete video?")
     chosen = sharpest(np.array(sharpnesses), np.array(times), count)
     task = progress.add_task("keeping the sharpest", total=len(chosen))
-    with _opened(video) as container:
-        for number, frame in enumerate(container.decode(video=0)):
+    with _opened(video) as (container, stream):
+        for number, frame in enumerate(container.decode(stream)):
             if number in chosen:
                 image = frame.to_image().rotate(frame.rotation, expand=True)
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
@@ -71,15 +75,38 @@ def sharpest(sharpnesses: Float[np.ndarray, " N"], times: Float[np.ndarray, " N"
 
 
 @contextmanager
-def _opened(video: Path) -> Iterator[av.container.InputContainer]:
+def _opened(video: Path) -> Iterator[tuple[av.container.InputContainer, VideoStream]]:
     try:
         with av.open(str(video)) as container:
-            if not container.streams.video:
-                raise SceneError(f"{video} holds no video")
-            container.streams.video[0].thread_type = "AUTO"
-            yield container
+            stream = _main_stream(video, container.streams.video)
+            stream.thread_type = "AUTO"
+            yield container, stream
     except av.error.FFmpegError as error:
         raise SceneError(
             f"{video} cannot be read as a video ({error.strerror}): copy it again if it is cut off or damaged, or "
             "convert it to mp4"
         ) from error
+
+
+def _main_stream(video: Path, streams: Sequence[VideoStream]) -> VideoStream:
+    """The largest stream that is a video, not a cover, which files may begin with, nor a proxy."""
+    moving = [stream for stream in streams if not stream.disposition & _PICTURES and stream.frames != 1]
+    if not moving:
+        what = f", but {len(streams)} pictures" if streams else ""
+        raise SceneError(f"{video} holds no video{what}")
+    largest = max(moving, key=lambda stream: stream.width * stream.height)  # the first of equals
+    if len(moving) > 1:
+        sizes = ", ".join(f"{stream.width}x{stream.height}" for stream in moving)
+        notice(
+            f"{video} holds {len(moving)} videos of {sizes} pixels: {largest.width}x{largest.height} is used, the "
+            f"stream {largest.index}."
+        )
+    return largest
+
+
+def _tell_of_hdr(video: Path, stream: VideoStream) -> None:
+    if kind := _HDR.get(stream.codec_context.color_trc):
+        notice(
+            f"{video} is HDR ({kind}), and its frames are taken without tone mapping, with flat colours: for true "
+            "ones, record or export it as SDR, or convert it with ffmpeg's filters zscale and tonemap."
+        )

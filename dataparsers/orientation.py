@@ -1,0 +1,107 @@
+"""Whether cameras are of photographs as they are stored or as viewers show them, where the shape does not tell.
+
+Programs apply the EXIF orientation or not. A quarter turn changes the shape of a photograph, which the camera's shows;
+half a turn, a mirror image or a square photograph does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from dataparsers.camera import in_view, upwards
+from dataparsers.errors import notice
+from dataparsers.photograph import View, load_photograph
+from dataparsers.sparse_points import SparsePoints, find_sparse_points
+
+if TYPE_CHECKING:
+    from dataparsers.layout import SceneLayout
+
+_ROUNDING = 0.01  # of a photograph's sides, as a share
+_COMPARED, _SIZE = 4, 400  # photographs, and their longer side in pixels
+_LEAST_POINTS = 20
+_CLEARER = 0.85  # of the differences of colours, the smaller to the larger: less than this decides
+_ALIKE, _UNLIKE = 0.7, 0.3  # cosines of mean up axes
+
+
+def oriented(views: Sequence[View], layout: SceneLayout) -> list[View]:
+    """The views, those :attr:`~dataparsers.photograph.View.turned` whose cameras are of the upright photograph.
+
+    One program found all cameras, so that they are judged together: by the colours of the SfM points, else by the up
+    axes of the cameras of photographs that are stored upright. What is found is told.
+    """
+    marked = [view for view in views if _is_unclear(view.image)]
+    if not marked:
+        return list(views)
+    applied, by = _by_colours(marked, find_sparse_points(layout)), "the colours of the SfM points"
+    if applied is None:
+        applied, by = _by_axes(marked, [v for v in views if _orientation(v.image) == 1]), "the cameras' up axes"
+    shown = (
+        f"{len(marked)} photographs of {layout.data} are stored turned, by their EXIF ({marked[0].name}, for example)"
+    )
+    if applied is None:
+        notice(f"{shown}; nothing tells whether their cameras are of the upright ones: they are taken as stored.")
+    else:
+        notice(f"{shown}; their cameras are of them {'upright' if applied else 'as stored'}, by {by}.")
+    names = {view.name for view in marked} if applied else set()
+    return [replace(view, turned=view.name in names) for view in views]
+
+
+def _is_unclear(photograph: Path) -> bool:
+    """Whether a photograph has an EXIF orientation that leaves its shape as it is."""
+    orientation = _orientation(photograph)
+    if orientation in (2, 3, 4):
+        return True
+    if orientation == 1:
+        return False
+    with Image.open(photograph) as image:
+        return abs(image.width - image.height) <= _ROUNDING * image.width
+
+
+def _orientation(photograph: Path) -> int:
+    return _orientation_of(photograph, photograph.stat().st_mtime_ns)
+
+
+@cache
+def _orientation_of(photograph: Path, _changed: int) -> int:
+    """EXIF orientation, by the header; 1, upright, where there is none or the file is damaged."""
+    with suppress(Exception), Image.open(photograph) as image:
+        if image.format != "PNG" or "exif" in image.info:  # else a PNG would be decoded to look behind its pixels
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+            return orientation if orientation in range(1, 9) else 1
+    return 1
+
+
+def _by_colours(views: Sequence[View], points: SparsePoints) -> bool | None:
+    """Whether points have rather the colours of the upright photographs; None if these differ as much."""
+    if points.colours is None or np.ptp(points.colours, axis=0).max(initial=0) == 0:
+        return None
+    differences = [], []
+    for view in views[:: max(1, len(views) // _COMPARED)]:
+        of = slice(None) if points.observed is None else points.observed.get(view.name, np.empty(0, int))
+        camera = view.camera.shrunk(_SIZE)
+        inside, pixels, _ = in_view(camera, points.positions[of])
+        columns, rows = pixels.astype(int).T
+        for turned, found in zip((False, True), differences, strict=True):
+            image = load_photograph(replace(view, camera=camera, turned=turned))
+            found.append(np.abs(image[rows, columns].astype(float) - points.colours[of][inside]).mean(axis=1))
+    stored, upright = map(np.concatenate, differences)
+    if len(stored) < _LEAST_POINTS:
+        return None
+    less, more = sorted((stored.mean(), upright.mean()))
+    return bool(upright.mean() < stored.mean()) if less < _CLEARER * more else None
+
+
+def _by_axes(views: Sequence[View], straight: Sequence[View]) -> bool | None:
+    """Whether cameras are as upright as those of photographs that are stored upright; None if that is unclear."""
+    if not straight:
+        return None
+    cosine = float(upwards(view.camera for view in views) @ upwards(view.camera for view in straight))
+    return True if cosine > _ALIKE else False if cosine < _UNLIKE else None
