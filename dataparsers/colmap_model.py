@@ -174,7 +174,7 @@ def _shot(scene: Path, path: str, image: _Image, cameras: Mapping[int, _Camera],
         lens = parse_colmap_camera_params(camera)
     except NotImplementedError as error:  # which names the model
         reason = str(error).rstrip("!")
-        raise SceneError(f"nerfstudio cannot read the cameras of {where}: {reason}; {_remedy(camera.model)}") from error
+        raise SceneError(f"nerfstudio cannot read the cameras of {scene}: {reason}; {_remedy(camera.model)}") from error
     quaternion = np.array(image.quaternion)
     if not np.isfinite(quaternion).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
         raise SceneError(f"{where}: the pose of {image.name} has no rotation: its quaternion is {image.quaternion}")

@@ -135,8 +135,10 @@ class SceneLayout(ScenePaths):
             named = {shot.mask for shot in shots}
             if any(folder.iterdir()) and not any(masks.values()) and not any(named):
                 first = next(iter(candidates.values()))[0]
+                inverse = any(path.name.startswith("dynamic_mask_") for path in there)  # of instant-ngp
+                remedy = "invert (the white of dynamic_mask_… is ignored) and rename" if inverse else "rename"
                 raise SceneError(
-                    f"no photograph has a mask in {folder}: the first one's would be {first}; rename the masks, or "
+                    f"no photograph has a mask in {folder}: the first one's would be {first}; {remedy} the masks, or "
                     "move the folder away"
                 )
             tell_of_masks(masks, there - named, folder)

@@ -103,6 +103,11 @@ def _shot(files: NamedFiles, frame: Any, meta: Mapping[str, Any], applied: np.nd
     for key in DISTORTION if _has_distortion(meta) else ():  # as in nerfstudio, the file's own take precedence
         lens.pop(key, None)
     lens |= _distortion(meta if _has_distortion(meta) else frame, where)
+    fisheye = frame.get("is_fisheye", meta.get("is_fisheye"))
+    if fisheye is True and lens.get("camera_model") != "OPENCV_FISHEYE":  # instant-ngp's
+        raise SceneError(
+            f"{where}: is_fisheye is set, which counts only with the camera_model OPENCV_FISHEYE: set it too"
+        )
     name = files.photograph(frame["file_path"], where).relative_to(files.scene).as_posix()
     made = shot(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
     if frame.get("mask_path") is None:

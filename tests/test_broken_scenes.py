@@ -102,6 +102,7 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a huge image": (lambda scene: change(scene, None, w=64_000, h=48_000), "has 64000x48000 pixels, more than"),
     "an unknown model": (lambda scene: change(scene, None, camera_model="SPHERE"), "is SPHERE, but only perspective"),
     "a model of numbers": (lambda scene: change(scene, None, camera_model=4), "is 4, but only perspective"),
+    "a fisheye lens of instant-ngp": (lambda scene: change(scene, None, is_fisheye=True), "is_fisheye is set, which"),
     "distortion of words": (lambda scene: change(scene, None, k1="strong"), "'strong' as its k1"),
     "five coefficients": (lambda scene: change(scene, None, distortion_params=[0] * 5), "distortion_params are k1"),
     "a pose of nan": (lambda scene: pose(scene, 3, lambda m: m.fill(np.nan)), "frame_00004.png has NaN"),

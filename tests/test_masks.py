@@ -272,6 +272,12 @@ def test_hidden_colours_change_nothing_in_the_check(scene):
     assert one.any()
 
 
+def test_inverse_masks_are_refused_with_how_they_differ(scene):
+    paint_all(scene, "masks/dynamic_mask_{stem}.png")
+    with pytest.raises(SceneError, match=r"no photograph has a mask.*invert \(the white of dynamic_mask_"):
+        read_views(FacadeDataParserConfig(data=scene))
+
+
 def test_masks_of_no_photograph_are_refused(scene):
     paint(scene / "masks" / "elsewhere.png", left=12)
     with pytest.raises(SceneError, match=r"no photograph has a mask in .*masks/frame_00001.png.png; rename the masks"):
