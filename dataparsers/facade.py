@@ -19,6 +19,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from dataparsers.camera import Camera
 from dataparsers.cue_maps import CueMaps, find_cues
 from dataparsers.errors import SceneError, refusals_end_the_program
+from dataparsers.frames import check_points
 from dataparsers.layout import SceneLayout
 from dataparsers.orientation import oriented
 from dataparsers.photograph import View, undistort
@@ -83,6 +84,8 @@ class FacadeDataParser(DataParser):
         chosen = _of_split(recording, split, config)
         views = [replace(views[k], camera=views[k].camera.shrunk(max_image_size)) for k in chosen]
         points = find_sparse_points(config)
+        if split == "train":
+            check_points(points, views)
         placed = scale * (points.positions @ transform[:3, :3].T + transform[:3, 3])
         metres_per_unit = shell.metres_per_unit if shell else None
         masks = [view.mask for view in views if view.mask is not None]

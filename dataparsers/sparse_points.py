@@ -28,11 +28,13 @@ class SparsePoints:
         observed: indices of the points that each view observes, by the view's name; None where unknown, as with a
             transforms.json.
         colours: RGB, where known.
+        called: the points and their file, for messages.
     """
 
     positions: Float64[np.ndarray, "N 3"]
     observed: Mapping[str, Int[np.ndarray, " M"]] | None = None
     colours: UInt8[np.ndarray, "N 3"] | None = None
+    called: str = "the SfM points"
 
     def seen_in(self, view: View) -> tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, " M"]]:
         """Pixels and z-depths of the view's points: those it observes, or else all that project into it.
@@ -72,7 +74,8 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
     if folder is None:
         positions, colours = transforms.read_cloud(layout.data)
         kept = _sound(positions, layout)
-        return SparsePoints(positions[kept], None, colours[kept])
+        called = f"the SfM points that {layout.data / transforms.NAME} names as ply_file_path"
+        return SparsePoints(positions[kept], None, colours[kept], called)
     points, names = colmap_model.read_points(layout.data, folder, layout.images_path)
     kept = _sound(points.positions, layout)
     observed: dict[str, list[int]] = {name: [] for name in names.values()}
@@ -80,9 +83,8 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
         for image in set(points.observers[point].tolist()) & names.keys():
             observed[names[image]].append(index)
     positions, colours = points.positions[kept], points.colours[kept]
-    if not any(observed.values()):
-        return SparsePoints(positions, None, colours)
-    return SparsePoints(positions, {name: np.array(of, dtype=int) for name, of in observed.items()}, colours)
+    seen = {name: np.array(of, dtype=int) for name, of in observed.items()} if any(observed.values()) else None
+    return SparsePoints(positions, seen, colours, f"the SfM points of {layout.data / folder}")
 
 
 def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:

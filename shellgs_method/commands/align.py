@@ -53,11 +53,14 @@ def align(
     """
     from dataparsers.cue_maps import relative_path
     from dataparsers.facade import read_views
+    from dataparsers.frames import check_points
     from dataparsers.sparse_points import read_sparse_points
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
     from shellgs_method.shell.registration.align import (
         PROPOSAL,
+        REPORT,
         Placement,
+        misplaced,
         place_as_before,
         place_as_proposed,
         place_by_guess,
@@ -66,6 +69,7 @@ def align(
         refined,
         validate_placement,
     )
+    from shellgs_method.shell.registration.frames import ShellPlace
 
     starts = [start for start in (matrix, picks, positions) if start]
     if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
@@ -78,6 +82,7 @@ def align(
         raise SceneError("--metres-per-shell-unit belongs to a shell: give the shell and a start, to align it again")
     layout = paths.of(scene)
     views, points = read_views(layout), read_sparse_points(layout)
+    check_points(points, views)
     name = relative_path(shell, scene) if shell else ""
     if accept:
         placement = place_as_proposed(scene / PROPOSAL, scene, views)
@@ -86,22 +91,31 @@ def align(
     elif matrix:
         placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
     elif picks:
-        placement = place_by_picks(picks, views, name, metres_per_shell_unit)
+        placement = place_by_picks(picks, views, ShellPlace(shell), name, metres_per_shell_unit)
     elif positions:
-        placement = place_by_positions(positions, views, name, metres_per_shell_unit)
+        placement = place_by_positions(positions, views, ShellPlace(shell), name, metres_per_shell_unit)
     else:
         unaligned = load_shell(shell, cache=scene / "shell", mesher=mesher or "planes")
         placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
     placement = replace(placement, alignment=placement.alignment.meshed_by(mesher))
     mesh = placement.alignment.load_shell(scene, views)
+    misplacement = misplaced(placement, mesh, views, points)
+    if refine is not None and misplacement:
+        raise SceneError(f"the alignment cannot be refined: {misplacement}")
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
-    _show_alignment(scene, target, placement, validate_placement(scene, placement, mesh, views, points, target))
+    validation = validate_placement(scene, placement, mesh, views, points, target)
+    _show_alignment(scene, target, placement, validation)
+    if validation.verdict == "refused":
+        why = f"{misplacement}; " if misplacement else ""
+        raise SceneError(
+            f"the alignment is refused and {target} is unchanged: {why}see {scene / REPORT / 'index.html'}"
+        )
 
 
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
-    """Print the result of the validation; a refused alignment ends the program."""
+    """Print the result of the validation."""
     from shellgs_method.shell.registration.align import REPORT
     from shellgs_method.shell.validation.report import residual_table
 
@@ -115,9 +129,9 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
         console.print(table)
     for reason in validation.reasons:
         console.print(f"[yellow]{reason}.", highlight=False)
-    report = scene / REPORT / "index.html"
     if validation.verdict == "refused":
-        raise SceneError(f"the alignment is refused and {target} is unchanged: see {report}")
+        return
+    report = scene / REPORT / "index.html"
     console.print(
         f"Verdict: {validation.verdict}. Look at {report}: the shell's edges must lie on the photographed ones."
     )

@@ -37,6 +37,7 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
     """
     from dataparsers.cue_maps import CueMaps, find_cues
     from dataparsers.facade import read_views
+    from dataparsers.frames import check_points
     from dataparsers.sparse_points import read_sparse_points
     from shellgs_method.cues.maps import make_maps
 
@@ -44,6 +45,7 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
         raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
     layout = paths.of(scene)
     views, points, predictor = read_views(layout), read_sparse_points(layout), source.load()
+    check_points(points, views)
     if max_image_size is None and "shell" in find_cues(scene):
         max_image_size = CueMaps.open(scene, "shell").manifest.max_image_size
     licence = f", licence {predictor.licence}" if predictor.licence else ""

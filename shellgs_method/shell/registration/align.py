@@ -18,10 +18,12 @@ from dataparsers.errors import SceneError
 from dataparsers.photograph import View
 from shellgs_method.shell.geometry.files import up_axis
 from shellgs_method.shell.geometry.mesh import ShellMesh
+from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.shell.geometry.surface import ShellSurface
 from shellgs_method.shell.registration.alignment import Alignment
 from shellgs_method.shell.registration.bays import facade_axes
 from shellgs_method.shell.registration.correspondences import Correspondence, measured_again
+from shellgs_method.shell.registration.frames import ShellPlace, apart
 from shellgs_method.shell.registration.picks import align_picks, read_picks
 from shellgs_method.shell.registration.positions import align_positions, read_positions
 from shellgs_method.shell.registration.proposal import propose
@@ -84,26 +86,33 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
     return Placement(alignment)
 
 
-def place_by_picks(path: Path, views: Sequence[View], shell: str, metres_per_shell_unit: float) -> Placement:
+def place_by_picks(
+    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+) -> Placement:
     """Align the shell by a file of picks.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the picks cannot be read, triangulated or trusted.
+        SceneError: the picks cannot be read, triangulated or trusted, or are not in the shell's frame.
     """
-    matrix, picked = align_picks(read_picks(path, views), views, metres_per_shell_unit)
+    picks = read_picks(path, views)
+    place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
+    matrix, picked = align_picks(picks, views, metres_per_shell_unit)
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
     return Placement(alignment, [_residuals_in_words(picked, "picks")], picked)
 
 
-def place_by_positions(path: Path, views: Sequence[View], shell: str, metres_per_shell_unit: float) -> Placement:
+def place_by_positions(
+    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+) -> Placement:
     """Align the shell by a file of surveyed camera positions.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the positions cannot be read or trusted.
+        SceneError: the positions cannot be read or trusted, or are not in the shell's frame.
     """
     surveyed = read_positions(path, views)
+    place.check_positions(surveyed.shell, f"the camera positions of {path}")
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
     history = [_residuals_in_words(cameras, "camera positions")]
@@ -142,6 +151,12 @@ def place_by_guess(
     ]
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     return Placement(Alignment(matrix, shell, metres_per_shell_unit, source="proposal"), history, proposed=True)
+
+
+def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:
+    """How a placement puts the shell elsewhere, or makes it larger or smaller, than what cameras see; None if not."""
+    seen = np.concatenate([points.positions, positions(view.camera for view in views)])
+    return apart(transformed(mesh.vertices, placement.alignment.shell_to_scene), seen)
 
 
 def refined(
