@@ -47,10 +47,18 @@ class Load:
 
 
 class ThreadsByLoad:
-    """Set torch's number of threads by the machine's load, unless ``OMP_NUM_THREADS`` is set."""
+    """Set torch's number of threads by the machine's load, unless ``OMP_NUM_THREADS`` is set.
+
+    Models of one process share its threads: a new one may have as many as the first, however few another one left.
+    """
+
+    _most = _set = 0
+    """Number of threads that the process may have, and the number that was set last."""
 
     def __init__(self) -> None:
-        self._most = torch.get_num_threads()
+        threads = torch.get_num_threads()
+        if threads != ThreadsByLoad._set:  # not by us: by the user, or it is torch's own
+            ThreadsByLoad._most = threads
         self._fixed = "OMP_NUM_THREADS" in os.environ
         self._load = Load.now()
 
@@ -61,7 +69,8 @@ class ThreadsByLoad:
         load = Load.now()
         cores = int(load.cores_since(self._load) + 1 - ENOUGH)
         self._load = load
-        torch.set_num_threads(min(max(cores, 1), self._most))
+        ThreadsByLoad._set = min(max(cores, 1), ThreadsByLoad._most)
+        torch.set_num_threads(ThreadsByLoad._set)
 
 
 @contextmanager

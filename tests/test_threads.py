@@ -51,6 +51,28 @@ def test_cores_that_come_free_are_used_again(machine):
     assert counts == [1, 4, 4]  # the last update came too soon
 
 
+def test_a_second_model_may_have_as_many_threads_as_the_first_even_if_that_left_few(machine):
+    first = ThreadsByLoad()
+    machine.append(Load(10.0, 0.0, 1.0))
+    first.follow()
+    assert torch.get_num_threads() == 1
+    second = ThreadsByLoad()
+    machine.append(Load(20.0, 40.0, 1.0))
+    second.follow()
+    assert torch.get_num_threads() == 4
+
+
+def test_a_second_model_has_no_more_threads_than_the_user_set_in_between(machine):
+    first = ThreadsByLoad()
+    machine.append(Load(10.0, 0.0, 1.0))
+    first.follow()
+    torch.set_num_threads(2)
+    second = ThreadsByLoad()
+    machine.append(Load(20.0, 40.0, 1.0))
+    second.follow()
+    assert torch.get_num_threads() == 2
+
+
 def test_the_users_number_of_threads_is_kept(machine, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     process = ThreadsByLoad()
