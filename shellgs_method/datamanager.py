@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import psutil
 import torch
 from jaxtyping import Float, Float64, UInt8
 from nerfstudio.cameras.cameras import Cameras
@@ -30,14 +29,12 @@ from shellgs_method.bands import Bands, facade_bands
 from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps, seen_through
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.host import NO_RAYS, Refused
+from shellgs_method.memory import available_memory
 from shellgs_method.reference import Reference
 from shellgs_method.seeding import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
 
 logger = logging.getLogger(__name__)
 
-COLOUR_BYTES = 3
-MAP_BYTES = 11
-"""Bytes of a pixel: depth float32, normal float16, mask."""
 MIN_SIDE = 11
 """Least side of a photograph in pixels: the size of SSIM's window."""
 MIN_REPORTED_BYTES = 1e9
@@ -84,6 +81,12 @@ class FacadeDataset(InputDataset):
         return {kind: maps for kind, maps in found.items() if kind in wanted}
 
     @property
+    def sets(self) -> dict[str, CueMaps]:
+        """All sets that are read: :attr:`cues`, and with the shell what photographs say against it."""
+        checked = self._dataparser_outputs.metadata["cues"].get("checked")
+        return self.cues | ({"checked": checked} if checked and "shell" in self.cues else {})
+
+    @property
     def views(self) -> list[View]:
         """The views in the order of the images."""
         return self._dataparser_outputs.metadata["views"]
@@ -93,7 +96,15 @@ class FacadeDataset(InputDataset):
         return load_photograph(self.views[image_idx])
 
     def get_data(self, image_idx: int, image_type="float32") -> dict:
-        """Photograph, intrinsics, mask and maps of a view."""
+        """Photograph, intrinsics, mask and maps of a view, and what training views see of it."""
+        data = self._read_data(image_idx, image_type)
+        if self.seen_by is not None:
+            camera = self.camera(image_idx)
+            no_depth = torch.zeros(camera.height, camera.width, 1)
+            data["seen"] = self.seen_by().mask(camera, data.get("shell_depth", no_depth))
+        return data
+
+    def _read_data(self, image_idx: int, image_type) -> dict:
         image = self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx)
         data = {"image_idx": image_idx, "image": image, "K": self.views[image_idx].camera.K.float()}
         mask = load_mask(self.views[image_idx])
@@ -103,13 +114,7 @@ class FacadeDataset(InputDataset):
             raise SceneError(f"{by} is black everywhere: white is kept; leave {view.name} out instead")
         if mask is not None:
             data["mask"] = torch.from_numpy(mask)[..., None]
-        if self.held:
-            data |= self.get_metadata(data)
-        if self.seen_by is not None:
-            camera = self.camera(image_idx)
-            no_depth = torch.zeros(camera.height, camera.width, 1)
-            data["seen"] = self.seen_by().mask(camera, data.get("shell_depth", no_depth))
-        return data
+        return data | self.get_metadata(data) if self.held else data
 
     def get_metadata(self, data: dict) -> dict:
         """Cue maps of the view ``data["image_idx"]``."""
@@ -121,7 +126,7 @@ class FacadeDataset(InputDataset):
             shell = cues.get("shell") or self._read(self._dataparser_outputs.metadata["cues"]["shell"], view)
             inside = False if shell is None else self.bands.mask(shell, view.camera)
         maps = {}
-        checked = self._dataparser_outputs.metadata["cues"].get("checked")
+        checked = self.sets.get("checked")
         if "shell" in cues and checked and (found := self._read(checked, view)):
             occluder, maps["transient"], maps["beyond"], _, behind = (
                 torch.from_numpy(mask & inside)[..., None] for mask in Findings.of(found, cues["shell"])
@@ -139,11 +144,18 @@ class FacadeDataset(InputDataset):
         cue = shell and shell.read(view.name, view.camera, any_size=True)
         return cue and self._rescaled_depth(cue)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that all photographs and maps take."""
-        pixels = sum(view.camera.width * view.camera.height for view in self.views)
-        return pixels * (COLOUR_BYTES + MAP_BYTES * len(self.cues))
+    def nbytes(self, image_type="float32") -> int:
+        """Memory that all photographs and maps take, by one view of those that have the same maps."""
+        of_a_pixel: dict[tuple[bool, ...], float] = {}
+        total = 0.0
+        for index, view in enumerate(self.views):
+            pixels = view.camera.width * view.camera.height
+            has = view.mask is not None, *(maps.record(view.name) is not None for maps in self.sets.values())
+            if has not in of_a_pixel:
+                data = self._read_data(index, image_type).values()
+                of_a_pixel[has] = sum(each.nbytes for each in data if isinstance(each, Tensor)) / pixels
+            total += pixels * (of_a_pixel[has] + (self.seen_by is not None))
+        return round(total)
 
     def missing(self) -> dict[str, int]:
         """Number of views without a map that supports a pixel, by kind.
@@ -151,10 +163,11 @@ class FacadeDataset(InputDataset):
         Raises:
             SceneError: a view's map belongs to another camera, shell or alignment.
         """
-        counts = {}
-        for kind, maps in self.cues.items():
+        for maps in self.sets.values():
             for view in self.views:
                 maps.check(view.name, view.camera, any_size=self.any_size)
+        counts = {}
+        for kind, maps in self.cues.items():
             records = [maps.record(view.name) for view in self.views]
             counts[kind] = sum(record is None or not record.supported for record in records)
         return counts
@@ -209,11 +222,16 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         dataset.any_size, dataset.kinds = True, tuple(REFERENCES)
         return dataset
 
-    def _can_be_measured(self, kind: str, maps: CueMaps) -> bool:
-        held_out = self.eval_dataset.views
+    def _can_be_measured(self, kind: str) -> bool:
+        views, sets = self.eval_dataset.views, self.eval_dataset.sets
+        read = [sets[kind]]
+        if kind == "shell":  # it also says what the training views see
+            views = [*self.train_dataset.views, *views]
+            read += [maps for name, maps in sets.items() if name == "checked"]
         try:
-            for view in [*self.train_dataset.views, *held_out] if kind == "shell" else held_out:
-                maps.check(view.name, view.camera, any_size=True)
+            for maps in read:
+                for view in views:
+                    maps.check(view.name, view.camera, any_size=True)
         except SceneError as error:
             logger.warning("No metrics against the %s maps in this run: %s.", kind, error)
             return False
@@ -245,7 +263,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
                 )
         held_out = self.eval_dataset
         held_out.kinds = {*REFERENCES, *kinds}
-        held_out.kinds = [kind for kind, maps in held_out.cues.items() if self._can_be_measured(kind, maps)]
+        held_out.kinds = [kind for kind in held_out.cues if self._can_be_measured(kind)]
 
     @property
     def scene_to_world(self) -> Float64[np.ndarray, "4 4"]:
@@ -340,22 +358,25 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return batch if self.train_dataset.held else batch | self.train_dataset.get_metadata(batch)
 
     def _hold_maps_if_they_fit(self) -> None:
-        dataset, free = self.train_dataset, psutil.virtual_memory().available
-        dataset.held = dataset.nbytes <= MAX_MEMORY_SHARE * free
-        if dataset.nbytes > MIN_REPORTED_BYTES:
+        dataset, free = self.train_dataset, available_memory()
+        dataset.held = True
+        both = [each for each in (dataset, self.eval_dataset) if len(each)]  # the held-out views are held too
+        needed = sum(each.nbytes(self.config.cache_images_type) for each in both)
+        dataset.held = needed <= MAX_MEMORY_SHARE * free
+        if needed > MIN_REPORTED_BYTES:
             kinds = f" and their {' and '.join(dataset.cues)} maps" if dataset.cues else ""
             how = "" if dataset.held else ": the maps are read from disk in every step, which is slower"
             CONSOLE.print(
-                f"{len(dataset)} photographs{kinds} take {dataset.nbytes / 1e9:.1f} GB of memory, of which "
+                f"{sum(map(len, both))} photographs{kinds} take {needed / 1e9:.1f} GB of memory, of which "
                 f"{free / 1e9:.1f} GB are free{how}."
             )
 
     def _load_images(self, split, cache_images_device):
-        if split == "train":
-            self._hold_maps_if_they_fit()
         # "cpu" pins memory, which needs CUDA, and nerfstudio switches to it by itself above 500 images; "gpu" means
         # self.device (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
         with refusals_end_the_program():
+            if split == "train":
+                self._hold_maps_if_they_fit()
             return super()._load_images(split, cache_images_device if torch.cuda.is_available() else "gpu")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import psutil
 import pytest
 import torch
+from PIL import Image
 from runs import data_of, model_of, render, trainer_of
 
 import method_configs
@@ -49,6 +50,46 @@ def test_maps_that_a_method_does_not_train_on_do_not_stop_it(scene, tmp_path, ki
     warnings = [record.message for record in caplog.records if "No metrics against" in record.message]
     assert len(warnings) == (kind != "mono")
     assert all(f"the {kind} maps" in message for message in warnings)
+
+
+def test_what_photographs_say_against_another_shell_is_refused_before_anything_is_cached(scene, tmp_path):
+    spoil(scene, "checked")
+    with pytest.raises(SystemExit, match=r"^shellgs: the checked map of view 'images/frame_\d+.png'.*run `shellgs"):
+        trainer_of(scene, tmp_path, "shellgs")
+
+
+def test_what_photographs_say_against_another_shell_stops_no_method_without_a_shell(scene, tmp_path, caplog):
+    spoil(scene, "checked")
+    metrics = trainer_of(scene, tmp_path, "photo_gs").pipeline.get_average_eval_image_metrics()
+    assert "No metrics against the shell maps" in caplog.text
+    assert "truth_normal_deg" in metrics
+    assert "normal_deg" not in metrics
+
+
+def with_all_maps(scene: Path) -> None:
+    """Check the shell, mask two photographs, and take the maps of a third."""
+    cli.cast(scene)
+    assert CueMaps.open(scene, "checked").names
+    for name in ("frame_00002", "frame_00005"):
+        (scene / "masks").mkdir(exist_ok=True)
+        kept = np.full((32, 48), 255, np.uint8)
+        kept[:9] = 0
+        Image.fromarray(kept).save(scene / "masks" / f"{name}.png.png")
+    CueMaps.open(scene, "shell").remove("images/frame_00003.png")
+
+
+@pytest.mark.parametrize("image_type", ["uint8", "float32"])
+@pytest.mark.parametrize("change", [with_all_maps, lambda _: None], ids=["all maps", "shell alone"])
+def test_the_memory_that_photographs_and_maps_take_is_known_before_they_are_read(scene, tmp_path, change, image_type):
+    change(scene)
+
+    def cached(config):
+        config.pipeline.datamanager.cache_images_type = image_type
+
+    data = data_of(trainer_of(scene, tmp_path, "shellgs", change=cached))
+    for dataset, batches in ((data.train_dataset, data.cached_train), (data.eval_dataset, data.cached_eval)):
+        held = sum(each.nbytes for batch in batches for each in batch.values() if isinstance(each, torch.Tensor))
+        assert dataset.nbytes(image_type) == pytest.approx(held, rel=1e-4)
 
 
 def test_only_what_is_trained_on_is_held_in_memory(scene, tmp_path):
@@ -131,7 +172,7 @@ def test_memory_is_reported_and_maps_that_do_not_fit_are_read_in_every_step(scen
     data_of(read).train_dataset.held = True
     data_of(read).__dict__.pop("cached_train", None)
     said = data_of(read).cached_train and " ".join(capsys.readouterr().out.split())
-    assert "8 photographs and their shell maps take 0.0 GB of memory" in said
+    assert "10 photographs and their shell maps take 0.0 GB of memory" in said
     assert "read from disk in every step" in said
     assert "shell_depth" not in data_of(read).cached_train[0]
     (_, one), (_, other) = data_of(held).next_train(0), data_of(read).next_train(0)
