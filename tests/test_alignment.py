@@ -30,10 +30,12 @@ from shellgs_method.shell.geometry.raycast import ShellCaster
 from shellgs_method.shell.geometry.similarity import fit_similarity, transformed
 from shellgs_method.shell.geometry.surface import ShellSurface
 from shellgs_method.shell.registration import alignment as alignment_module
+from shellgs_method.shell.registration import proposal
 from shellgs_method.shell.registration.align import PROPOSAL, REPORT, place_by_guess
 from shellgs_method.shell.registration.bays import facade_axes, scan_shifts
 from shellgs_method.shell.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.shell.registration.positions import SurveyedPositions, align_positions, read_positions
+from shellgs_method.shell.registration.proposal import Candidate
 from shellgs_method.shell.registration.proposal import _main_wall as main_wall
 from shellgs_method.shell.registration.refinement import refine
 from shellgs_method.shell.validation.report import shell_edges, write_report
@@ -180,6 +182,15 @@ def test_the_main_wall_is_the_same_in_each_run():
     found = [main_wall(np.concatenate([ground, wall]), cameras, up) for _ in range(20)]
     assert len({cloud.axes.tobytes() for cloud in found}) == 1
     assert np.degrees(np.arccos(-found[0].axes[2, 1])) < 1
+
+
+def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh, views, points, monkeypatch):
+    """As a shell in millimetres gives, if taken for one in metres."""
+    unsupported = [Candidate(np.eye(4), score=0.0)]
+    monkeypatch.setattr(proposal, "_upwards", lambda *_: [])
+    monkeypatch.setattr(proposal, "_refined", lambda *_: unsupported)
+    with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
+        place_by_guess(mesh, views, points, "shell/facade.glb", 1.0)
 
 
 def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):

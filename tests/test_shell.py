@@ -247,6 +247,24 @@ def test_triangles_with_nan_are_dropped_and_counted(tmp_path: Path, caplog: pyte
     assert "dropped 1 of 2 triangles" in caplog.text
 
 
+@pytest.mark.parametrize("origin", [np.zeros(3), GEOREFERENCE + 0.1])
+def test_triangles_without_area_are_dropped_and_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, origin: np.ndarray
+):
+    """A point, an edge, a T-junction, and a needle thinner than single precision; 1 mm wide is a triangle."""
+    corners = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0], [3, 0, 0], [4.5, 1e-7, 0], [4.5, -1e-3, 0]]) + origin
+    faces = ["3 0 1 2", "3 0 0 0", "3 0 1 1", "3 0 1 3", "3 0 1 4", "3 0 1 5"]
+    mesh = load_shell(write_ply(tmp_path / "a.ply", [" ".join(map(repr, c)) for c in corners.tolist()], faces))
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 1, 5]])
+    assert "dropped 4 of 6 triangles, which have no area" in caplog.text
+
+
+def test_a_vertex_far_away_makes_no_other_triangle_flat(tmp_path: Path):
+    corners = [" ".join(map(repr, c)) for c in (np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + GEOREFERENCE).tolist()]
+    mesh = load_shell(write_ply(tmp_path / "a.ply", [*corners, "0 0 0"], ["3 0 1 3", "3 0 1 2"]))
+    np.testing.assert_array_equal(mesh.faces[-1], [0, 1, 2])
+
+
 def test_large_coordinates_in_single_precision_cause_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     load_shell(save(tmp_path / "survey.stl", ShellMesh(box().vertices + GEOREFERENCE, box().faces)))
     assert "single precision, in steps of 0.5" in caplog.text

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash
 from dataparsers.strays import sound
 from shellgs_method.shell.geometry.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.geometry.files import read_geometry
-from shellgs_method.triangles import area_vectors
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +48,7 @@ class ShellMesh:
             raise SceneError(f"the shell's triangles have vertex indices outside its {len(self.vertices)} vertices")
         if not np.isfinite(self.vertices).all():
             raise SceneError("the shell has NaN or infinite vertices")
-        if not self._areas().any():
+        if without_area(self.vertices, self.faces).all():
             raise SceneError("all triangles of the shell are degenerate: their areas are 0")
 
     @property
@@ -57,12 +56,18 @@ class ShellMesh:
         """Lowest and highest corner of the bounding box."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
-    def _areas(self) -> np.ndarray:
-        """Area of each triangle relative to the shell's size squared; 0 where it is only rounding error."""
-        extent = np.ptp(self.bounds, axis=0).max()
-        areas = np.linalg.norm(area_vectors(self.vertices, self.faces), axis=1)
-        areas /= max(extent, np.finfo(float).tiny) ** 2
-        return np.where(areas > 1e-14, areas, 0.0)
+
+def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
+    """Mask of the triangles that have no area in single precision, in which rays are cast and distances measured.
+
+    Their normals are not defined, and their points nearest to another are NaN. Their heights are within the rounding of
+    their own corners, relative to the median vertex: a vertex far away makes no other triangle flat.
+    """
+    corners = (vertices - np.median(vertices, axis=0))[faces].astype(np.float32)
+    step = np.spacing(np.abs(corners).max(axis=(1, 2))).astype(np.float64)
+    a, b, c = corners.astype(np.float64).transpose(1, 0, 2)
+    longest = np.sqrt(np.max([((a - b) ** 2).sum(1), ((b - c) ** 2).sum(1), ((c - a) ** 2).sum(1)], axis=0))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 2 * step * longest  # area = height * longest / 2
 
 
 def load_shell(
@@ -74,8 +79,9 @@ def load_shell(
 ) -> ShellMesh:
     """Load a shell, a triangle mesh or a point cloud, in double precision if the file has it.
 
-    Points and vertices that are NaN, infinite or absurdly far away are dropped, with their triangles, and counted. A
-    point cloud is meshed by :func:`~shellgs_method.shell.geometry.clouds.mesh_cloud`; its mesh is cached as
+    Points and vertices that are NaN, infinite or absurdly far away are dropped, with their triangles, as are triangles
+    without area; what is dropped is counted. A point cloud is meshed by
+    :func:`~shellgs_method.shell.geometry.clouds.mesh_cloud`; its mesh is cached as
     ``<cache>/<file name>.<mesher>.ply`` until the cloud changes.
 
     Args:
@@ -96,9 +102,9 @@ def load_shell(
     geometry = read_geometry(path)
     try:
         if len(geometry.faces) or not len(geometry.vertices):
-            return ShellMesh(*_without_strays(geometry.vertices, geometry.faces, path))
+            return _with_area(ShellMesh(*_without_strays(geometry.vertices, geometry.faces, path)), path)
         seen_from = viewpoints if viewpoints is not None and not len(geometry.scanners) else geometry.scanners
-        mesh = ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher))
+        mesh = _with_area(ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher)))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     if cached is not None:
@@ -163,3 +169,13 @@ def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tupl
     )
     renumbered = np.cumsum(kept) - 1
     return vertices[kept], renumbered[faces[usable]]
+
+
+def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
+    """Drop triangles without area; those of a file are counted, those that a mesher leaves are nobody's loss."""
+    flat = without_area(mesh.vertices, mesh.faces)
+    if not flat.any():
+        return mesh
+    if path is not None:
+        log.warning("%s: dropped %d of %d triangles, which have no area", path, flat.sum(), len(flat))
+    return replace(mesh, faces=mesh.faces[~flat])

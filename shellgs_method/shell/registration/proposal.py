@@ -96,9 +96,14 @@ def propose(
             starts += _distinct(_wall_candidates(cloud, axes, wall), spread, _KEPT)
     starts = [replace(s, score=_score(surface, spread, few, s.survey_from_scene, _COARSE)) for s in starts]
     found = _refined(surface, spread, few, _best_first(starts)[:_REFINED], _REACH)
-    if not found:
-        raise SceneError("no alignment of the shell was found: pick points in the photographs and use --picks")
     found = _refined(surface, spread, cloud, _close_to_best(_distinct(found, spread, _KEPT)), 2 * FINAL_GATE)
+    found = [candidate for candidate in found if candidate.score > 0]
+    if not found:
+        size = float(np.ptp(surface.bounds, axis=0).max())
+        raise SceneError(
+            f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
+            "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"
+        )
     best, *rivals = _close_to_best(_best_first(found))
     return [best, *(replace(rival, displacement=_displacement(best, rival, spread)) for rival in rivals)]
 
