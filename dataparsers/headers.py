@@ -1,55 +1,121 @@
-"""Check PLY and LAS headers against the file size: readers allocate whatever a header claims."""
+"""Read PLY and LAS headers and check them against the file size: readers allocate whatever a header claims."""
 
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 
-_BYTES = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
+_TYPES = {
+    **{
+        name: f"{kind}{size}"
+        for names, kind, size in (
+            (("char", "int8"), "i", 1),
+            (("uchar", "uint8"), "u", 1),
+            (("short", "int16"), "i", 2),
+            (("ushort", "uint16"), "u", 2),
+            (("int", "int32"), "i", 4),
+            (("uint", "uint32"), "u", 4),
+            (("long", "int64"), "i", 8),
+            (("ulong", "uint64"), "u", 8),
+            (("half", "float16"), "f", 2),
+            (("float", "float32"), "f", 4),
+            (("double", "float64"), "f", 8),
+        )
+        for name in names
+    },
 }
 _LONGEST_HEADER = 1 << 16
 
 
-def check_ply(path: Path) -> None:
-    """Check that a PLY file is as long as its header claims.
+@dataclass
+class PlyProperty:
+    """A property of an element of a PLY; types are numpy's, without byte order.
+
+    Attributes:
+        name: its name.
+        type: type of its value, or of each of its list.
+        counted: type of the length of its list; None if it is no list.
+    """
+
+    name: str
+    type: str
+    counted: str | None = None
+
+
+@dataclass
+class PlyElement:
+    """An element of a PLY: ``count`` rows, each with all properties."""
+
+    name: str
+    count: int
+    properties: list[PlyProperty]
+
+
+@dataclass
+class PlyHeader:
+    """Header of a PLY.
+
+    Attributes:
+        order: numpy's byte order, < or >; None for text.
+        length: bytes before the data.
+        elements: what the data holds, in this order.
+    """
+
+    order: str | None
+    length: int
+    elements: list[PlyElement]
+
+
+_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def read_ply_header(path: Path) -> PlyHeader:
+    """Read the header of a PLY file, and check that the file is as long as it claims.
 
     Raises:
         ValueError: it is cut off, or its header is damaged.
     """
     with path.open("rb") as file:
         start = file.read(_LONGEST_HEADER)
-    header, found, rest = start.partition(b"end_header")
+    text, found, rest = start.partition(b"end_header")
     if not start.startswith(b"ply") or not found:
         raise ValueError("it does not begin with the header of a PLY")
-    length = len(header) + len(found) + (2 if rest.startswith(b"\r\n") else 1)
-    words = [line.split() for line in header.decode("latin-1").splitlines()]
-    elements: list[tuple[str, int, int]] = []  # name, count, and least bytes of one
-    for line in words:
-        if line[:1] == ["element"]:
-            elements.append((line[1], int(line[2]), 0))
-        elif line[:1] == ["property"] and elements:
-            name, count, size = elements[-1]
-            elements[-1] = name, count, size + _BYTES[line[2] if line[1] == "list" else line[1]]
-    if any(count < 0 for _, count, _ in elements):
+    line_end = rest[: len(rest) - len(rest.lstrip(b" \t"))]
+    rest = rest[len(line_end) :]
+    length = len(text) + len(found) + len(line_end) + (2 if rest.startswith(b"\r\n") else 1)
+    order, elements = "", []
+    for words in (line.split() for line in text.decode("latin-1").splitlines()):
+        match words:
+            case ["format", form, _]:
+                order = _ORDERS[form]
+            case ["element", name, count]:
+                elements.append(PlyElement(name, int(count), []))
+            case ["property", "list", counted, kind, name]:
+                elements[-1].properties.append(PlyProperty(name, _TYPES[kind], _TYPES[counted]))
+            case ["property", kind, name]:
+                elements[-1].properties.append(PlyProperty(name, _TYPES[kind]))
+    if any(element.count < 0 for element in elements):
         raise ValueError("its header has a negative count")
-    if ["format", "ascii", "1.0"] in words:
+    if order is None:
         _check_lines(path, length, elements)
-    elif (claimed := length + sum(count * size for _, count, size in elements)) > path.stat().st_size:
+    elif (claimed := length + sum(_least_bytes(element) for element in elements)) > path.stat().st_size:
         raise ValueError(f"its header claims at least {claimed} bytes, but it has {path.stat().st_size}")
+    return PlyHeader(order, length, elements)
 
 
-def _check_lines(path: Path, length: int, elements: list[tuple[str, int, int]]) -> None:
+def _least_bytes(element: PlyElement) -> int:
+    return element.count * sum(int((prop.counted or prop.type)[1:]) for prop in element.properties)
+
+
+def _check_lines(path: Path, length: int, elements: list[PlyElement]) -> None:
     with path.open("rb") as file:
         file.seek(length)
         there = sum(1 for line in file if line.strip())
-    for name, count, _ in elements:
-        if count > there:
-            raise ValueError(f"it holds {there} of the {count} lines of its element {name!r}")
-        there -= count
+    for element in elements:
+        if element.count > there:
+            raise ValueError(f"it holds {there} of the {element.count} lines of its element {element.name!r}")
+        there -= element.count
 
 
 _LAS_RECORD, _LAS_EXTENDED_RECORD = 54, 60  # least bytes of a record of a LAS file besides its points

@@ -12,7 +12,7 @@ from jaxtyping import Float64, UInt8
 
 from dataparsers.errors import SceneError
 from dataparsers.files import read_json
-from dataparsers.headers import check_ply
+from dataparsers.headers import read_ply_header
 from dataparsers.scene_files import NamedFiles
 from dataparsers.shots import DISTORTION, Recording, Shot, in_order, shot
 
@@ -78,7 +78,7 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
     import trimesh
 
     try:
-        check_ply(path)
+        read_ply_header(path)
         cloud = trimesh.load(path, process=False)
         positions = np.asarray(cloud.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
         colours = np.asarray(cloud.visual.vertex_colors, np.uint8)  # pyright: ignore[reportAttributeAccessIssue]

@@ -22,8 +22,8 @@ log = logging.getLogger(__name__)
 
 Mesher = Literal["planes", "bpa", "poisson"]
 
-VERSION = 1
-"""Version of the meshers: clouds are meshed again if it changes."""
+VERSION = 2
+"""Version of the meshers and of what the readers of clouds leave out: clouds are meshed again if it changes."""
 
 CELLS = 1500  # cells along the cloud's extent in which points are merged: 2 cm of 30 m
 LONGEST_EDGE = 3.0  # this and the next two lengths are in units of the cloud's spacing

@@ -85,7 +85,8 @@ def load_shell(
     ``<cache>/<file name>.<mesher>.ply`` until the cloud changes.
 
     Args:
-        path: ply, obj, glb, gltf, stl, off, pcd, xyz, las, laz or e57; the last three need the extras ``las``, ``e57``.
+        path: a mesh (ply, obj, glb, gltf, stl, off) or a cloud (ply, pcd, xyz, pts, txt, asc, csv, las, laz, e57; the
+            last three need the extras ``las`` and ``e57``).
         cache: folder for the mesh of a point cloud; None for no cache.
         viewpoints: positions that see the surface, in the shell's frame. They orient the normals of a cloud whose file
             has no scanner positions. A mesh cached for other viewpoints is made again.

@@ -1,0 +1,131 @@
+"""Read point clouds of text: columns with or without a header, a number of points, and separators."""
+
+from __future__ import annotations
+
+import codecs
+import re
+from collections.abc import Iterator
+from itertools import chain, islice
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from dataparsers.errors import SceneError
+from shellgs_method.shell.geometry.readers.contents import NO_POINTS, Geometry, log
+
+_COMMENTS = ("#", "//")
+_BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_SAMPLE = 100  # lines that decide on the layout
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_WHOLE = re.compile(r"[-+]?\d+")
+
+
+def read_text_cloud(path: Path) -> Geometry:
+    """Read X, Y and Z of each line: the first three columns, or those that a header names so.
+
+    Columns are separated by spaces, tabs, commas or semicolons. A line with one number counts the points after it.
+    Where the first column numbers or names the points, X is the second.
+
+    Raises:
+        SceneError: the first lines are no such columns.
+        ValueError: a later line is not, or points are missing.
+    """
+    with path.open("rb") as file:
+        start = file.read(4)
+    encoding = next((name for bom, name in _BOMS.items() if start.startswith(bom)), "utf-8")
+    with path.open(encoding=encoding, errors="replace") as file:
+        lines = _Lines(file)
+        first = list(islice(lines, _SAMPLE))
+        if not first:
+            return Geometry(NO_POINTS)
+        separator = _separator(first, path)
+        header = [word.strip("\"' ") for word in first[0].split(separator)]
+        named = not any(map(_is_number, header))
+        columns = _named(header, first[0], path) if named else _columns(first, separator, path)
+        rows = chain(first[1:] if named else first, lines)
+        spaced = rows if separator is None else (row.replace(separator, " ") for row in rows)
+        points = np.loadtxt(spaced, usecols=columns, comments=None, ndmin=2)
+    if lines.claimed and lines.claimed != len(points):
+        raise ValueError(f"it holds {len(points)} of {lines.claimed} points")
+    return Geometry(points)
+
+
+class _Lines:
+    """The lines of a file, without comments, empty lines, and those that count points.
+
+    Attributes:
+        claimed: how many points the lines so far have counted.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self.file, self.claimed = file, 0
+
+    def __iter__(self) -> Iterator[str]:
+        for line in self.file:
+            line = line.strip()
+            if not line or line.startswith(_COMMENTS):
+                continue
+            if _WHOLE.fullmatch(line):
+                self.claimed += int(line)
+                continue
+            yield line
+
+
+def _separator(lines: list[str], path: Path) -> str | None:
+    """What separates the columns of the last line; None for spaces."""
+    line = lines[-1]
+    other = ";" if ";" in line else None
+    if any(_DECIMAL_COMMA.fullmatch(word) for word in line.replace(";", " ").split()) and (
+        other or len(line.split()) > 2
+    ):
+        raise SceneError(f"the shell {path} has decimal commas ({_shown(line)}): export it with decimal points")
+    return other or ("," if "," in line else None)
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    return (line if separator is None else line.replace(separator, " ")).split()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _named(header: list[str], line: str, path: Path) -> list[int]:
+    """Columns that a header calls X, Y and Z, with a unit or without."""
+    names = [re.split(r"[^a-z]", name.lower().lstrip("/"))[0] for name in header]
+    if any(names.count(axis) != 1 for axis in "xyz"):
+        raise SceneError(
+            f"the shell {path} cannot be read: it begins with {_shown(line)}, which does not name one column each of "
+            "X, Y and Z: name them in that line, or delete it if they are the first three columns"
+        )
+    return [names.index(axis) for axis in "xyz"]
+
+
+def _columns(lines: list[str], separator: str | None, path: Path) -> list[int]:
+    """The first three columns, or those after one that numbers or names the points."""
+    rows = [_split(line, separator) for line in lines]
+    width = min(len(row) for row in rows)
+    numeric = [all(_is_number(row[k]) for row in rows) for k in range(min(width, 4))]
+    if width >= 4 and all(numeric[1:]):
+        whole = [all(_WHOLE.fullmatch(row[k]) for row in rows) for k in range(4)]
+        varies = len({row[0] for row in rows}) > 1
+        if not numeric[0] or (varies and whole[0] and not any(whole[1:])):
+            log.warning(
+                "%s: its first column (%s) is taken for the points' numbers, and X for the second", path, rows[0][0]
+            )
+            return [1, 2, 3]
+    if width < 3 or not all(numeric[:3]):
+        raise SceneError(
+            f"the shell {path} cannot be read: it begins with {_shown(lines[0])} where X, Y and Z are expected: export "
+            "it with these in each line, after a line that names the columns, if they are not the first three"
+        )
+    return [0, 1, 2]
+
+
+def _shown(line: str) -> str:
+    return repr(line if len(line) <= 60 else f"{line[:57]}...")
