@@ -394,7 +394,7 @@ def test_negative_indices_of_an_obj_count_back_from_their_face(tmp_path: Path):
     groups = "".join(
         f"g {z}\nv 0 0 {z}\nv 1 0 {z}\nv 0 1 {z} 0.5 0.5 0.5\nvt 0 0\nf -3/-1 -2/-1 -1/-1\n" for z in range(3)
     )
-    (tmp_path / "a.obj").write_text("mtllib gone.mtl\n" + groups + "f 1// 2// \\\n3//\nl 1 2\np 1\n")
+    (tmp_path / "a.obj").write_text("mtllib gone.mtl\n" + groups + "\n \tf 1// 2// \\\n3// # a face\n \nl 1 2\np 1\n")
     read = read_geometry(tmp_path / "a.obj")
     np.testing.assert_array_equal(read.vertices[read.faces][:, :, 2], [[0] * 3, [1] * 3, [2] * 3, [0] * 3])
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int, Int64
+from jaxtyping import Bool, Float64, Int, Int64, Shaped
 
 from dataparsers.errors import SceneError
 
@@ -44,6 +45,17 @@ def left_out(path: Path, count: int, total: int, what: str, why: str) -> None:
     """Warn of what a reader leaves out of a file, if anything."""
     if count:
         log.warning("%s: left out %d of %d %s%s", path, count, total, what, why)
+
+
+def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
+    """The numbers of a text that holds nothing else.
+
+    Raises:
+        DeprecationWarning: it holds something else.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # numpy stops there, and warns
+        return np.fromstring(text, kind, sep=" ")
 
 
 def polygon_triangles(

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from dataparsers.errors import SceneError
-from shellgs_method.shell.geometry.readers.contents import Geometry, left_out, polygon_triangles
+from shellgs_method.shell.geometry.readers.contents import NO_POINTS, Geometry, left_out, numbers_in, polygon_triangles
 
-_CURVED = ("curv", "curv2", "surf", "bsp", "bzp", "cdc", "cdp", "res")
+_CURVED = ("curv", "surf", "bsp", "bzp", "cdc", "cdp", "res ")
 
 
 def read_obj(path: Path) -> Geometry:
@@ -22,30 +22,27 @@ def read_obj(path: Path) -> Geometry:
         Exception: it is damaged; of any kind.
     """
     text = path.read_text("utf-8-sig", errors="replace").replace("\\\n", " ")
-    vertices: list[list[str]] = []
-    faces: list[list[int]] = []
+    vertices: list[str] = []
+    faces: list[str] = []
+    above: list[int] = []  # number of vertices before each face
     curved = 0
-    for line in text.splitlines():
-        words = line.partition("#")[0].split()
-        key = words[0] if words else ""
+    for line in map(str.lstrip, text.splitlines()):
+        key = line[:2].rstrip()
         if key == "v":
-            vertices.append(words[1:4])
+            vertices.append(line)
         elif key in ("f", "fo"):
-            corners = [int(corner.partition("/")[0]) for corner in words[1:]]
-            # counted from 1, or backwards from the vertex before the face
-            faces.append([corner - 1 if corner > 0 else _before(corner, len(vertices)) for corner in corners])
-        elif key in _CURVED:
+            faces.append(line.partition("#")[0].lstrip("fo"))
+            above.append(len(vertices))
+        elif line.startswith(_CURVED):
             curved += 1
     left_out(path, curved, curved + len(faces), "elements", ", which are curves or curved surfaces")
-    points = np.array(vertices, np.float64).reshape(-1, 3)
-    sizes = np.array([len(face) for face in faces], np.int64)
-    return Geometry(points, polygon_triangles(points, sizes, np.fromiter(chain(*faces), np.int64), path))
-
-
-def _before(corner: int, count: int) -> int:
-    if not -count <= corner < 0:
-        raise ValueError(f"a face has vertex {corner}, after {count} vertices")
-    return count + corner
+    points = np.loadtxt(vertices, usecols=(1, 2, 3), ndmin=2) if vertices else NO_POINTS
+    sizes = np.array([len(face.split()) for face in faces], np.int64)
+    stored = numbers_in(re.sub(r"/\S*", "", " ".join(faces)), int)
+    corners = np.where(stored > 0, stored - 1, stored + np.repeat(np.array(above, np.int64), sizes))
+    if (stored == 0).any() or (corners < 0).any():  # counted from 1, or backwards from the last vertex before the face
+        raise ValueError("a face has a vertex before the first")
+    return Geometry(points, polygon_triangles(points, sizes, corners, path))
 
 
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

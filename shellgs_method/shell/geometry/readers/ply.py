@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +14,7 @@ from shellgs_method.shell.geometry.readers.contents import (
     NO_FACES,
     Geometry,
     left_out,
+    numbers_in,
     polygon_triangles,
     splats,
     strip_triangles,
@@ -83,8 +83,8 @@ class _Numbers(Protocol):
 
 
 class _Binary:
-    def __init__(self, data: bytes, order: str) -> None:
-        self.data, self.order, self.at = data, order, 0
+    def __init__(self, data: bytes, order: str, at: int) -> None:
+        self.data, self.order, self.at = data, order, at
 
     def take(self, kind: str, count: int) -> np.ndarray:
         if count < 0:
@@ -104,9 +104,7 @@ class _Binary:
 
 class _Text:
     def __init__(self, data: bytes) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # of what is no number
-            self.numbers, self.at = np.fromstring(data.decode("latin-1"), sep=" "), 0
+        self.numbers, self.at = numbers_in(data.decode("latin-1")), 0
 
     def take(self, kind: str, count: int) -> np.ndarray:
         values = self.numbers[self.at : self.at + count]
@@ -124,8 +122,8 @@ class _Text:
 
 
 def _elements(path: Path, header: PlyHeader) -> Iterator[tuple[PlyElement, dict[str, _Column]]]:
-    data = path.read_bytes()[header.length :]
-    numbers: _Numbers = _Text(data) if header.order is None else _Binary(data, header.order)
+    data, start = path.read_bytes(), header.length
+    numbers: _Numbers = _Text(data[start:]) if header.order is None else _Binary(data, header.order, start)
     for element in header.elements:
         yield element, _columns(element, numbers)
     if isinstance(numbers, _Text) and numbers.at < len(numbers.numbers):
