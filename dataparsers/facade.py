@@ -16,13 +16,14 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from dataparsers.camera import Camera
+from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMaps, find_cues
 from dataparsers.errors import SceneError, refusals_end_the_program
 from dataparsers.frames import check_points
 from dataparsers.layout import SceneLayout
 from dataparsers.orientation import oriented
 from dataparsers.photograph import View, undistort
+from dataparsers.precision import camera_step, warn_of_coarse
 from dataparsers.shots import Recording, Shot
 from dataparsers.sparse_points import find_sparse_points
 
@@ -121,6 +122,8 @@ def held_out_names(config: FacadeDataParserConfig) -> set[str]:
 
 def _views(shots: Sequence[Shot], layout: SceneLayout) -> list[View]:
     _refuse_missing_images(shots, layout.data)
+    cameras = [shot.camera for shot in shots]
+    warn_of_coarse(camera_step(cameras), positions(cameras), f"the cameras of {layout.data}")
     masks = layout.masks(shots)
     views = []
     pinholes: dict[tuple, Camera] = {}  # photographs of one lens share their undistorted camera

@@ -14,6 +14,7 @@ from dataparsers.camera import in_view
 from dataparsers.errors import SceneError
 from dataparsers.layout import SceneLayout
 from dataparsers.photograph import View
+from dataparsers.precision import Step, cloud_step, warn_of_coarse
 from dataparsers.strays import sound
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,11 @@ class SparsePoints:
     observed: Mapping[str, Int[np.ndarray, " M"]] | None = None
     colours: UInt8[np.ndarray, "N 3"] | None = None
     called: str = "the SfM points"
+
+    @property
+    def step(self) -> Step:
+        """Step of the positions as they are stored."""
+        return cloud_step(self.positions)
 
     def seen_in(self, view: View) -> tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, " M"]]:
         """Pixels and z-depths of the view's points: those it observes, or else all that project into it.
@@ -65,7 +71,8 @@ def read_sparse_points(layout: SceneLayout) -> SparsePoints:
 def find_sparse_points(layout: SceneLayout) -> SparsePoints:
     """Read the SfM points of a scene, if any.
 
-    Points that are NaN, infinite or absurdly far away are left out, with a warning.
+    Points that are NaN, infinite or absurdly far away are left out, with a warning. Coordinates that are stored too
+    coarsely are warned of.
 
     Raises:
         SceneError: their file is damaged.
@@ -97,4 +104,6 @@ def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np
             len(positions),
             layout.data,
         )
+    if near.any():
+        warn_of_coarse(cloud_step(positions[near]), positions[near], f"the SfM points of {layout.data}")
     return np.flatnonzero(near)

@@ -23,6 +23,7 @@ from dataparsers.cue_maps import CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, to_camera
+from dataparsers.precision import mesh_step
 from dataparsers.sparse_points import SparsePoints
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, cast_views, load_shell
@@ -31,7 +32,7 @@ from shellgs_method.shell.geometry.similarity import fit_similarity, transformed
 from shellgs_method.shell.geometry.surface import ShellSurface
 from shellgs_method.shell.registration import alignment as alignment_module
 from shellgs_method.shell.registration import proposal
-from shellgs_method.shell.registration.align import PROPOSAL, REPORT, place_by_guess
+from shellgs_method.shell.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
 from shellgs_method.shell.registration.bays import facade_axes, scan_shifts
 from shellgs_method.shell.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.shell.registration.positions import SurveyedPositions, align_positions, read_positions
@@ -109,7 +110,48 @@ def shifted(right: float = 0.0, up: float = 0.0, out: float = 0.0) -> Alignment:
     return Alignment(TRUTH @ move, "shell/facade.ply")
 
 
+def in_its_own_frame(mesh: ShellMesh, points: SparsePoints) -> tuple[Placement, np.ndarray]:
+    """A scene in the shell's national coordinates: the exact placement, and the SfM points."""
+    return Placement(Alignment(np.eye(4), "facade.ply")), transformed(points.positions, np.linalg.inv(TRUTH))
+
+
 # Similarities and refinement
+
+
+def test_refinement_does_not_follow_points_in_single_precision(mesh, views, points):
+    placement, exact = in_its_own_frame(mesh, points)
+    rounded = SparsePoints(exact.astype(np.float32).astype(np.float64))
+    with pytest.raises(
+        SceneError, match=r"--refine .* the SfM points are stored in steps of 0\.031 x 0\.5 x 1\.5e-05 m"
+    ):
+        refined(placement, mesh, views, rounded, 0.3)
+    assert "Refined" in refined(placement, mesh, views, SparsePoints(exact), 0.3).history[-1]
+
+
+def test_points_beyond_the_last_gate_by_rounding_count(surface, points, survey_from_scene):
+    exact = refine(surface, points.positions, survey_from_scene, 0.1).evidence.points
+    assert refine(surface, points.positions, survey_from_scene, 0.1, rounding=0.02).evidence.points > exact
+
+
+def test_decimetres_of_a_shell_are_never_good(mesh, views, points):
+    vertices = mesh.vertices.round(1)
+    rounded = replace(mesh, vertices=vertices, step=mesh_step(vertices, mesh.faces))
+    validation = validate(rounded, shifted(), views, points)
+    assert any("Steps of the coordinates of shell/facade.ply: 0.1 x 0.1" in reason for reason in validation.reasons)
+    assert (validation.metrics()["rounding_m"] or 0.0) >= 0.05
+
+
+def test_an_alignment_is_refused_if_its_cameras_were_rounded_to_metres(mesh, views, points):
+    placement, exact = in_its_own_frame(mesh, points)
+    moved = []
+    for view in views:
+        viewmat = view.camera.viewmat @ torch.from_numpy(TRUTH)
+        viewmat[:3] /= np.cbrt(np.linalg.det(TRUTH[:3, :3]))
+        viewmat[:3, 3] = viewmat[:3, 3].float().double()
+        moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+    validation = validate(mesh, placement.alignment, moved, SparsePoints(exact))
+    assert validation.verdict == "refused"
+    assert validation.reasons[0].startswith("Steps of the cameras: 0.")
 
 
 def test_a_similarity_is_found_from_exact_points():

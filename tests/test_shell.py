@@ -255,7 +255,7 @@ def test_triangles_without_area_are_dropped_and_counted(
     corners = np.array([[0, 0, 0], [9, 0, 0], [0, 9, 0], [3, 0, 0], [4.5, 1e-7, 0], [4.5, -1e-3, 0]]) + origin
     faces = ["3 0 1 2", "3 0 0 0", "3 0 1 1", "3 0 1 3", "3 0 1 4", "3 0 1 5"]
     mesh = load_shell(write_ply(tmp_path / "a.ply", [" ".join(map(repr, c)) for c in corners.tolist()], faces))
-    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 1, 5]])
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], corners[[[0, 1, 2], [0, 1, 5]]])
     assert "dropped 4 of 6 triangles, which have no area" in caplog.text
 
 
@@ -265,9 +265,61 @@ def test_a_vertex_far_away_makes_no_other_triangle_flat(tmp_path: Path):
     np.testing.assert_array_equal(mesh.faces[-1], [0, 1, 2])
 
 
-def test_large_coordinates_in_single_precision_cause_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    load_shell(save(tmp_path / "survey.stl", ShellMesh(box().vertices + GEOREFERENCE, box().faces)))
-    assert "single precision, in steps of 0.5" in caplog.text
+def turned_box() -> ShellMesh:
+    return ShellMesh(3.3 * box().vertices @ TURN.T + GEOREFERENCE, box().faces)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "glb"])
+def test_large_coordinates_in_single_precision_are_refused(tmp_path: Path, suffix: str):
+    path = save(tmp_path / f"survey.{suffix}", turned_box())
+    with pytest.raises(SceneError, match=rf"survey\.{suffix}: the coordinates are stored in steps of .* 0\.5 x"):
+        load_shell(path)
+
+
+def test_the_tolerance_of_a_shell_is_in_metres(tmp_path: Path):
+    """Half a millimetre is none too much."""
+    step = load_shell(save(tmp_path / "survey.stl", turned_box()), metres_per_unit=0.001).step
+    assert step.coarsest == 0.5
+
+
+def surveyed() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a subdivided box in national coordinates."""
+    mesh = trimesh.creation.box((2, 2, 2)).subdivide()
+    return (np.asarray(mesh.vertices) + np.array([0, 0, 8])) @ TURN.T + GEOREFERENCE, np.asarray(mesh.faces)
+
+
+def write_doubles(path: Path, vertices: np.ndarray, faces: np.ndarray, form: str = "{!r}") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    corners = [" ".join(form.format(float(value)) for value in vertex) for vertex in vertices]
+    return write_ply(path, corners, [f"3 {a} {b} {c}" for a, b, c in faces])
+
+
+def test_few_digits_of_a_shell_are_said_with_its_maps(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    write_doubles(tmp_path / "shell/few.ply", *surveyed(), form="{:.1f}")
+    cast_views(tmp_path, VIEWS, Alignment(np.linalg.inv(similarity(1.0, TURN, GEOREFERENCE)), "shell/few.ply"))
+    assert "few.ply are stored in steps of 0.1 x 0.1 x 0.1 m" in caplog.text
+
+
+@pytest.mark.parametrize("faces", [[], [[0, 1, 29]], [[26, 27, 28]]], ids=["unreferenced", "spike", "triangle"])
+def test_vertices_at_the_origin_of_national_coordinates_cost_no_precision(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, faces: list[list[int]]
+):
+    vertices, used = surveyed()
+    stray = np.concatenate([vertices, np.eye(3), np.zeros((9, 3))])
+    loaded = load_shell(write_doubles(tmp_path / "survey.ply", stray, np.array([*used, *faces])))
+    np.testing.assert_array_equal(loaded.vertices, vertices)
+    np.testing.assert_array_equal(loaded.faces, used)
+    assert ("dropped 1 of 49 triangles" in caplog.text) == bool(faces)
+
+
+def test_a_vertex_far_away_moves_no_map():
+    """Even if it is kept: rays are cast relative to the median vertex."""
+    camera = camera_at([-2, 0.4, 0], yaw=-15)
+    mesh = box()
+    far = ShellMesh(
+        np.array([*mesh.vertices, [0, 0, -5e6], [1, 0, -5e6], [0, 1, -5e6]]), np.array([*mesh.faces, [8, 9, 10]])
+    )
+    assert_same_maps(ShellCaster(far, np.eye(4)).cast(camera), ShellCaster(mesh, np.eye(4)).cast(camera))
 
 
 # Alignment

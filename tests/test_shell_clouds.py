@@ -275,6 +275,19 @@ def test_a_cloud_is_meshed_once(cloud: Path, monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_array_equal(again.vertices, first.vertices)
     np.testing.assert_array_equal(again.faces, first.faces)
     assert again.meshing == first.meshing
+    np.testing.assert_array_equal(again.step.lengths, first.step.lengths)
+
+
+def test_the_mesh_of_a_rounded_cloud_remembers_its_step(cloud: Path):
+    write_open3d(cloud, np.round(scan(3000) + GEOREFERENCE, 2))
+    for _ in range(2):  # meshed, and read from the cache
+        np.testing.assert_allclose(load_shell(cloud, cache=cloud.parent).step.lengths, 0.01)
+
+
+def test_a_cloud_of_six_digits_is_refused_before_it_is_meshed(tmp_path: Path):
+    np.savetxt(tmp_path / "scan.xyz", scan(3000) + GEOREFERENCE, fmt="%.6g")
+    with pytest.raises(SceneError, match=r"scan\.xyz: the coordinates are stored in steps of 1 x 10 x 0\.001 m"):
+        load_shell(tmp_path / "scan.xyz")
 
 
 def test_the_cached_mesh_can_be_opened_by_other_programs(cloud: Path):

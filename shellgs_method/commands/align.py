@@ -95,7 +95,8 @@ def align(
     elif positions:
         placement = place_by_positions(positions, views, ShellPlace(shell), name, metres_per_shell_unit)
     else:
-        unaligned = load_shell(shell, cache=scene / "shell", mesher=mesher or "planes")
+        method, unit = mesher or "planes", metres_per_shell_unit
+        unaligned = load_shell(shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
         placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
     placement = replace(placement, alignment=placement.alignment.meshed_by(mesher))
     mesh = placement.alignment.load_shell(scene, views)

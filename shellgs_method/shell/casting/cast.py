@@ -18,6 +18,7 @@ from dataparsers.camera import Camera, positions
 from dataparsers.cue_maps import CueMap, CueMaps
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View, load_mask
+from dataparsers.precision import FINE, camera_step, refuse_coarse
 from shellgs_method.shell.geometry.clouds import VERSION, Meshing
 from shellgs_method.shell.geometry.raycast import ShellCaster
 from shellgs_method.shell.registration.alignment import ALIGNMENT, Alignment
@@ -85,6 +86,14 @@ def cast_views(
     shell = scene / alignment.shell
     cameras = [view.camera for view in views]
     mesh = alignment.load_shell(scene, views)
+    refuse_coarse(camera_step(cameras).scaled(alignment.metres_per_unit), f"the cameras of {scene}")
+    step = mesh.step.scaled(alignment.metres_per_shell_unit)
+    if step.coarsest > FINE:
+        log.warning(
+            "the coordinates of %s are stored in steps of %s: the maps are up to half of that off",
+            shell,
+            step.in_words(),
+        )
     caster = ShellCaster(mesh, alignment.shell_to_scene)
     _check_placement(caster, cameras, shell)
     if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):

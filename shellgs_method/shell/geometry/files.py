@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +18,6 @@ from shellgs_method.shell.geometry.readers.pcd import read_pcd
 from shellgs_method.shell.geometry.readers.ply import read_ply
 from shellgs_method.shell.geometry.readers.scans import read_e57, read_las
 from shellgs_method.shell.geometry.readers.text_clouds import read_text_cloud
-
-log = logging.getLogger(__name__)
 
 READERS: dict[str, Callable[[Path], Geometry]] = {
     ".ply": read_ply,
@@ -73,7 +70,6 @@ def read_geometry(path: Path) -> Geometry:
         raise SceneError(f"the shell {path} needs {error.name}: run `pip install 'shellgs[{extra}]'`") from error
     except Exception as error:  # each format's reader raises errors of its own for a damaged file
         raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason(error)})") from error
-    _warn_of_float32(geometry.vertices, path)
     return geometry if len(geometry.faces) else _without_misses(geometry, path)
 
 
@@ -89,20 +85,3 @@ def _without_misses(cloud: Geometry, path: Path) -> Geometry:
         return cloud
     left_out(path, int(missed.sum()), len(missed), "points", " at exactly 0 0 0, which are misses of the scanner")
     return replace(cloud, vertices=others)
-
-
-def _warn_of_float32(vertices: np.ndarray, path: Path) -> None:
-    """Warn of georeferenced coordinates stored as float32: they were rounded when the file was written."""
-    vertices = vertices[np.isfinite(vertices).all(axis=1)]
-    if not len(vertices):
-        return
-    single = vertices.astype(np.float32)
-    step = float(np.spacing(np.abs(single).max()))
-    extent = np.ptp(vertices, axis=0).max()
-    if step > 1e-4 * extent and np.array_equal(single, vertices):
-        log.warning(
-            "%s stores large coordinates in single precision, in steps of %.2g units: export the shell in double "
-            "precision (PLY, OBJ, LAS or E57), or move it near the origin first",
-            path,
-            step,
-        )

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from dataparsers.errors import SceneError
 from dataparsers.files import atomic_write, content_hash
+from dataparsers.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
 from dataparsers.strays import sound
 from shellgs_method.shell.geometry.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.geometry.files import read_geometry
@@ -19,6 +20,9 @@ from shellgs_method.shell.geometry.files import read_geometry
 log = logging.getLogger(__name__)
 
 COMMENT = "comment shellgs "
+_FAR = 1e4
+"""Times the median distance from the median vertex beyond which a vertex is not the building's, but at the origin of
+national coordinates, for example. It would stretch every box and take most of the area."""
 SCANNER = "scanner"
 """Source of the viewpoints: scanner positions in the file."""
 
@@ -31,6 +35,7 @@ class ShellMesh:
         vertices: positions in the shell's own frame and units, possibly georeferenced.
         faces: three vertex indices per triangle.
         meshing: how a point cloud was meshed; None if the file holds a mesh.
+        step: step of the coordinates in the file.
 
     Raises:
         SceneError: the arrays are not such a mesh.
@@ -39,6 +44,7 @@ class ShellMesh:
     vertices: Float64[np.ndarray, "V 3"]
     faces: Int64[np.ndarray, "F 3"]
     meshing: Meshing | None = None
+    step: Step = NO_STEP
 
     def __post_init__(self) -> None:
         """Check what Open3D does not: it accepts indices out of range."""
@@ -55,6 +61,11 @@ class ShellMesh:
     def bounds(self) -> Float64[np.ndarray, "2 3"]:
         """Lowest and highest corner of the bounding box."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
+
+    @property
+    def centre(self) -> Float64[np.ndarray, " 3"]:
+        """Median vertex. What is in float32 is relative to it, so that no vertex far away costs the others theirs."""
+        return np.median(self.vertices, axis=0)
 
 
 def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
@@ -76,11 +87,12 @@ def load_shell(
     cache: Path | None = None,
     viewpoints: Float64[np.ndarray, "V 3"] | None = None,
     mesher: Mesher = "planes",
+    metres_per_unit: float = 1.0,
 ) -> ShellMesh:
     """Load a shell, a triangle mesh or a point cloud, in double precision if the file has it.
 
     Points and vertices that are NaN, infinite or absurdly far away are dropped, with their triangles, as are triangles
-    without area; what is dropped is counted. A point cloud is meshed by
+    without area; what is dropped is counted. Vertices of no triangle are dropped. A point cloud is meshed by
     :func:`~shellgs_method.shell.geometry.clouds.mesh_cloud`; its mesh is cached as
     ``<cache>/<file name>.<mesher>.ply`` until the cloud changes.
 
@@ -91,10 +103,12 @@ def load_shell(
         viewpoints: positions that see the surface, in the shell's frame. They orient the normals of a cloud whose file
             has no scanner positions. A mesh cached for other viewpoints is made again.
         mesher: method that meshes a point cloud.
+        metres_per_unit: 1 for a shell in metres.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is empty or damaged, its reader is not installed, or it holds no surface.
+        SceneError: the file is empty or damaged, its reader is not installed, it holds no surface, or its coordinates
+            were rounded by decimetres.
     """
     path = Path(path)
     cached = None if cache is None else cache / f"{path.name}.{mesher}.ply"
@@ -103,9 +117,15 @@ def load_shell(
     geometry = read_geometry(path)
     try:
         if len(geometry.faces) or not len(geometry.vertices):
-            return _with_area(ShellMesh(*_without_strays(geometry.vertices, geometry.faces, path)), path)
+            used = _referenced(geometry.vertices, geometry.faces)
+            mesh = ShellMesh(*_referenced(*_without_strays(*used, path)))
+            step = mesh_step(mesh.vertices, mesh.faces)
+            refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
+            return replace(_with_area(mesh, path), step=step)
+        step = cloud_step(geometry.vertices)
+        refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
         seen_from = viewpoints if viewpoints is not None and not len(geometry.scanners) else geometry.scanners
-        mesh = _with_area(ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher)))
+        mesh = _with_area(ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher), step))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     if cached is not None:
@@ -128,7 +148,7 @@ def _write_cached(mesh: ShellMesh, cached: Path, source: Path, seen_from: list[f
     """Write the mesh as a PLY of doubles, with a comment that identifies its source."""
     assert mesh.meshing is not None
     made = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
-    record = json.dumps(made | {"seen_from": seen_from})
+    record = json.dumps(made | {"seen_from": seen_from, "step": mesh.step.lengths.tolist()})
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
     faces["count"], faces["indices"] = 3, mesh.faces
     header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]
@@ -148,7 +168,8 @@ def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> S
         if (record["version"], record["sha256"]) != (VERSION, content_hash(source)):
             return None
         geometry = read_geometry(cached)
-        mesh = ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]))
+        step = Step(np.array(record["step"], np.float64))
+        mesh = ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]), step)
         return mesh if _seen_alike(record["seen_from"], _seen_from(viewpoints), mesh) else None
     except (OSError, IndexError, KeyError, TypeError, ValueError):  # missing or damaged: it is made again
         return None
@@ -156,20 +177,29 @@ def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> S
 
 def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Drop vertices that are not finite or absurdly far away, and their triangles."""
-    kept = sound(vertices)
+    kept = sound(vertices, _FAR)
     if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
         return vertices, faces
     usable = kept[faces].all(axis=1)
     if not usable.any():
         raise SceneError("every triangle of the shell has a NaN or infinite vertex")
     log.warning(
-        "%s: dropped %d of %d triangles with a NaN or infinite vertex, or one absurdly far away",
+        "%s: dropped %d of %d triangles with a NaN or infinite vertex, or one absurdly far away, at %s",
         path,
         (~usable).sum(),
         len(faces),
+        " ".join(f"{value:g}" for value in vertices[~kept][0]),
     )
-    renumbered = np.cumsum(kept) - 1
-    return vertices[kept], renumbered[faces[usable]]
+    return vertices, faces[usable]
+
+
+def _referenced(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Drop vertices of no triangle; indices that are out of range are left for :class:`ShellMesh` to refuse."""
+    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+        return vertices, faces
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
 
 
 def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
@@ -179,4 +209,5 @@ def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
         return mesh
     if path is not None:
         log.warning("%s: dropped %d of %d triangles, which have no area", path, flat.sum(), len(flat))
-    return replace(mesh, faces=mesh.faces[~flat])
+    vertices, faces = _referenced(mesh.vertices, mesh.faces[~flat])
+    return replace(mesh, vertices=vertices, faces=faces)

@@ -21,7 +21,7 @@ class ShellCaster:
 
     Attributes:
         triangles: the shell relative to :attr:`origin`.
-        origin: centre of the shell's bounding box, in the scene's frame.
+        origin: median vertex of the shell, in the scene's frame.
         extent: longest side of the bounding box, in scene units.
 
     Raises:
@@ -31,7 +31,7 @@ class ShellCaster:
     def __init__(self, mesh: ShellMesh, shell_to_scene: Float64[np.ndarray, "4 4"]) -> None:
         placed = transformed(mesh.vertices, shell_to_scene)
         # Embree computes in float32, whose steps are 3 cm at 4e5: its coordinates are relative to the shell's centre.
-        self.origin = (placed.min(0) + placed.max(0)) / 2
+        self.origin = transformed(mesh.centre, shell_to_scene)
         self.extent = float(np.ptp(placed, axis=0).max())
         placed -= self.origin
         self.triangles = Triangles(placed, mesh.faces)

@@ -11,7 +11,7 @@ from shellgs_method.triangles import Triangles, area_vectors, rays_from, sampled
 
 
 class ShellSurface(Triangles):
-    """A shell in its *survey frame*: the shell's axes, in metres, with the origin at the centre of its bounding box.
+    """A shell in its *survey frame*: the shell's axes, in metres, with the origin at its median vertex.
 
     Open3D computes in float32, which is accurate to a micrometre there, and to decimetres in national coordinates.
 
@@ -25,7 +25,7 @@ class ShellSurface(Triangles):
     """
 
     def __init__(self, mesh: ShellMesh, metres_per_shell_unit: float = 1.0) -> None:
-        self.survey_from_shell = centred(mesh.bounds.mean(axis=0), metres_per_shell_unit)
+        self.survey_from_shell = centred(mesh.centre, metres_per_shell_unit)
         self.vertices = transformed(mesh.vertices, self.survey_from_shell)
         self.faces: Int64[np.ndarray, "F 3"] = mesh.faces
         self.bounds = np.stack([self.vertices.min(0), self.vertices.max(0)])

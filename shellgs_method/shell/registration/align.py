@@ -16,6 +16,7 @@ from dataparsers.camera import positions, upwards
 from dataparsers.cue_maps import CueMaps, source_hash
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
+from dataparsers.precision import FINE, REMEDY
 from shellgs_method.shell.geometry.files import up_axis
 from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.similarity import transformed
@@ -29,7 +30,7 @@ from shellgs_method.shell.registration.positions import align_positions, read_po
 from shellgs_method.shell.registration.proposal import propose
 from shellgs_method.shell.registration.refinement import refine
 from shellgs_method.shell.validation.report import write_report
-from shellgs_method.shell.validation.validation import Validation, validate
+from shellgs_method.shell.validation.validation import Validation, rounding_of, steps_in_metres, validate
 
 if TYPE_CHECKING:
     from dataparsers.sparse_points import SparsePoints
@@ -165,14 +166,21 @@ def refined(
     """Refine a placement against the SfM points.
 
     Raises:
-        SceneError: ``reach`` is not a positive number, or too few points are within ``reach`` metres of the shell.
+        SceneError: ``reach`` is not a positive number, the coordinates of the points or the shell are too coarse to
+            follow, or too few points are within ``reach`` metres of the shell.
     """
     if not 0 < reach < np.inf:
         raise SceneError(f"--refine must be the largest error of the start in metres, more than 0, not {reach:g}")
     alignment = placement.alignment
+    steps = steps_in_metres(mesh, alignment, views, points)
+    for what, step in steps.items():
+        if step.rounded and step.coarsest > FINE:
+            raise SceneError(
+                f"--refine would follow a rounding: {what} are stored in steps of {step.in_words()}; {REMEDY}"
+            )
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
-    result = refine(surface, points.positions, start, reach)
+    result = refine(surface, points.positions, start, reach, rounding_of(steps))
     up = start[:3, :3] @ upwards(view.camera for view in views)
     axes = facade_axes(surface.samples(5000)[1], up / np.linalg.norm(up))
     sentence = f"Refined against {result.evidence.points} SfM points, which moved by {result.moved:.3f} m."

@@ -87,9 +87,11 @@ class Alignment:
     def error(self) -> float | None:
         """Error of the alignment as a whole, in metres; None if it was not validated.
 
-        It is the larger of the magnitude of the SfM points' median signed distance and the motion of a fit to them.
+        It is the largest of the magnitude of the SfM points' median signed distance, the motion of a fit to them, and
+        what coordinates are rounded by.
         """
-        known = [abs(metric) for name in ("bias_m", "pull_m") if (metric := self.metrics.get(name)) is not None]
+        names = ("bias_m", "pull_m", "rounding_m")
+        known = [abs(metric) for name in names if (metric := self.metrics.get(name)) is not None]
         return max(known, default=None)
 
     def places_like(self, other: Alignment) -> bool:
@@ -128,11 +130,17 @@ class Alignment:
 
         Raises:
             FileNotFoundError: the shell is missing.
-            SceneError: the shell cannot be used.
+            SceneError: the shell cannot be used, or its coordinates were rounded by decimetres.
         """
         cameras = positions(view.camera for view in views)
         viewpoints = transformed(cameras, np.linalg.inv(self.shell_to_scene))
-        return load_shell(scene / self.shell, cache=scene / "shell", viewpoints=viewpoints, mesher=self.mesher)
+        return load_shell(
+            scene / self.shell,
+            cache=scene / "shell",
+            viewpoints=viewpoints,
+            mesher=self.mesher,
+            metres_per_unit=self.metres_per_shell_unit,
+        )
 
     def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Transform points of the shell to the scene's frame, in double precision."""

@@ -86,30 +86,33 @@ def refine(
     points: Float64[np.ndarray, "N 3"],
     survey_from_scene: Float64[np.ndarray, "4 4"],
     reach: float,
+    rounding: float = 0.0,
 ) -> Refinement:
     """Refine an alignment by fitting the SfM points to the shell.
 
     Each step applies the similarity that best moves the points onto the planes of their closest triangles (Chen and
     Medioni 1991, with a scale), weighted by Tukey's biweight, whose limit shrinks from ``reach`` to
-    :data:`FINAL_GATE`. Directions that the points do not determine stay unchanged.
+    :data:`FINAL_GATE` and the rounding of the coordinates. Directions that the points do not determine stay unchanged.
 
     Args:
         surface: the shell.
         points: SfM points in the scene's frame; points off the shell do no harm.
         survey_from_scene: initial similarity.
         reach: largest error of the initial similarity, in metres.
+        rounding: largest error of the points and the shell by the rounding of their coordinates, in metres.
 
     Raises:
         SceneError: fewer than 7 points are within reach of the shell.
     """
     start = transformed(points, survey_from_scene)
     similarity = survey_from_scene
-    gates = np.geomspace(max(reach, FINAL_GATE), FINAL_GATE, _STEPS // 2)
+    last = FINAL_GATE + rounding
+    gates = np.geomspace(max(reach, last), last, _STEPS // 2)
     evidence, used = None, np.ones(len(points), bool)
-    for gate in np.append(gates, np.full(_STEPS - len(gates), FINAL_GATE)):
+    for gate in np.append(gates, np.full(_STEPS - len(gates), last)):
         evidence, step, used = _solve(surface, transformed(points, similarity), gate)
         similarity = step @ similarity
-        if gate == FINAL_GATE and np.abs(step - np.eye(4)).max() < 1e-7:
+        if gate == last and np.abs(step - np.eye(4)).max() < 1e-7:
             break
     assert evidence is not None
     moved = transformed(points[used], similarity) - start[used]

@@ -5,7 +5,7 @@ All metrics are measured before training, on data that do not depend on the alig
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from dataparsers.camera import positions, upwards
 from dataparsers.errors import SceneError
 from dataparsers.photograph import View
+from dataparsers.precision import COARSEST, FINE, REMEDY, Step, camera_step
 from shellgs_method.nearest import point_tree
 from shellgs_method.shell.geometry.mesh import ShellMesh
 from shellgs_method.shell.geometry.raycast import ShellCaster
@@ -65,10 +66,13 @@ LIMITS = {
     ),
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
+    "step": Limit(FINE, COARSEST, f"an error of half a step does not average out; {REMEDY}"),
     "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
 }
 """All thresholds of the verdict, with their reasons."""
 
+SHOWN = 0.005
+"""Metres from which a step of coordinates is shown in the report."""
 _REACH = 0.25  # metres: reach of the test refinement
 
 
@@ -97,6 +101,7 @@ class Validation:
         scans: fit at shifts along the facade and upwards.
         test: test refinement of the alignment; None if too few points are near the shell.
         correspondences: picks or camera positions and their residuals, if any.
+        steps: steps of the coordinates in metres, by what they are of.
     """
 
     alignment: Alignment
@@ -108,6 +113,7 @@ class Validation:
     scans: Sequence[ShiftScan] = ()
     test: Refinement | None = None
     correspondences: Sequence[Correspondence] = ()
+    steps: Mapping[str, Step] = field(default_factory=dict)
 
     @property
     def verdict(self) -> Verdict:
@@ -136,6 +142,7 @@ class Validation:
         values |= {"bias_m": self.bias, "near": self.near, "metres_per_unit": self.alignment.metres_per_unit}
         if self.test is not None:
             values |= {"pull_m": self.test.moved, "condition": self.test.evidence.condition}
+        values["rounding_m"] = rounding_of(self.steps)
         values |= {f"best_elsewhere_{scan.name.replace(' ', '_')}": scan.elsewhere[1] for scan in self.scans}
         if held := [p.residual for p in self.correspondences if p.held_out]:
             values["check_points_m"] = float(np.median(held))
@@ -161,6 +168,7 @@ def validate(
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     survey_from_scene = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
     caster = ShellCaster(mesh, alignment.shell_to_scene)
+    steps = steps_in_metres(mesh, alignment, views, points)
     supports = [look(caster, view, points, survey_from_scene) for view in views]
     seeing = [support for support in supports if len(support.hits)]
     sight = _check("views", len(seeing) / max(len(views), 1), "Views that see the shell", "{:.0%}")
@@ -177,7 +185,7 @@ def validate(
     signed = _signed_distances(surface, placed, cameras)
     near = np.abs(signed) < NEAR
     try:
-        test = refine(surface, points.positions, survey_from_scene, _REACH)
+        test = refine(surface, points.positions, survey_from_scene, _REACH, rounding_of(steps))
     except SceneError:
         test = None
     measured = Validation(
@@ -190,11 +198,33 @@ def validate(
         scans=scan_shifts(surface, placed, axes),
         test=test,
         correspondences=correspondences,
+        steps=steps,
     )
     return replace(measured, checks=[sight, size, *_checks(measured)])
 
 
+def steps_in_metres(
+    mesh: ShellMesh, alignment: Alignment, views: Sequence[View], points: SparsePoints
+) -> dict[str, Step]:
+    """Steps of all coordinates of an alignment in metres, by what they are of."""
+    return {
+        f"the coordinates of {alignment.shell}": mesh.step.scaled(alignment.metres_per_shell_unit),
+        "the SfM points": points.step.scaled(alignment.metres_per_unit),
+        "the cameras": camera_step(view.camera for view in views).scaled(alignment.metres_per_unit),
+    }
+
+
+def rounding_of(steps: Mapping[str, Step]) -> float:
+    """Largest error by rounding, half of the coarsest step, in metres."""
+    return max((step.coarsest / 2 for step in steps.values() if step.rounded), default=0.0)
+
+
 def _checks(measured: Validation) -> Iterator[Check]:
+    for what, step in measured.steps.items():
+        if step.coarsest >= SHOWN:
+            name = f"Steps of {what}" + ("" if step.rounded else ", if they were rounded")
+            check = _check("step", step.coarsest, name, step.in_words())
+            yield check if step.rounded or check.verdict == "good" else replace(check, verdict="doubtful")
     yield _check("points", len(measured.signed), "SfM points within 1 m of the shell", "{:.0f}")
     yield _check("share", measured.share_within(0.10), "SfM points within 1 m, share within 10 cm", "{:.0%}")
     yield _check("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
