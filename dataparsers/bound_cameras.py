@@ -57,7 +57,7 @@ class BoundCameras:
         Two photographs in common show that the frame is the same; one does not tell its scale.
         """
         shared = [view for view in views if view.name in self.cameras]
-        if len(shared) < min(2, len(self.cameras)):
+        if len(shared) < min(2, len(self.cameras), len(views)):
             return f"of their {len(self.cameras)} photographs, {len(shared)} are in the scene"
         return next((words for view in shared if (words := self.camera_changed(view.name, view.camera))), None)
 

@@ -880,6 +880,7 @@ def test_photographs_come_and_go_without_harm_to_the_alignment(scene):
     views = scene_views(scene)
     added = replace(views[0], name="images/new.png", camera=replace(views[0].camera, width=7))
     assert found.cameras.changed([*views[3:], added]) is None
+    assert found.cameras.changed(views[4:5]) is None
     assert "of their 10 photographs, 1 are in the scene" in (found.cameras.changed([views[0], added]) or "")
 
 

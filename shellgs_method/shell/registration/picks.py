@@ -80,8 +80,7 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
     for where, words in read_lines(path, "picks"):
         if len(words) < 6 or not are_numbers(words[:5]):
             raise SceneError(
-                f"{where}: expected X Y Z of the shell, x y in the photograph, the image, and a name, separated by "
-                "spaces"
+                f"{where}: expected X Y Z of the shell, x y in the photograph, the image, a name, separated by spaces"
             )
         point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
         view = view_named(words[5], views, where)
