@@ -28,7 +28,7 @@ from dataparsers.photograph import View, load_mask, load_photograph
 from shellgs_method.bands import Bands, facade_bands
 from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps, seen_through
 from shellgs_method.covisibility import MAX_SIZE, SeenBy
-from shellgs_method.host import NO_RAYS, Refused
+from shellgs_method.host import NoPixelSampler
 from shellgs_method.memory import available_memory
 from shellgs_method.reference import Reference
 from shellgs_method.seeding import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
@@ -198,7 +198,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     """Full images with cue maps, cached on any machine."""
 
     config: FacadeDataManagerConfig
-    train_pixel_sampler = Refused(NO_RAYS)
+    train_pixel_sampler = NoPixelSampler()
 
     @cached_property
     def eval_dataloader(self) -> FixedIndicesEvalDataloader:

@@ -1,15 +1,15 @@
 """Nerfstudio's commands on runs of these methods: what they cannot do there ends in one sentence.
 
 They are not ours to change, and with these methods end in a traceback, or write something else than what was asked
-for. Where a model, a data manager or a config is asked for what it has not, it refuses by :class:`Refused` and
-:func:`refuse`; the rest is mended in the modules of the commands, in processes that run one of them.
+for. Where a model, a data manager or a config is asked for what it has not, it refuses by :func:`refuse`; the rest is
+mended in the modules of the commands, in processes that run one of them.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import cached_property, wraps
+from functools import wraps
 from typing import Any, NoReturn
 
 from dataparsers.errors import SceneError, refusals_end_the_program
@@ -35,14 +35,11 @@ def refuse(sentence: str) -> NoReturn:
     raise AssertionError
 
 
-class Refused(cached_property):
-    """An attribute that only commands read which cannot serve these methods: reading it ends them with a sentence.
+class NoPixelSampler:
+    """A data manager's sampler of rays, which ns-export configures: that ends it, but not a viewer that looks at it."""
 
-    A cached property, as nerfstudio's viewer reads all other attributes of a pipeline.
-    """
-
-    def __init__(self, sentence: str) -> None:
-        super().__init__(lambda _: refuse(sentence))
+    def __setattr__(self, _name: str, _value: object) -> NoReturn:
+        refuse(NO_RAYS)
 
 
 def mend_commands() -> None:

@@ -7,7 +7,6 @@ import math
 import socket
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import torch
@@ -202,8 +201,8 @@ def check_training(config: TrainerConfig) -> None:
         raise SceneError("load_dir and load_checkpoint name two checkpoints: give one of them")
     if config.load_step is not None and config.load_dir is None:
         raise SceneError(f"load_step cannot be {config.load_step} alone: give the --load-dir that holds this step")
-    if config.is_comet_enabled() and find_spec("comet_ml") is None:
-        raise SceneError(f"vis cannot be {config.vis}: comet is not installed: pip install comet_ml")
+    if config.is_comet_enabled():
+        _check_comet()
     if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
         check_viewer(config.viewer)
     elif config.start_paused:
@@ -223,6 +222,15 @@ def _check_scene(config: TrainerConfig) -> None:
         )
     if data.data is not None and parser.data not in (FacadeDataParserConfig.data, data.data):
         raise SceneError(f"two scenes are given, {data.data} and {parser.data}: give one of them, by --data")
+
+
+def _check_comet() -> None:
+    try:
+        from comet_ml import get_config  # slow to import  # pyright: ignore[reportPrivateImportUsage]
+    except ImportError as error:
+        raise SceneError(f"comet cannot be imported ({error}): pip install comet_ml, or another --vis") from error
+    if get_config("comet.api_key") is None:
+        raise SceneError("comet has no key: set COMET_API_KEY, run `comet login`, or give another --vis")
 
 
 def check_viewer(viewer: ViewerConfig) -> None:

@@ -47,7 +47,7 @@ from shellgs_method.geometry import (
     rendered_geometry,
     squared_depths,
 )
-from shellgs_method.host import NO_FIELD, NO_RAYS, NO_RGBA, Refused, refuse
+from shellgs_method.host import NO_FIELD, NO_RAYS, NO_RGBA, refuse
 from shellgs_method.limits import MIN_POINTS
 from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
 from shellgs_method.losses.reduction import weighted_mean
@@ -146,7 +146,10 @@ class FacadeModelConfig(SplatfactoModelConfig):
     eval_num_rays_per_chunk: Suppress[int] = 4096
     prompt: Suppress[Optional[str]] = None
 
-    sdf_field = Refused(NO_FIELD)
+    @property
+    def sdf_field(self) -> NoReturn:
+        """Refuse what ns-export marching-cubes looks for."""
+        refuse(NO_FIELD)
 
 
 class FacadeModel(SplatfactoModel):

@@ -16,6 +16,7 @@ from nerfstudio.scripts import exporter, render  # before a pipeline is built, a
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
+from nerfstudio.viewer_legacy.server.gui_utils import parse_object as parse_for_legacy
 from PIL import Image
 from runs import data_of, held_out, model_of, trainer_of
 
@@ -155,3 +156,4 @@ def test_a_port_that_there_is_not_ends_ns_viewer(trainer):
 def test_what_is_refused_to_commands_does_not_stop_the_viewer(trainer):
     """It reads every attribute of a pipeline in search of its elements."""
     assert parse_object(trainer.pipeline, ViewerElement, "Custom") is not None
+    assert parse_for_legacy(trainer.pipeline, ViewerElement, "Custom") is not None

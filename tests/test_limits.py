@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import sys
 from dataclasses import is_dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -130,6 +132,13 @@ def test_a_run_that_waits_for_the_viewers_button_needs_the_viewer():
     check_training(with_setting("start_paused", True))
     with pytest.raises(SceneError, match=r"start_paused needs the viewer.*--vis viewer\+tensorboard"):
         check_training(replace(with_setting("start_paused", True), vis="tensorboard"))
+
+
+def test_comet_without_a_key_is_refused(monkeypatch):
+    comet = SimpleNamespace(get_config=lambda name: {"comet.api_key": None}[name])
+    monkeypatch.setitem(sys.modules, "comet_ml", comet)
+    with pytest.raises(SceneError, match="comet has no key: set COMET_API_KEY"):
+        check_training(with_setting("vis", "viewer+comet"))
 
 
 def test_two_scenes_are_refused(tmp_path):

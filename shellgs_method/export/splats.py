@@ -73,9 +73,9 @@ def check_splats_format(path: Path) -> None:
     Raises:
         SceneError: it is not named as a ply, or the path is not writable.
     """
+    check_output(path)
     if path.suffix.lower() != ".ply":
         raise SceneError(f"{path}: splats are written as ply: name a file that ends in .ply")
-    check_output(path)
 
 
 def write_splats(path: Path, splats: Splats) -> int:
