@@ -113,6 +113,7 @@ def load_shell(
     path = Path(path)
     cached = None if cache is None else cache / f"{path.name}.{mesher}.ply"
     if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, viewpoints)):
+        refuse_coarse(mesh.step.scaled(metres_per_unit), f"the coordinates of {path}")
         return mesh
     geometry = read_geometry(path)
     try:
