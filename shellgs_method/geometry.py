@@ -7,7 +7,7 @@ is the same for both primitives.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -71,6 +71,13 @@ class Geometry:
     def solid(self) -> Float[Tensor, "H W 1"]:
         """Accumulated opacity of what makes up depth and normals."""
         return self.alpha if self.surface is None else self.surface
+
+    def detached(self) -> Geometry:
+        """The same maps without their graph."""
+        maps = {name: value.detach() for name, value in vars(self).items() if isinstance(value, Tensor)}
+        maps.pop("depth_normal", None)  # of the depth
+        moments = self.moments and DepthMoments(*(each.detach() for each in self.moments))
+        return replace(self, moments=moments, **maps)
 
     @cached_property
     def depth_normal(self) -> Float[Tensor, "H W 3"]:

@@ -178,6 +178,7 @@ class FacadeModel(SplatfactoModel):
             "black" if self.config.background_color == "random" else self.config.background_color
         )
         self.crop_box = None
+        self.info: dict[str, Any] = {}
         self.geometry: Geometry | None = None
         self.surface_weights: SurfaceWeights | None = None
         self.register_buffer("surface", None)
@@ -367,10 +368,16 @@ class FacadeModel(SplatfactoModel):
         return self._outside_training(camera) if is_pinhole(camera) else render_around(camera, self._outside_training)
 
     def _outside_training(self, camera: Cameras) -> dict[str, Tensor]:
-        # The kernels compiled on a CPU for training serve here too; without gradients, they would be compiled again.
-        with torch.set_grad_enabled(self.device.type == "cpu"):
-            outputs = self.get_outputs(camera)
-        return {name: output.detach() for name, output in outputs.items()}
+        try:
+            # On a CPU, the kernels compiled for training serve here too; without gradients, others would be compiled.
+            with torch.set_grad_enabled(self.device.type == "cpu"):
+                outputs = self.get_outputs(camera)
+            return {name: output.detach() for name, output in outputs.items()}
+        finally:  # these would keep all that a backward pass needs
+            self.info = {
+                name: value.detach() if isinstance(value, Tensor) else value for name, value in self.info.items()
+            }
+            self.geometry = self.geometry and self.geometry.detached()
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         """Render one pinhole camera; geometry is skipped in training where no loss needs it."""
@@ -464,8 +471,9 @@ class FacadeModel(SplatfactoModel):
     def _rasterize(
         self, gaussians: dict[str, Tensor], features: Float[Tensor, "N C"], camera: Camera
     ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W 1"], dict[str, Any]]:
-        # Only gradients of the colours densify, not those of the geometry.
-        densifies_by_gradient = self.training and self.config.densification == "default"
+        # Only gradients of colours densify, not those of the geometry; telling them apart costs gsplat a second pass.
+        strategy = self.strategy
+        densifies = self.training and isinstance(strategy, GradientStrategy) and self.step < strategy.refine_stop_iter
         return rasterize(
             gaussians["means"],
             gaussians["quats"],
@@ -474,7 +482,7 @@ class FacadeModel(SplatfactoModel):
             features,
             camera,
             self.config.primitive,
-            n_densifying=3 if self._renders_geometry and densifies_by_gradient else None,
+            n_densifying=3 if self._renders_geometry and densifies else None,
         )
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import shutil
 from pathlib import Path
@@ -15,6 +16,7 @@ from runs import data_of, held_out, model_of, render, trainer_of
 from scipy.spatial.transform import Rotation
 
 import benchmarks.step
+import shellgs_method.model
 from dataparsers.camera import Camera
 from dataparsers.errors import SceneError
 from shellgs_method.batches import pinhole_camera
@@ -74,6 +76,40 @@ def test_held_out_views_are_rendered_by_the_kernels_of_training(pristine_scene, 
     assert len(used) > 3
     assert used <= in_training
     assert not any(output.requires_grad for output in outputs.values())
+
+
+def graphs() -> int:
+    """Number of tensors that a backward pass could start from."""
+    gc.collect()
+    return sum(isinstance(each, torch.Tensor) and each.grad_fn is not None for each in gc.get_objects())
+
+
+def test_a_render_outside_training_keeps_no_graph(trained):
+    model_of(trained).info.clear()
+    model_of(trained).geometry = None
+    before = graphs()
+    render(trained)
+    assert graphs() == before
+
+
+@pytest.mark.parametrize(("step", "apart"), [(2, [3]), (9, [3]), (10, [None]), (18, [None])])
+def test_gradients_that_densify_are_kept_apart_only_until_densification_stops(trained, monkeypatch, step, apart):
+    model, (camera, _) = model_of(trained), data_of(trained).next_train(0)
+    monkeypatch.setattr(model, "training", True)
+    monkeypatch.setattr(model, "step", step)
+    monkeypatch.setattr(model.strategy, "refine_stop_iter", 10)
+    given, rasterize = [], shellgs_method.model.rasterize
+
+    def watched(*args, n_densifying):
+        given.append(n_densifying)
+        return rasterize(*args, n_densifying=n_densifying)
+
+    monkeypatch.setattr(shellgs_method.model, "rasterize", watched)
+    outputs = model.get_outputs(camera)
+    assert given == apart
+    outputs["depth"].sum().backward()
+    densifies = model.info["means2d"].grad  # depth densifies nothing
+    assert (densifies.norm() == 0) == (step < 10)
 
 
 def test_metrics_of_training_views_are_computed_in_the_steps_that_log_them(trained, monkeypatch):
