@@ -11,6 +11,7 @@ from shellgs_method.commands.common import UpAxis, console
 from shellgs_method.sim.settings import SimSettings
 
 _SIM = SimSettings()
+_PACKAGES = {"pxr.UsdGeom": "usd-core", "xatlas": "xatlas", "shapely": "shapely", "mapbox_earcut": "mapbox-earcut"}
 
 
 def sim(
@@ -27,6 +28,12 @@ def sim(
         settings: Settings.
         up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
     """
+    from shellgs_method.extras import import_extra
+    from shellgs_method.sim.engine import import_mujoco
+
+    import_mujoco()
+    for module, package in _PACKAGES.items():  # fail before hours of work
+        import_extra(module, package, "sim", "`shellgs sim`")
     from shellgs_method.sim.simulate import simulate
 
     def report(sentence: str) -> None:

@@ -34,6 +34,7 @@ from dataparsers.files import atomic_write, content_hash, fingerprint
 from shellgs_method.compare.launch import BIN, PROGRESS_SECONDS, CommandError, finish
 from shellgs_method.compare.runs import Run
 from shellgs_method.config_file import load_config
+from shellgs_method.extras import import_extra
 from shellgs_method.folders import replace_folder
 
 RETRIES = 3
@@ -59,13 +60,11 @@ def launch_on_ray(runs: Sequence[Run], address: str | None, console: Console) ->
         console: where progress is printed.
 
     Raises:
-        SceneError: Ray is not installed, or there is no cluster at the address.
+        SceneError: Ray is not installed, or too old, or there is no cluster at the address.
     """
-    try:
-        import ray
-        from ray.exceptions import RayError
-    except ImportError as error:
-        raise SceneError("the ray launcher needs Ray: pip install 'shellgs[ray]'") from error
+    ray = import_extra("ray", "ray", "ray", "the ray launcher")
+    from ray.exceptions import RayError
+
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address:
         _check_cluster(address)

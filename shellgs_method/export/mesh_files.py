@@ -11,6 +11,7 @@ import numpy as np
 from dataparsers.errors import SceneError, check_output
 from dataparsers.files import atomic_write, unfinished
 from shellgs_method.export.frame import Frame
+from shellgs_method.extras import import_extra
 
 if TYPE_CHECKING:
     import trimesh
@@ -68,11 +69,8 @@ def set_unit(UsdGeom: Any, stage: Any, metric: bool) -> None:
 
 
 def _usd_modules(path: Path) -> tuple[Any, ...]:
-    try:
-        from pxr import Usd, UsdGeom, UsdPhysics, Vt
-    except ImportError as error:
-        raise SceneError(f"{path}: USD needs a library that is not installed: pip install 'shellgs[usd]'") from error
-    return Usd, UsdGeom, UsdPhysics, Vt
+    names = "Usd", "UsdGeom", "UsdPhysics", "Vt"
+    return tuple(import_extra(f"pxr.{name}", "usd-core", "usd", f"{path}: USD") for name in names)
 
 
 def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dataparsers.errors import SceneError
+from shellgs_method.extras import import_extra
 
 BEAMS = -22.5, 22.5
 """Vertical field of view of the lidar in degrees: that of an Ouster OS1."""
@@ -21,15 +22,11 @@ def import_mujoco() -> ModuleType:
     """Import MuJoCo.
 
     Raises:
-        SceneError: MuJoCo is not installed.
+        SceneError: MuJoCo is not installed, or too old.
     """
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # read once, when MuJoCo is imported
-    try:
-        import mujoco
-    except ImportError as error:
-        raise SceneError("trials need MuJoCo, which is not installed: pip install 'shellgs[sim]'") from error
-    return mujoco
+    return import_extra("mujoco", "mujoco", "sim", "a trial")
 
 
 def read_spec(path: Path):

@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.sparse import coo_matrix, csc_array, hstack
 
 from dataparsers.camera import Camera, project
-from dataparsers.errors import SceneError
+from shellgs_method.extras import import_extra
 from shellgs_method.sim.rays import Surface
 
 SHARPNESS = 6.0
@@ -144,10 +144,7 @@ def _atlas(
     surface: Surface, texel: float
 ) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, "M 2"], Int64[np.ndarray, "F 3"], tuple[int, int]]:
     """For each atlas vertex its mesh vertex and its UV in [0, 1]², the faces, and the texture's height and width."""
-    try:
-        import xatlas
-    except ImportError as error:
-        raise SceneError("a texture needs a library that is not installed: pip install 'shellgs[sim]'") from error
+    xatlas = import_extra("xatlas", "xatlas", "sim", "a texture")
     size = float(np.sqrt(surface.areas.sum()) / texel)
     atlas = xatlas.Atlas()
     atlas.add_mesh(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))

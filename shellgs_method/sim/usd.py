@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from dataparsers.errors import SceneError
 from dataparsers.files import unfinished
 from shellgs_method.export.mesh_files import set_unit
 from shellgs_method.export.splats import Splats
+from shellgs_method.extras import import_extra
 from shellgs_method.sim.parts import Part
 from shellgs_method.sim.texture import TexturedMesh
 from shellgs_method.sim.visual import TEXTURE
@@ -202,20 +202,7 @@ def import_pxr() -> SimpleNamespace:
     """Import the modules of usd-core.
 
     Raises:
-        SceneError: usd-core is not installed.
+        SceneError: usd-core is not installed, or too old.
     """
-    try:
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation, UsdVol, Vt
-    except ImportError as error:
-        raise SceneError("USD needs a library that is not installed: pip install 'shellgs[sim]'") from error
-    return SimpleNamespace(
-        Gf=Gf,
-        Sdf=Sdf,
-        Usd=Usd,
-        UsdGeom=UsdGeom,
-        UsdPhysics=UsdPhysics,
-        UsdShade=UsdShade,
-        UsdValidation=UsdValidation,
-        UsdVol=UsdVol,
-        Vt=Vt,
-    )
+    names = "Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade", "UsdValidation", "UsdVol", "Vt"
+    return SimpleNamespace(**{name: import_extra(f"pxr.{name}", "usd-core", "sim", "USD") for name in names})
