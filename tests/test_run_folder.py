@@ -204,6 +204,17 @@ def test_a_run_is_not_loaded_with_another_scene(trained, tmp_path, load):
         load(tmp_path / "a" / NAMES / "config.yml", "inference")
 
 
+def test_a_command_of_nerfstudio_may_give_a_scene_in_place_of_one_that_is_gone(trained, pristine_scene, tmp_path):
+    run = Path(shutil.copytree(trained / "a" / NAMES, tmp_path / "best"))
+
+    def give(config):  # as ns-render dataset --data does
+        config.pipeline.datamanager.data = pristine_scene
+        return config
+
+    _, _, checkpoint, _ = eval_setup(run / "config.yml", test_mode="inference", update_config_callback=give)
+    assert checkpoint == run / LAST
+
+
 # ns-train --load-config
 
 

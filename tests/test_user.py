@@ -27,6 +27,7 @@ def test_a_user_without_a_name_gets_that_of_later_versions_of_torch(monkeypatch)
 def test_a_user_with_a_name_keeps_it(monkeypatch):
     for name in VARIABLES:
         monkeypatch.setenv(name, "")
+    monkeypatch.setattr(os, "getuid", lambda: 0)
     before = getpass.getuser()
     name_the_user()
     assert os.environ["LOGNAME"] == ""
