@@ -61,15 +61,17 @@ def open_run(path: Path, find_scene: bool = True) -> TrainerConfig:
         if given := getattr(config, name):
             setattr(config, name, _find(given, written, folder) or given)
     manager: Any = config.pipeline.datamanager
-    stored = manager.data or manager.dataparser.data
-    scene = _find(stored, written, folder)
-    if scene is None and find_scene:
+    stored = manager.data or getattr(getattr(manager, "dataparser", None), "data", None)
+    if stored is None:  # a method that needs no scene
+        return config
+    manager.data = _find(stored, written, folder)
+    if manager.data is None and find_scene:
         elsewhere = f", and no {stored.name}" if stored.is_absolute() else f" in {Path.cwd()} or"
         raise SceneError(
             f"the scene of the run {folder} is not found: there is no {stored}{elsewhere} beside the run; put it "
             f"there, or correct `data` in {path}"
         )
-    manager.data = scene or stored
+    manager.data = manager.data or stored
     return config
 
 
@@ -188,7 +190,7 @@ def _find(path: Path, written: Path, folder: Path) -> Path | None:
         written: the run's folder by the names in the config, likewise.
         folder: the run's folder.
     """
-    return next((candidate for candidate in _candidates(path, written, folder) if candidate.exists()), None)
+    return next((candidate for candidate in _candidates(path, written, folder) if os.path.exists(candidate)), None)
 
 
 def _candidates(path: Path, written: Path, folder: Path) -> Iterator[Path]:
@@ -196,7 +198,8 @@ def _candidates(path: Path, written: Path, folder: Path) -> Iterator[Path]:
     inside = (start / path).is_relative_to(start / written)
     if path.is_absolute() and not inside:
         yield path
-    if path.is_absolute() == written.is_absolute():  # moved together with the run
+    in_place = folder.parent.name == written.parent.name  # still in the folder of its method
+    if inside or (in_place and path.is_absolute() == written.is_absolute()):  # moved together with the run
         yield Path(os.path.normpath(folder / os.path.relpath(start / path, start / written)))
     yield path
     for above in (folder, *folder.parents):

@@ -128,6 +128,16 @@ def test_a_scene_that_lies_beside_the_run_is_found(tmp_path):
     assert scene_of(open_run(path)) == tmp_path / "facade"
 
 
+def test_a_run_that_was_trained_in_its_scene_and_moved_out_of_it_is_used_from_there(tmp_path, monkeypatch):
+    scene = tmp_path / "facade"
+    path = write_run(scene / NAMES, Path("outputs"), Path())
+    monkeypatch.chdir(tmp_path)
+    assert scene_of(open_run(path)) == scene
+    path.parent.rename(tmp_path / "best")
+    monkeypatch.chdir(scene)
+    assert scene_of(open_run(tmp_path / "best/config.yml")) == scene
+
+
 def test_the_folder_of_the_runs_of_a_scene_is_not_taken_for_the_scene(tmp_path):
     path = write_run(tmp_path / NAMES, tmp_path / "outputs", Path("scene"))
     with pytest.raises(SceneError, match="is not found"):
