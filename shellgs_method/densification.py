@@ -75,11 +75,13 @@ class GradientStrategy(DefaultStrategy):
     def _gather(self, params: nn.ParameterDict, state: dict[str, Any], info: dict[str, Any]) -> None:
         """Add gradients, in units of half the image, and radii of a rendering by our rasterizer to the state."""
         centres, radii = info[self.key_for_gradient], info["radii"]
-        size = radii.new_tensor([info["width"], info["height"]])
-        gradients = (centres.absgrad if self.absgrad else centres.grad) * size / 2 * len(radii)
         for gathered in ("grad2d", "count", "radii"):
             if state[gathered] is None:
-                state[gathered] = gradients.new_zeros(len(params["means"]))
+                state[gathered] = centres.new_zeros(len(params["means"]))
+        if radii.shape[1] != len(params["means"]):
+            return  # broken ones were removed since, and nobody knows which of these are left
+        size = radii.new_tensor([info["width"], info["height"]])
+        gradients = (centres.absgrad if self.absgrad else centres.grad) * size / 2 * len(radii)
         state["grad2d"] += torch.where(radii > 0, gradients.norm(dim=-1), 0.0).sum(dim=0)
         state["count"] += (radii > 0).sum(dim=0)
         state["radii"] = state["radii"].maximum(radii.amax(dim=0) / size.amax())

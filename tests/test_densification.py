@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from gsplat.strategy.ops import remove
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 from torch import nn
@@ -209,6 +210,20 @@ def test_gaussians_that_are_wide_in_a_view_split_and_are_pruned_by_their_radius(
     strategy.step_post_backward(params, optimizers, state, 10, rendering(3, radii=(1, 1, 1)))
     assert len(params["means"]) == 3  # one, and two of the second; the two of the third are pruned
     assert not state["radii"].any()
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_rendering_of_gaussians_some_of_which_were_removed_since_is_not_counted(first):
+    params = gaussians(5)
+    optimizers, strategy = stepped(params), GradientStrategy()
+    state = strategy.initialize_state()
+    if not first:
+        strategy.step_post_backward(params, optimizers, state, 1, rendering(5))
+    remove(params, optimizers, state, torch.arange(5) == 0)
+    strategy.step_post_backward(params, optimizers, state, 2, rendering(5, radii=(9, 9, 9, 9, 9)))
+    strategy.step_post_backward(params, optimizers, state, 3, rendering(4))
+    assert state["count"].tolist() == [1 if first else 2] * 4
+    assert state["radii"].max() == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("kind", [GradientStrategy, SkyboxStrategy])

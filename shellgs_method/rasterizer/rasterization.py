@@ -58,7 +58,8 @@ def rasterize(
     Returns:
         Sums of weight times feature (not divided by alpha, no background), sums of the weights, and the ``info`` of
         gsplat's densification strategies: ``means2d`` [B, N, 2] in pixels, whose gradient can be retained, ``radii``
-        [B, N] as in :class:`Renders` with every backend, …. The renders of a sequence of cameras are stacked.
+        [B, N] as in :class:`Renders` with every backend (those of gsplat 1.5 take ``radii[..., None]``), …. The renders
+        of a sequence of cameras are stacked.
 
         For discs, ``info`` also has differentiable maps ``[*B, H, W, 1]``: ``inverse_depth``, the sum of weight over z
         of the ray's intersection, so that alpha / inverse_depth is the expected depth (1/z is averaged because it is
