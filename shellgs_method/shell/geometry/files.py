@@ -83,5 +83,5 @@ def _without_misses(cloud: Geometry, path: Path) -> Geometry:
     among = len(others) and (np.nanmin(others, axis=0) <= 0).all() and (np.nanmax(others, axis=0) >= 0).all()
     if not missed.any() or (missed.sum() == 1 and among):
         return cloud
-    left_out(path, int(missed.sum()), len(missed), "points", " at exactly 0 0 0, which are misses of the scanner")
+    left_out(path, int(missed.sum()), len(missed), "points at exactly 0 0 0, which are misses of the scanner")
     return replace(cloud, vertices=others)

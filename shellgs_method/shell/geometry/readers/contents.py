@@ -41,10 +41,10 @@ def splats(path: Path) -> SceneError:
     )
 
 
-def left_out(path: Path, count: int, total: int, what: str, why: str) -> None:
-    """Warn of what a reader leaves out of a file, if anything."""
+def left_out(path: Path, count: int, total: int, what: str) -> None:
+    """Warn of what a reader leaves out of a file, and why, if anything."""
     if count:
-        log.warning("%s: left out %d of %d %s%s", path, count, total, what, why)
+        log.warning("%s: left out %d of %d %s", path, count, total, what)
 
 
 def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
@@ -81,7 +81,7 @@ def polygon_triangles(
             faces += [polygon[_ears(vertices[polygon])] for polygon in polygons[concave]]
             fans = fans[:, ~concave]
         faces.append(fans.transpose(1, 0, 2).reshape(-1, 3))
-    left_out(path, int((sizes < 3).sum()), len(sizes), "faces", ", which have fewer than 3 corners")
+    left_out(path, int((sizes < 3).sum()), len(sizes), "faces, which have fewer than 3 corners")
     return np.concatenate(faces)
 
 

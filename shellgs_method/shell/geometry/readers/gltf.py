@@ -68,10 +68,10 @@ def read_gltf(path: Path) -> Geometry:
     placed = list(document.placed_meshes())
     nodes = sum("mesh" in node for node in document.listed("nodes"))
     seen = len({index for index, _ in placed})
-    left_out(path, nodes - seen, nodes, "meshes", ", which are not in the file's default scene")
+    left_out(path, nodes - seen, nodes, "meshes, which are not in the file's default scene")
     modes = [p.get("mode", _TRIANGLES) for k, _ in placed for p in document.mesh_of(k)["primitives"]]
     wanted = {_TRIANGLES, _STRIP, _FAN} if any(mode >= _TRIANGLES for mode in modes) else {_POINTS}
-    left_out(path, sum(m not in wanted for m in modes), len(modes), "primitives", ", which are points or lines")
+    left_out(path, sum(m not in wanted for m in modes), len(modes), "primitives, which are points or lines")
     vertices, faces, count = [NO_POINTS], [NO_FACES], 0
     for index, matrices in placed:
         points, triangles = document.surface(index, wanted)

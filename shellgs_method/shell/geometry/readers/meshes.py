@@ -35,7 +35,7 @@ def read_obj(path: Path) -> Geometry:
             above.append(len(vertices))
         elif line.startswith(_CURVED):
             curved += 1
-    left_out(path, curved, curved + len(faces), "elements", ", which are curves or curved surfaces")
+    left_out(path, curved, curved + len(faces), "elements, which are curves or curved surfaces")
     points = np.loadtxt(vertices, usecols=(1, 2, 3), ndmin=2) if vertices else NO_POINTS
     sizes = np.array([len(face.split()) for face in faces], np.int64)
     stored = numbers_in(re.sub(r"/\S*", "", " ".join(faces)), int)

@@ -49,7 +49,7 @@ def read_ply(path: Path) -> Geometry:
         faces.append(strip_triangles(strips, strips == _STRIP_END))
     for element in header.elements:
         if element.name not in _KNOWN:
-            left_out(path, element.count, element.count, f"of the element {element.name!r}", ", which is not known")
+            left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     return Geometry(vertices, np.concatenate(faces))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 NOISE = (7, 18)
 """Classes of LAS: low and high noise."""
 Read = tuple[np.ndarray, np.ndarray, dict[str, int]]
-"""Points, scanner positions, and how many points were left out, by the reason."""
+"""Points, scanner positions, and how many points were left out, by which they are and why."""
 
 
 def read_las(path: str) -> Read:
@@ -34,7 +34,7 @@ def read_las(path: str) -> Read:
         claimed = file.header.point_count
     if read != claimed:
         raise ValueError(f"it holds {read} of {claimed} points")
-    return np.concatenate(pieces), no_scanners, {"withheld": withheld, "classified as noise": noise}
+    return np.concatenate(pieces), no_scanners, {"points, which are withheld": withheld, "points, which are classified as noise": noise}
 
 
 def read_e57(path: str) -> Read:
@@ -60,7 +60,10 @@ def read_e57(path: str) -> Read:
         pieces.append(points[~missed] @ rotation.T + translation)
         if translation.any() or not np.array_equal(rotation, np.eye(3)):
             scanners.append(translation[None])
-    left_out = {"flagged as invalid": invalid, "at 0 0 0, which are misses of the scanner": misses}
+    left_out = {
+        "points, which are flagged as invalid": invalid,
+        "points at 0 0 0, which are misses of the scanner": misses,
+    }
     return np.concatenate(pieces), np.concatenate(scanners), left_out
 
 

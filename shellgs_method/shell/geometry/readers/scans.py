@@ -55,8 +55,8 @@ def _read(path: Path) -> Geometry:
     rows = np.frombuffer(data, "<f8").reshape(-1, 3)
     points, scanners = rows[: about["points"]], rows[about["points"] :]
     total = len(points) + sum(about["left_out"].values())
-    for why, count in about["left_out"].items():
-        left_out(path, count, total, "points", f" {why}" if why.startswith("at") else f", which are {why}")
+    for what, count in about["left_out"].items():
+        left_out(path, count, total, what)
     return Geometry(points, NO_FACES, scanners)
 
 
