@@ -34,7 +34,11 @@ def read_las(path: str) -> Read:
         claimed = file.header.point_count
     if read != claimed:
         raise ValueError(f"it holds {read} of {claimed} points")
-    return np.concatenate(pieces), no_scanners, {"points, which are withheld": withheld, "points, which are classified as noise": noise}
+    return (
+        np.concatenate(pieces),
+        no_scanners,
+        {"points, which are withheld": withheld, "points, which are classified as noise": noise},
+    )
 
 
 def read_e57(path: str) -> Read:
