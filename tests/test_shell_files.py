@@ -589,6 +589,9 @@ def columns(order: list[int], separator: str = " ") -> list[str]:
         [f"P{k} {line}" for k, line in enumerate(LINES)],
         [f"{k + 1000} {line}" for k, line in enumerate(LINES)],
         ["id x y z", *(f"{k} {line}" for k, line in enumerate(LINES))],
+        ["name,x,y,z", *(f"wall {k},{line}" for k, line in enumerate(columns([0, 1, 2], ",")))],
+        ["name;note;x;y;z", *(f"a;;{line}" for line in columns([0, 1, 2], ";"))],
+        ["name,x,y,z", *(f'"a, b",{line}' for line in columns([0, 1, 2], ","))],
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
@@ -619,6 +622,7 @@ def test_whole_numbers_in_all_columns_are_coordinates(tmp_path: Path, caplog):
         (["East North Up", *columns([0, 1, 2])], "'East North Up', which does not name one column each of X, Y and Z"),
         (["x y 3", *columns([0, 1, 2])], "begins with 'x y 3' where X, Y and Z are expected"),
         (columns([0, 1]), "where X, Y and Z are expected"),
+        (["name X Y Z", *(f"wall 3 {line}" for line in LINES)], "its header names 4 columns, and a line has 8"),
         (["301", *LINES], "it holds 300 of 301 points"),
         ([*LINES[:200], "end of file", *LINES[200:]], "cannot be read"),
         ([*LINES[:200], "412345.1 5123", *LINES[200:]], "cannot be read"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import re
 from collections.abc import Iterator
 from itertools import chain, islice
@@ -40,12 +41,11 @@ def read_text_cloud(path: Path) -> Geometry:
         if not first:
             return Geometry(NO_POINTS)
         separator = _separator(first, path)
-        header = [word.strip("\"' ") for word in first[0].split(separator)]
-        named = not any(map(_is_number, header))
-        columns = _named(header, first[0], path) if named else _columns(first, separator, path)
-        rows = chain(first[1:] if named else first, lines)
-        spaced = rows if separator is None else (row.replace(separator, " ") for row in rows)
-        points = np.loadtxt(spaced, usecols=columns, comments=None, ndmin=2)
+        rows = [_split(line, separator) for line in first]
+        named = not any(map(_is_number, rows[0]))
+        columns = _named(rows, first[0], path) if named else _columns(rows, first[0], path)
+        data = chain(first[1:] if named else first, lines)
+        points = np.loadtxt(data, usecols=columns, comments=None, ndmin=2, delimiter=separator, quotechar='"')
     if lines.claimed and lines.claimed != len(points):
         raise ValueError(f"it holds {len(points)} of {lines.claimed} points")
     return Geometry(points)
@@ -84,7 +84,10 @@ def _separator(lines: list[str], path: Path) -> str | None:
 
 
 def _split(line: str, separator: str | None) -> list[str]:
-    return (line if separator is None else line.replace(separator, " ")).split()
+    """The words of a line; a quoted one may hold separators, and there may be empty ones between them."""
+    if separator is None:
+        return line.split()
+    return [word.strip() for word in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
 
 
 def _is_number(word: str) -> bool:
@@ -95,20 +98,26 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _named(header: list[str], line: str, path: Path) -> list[int]:
+def _named(rows: list[list[str]], line: str, path: Path) -> list[int]:
     """Columns that a header calls X, Y and Z, with a unit or without."""
-    names = [re.split(r"[^a-z]", name.lower().lstrip("/"))[0] for name in header]
+    names = [re.split(r"[^a-z]", name.lower().strip("\"' "))[0] for name in rows[0]]
     if any(names.count(axis) != 1 for axis in "xyz"):
         raise SceneError(
             f"the shell {path} cannot be read: it begins with {_shown(line)}, which does not name one column each of "
             "X, Y and Z: name them in that line, or delete it if they are the first three columns"
         )
-    return [names.index(axis) for axis in "xyz"]
+    columns = [names.index(axis) for axis in "xyz"]
+    for row in rows[1:]:
+        if any(row[len(names) :]) and not all(map(_is_number, row[: max(columns)])):  # words of one name, perhaps
+            raise SceneError(
+                f"the shell {path} cannot be read: its header names {len(names)} columns, and a line has {len(row)} "
+                f"({_shown(' '.join(row))}): name them all, and quote names that hold separators"
+            )
+    return columns
 
 
-def _columns(lines: list[str], separator: str | None, path: Path) -> list[int]:
+def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
     """The first three columns, or those after one that numbers or names the points."""
-    rows = [_split(line, separator) for line in lines]
     width = min(len(row) for row in rows)
     numeric = [all(_is_number(row[k]) for row in rows) for k in range(min(width, 4))]
     if width >= 4 and all(numeric[1:]):
@@ -121,7 +130,7 @@ def _columns(lines: list[str], separator: str | None, path: Path) -> list[int]:
             return [1, 2, 3]
     if width < 3 or not all(numeric[:3]):
         raise SceneError(
-            f"the shell {path} cannot be read: it begins with {_shown(lines[0])} where X, Y and Z are expected: export "
+            f"the shell {path} cannot be read: it begins with {_shown(line)} where X, Y and Z are expected: export "
             "it with these in each line, after a line that names the columns, if they are not the first three"
         )
     return [0, 1, 2]
