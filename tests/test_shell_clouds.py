@@ -290,6 +290,16 @@ def test_a_cloud_of_six_digits_is_refused_before_it_is_meshed(tmp_path: Path):
         load_shell(tmp_path / "scan.xyz")
 
 
+def test_the_mesh_of_heights_above_a_raster_is_accepted_from_the_cache_too(tmp_path: Path):
+    across = np.stack(np.meshgrid(np.arange(0, 12, 0.5), np.arange(0, 12, 0.5)), axis=-1).reshape(-1, 2)
+    heights = np.random.default_rng(0).normal(0, 0.02, len(across))
+    np.savetxt(tmp_path / "a.xyz", np.c_[across, heights] + GEOREFERENCE, fmt="%.9f")
+    first, second = (load_shell(tmp_path / "a.xyz", cache=tmp_path) for _ in range(2))
+    assert first.step.coarsest == second.step.coarsest == 0.5
+    assert not first.step.rounded
+    assert not second.step.rounded
+
+
 def test_the_cached_mesh_can_be_opened_by_other_programs(cloud: Path):
     mesh = load_shell(cloud, cache=cloud.parent)
     seen = trimesh.load(cloud.parent / "scan.ply.planes.ply", process=False)

@@ -149,7 +149,8 @@ def _write_cached(mesh: ShellMesh, cached: Path, source: Path, seen_from: list[f
     """Write the mesh as a PLY of doubles, with a comment that identifies its source."""
     assert mesh.meshing is not None
     made = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
-    record = json.dumps(made | {"seen_from": seen_from, "step": mesh.step.lengths.tolist()})
+    step = {"lengths": mesh.step.lengths.tolist(), "rounded": mesh.step.rounded}
+    record = json.dumps(made | {"seen_from": seen_from, "step": step})
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
     faces["count"], faces["indices"] = 3, mesh.faces
     header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]
@@ -169,7 +170,7 @@ def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> S
         if (record["version"], record["sha256"]) != (VERSION, content_hash(source)):
             return None
         geometry = read_geometry(cached)
-        step = Step(np.array(record["step"], np.float64))
+        step = Step(np.array(record["step"]["lengths"], np.float64), record["step"]["rounded"])
         mesh = ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]), step)
         return mesh if _seen_alike(record["seen_from"], _seen_from(viewpoints), mesh) else None
     except (OSError, IndexError, KeyError, TypeError, ValueError):  # missing or damaged: it is made again
