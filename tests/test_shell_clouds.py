@@ -23,6 +23,8 @@ GEOREFERENCE = np.array([410_000.0, 5_413_000.0, 250.0])
 NO_POINTS = np.empty((0, 3))
 K = torch.tensor([[80.0, 0, 40], [0, 80, 30], [0, 0, 1]], dtype=torch.float64)
 STREET = np.array([[0.0, 0, -10]])
+OPAQUE = Path(__file__).parents[1] / "docs/picture.jpg"
+"""Any photograph: casting looks whether it is transparent."""
 
 
 def camera() -> Camera:
@@ -325,7 +327,7 @@ def test_a_damaged_cached_mesh_is_made_again(cloud: Path, damage: Callable[[byte
 def test_maps_are_cast_from_a_cloud_and_bound_to_it(cloud: Path, tmp_path: Path):
     to_scene = np.eye(4)
     to_scene[:3, 3] = -GEOREFERENCE
-    alignment, views = Alignment(to_scene, "shell/scan.ply"), [View("images/a.jpg", Path("a.jpg"), camera())]
+    alignment, views = Alignment(to_scene, "shell/scan.ply"), [View("images/a.jpg", OPAQUE, camera())]
     summary = cast_views(tmp_path, views, alignment)
     assert summary.meshing is not None
     assert summary.meshing.planes == 5
