@@ -6,7 +6,6 @@ are tried one by one.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
@@ -16,11 +15,9 @@ from jaxtyping import Float64
 from PIL import Image
 
 from dataparsers.camera import Camera, in_view, positions
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, notice
 from dataparsers.photograph import View, load_photograph
 from dataparsers.sparse_points import SparsePoints
-
-log = logging.getLogger(__name__)
 
 UNITS = {
     0.001: "are in millimetres instead of metres",
@@ -132,9 +129,7 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
         )
     if alike < _UNLIKE or seen < _ALIKE:
         colours = " and have other colours than the photographs there" if alike < _UNLIKE else ""
-        log.warning(
-            "%s may be in another frame than the cameras: %s%s; if so, %s", points.called, apart, colours, remedy
-        )
+        notice(f"{points.called} may be in another frame than the cameras: {apart}{colours}; if so, {remedy}.")
 
 
 @dataclass(frozen=True)

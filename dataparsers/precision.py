@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -10,9 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dataparsers.camera import Camera, positions
-from dataparsers.errors import SceneError
-
-log = logging.getLogger(__name__)
+from dataparsers.errors import SceneError, notice
 
 FINE = 0.05
 """Metres up to which a step does no harm: half of it, the largest error, is less than the scatter of SfM points."""
@@ -105,7 +102,7 @@ def warn_of_coarse(step: Step, points: Float64[np.ndarray, "N 3"], what: str) ->
     """Warn of a step that is large beside the spread of the coordinates, whatever their unit."""
     if step.coarsest > 0 and step.coarsest > _NOTICED * np.ptp(np.percentile(points, [5, 95], axis=0), axis=0).max():
         doubt = "" if step.rounded else ", which is harmless only if they are meant to lie on such a grid"
-        log.warning("%s are stored in steps of %s%s: %s", what, step.in_words("units"), doubt, REMEDY)
+        notice(f"{what} are stored in steps of {step.in_words('units')}{doubt}: {REMEDY}.")
 
 
 @dataclass(frozen=True)

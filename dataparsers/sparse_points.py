@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,13 +10,11 @@ from jaxtyping import Float64, Int, UInt8
 
 from dataparsers import colmap_model, transforms
 from dataparsers.camera import in_view
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, notice
 from dataparsers.layout import SceneLayout
 from dataparsers.photograph import View
 from dataparsers.precision import Step, cloud_step, warn_of_coarse
 from dataparsers.strays import sound
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -98,11 +95,9 @@ def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np
     """Indices of the points that are finite and near the others."""
     near = sound(positions)
     if not near.all():
-        log.warning(
-            "%d of %d SfM points of %s are NaN, infinite or absurdly far away, and are left out",
-            (~near).sum(),
-            len(positions),
-            layout.data,
+        notice(
+            f"{(~near).sum()} of {len(positions)} SfM points of {layout.data} are NaN, infinite or absurdly far away, "
+            "and are left out."
         )
     if near.any():
         warn_of_coarse(cloud_step(positions[near]), positions[near], f"the SfM points of {layout.data}")

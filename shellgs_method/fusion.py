@@ -20,6 +20,8 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from dataparsers.errors import notice
+
 logger = logging.getLogger(__name__)
 
 _Parameters, _Result = ParamSpec("_Parameters"), TypeVar("_Result")
@@ -202,7 +204,7 @@ def _compiler_works() -> bool:
     try:
         get_cpp_compiler()
     except InvalidCxxCompiler as error:
-        _warn_once(f"Rasterizer and losses run without torch.compile, slower: {_reason(error)}")
+        notice(f"Rasterizer and losses run without torch.compile, slower: {_reason(error)}")
         return False
     return True
 
@@ -210,16 +212,11 @@ def _compiler_works() -> bool:
 def _explain(kernel: Callable[..., Any], error: Exception) -> None:
     """Log why a kernel runs without torch.compile; a reason that many have in common, once."""
     _failed.add(_name(kernel))
-    _warn_once(f"Some kernels of rasterizer or losses run without torch.compile, slower: {_reason(error)}")
+    notice(f"Some kernels of rasterizer or losses run without torch.compile, slower: {_reason(error)}")
 
 
 def _reason(error: Exception) -> str:
     return f"{type(error).__name__}: {next(iter(str(error).strip().splitlines()), '')}"
-
-
-@functools.cache
-def _warn_once(message: str) -> None:
-    logger.warning(message)
 
 
 def _name(kernel: Callable[..., Any]) -> str:

@@ -11,10 +11,17 @@ import pytest
 from torch._inductor.cpp_builder import get_cpp_compiler
 from torch._inductor.exc import InvalidCxxCompiler
 
+from dataparsers.errors import notice
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli, fusion
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
+
+
+@pytest.fixture(autouse=True)
+def nothing_told() -> None:
+    """Each test is told what a new process would be."""
+    notice.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -54,7 +54,6 @@ def viewer() -> RenderStateMachine:
 @pytest.fixture(autouse=True)
 def nothing_compiled(compiler, monkeypatch):
     fusion._compiled.cache_clear()
-    fusion._warn_once.cache_clear()
 
 
 def test_the_viewers_interrupt_while_a_kernel_compiles_passes_through_and_the_kernel_is_compiled(viewer, monkeypatch):

@@ -41,10 +41,8 @@ def kernels(monkeypatch) -> Iterator[ModuleType]:
     setattr(module, "_C", None)  # noqa: B010
     monkeypatch.setitem(sys.modules, module.__name__, module)
     gsplat_backend._kernels_fault.cache_clear()
-    gsplat_backend._warn_once.cache_clear()
     yield module
     gsplat_backend._kernels_fault.cache_clear()
-    gsplat_backend._warn_once.cache_clear()
 
 
 def gradients(splats: list[Tensor], maps: list[Tensor], means2d: Tensor) -> list[Tensor]:

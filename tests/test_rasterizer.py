@@ -99,7 +99,6 @@ def test_with_a_compiler_that_fails_rendering_works_and_warns_once(monkeypatch, 
 
     expected = render(50, 33, 21, torch.float64).float()
     fusion._compiled.cache_clear()
-    fusion._warn_once.cache_clear()
     monkeypatch.setattr(fusion, "_compiler_works", lambda: True)
     monkeypatch.setattr(torch, "compile", fail)
     monkeypatch.setattr(fusion, "_failed", set())

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -29,12 +28,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dataparsers.camera import Camera
+from dataparsers.errors import notice
 from shellgs_method.fusion import uninterrupted
 from shellgs_method.rasterizer import discs as disc_projection
 from shellgs_method.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs, three_sigmas
 from shellgs_method.rasterizer.renders import Renders
-
-logger = logging.getLogger(__name__)
 
 Backend = Literal["auto", "torch", "gsplat"]
 
@@ -59,7 +57,7 @@ def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
     if backend == "gsplat" and fault:
         raise ValueError(f'backend="gsplat" cannot run here; use "auto" or "torch": {fault}.')
     if on_cuda and fault:
-        _warn_once(f"The rasterizer runs on {means.device} in plain torch, slower than gsplat: {fault}.")
+        notice(f"The rasterizer runs on {means.device} in plain torch, slower than gsplat: {fault}.")
     return fault is None and means.shape[0] > 0
 
 
@@ -349,8 +347,3 @@ def _kernels_fault() -> str | None:
     return (
         None if kernels is not None else "it came without compiled kernels, and there is no nvcc to compile them with"
     )
-
-
-@functools.cache
-def _warn_once(message: str) -> None:
-    logger.warning(message)

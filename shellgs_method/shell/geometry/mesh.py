@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-import logging
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from dataparsers.errors import SceneError
+from dataparsers.errors import SceneError, notice
 from dataparsers.files import atomic_write, content_hash
 from dataparsers.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
 from dataparsers.strays import sound
 from shellgs_method.shell.geometry.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.geometry.files import read_geometry
-
-log = logging.getLogger(__name__)
 
 COMMENT = "comment shellgs "
 _FAR = 1e4
@@ -185,12 +182,10 @@ def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tupl
     usable = kept[faces].all(axis=1)
     if not usable.any():
         raise SceneError("every triangle of the shell has a NaN or infinite vertex")
-    log.warning(
-        "%s: dropped %d of %d triangles with a NaN or infinite vertex, or one absurdly far away, at %s",
-        path,
-        (~usable).sum(),
-        len(faces),
-        " ".join(f"{value:g}" for value in vertices[~kept][0]),
+    place = " ".join(f"{value:g}" for value in vertices[~kept][0])
+    notice(
+        f"{path}: dropped {(~usable).sum()} of {len(faces)} triangles with a NaN or infinite vertex, or one absurdly "
+        f"far away, at {place}."
     )
     return vertices, faces[usable]
 
@@ -210,6 +205,6 @@ def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
     if not flat.any():
         return mesh
     if path is not None:
-        log.warning("%s: dropped %d of %d triangles, which have no area", path, flat.sum(), len(flat))
+        notice(f"{path}: dropped {flat.sum()} of {len(flat)} triangles, which have no area.")
     vertices, faces = _referenced(mesh.vertices, mesh.faces[~flat])
     return replace(mesh, vertices=vertices, faces=faces)

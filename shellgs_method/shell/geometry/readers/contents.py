@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,9 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, Int, Int64, Shaped
 
-from dataparsers.errors import SceneError
-
-log = logging.getLogger(__name__)
+from dataparsers.errors import SceneError, notice
 
 NO_FACES = np.empty((0, 3), np.int64)
 NO_POINTS = np.empty((0, 3))
@@ -44,7 +41,7 @@ def splats(path: Path) -> SceneError:
 def left_out(path: Path, count: int, total: int, what: str) -> None:
     """Warn of what a reader leaves out of a file, and why, if anything."""
     if count:
-        log.warning("%s: left out %d of %d %s", path, count, total, what)
+        notice(f"{path}: left out {count} of {total} {what}.")
 
 
 def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:

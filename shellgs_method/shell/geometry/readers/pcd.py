@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.shell.geometry.readers.contents import Geometry, log
+from dataparsers.errors import notice
+from shellgs_method.shell.geometry.readers.contents import Geometry
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _IDENTITY = [0.0, 0, 0, 1, 0, 0, 0]
@@ -46,7 +47,7 @@ def read_pcd(path: Path) -> Geometry:
     axes = [_Axis(np.dtype("<" + kinds[k]), sum(sizes[:k]), sum(counts[:k])) for k in where]
     points = int(fields["POINTS"][0]) if "POINTS" in fields else int(fields["WIDTH"][0]) * int(fields["HEIGHT"][0])
     if [float(value) for value in fields.get("VIEWPOINT", _IDENTITY)] != _IDENTITY:
-        log.warning("%s: its VIEWPOINT is not applied: the points are taken for those of one frame", path)
+        notice(f"{path}: its VIEWPOINT is not applied: the points are taken for those of one frame.")
     form = fields["DATA"][0].lower()
     read = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}[form]
     return Geometry(read(data[body:], axes, points, sizes))

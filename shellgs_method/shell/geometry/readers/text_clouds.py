@@ -12,8 +12,8 @@ from typing import TextIO
 
 import numpy as np
 
-from dataparsers.errors import SceneError
-from shellgs_method.shell.geometry.readers.contents import NO_POINTS, Geometry, log
+from dataparsers.errors import SceneError, notice
+from shellgs_method.shell.geometry.readers.contents import NO_POINTS, Geometry
 
 _COMMENTS = ("#", "//")
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -124,9 +124,7 @@ def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
         whole = [all(_WHOLE.fullmatch(row[k]) for row in rows) for k in range(4)]
         varies = len({row[0] for row in rows}) > 1
         if not numeric[0] or (varies and whole[0] and not any(whole[1:])):
-            log.warning(
-                "%s: its first column (%s) is taken for the points' numbers, and X for the second", path, rows[0][0]
-            )
+            notice(f"{path}: its first column ({rows[0][0]}) is taken for the points' numbers, and X for the second.")
             return [1, 2, 3]
     if width < 3 or not all(numeric[:3]):
         raise SceneError(
