@@ -89,25 +89,24 @@ def _ears(polygon: Float64[np.ndarray, "N 3"]) -> Int64[np.ndarray, "N-2 3"]:
     across = np.delete(np.arange(3), np.abs(normal).argmax())
     flat = local[:, across]
 
-    def turn(a: int, b: int, c: np.ndarray | int) -> np.ndarray:
+    def turn(a: np.ndarray | int, b: np.ndarray | int, c: np.ndarray | int) -> np.ndarray:
         u, v = flat[b] - flat[a], flat[c] - flat[a]
-        return (u[0] * v[..., 1] - u[1] * v[..., 0]) * orientation
+        return (u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]) * orientation
+
+    def is_ear(a: int, b: int, c: int) -> bool:
+        return not ((turn(a, b, left) > 0) & (turn(b, c, left) > 0) & (turn(c, a, left) > 0)).any()
 
     around = np.roll(flat, -1, axis=0)
     orientation = np.sign((flat[:, 0] * around[:, 1] - flat[:, 1] * around[:, 0]).sum())
-    left, triangles = list(range(len(polygon))), []
+    left, triangles = np.arange(len(polygon)), []
     while len(left) > 2:
-        corners = [(left[k - 1], left[k], left[(k + 1) % len(left)]) for k in range(len(left))]
-
-        def is_ear(a: int, b: int, c: int) -> bool:
-            others = np.setdiff1d(left, [a, b, c])
-            inside = (turn(a, b, others) > 0) & (turn(b, c, others) > 0) & (turn(c, a, others) > 0)
-            return bool(turn(a, b, c) > 0) and not inside.any()
-
-        straight = [corner for corner in corners if turn(*corner) == 0]  # what is cut off there has no area
-        ear = next((corner for corner in [*straight, *corners] if corner in straight or is_ear(*corner)), corners[0])
-        triangles.append(ear)
-        left.remove(ear[1])
+        corners = np.stack([np.roll(left, 1), left, np.roll(left, -1)], axis=1)
+        turns = turn(*corners.T)
+        straight = np.flatnonzero(turns == 0)  # what is cut off there has no area
+        ears = (k for k in np.flatnonzero(turns > 0) if is_ear(*corners[k]))
+        cut = straight[0] if len(straight) else next(ears, 0)
+        triangles.append(corners[cut])
+        left = np.delete(left, cut)
     return np.array(triangles)
 
 
