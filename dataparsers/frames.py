@@ -39,7 +39,7 @@ _AXES: dict[tuple[int, ...], str] = {
 }
 """Axes that are usually confused, by the numbers and signs of those that correct it."""
 _FEW = 10  # points that show nothing
-_POINTS, _CAMERAS, _PHOTOGRAPHS, _SIZE = 1000, 40, 6, 400  # that suffice
+_POINTS, _PHOTOGRAPHS, _SIZE = 1000, 6, 400  # that suffice
 _OBSERVATIONS = 50  # that suffice to compare colours
 # Cameras see nearly all points of their own frame, whose colours correlate with the photographs' by 0.6 and more. In a
 # wrong frame it is 0.35 at most, though cameras often see most of them (three scenes, ten wrong frames of each).
@@ -149,11 +149,16 @@ class _Sight:
             colours = points.colours[some].astype(np.float64)
         shown = _spread(views, _PHOTOGRAPHS) if np.ptp(colours, axis=0).max() > 0 else []
         photographs = [photograph for view in shown for photograph in _small(view)]
-        return cls(points.positions[some], colours, [view.camera for view in _spread(views, _CAMERAS)], photographs)
+        return cls(points.positions[some], colours, [view.camera for view in views], photographs)
 
     def seen(self, points: np.ndarray) -> float:
-        """Share of the points that a camera sees."""
-        return float(np.any([in_view(camera, points)[0] for camera in self.cameras], axis=0).mean())
+        """Share of the points that a camera sees; each of many cameras may see a small part of a street."""
+        unseen = points
+        for camera in self.cameras:
+            unseen = unseen[~in_view(camera, unseen)[0]]
+            if len(unseen) == 0:
+                break
+        return 1 - len(unseen) / len(points)
 
     def alike(self, points: np.ndarray) -> float:
         """Correlation of the points' colours with those of the photographs, in each; NaN if too few are compared."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
@@ -83,6 +84,17 @@ def test_points_beside_their_place_are_warned_of(points, views, caplog):
     check_points(replace(points, positions=np.add(points.positions, [1.0, 1.0, 0])), views)
     assert "may be in another frame than the cameras" in caplog.text
     assert "have other colours than the photographs there" in caplog.text
+
+
+def test_points_of_a_long_street_are_accepted_though_each_camera_sees_few_of_them(views, caplog):
+    photographs = 1000
+    facing, shift = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros((photographs, 3))
+    shift[:, 0] = -2 * np.arange(photographs)
+    viewmats = [np.vstack([np.column_stack([facing, each]), [0, 0, 0, 1]]) for each in shift]
+    street = [replace(views[0], camera=replace(views[0].camera, viewmat=torch.from_numpy(m))) for m in viewmats]
+    facades = np.random.default_rng(0).uniform([0, 5, -2], [2 * photographs, 6, 2], (2000, 3))
+    check_points(SparsePoints(facades), street)
+    assert not caplog.records
 
 
 def test_a_few_points_show_nothing(points, views):
