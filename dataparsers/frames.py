@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Shaped
 from PIL import Image
 
 from dataparsers.camera import Camera, in_view, positions
@@ -41,6 +41,9 @@ _AXES: dict[tuple[int, ...], str] = {
 _FEW = 10  # points that show nothing
 _POINTS, _PHOTOGRAPHS, _SIZE = 1000, 6, 400  # that suffice
 _OBSERVATIONS = 50  # that suffice to compare colours
+_OF_PHOTOGRAPHS = 3.0
+"""Contrast of hues in which points and their photographs differ less: .5 to 1.3 in three scenes, 0 for heights and
+intensities in grey, 5 and more for those in colours and for classes."""
 # Cameras see nearly all points of their own frame, whose colours correlate with the photographs' by 0.6 and more. In a
 # wrong frame it is 0.35 at most, though cameras often see most of them (three scenes, ten wrong frames of each).
 _SEEN, _ALIKE = 0.5, 0.4
@@ -128,7 +131,7 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
             f"explain, but a shift or a rotation; {remedy}"
         )
     if alike < _UNLIKE or seen < _ALIKE:
-        colours = " and have other colours than the photographs there" if alike < _UNLIKE else ""
+        colours = ", and they have other colours than the photographs there" if alike < _UNLIKE else ""
         notice(f"{points.called} may be in another frame than the cameras: {apart}{colours}; if so, {remedy}.")
 
 
@@ -149,6 +152,8 @@ class _Sight:
             colours = points.colours[some].astype(np.float64)
         shown = _spread(views, _PHOTOGRAPHS) if np.ptp(colours, axis=0).max() > 0 else []
         photographs = [photograph for view in shown for photograph in _small(view)]
+        if not may_be_of(colours, [image for _, image in photographs]):
+            photographs = []
         return cls(points.positions[some], colours, [view.camera for view in views], photographs)
 
     def seen(self, points: np.ndarray) -> float:
@@ -186,10 +191,29 @@ class _Sight:
             return first_slip(self.points, self._in_view) if seen < _HARDLY or away > _FAR else None
         found = [(self.alike(slip.corrected(self.points)), slip) for slip in slips()]
         likeness, slip = max(found, key=lambda pair: np.nan_to_num(pair[0]))
-        return slip if likeness >= _SEEN else None
+        return slip if likeness >= _SEEN and self.seen(slip.corrected(self.points)) >= _SEEN else None
 
     def _in_view(self, points: np.ndarray) -> bool:
         return self.seen(points) > _WELL and self.away(points) < _FAR / 5
+
+
+def may_be_of(colours: Shaped[np.ndarray, "N 3"], images: Sequence[Shaped[np.ndarray, "H W 3"]]) -> bool:
+    """Whether colours of points may be of these photographs, by the contrast of hues, not of heights or classes.
+
+    Args:
+        colours: RGB, up to 255.
+        images: photographs, likewise.
+    """
+    if not images or len(colours) == 0:
+        return False
+    points, photographs = _contrast(colours), _contrast(np.concatenate([image.reshape(-1, 3) for image in images]))
+    return points < _OF_PHOTOGRAPHS * photographs and photographs < _OF_PHOTOGRAPHS * points
+
+
+def _contrast(colours: np.ndarray) -> float:
+    """Deviation of red and blue from green; at least 1, of which compression makes a part."""
+    red, green, blue = np.asarray(colours, dtype=np.float64).T
+    return max(1.0, float(np.hypot(np.std(red - green), np.std(blue - green))))
 
 
 def _spread(views: Sequence[View], count: int) -> list[View]:

@@ -18,6 +18,7 @@ from PIL import ExifTags, Image
 
 from dataparsers.camera import in_view, upwards
 from dataparsers.errors import notice
+from dataparsers.frames import may_be_of
 from dataparsers.photograph import View, load_photograph
 from dataparsers.sparse_points import SparsePoints, find_sparse_points
 
@@ -83,17 +84,17 @@ def _by_colours(views: Sequence[View], points: SparsePoints) -> bool | None:
     """Whether points have rather the colours of the upright photographs; None if these differ as much."""
     if points.colours is None or np.ptp(points.colours, axis=0).max(initial=0) == 0:
         return None
-    differences = [], []
+    differences, images = ([], []), []
     for view in views[:: max(1, len(views) // _COMPARED)]:
         of = slice(None) if points.observed is None else points.observed.get(view.name, np.empty(0, int))
         camera = view.camera.shrunk(_SIZE)
         inside, pixels, _ = in_view(camera, points.positions[of])
         columns, rows = pixels.astype(int).T
         for turned, found in zip((False, True), differences, strict=True):
-            image = load_photograph(replace(view, camera=camera, turned=turned))
+            images.append(image := load_photograph(replace(view, camera=camera, turned=turned)))
             found.append(np.abs(image[rows, columns].astype(float) - points.colours[of][inside]).mean(axis=1))
     stored, upright = map(np.concatenate, differences)
-    if len(stored) < _LEAST_POINTS:
+    if len(stored) < _LEAST_POINTS or not may_be_of(points.colours, images):
         return None
     less, more = sorted((stored.mean(), upright.mean()))
     return bool(upright.mean() < stored.mean()) if less < _CLEARER * more else None

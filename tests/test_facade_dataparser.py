@@ -7,18 +7,20 @@ import shutil
 import unicodedata
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from dataparsers.camera import Camera
+from dataparsers.camera import Camera, upwards
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from dataparsers.photograph import View, load_photograph
@@ -264,6 +266,18 @@ def turn_cameras(scene: Path) -> None:
     (scene / "transforms.json").write_text(json.dumps(transforms))
 
 
+def with_heights_as_colours(scene: Path) -> None:
+    """Points darker at the top than below, and photographs the other way round."""
+    cloud: Any = trimesh.load(scene / "sparse_pc.ply")
+    heights = cloud.vertices @ upwards(view.camera for view in read_views(FacadeDataParserConfig(data=scene)))
+    grey = (255 * (heights.max() - heights) / np.ptp(heights)).astype(np.uint8)
+    trimesh.PointCloud(cloud.vertices, np.repeat(grey[:, None], 3, axis=1)).export(scene / "sparse_pc.ply")
+    for path in (scene / "images").iterdir():
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGB"))
+        Image.fromarray((pixels * np.linspace(1, 0.2, len(pixels))[:, None, None]).astype(np.uint8)).save(path)
+
+
 def without_colours(scene: Path) -> None:
     lines = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {axis}" for axis in "xyz"), "end_header"]
     (scene / "sparse_pc.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "0 0 1"]) + "\n")
@@ -306,9 +320,10 @@ def test_without_coloured_points_photographs_stored_turned_are_judged_by_their_n
     assert f"are of them {'upright' if applied else 'as stored'}, by the cameras' up axes" in caplog.text
 
 
-def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, caplog):
+@pytest.mark.parametrize("cloud", [with_heights_as_colours, without_colours])
+def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, caplog, cloud):
+    cloud(scene)
     store_turned(scene, 3)
-    without_colours(scene)
     read_views(FacadeDataParserConfig(data=scene))
     assert "nothing tells whether their cameras are of the upright ones" in caplog.text
 

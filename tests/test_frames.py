@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from dataparsers.frames import check_points, slips
+from dataparsers.frames import _Sight, check_points, slips
 from dataparsers.photograph import View
 from dataparsers.sparse_points import SparsePoints, find_sparse_points
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
@@ -83,7 +83,25 @@ def test_points_in_national_coordinates_are_refused_with_their_distance(points, 
 def test_points_beside_their_place_are_warned_of(points, views, caplog):
     check_points(replace(points, positions=np.add(points.positions, [1.0, 1.0, 0])), views)
     assert "may be in another frame than the cameras" in caplog.text
-    assert "have other colours than the photographs there" in caplog.text
+    assert "they have other colours than the photographs there" in caplog.text
+
+
+@pytest.mark.parametrize("shown", ["heights", "heights in colours", "inverted intensities", "classes"])
+def test_colours_that_are_not_of_photographs_are_not_compared_with_them(points, views, shown, caplog):
+    heights = np.argsort(np.argsort(points.positions[:, 1])) / len(points.positions)
+    ramp = np.stack([np.clip(2 - abs(4 * heights - middle), 0, 1) for middle in (4, 2, 0)], axis=1)
+    grey = {"heights": 255 * heights, "inverted intensities": 255 - points.colours.mean(axis=1)}
+    coloured = {"heights in colours": 255 * ramp, "classes": np.where(ramp[:, :1] > 0, [255, 0, 0], [0, 255, 0])}
+    colours = coloured[shown] if shown in coloured else np.repeat(grey[shown][:, None], 3, axis=1)
+    check_points(replace(points, colours=colours.astype(np.uint8)), views)
+    assert not caplog.records
+
+
+def test_a_slip_explains_nothing_if_cameras_do_not_see_what_it_corrects(points, views):
+    """The little that is seen of a real photograph may be alike by chance: its sky and its ground."""
+    sight = _Sight.of(other(points, np.diag([1, -1, -1])), views)
+    assert sight.explanation(seen=0.0, away=1.0)
+    assert replace(sight, cameras=[]).explanation(seen=0.0, away=1.0) is None
 
 
 def test_points_of_a_long_street_are_accepted_though_each_camera_sees_few_of_them(views, caplog):
