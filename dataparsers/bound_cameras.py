@@ -6,6 +6,7 @@ frame. Photographs that were added or left out do not matter, as long as those i
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -56,10 +57,20 @@ class BoundCameras:
 
         Two photographs in common show that the frame is the same; one does not tell its scale.
         """
-        shared = [view for view in views if view.name in self.cameras]
+        shared = self._shared(views)
         if len(shared) < min(2, len(self.cameras), len(views)):
             return f"of their {len(self.cameras)} photographs, {len(shared)} are in the scene"
-        return next((words for view in shared if (words := self.camera_changed(view.name, view.camera))), None)
+        return next((words for name, view in shared.items() if (words := self.camera_changed(name, view.camera))), None)
+
+    def _shared(self, views: Sequence[View]) -> dict[str, View]:
+        """Photographs in common by the names recorded; if none is, those of another folder, such as ``images_4``."""
+        same = {view.name: view for view in views if view.name in self.cameras}
+        if same:
+            return same
+        recorded, there = Counter(map(_below, self.cameras)), {_below(view.name): view for view in views}
+        return {
+            name: there[_below(name)] for name in self.cameras if _below(name) in there and recorded[_below(name)] == 1
+        }
 
     def camera_changed(self, name: str, camera: Camera) -> str | None:
         """How a photograph's camera, of any image size, differs from the one recorded, in words; None if it agrees."""
@@ -82,6 +93,11 @@ class BoundCameras:
     @cached_property
     def _extent(self) -> float:
         return float(np.linalg.norm(np.ptp(positions(self.cameras.values()), axis=0)))
+
+
+def _below(name: str) -> str:
+    """A photograph's path in its folder of the scene."""
+    return name.partition("/")[2] or name
 
 
 def _numbers(camera: Camera) -> list[float]:

@@ -884,6 +884,19 @@ def test_photographs_come_and_go_without_harm_to_the_alignment(scene):
     assert "of their 10 photographs, 1 are in the scene" in (found.cameras.changed([views[0], added]) or "")
 
 
+def test_photographs_in_another_folder_are_the_same(views):
+    before = BoundCameras.of(views)
+    smaller = [
+        replace(view, name=view.name.replace("images/", "images_2/"), camera=view.camera.resized(32, 24))
+        for view in views
+    ]
+    assert before.changed(smaller) is None
+    smaller[3] = replace(smaller[3], camera=smaller[4].camera)
+    assert "stood" in (before.changed(smaller) or "")
+    by_drones = [replace(view, name=f"drone_{k % 2}/{k // 2}.jpg") for k, view in enumerate(views)]
+    assert "0 are in the scene" in (BoundCameras.of(by_drones).changed([replace(views[0], name="2/0.jpg")]) or "")
+
+
 @pytest.mark.parametrize("digits", [6, 8])
 def test_cameras_printed_again_are_the_same(scene, digits):
     move_cameras(scene, np.eye(4), digits)
