@@ -190,7 +190,17 @@ def test_meshes_outside_the_default_scene_of_a_glb_are_counted(tmp_path: Path, c
         nodes=[{"mesh": 0, "translation": [50, 0, 0]}, {"mesh": 0}], scenes=[{"nodes": [0]}, {"nodes": [1]}], scene=1
     )
     assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", gltf.box())))
-    assert "left out 1 of 2 meshes, which are not in the file's default scene" in caplog.text
+    assert "left out 1 of 2 meshes, which are hidden or not in the file's default scene" in caplog.text
+
+
+@pytest.mark.parametrize("required", [{}, {"extensionsRequired": ["KHR_node_visibility"]}])
+def test_hidden_nodes_of_a_glb_are_left_out_with_those_below(tmp_path: Path, caplog, required: dict):
+    """As Blender writes objects that are hidden."""
+    hidden = {"mesh": 0, "children": [1], "extensions": {"KHR_node_visibility": {"visible": False}}}
+    shown = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": True}}}
+    gltf = Gltf(nodes=[hidden, {"mesh": 0}, shown], scenes=[{"nodes": [0, 2]}], **required)
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", gltf.box())))
+    assert "left out 2 of 3 meshes, which are hidden" in caplog.text
 
 
 def without_values(gltf: Gltf, name: str) -> dict[str, Any]:
@@ -384,6 +394,28 @@ def test_concave_polygons_are_covered_once(tmp_path: Path, polygon: np.ndarray, 
     assert len(read.faces) == len(polygon) - 2
     assert area(read) == pytest.approx(size)  # a fan of the first corner covers more
     assert np.linalg.norm(area_vectors(read.vertices, read.faces).sum(axis=0)) == pytest.approx(size)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
+def test_a_drawing_of_lines_is_no_cloud_of_their_ends(tmp_path: Path, suffix: str):
+    """As CAD programs write plans: walls between the lines would be missing."""
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".obj":
+        path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nl 1 2 3 1\n")
+    elif suffix == ".ply":
+        edges = ["element edge 2", "property int vertex1", "property int vertex2"]
+        save_ply(path, ["element vertex 6", *XYZ, *edges], rows(HEXAGON) + "0 1\n1 2\n", "ascii")
+    else:
+        gltf = Gltf()
+        gltf.save(path, gltf.primitive(HEXAGON.astype(np.float32), mode=1))
+    with pytest.raises(SceneError, match="a drawing of lines"):
+        read_geometry(path)
+
+
+def test_a_ply_without_a_coordinate_names_it(tmp_path: Path):
+    header = ["element vertex 6", *(line.upper().replace("PROPERTY DOUBLE", "property double") for line in XYZ)]
+    with pytest.raises(SceneError, match="its vertices have X, Y, Z, but no x"):
+        read_geometry(save_ply(tmp_path / "a.ply", header, rows(HEXAGON), "ascii"))
 
 
 # OBJ, STL, OFF

@@ -38,6 +38,11 @@ def splats(path: Path) -> SceneError:
     )
 
 
+def drawing(path: Path) -> SceneError:
+    """The refusal of a file of lines without faces, whose ends are no points of the surface between them."""
+    return SceneError(f"the shell {path} is a drawing of lines, which have no surface: export its faces, or a scan")
+
+
 def left_out(path: Path, count: int, total: int, what: str) -> None:
     """Warn of what a reader leaves out of a file, and why, if anything."""
     if count:

@@ -22,6 +22,7 @@ from shellgs_method.shell.geometry.readers.contents import (
     NO_FACES,
     NO_POINTS,
     Geometry,
+    drawing,
     left_out,
     splats,
     strip_triangles,
@@ -32,10 +33,11 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 _INSTANCES = "EXT_mesh_gpu_instancing"
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+_HIDING = "KHR_node_visibility"
 _SPLATS = "KHR_gaussian_splatting"
 _MOVED = "CESIUM_RTC"
 _READ = (
-    *("KHR_mesh_quantization", _INSTANCES),
+    *("KHR_mesh_quantization", _INSTANCES, _HIDING),
     # of materials, lights, metadata: without geometry
     *(
         "KHR_materials_",
@@ -60,7 +62,8 @@ def read_gltf(path: Path) -> Geometry:
     Normalized and sparse accessors, strips, fans, morph targets at their default weights, and instances are read.
 
     Raises:
-        SceneError: the file needs an extension that is not read, a skeleton, or a file that is not there.
+        SceneError: the file needs an extension that is not read, a skeleton, or a file that is not there; or it holds
+            lines only.
         Exception: it is damaged; of any kind.
     """
     document = _Document(path)
@@ -68,9 +71,11 @@ def read_gltf(path: Path) -> Geometry:
     placed = list(document.placed_meshes())
     nodes = sum("mesh" in node for node in document.listed("nodes"))
     seen = len({index for index, _ in placed})
-    left_out(path, nodes - seen, nodes, "meshes, which are not in the file's default scene")
+    left_out(path, nodes - seen, nodes, "meshes, which are hidden or not in the file's default scene")
     modes = [p.get("mode", _TRIANGLES) for k, _ in placed for p in document.mesh_of(k)["primitives"]]
     wanted = {_TRIANGLES, _STRIP, _FAN} if any(mode >= _TRIANGLES for mode in modes) else {_POINTS}
+    if modes and not wanted & set(modes):
+        raise drawing(path)
     left_out(path, sum(m not in wanted for m in modes), len(modes), "primitives, which are points or lines")
     vertices, faces, count = [NO_POINTS], [NO_FACES], 0
     for index, matrices in placed:
@@ -134,7 +139,7 @@ class _Document:
     # Nodes
 
     def placed_meshes(self) -> Iterator[tuple[int, Float64[np.ndarray, "I 4 4"]]]:
-        """Nodes of the default scene that have a mesh, with the pose of each of its instances."""
+        """Visible nodes of the default scene that have a mesh, with the pose of each of its instances."""
         nodes, scenes = self.listed("nodes"), self.listed("scenes")
         below = {child for node in nodes for child in node.get("children", [])}
         roots = [k for k in range(len(nodes)) if k not in below]
@@ -147,6 +152,8 @@ class _Document:
             if index in seen or index < 0:
                 raise ValueError(f"its node {index} is placed twice")
             seen.add(index)
+            if not node.get("extensions", {}).get(_HIDING, {}).get("visible", True):  # nor what is below it
+                continue
             pose = above @ self._pose(node)
             left += [(child, pose) for child in reversed(node.get("children", []))]
             if "mesh" not in node:

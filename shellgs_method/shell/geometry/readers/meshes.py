@@ -10,7 +10,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from dataparsers.errors import SceneError
-from shellgs_method.shell.geometry.readers.contents import NO_POINTS, Geometry, left_out, numbers_in, polygon_triangles
+from shellgs_method.shell.geometry.readers.contents import (
+    NO_POINTS,
+    Geometry,
+    drawing,
+    left_out,
+    numbers_in,
+    polygon_triangles,
+)
 
 _CURVED = ("curv", "surf", "bsp", "bzp", "cdc", "cdp", "res ")
 
@@ -19,13 +26,14 @@ def read_obj(path: Path) -> Geometry:
     """Read the vertices and faces of a Wavefront OBJ; without faces, its vertices are a cloud.
 
     Raises:
+        SceneError: it holds lines only.
         Exception: it is damaged; of any kind.
     """
     text = path.read_text("utf-8-sig", errors="replace").replace("\\\n", " ")
     vertices: list[str] = []
     faces: list[str] = []
     above: list[int] = []  # number of vertices before each face
-    curved = 0
+    curved = lines = 0
     for line in map(str.lstrip, text.splitlines()):
         key = line[:2].rstrip()
         if key == "v":
@@ -33,9 +41,13 @@ def read_obj(path: Path) -> Geometry:
         elif key in ("f", "fo"):
             faces.append(line.partition("#")[0].lstrip("fo"))
             above.append(len(vertices))
+        elif key == "l":
+            lines += 1
         elif line.startswith(_CURVED):
             curved += 1
     left_out(path, curved, curved + len(faces), "elements, which are curves or curved surfaces")
+    if lines and not faces:
+        raise drawing(path)
     points = np.loadtxt(vertices, usecols=(1, 2, 3), ndmin=2) if vertices else NO_POINTS
     sizes = np.array([len(face.split()) for face in faces], np.int64)
     stored = numbers_in(re.sub(r"/\S*", "", " ".join(faces)), int)

@@ -13,6 +13,7 @@ from dataparsers.headers import PlyElement, PlyHeader, read_ply_header
 from shellgs_method.shell.geometry.readers.contents import (
     NO_FACES,
     Geometry,
+    drawing,
     left_out,
     numbers_in,
     polygon_triangles,
@@ -29,7 +30,7 @@ def read_ply(path: Path) -> Geometry:
     """Read the vertices, and the triangles of its faces and strips.
 
     Raises:
-        SceneError: it holds Gaussian splats.
+        SceneError: it holds Gaussian splats, or edges without faces.
         Exception: it is damaged; of any kind.
     """
     header = read_ply_header(path)
@@ -37,8 +38,12 @@ def read_ply(path: Path) -> Geometry:
     if any(splat <= names for splat in _SPLAT):
         raise splats(path)
     read = {element.name: columns for element, columns in _elements(path, header) if element.count}
+    if "edge" in read and not read.keys() & {"face", "tristrips"}:
+        raise drawing(path)
     vertices = np.empty((0, 3))
     if "vertex" in read:
+        if missing := [axis for axis in "xyz" if axis not in read["vertex"]]:
+            raise ValueError(f"its vertices have {', '.join(read['vertex'])}, but no {missing[0]}")
         vertices = np.stack([read["vertex"][axis][1].astype(np.float64) for axis in "xyz"], axis=1)
     faces = [NO_FACES]
     if "face" in read:
