@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from dataparsers.errors import SceneError
 from shellgs_method.rasterizer import quats_to_rotations
 
 WIDE = 0.05
@@ -170,11 +171,15 @@ class MCMCStrategy(Strategy):
         info: dict[str, Any],
         packed: bool = False,
     ) -> None:
-        """Relocate, add Gaussians and add noise, after the optimizers' step."""
+        """Relocate, add Gaussians and add noise, after the optimizers' step.
+
+        Raises:
+            SceneError: all Gaussians are faint, so that there is none to divide.
+        """
         del state, info, packed
         in_window = self.refine_start_iter < step < self.refine_stop_iter
         if in_window and step % self.refine_every == 0:
-            self._relocate(params, optimizers)
+            self._relocate(params, optimizers, step)
             self._add(params, optimizers)
         means = params["means"]
         noise = self.noise * optimizers["means"].param_groups[0]["lr"]
@@ -183,10 +188,15 @@ class MCMCStrategy(Strategy):
         axes = quats_to_rotations(params["quats"]) * params["scales"].exp()[:, None]
         means += noise * faint * (axes @ (axes.mT @ torch.randn_like(means)[..., None])).squeeze(-1)
 
-    def _relocate(self, params: nn.ParameterDict, optimizers: dict[str, Optimizer]) -> None:
+    def _relocate(self, params: nn.ParameterDict, optimizers: dict[str, Optimizer], step: int) -> None:
         opacities = params["opacities"].sigmoid().flatten()
         dead = (opacities <= self.min_opacity).nonzero().squeeze(1)
-        if 0 < len(dead) < len(opacities):
+        if 0 < len(dead) == len(opacities):
+            raise SceneError(
+                f"training stopped at step {step}, because all Gaussians are transparent: lower the learning rate of "
+                "the opacities or --pipeline.model.mcmc.opacity; where a checkpoint was saved, --load-dir resumes it"
+            )
+        if len(dead):
             chances = opacities.index_fill(0, dead, 0.0)
             self._divide(params, optimizers, _multinomial_sample(chances, len(dead)), dead)
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from dataparsers.camera import Camera
+from dataparsers.errors import SceneError
 from shellgs_method.densification import MAX_COPIES, GradientStrategy, MCMCStrategy, SkyboxStrategy, relocated
 from shellgs_method.rasterizer import rasterize
 
@@ -121,6 +122,14 @@ def test_faint_gaussians_are_relocated_onto_visible_ones():
     same_place = (params["means"].detach()[:10, None] == before[None, 10:]).all(dim=-1)
     assert same_place.any(dim=1).all()
     assert params["opacities"].sigmoid().min() > 0.1
+
+
+@pytest.mark.parametrize("logit", [-6.0, -900.0])
+def test_mcmc_ends_with_a_sentence_where_all_gaussians_are_transparent(logit):
+    params = gaussians(100)
+    params["opacities"].data.fill_(logit)  # -900 is an opacity of exactly 0, of which none can be drawn
+    with pytest.raises(SceneError, match=r"training stopped at step 7, because all Gaussians are transparent"):
+        step(strategy(), params, stepped(params), at=7)
 
 
 def test_dividing_hardly_changes_the_image(eager):
