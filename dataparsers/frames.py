@@ -225,7 +225,7 @@ def _small(view: View) -> list[tuple[Camera, np.ndarray]]:
     """A view's photograph, small, and its camera; none if it is damaged, which is reported where it is used."""
     camera = view.camera.shrunk(_SIZE)
     try:
-        image = Image.fromarray(load_photograph(view)[..., :3])
+        image = Image.fromarray(load_photograph(view))
     except (SceneError, OSError):
         return []
     return [(camera, np.asarray(image.resize((camera.width, camera.height), Image.Resampling.BOX), np.float64))]

@@ -66,7 +66,10 @@ def _mend_exporter(exporter: Any) -> None:
 
     def refuse_none(filename: str, count: int, _columns: Any) -> None:
         if count == 0:
-            raise SceneError(f"{filename} would be empty: no Gaussian is inside the box of --obb-center, …")
+            raise SceneError(
+                f"{filename} would be empty: no Gaussian is inside the box of --obb-center, --obb-rotation and "
+                "--obb-scale: give another one, in nerfstudio's frame, or none"
+            )
 
     exporter.ExportGaussianSplat.write_ply = staticmethod(_before(exporter.ExportGaussianSplat.write_ply, refuse_none))
 

@@ -21,7 +21,7 @@ def save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
 
     view, cue = max(views_with_maps(maps, views, 8), key=lambda pair: pair[1].mask.mean())
     panel = maps.folder / "panel.png"
-    figure = supervision_panel(load_photograph(view)[..., :3], cue, maps.manifest.metres_per_unit, maps.kind)
+    figure = supervision_panel(load_photograph(view), cue, maps.manifest.metres_per_unit, maps.kind)
     save_figure(panel, figure)
     return panel
 

@@ -59,7 +59,7 @@ class MoGe2:
             raise _unusable(self.weights, "MoGe-2", error) from error
 
         def predict(view: View) -> Prediction:
-            image = torch.from_numpy(load_photograph(view)[..., :3].astype(np.float32) / 255).permute(2, 0, 1)
+            image = torch.from_numpy(load_photograph(view).astype(np.float32) / 255).permute(2, 0, 1)
             # The focal length is known, so only the shift of the point map is estimated.
             fov_x = math.degrees(2 * math.atan(view.camera.width / (2 * float(view.camera.K[0, 0]))))
             maps = model.infer(image.to(_device()), fov_x=fov_x, use_fp16=_device().type == "cuda")
@@ -114,7 +114,7 @@ class DepthAnything:
 
         @torch.inference_mode()
         def predict(view: View) -> Prediction:
-            inputs = processor(images=load_photograph(view)[..., :3], return_tensors="pt").to(_device())
+            inputs = processor(images=load_photograph(view), return_tensors="pt").to(_device())
             size = (view.camera.height, view.camera.width)
             (maps,) = processor.post_process_depth_estimation(model(**inputs), target_sizes=[size])
             return Prediction(as_disparity(maps["predicted_depth"].float().cpu().numpy(), meaning))

@@ -115,7 +115,7 @@ class Reconstruction:
     def photo(self, index: int) -> Photo:
         """Load the photograph of a view."""
         view, hidden = self.views[index], self.hidden[index]
-        image, kept = np.ascontiguousarray(load_photograph(view)[..., :3]), load_mask(view)
+        image, kept = np.ascontiguousarray(load_photograph(view)), load_mask(view)
         rows, columns = (np.arange(n) * m // n for n, m in zip(image.shape[:2], hidden.shape, strict=True))  # nearest
         clear = ~hidden[np.ix_(rows, columns)]
         return Photo(image, self.frame.camera(view.camera), clear if kept is None else clear & kept)

@@ -111,7 +111,7 @@ def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator
     caster = ShellCaster(mesh, validation.alignment.shell_to_scene)
     for number, support in enumerate(representative(validation.views, validation.axes[0]), start=1):
         view = replace(support.view, camera=support.view.camera.shrunk(_OVERLAY))
-        photograph = np.ascontiguousarray(load_photograph(view)[..., :3])
+        photograph = np.ascontiguousarray(load_photograph(view))
         edges = shell_edges(caster.cast(view.camera), validation.alignment.metres_per_unit)
         composite = photograph.copy()
         composite[edges] = _EDGE
