@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from dataparsers.camera import Camera, positions
+from dataparsers.camera import Camera, angle_between, positions
 from dataparsers.photograph import View
 from dataparsers.shots import MAX_PIXELS
 
@@ -80,9 +80,7 @@ class BoundCameras:
         moved = float(np.linalg.norm(positions([before]) - positions([camera])))
         if moved > POSITION_TOLERANCE * self._extent:
             return f"that of {name} stood {moved:.3g} scene units away"
-        # |R - R'| = 2 sqrt(2) sin(angle / 2) in the Frobenius norm; exact for small angles, where acos(trace) is not.
-        chord = float((before.viewmat[:3, :3] - camera.viewmat[:3, :3].cpu().double()).norm()) / np.sqrt(8)
-        if (angle := 2 * np.arcsin(min(chord, 1.0))) > ROTATION_TOLERANCE:
+        if (angle := angle_between(before, camera)) > ROTATION_TOLERANCE:
             return f"that of {name} was turned by {np.rad2deg(angle):.3g}°"
         resized = before.resized(camera.width, camera.height)
         pixels = float((resized.K - camera.K.cpu().double()).abs().max())

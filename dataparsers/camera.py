@@ -68,6 +68,13 @@ class Camera:
         return pixels @ torch.linalg.inv(self.K).T
 
 
+def angle_between(one: Camera, other: Camera) -> float:
+    """Angle in radians by which two cameras are turned from each other."""
+    first, second = (camera.viewmat[:3, :3].detach().cpu().double().numpy() for camera in (one, other))
+    # |R - R'| = 2 sqrt(2) sin(angle / 2) in the Frobenius norm; exact for small angles, where acos(trace) is not.
+    return float(2 * np.arcsin(np.minimum(np.linalg.norm(first - second) / np.sqrt(8), 1.0)))
+
+
 def positions(cameras: Iterable[Camera]) -> Float64[np.ndarray, "V 3"]:
     """Camera centres in the world."""
     return np.array([camera.position.detach().cpu().double().numpy() for camera in cameras]).reshape(-1, 3)

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float16, Float32
 from torch import Tensor
 
-from dataparsers.camera import Camera
+from dataparsers.camera import Camera, angle_between, positions
 from dataparsers.files import atomic_write
 from dataparsers.shots import MAX_PIXELS
 
@@ -237,13 +237,9 @@ def difference(record: MapRecord, own: Camera, camera: Camera, sources: Mapping[
     intrinsics = np.abs(_float64(own.K) - _float64(camera.K)).max()
     if not intrinsics <= INTRINSICS_TOLERANCE * max(camera.width, camera.height):
         return f"its intrinsics differ from the camera's by {intrinsics:.3g} pixels"
-    made, wanted = _float64(own.viewmat), _float64(camera.viewmat)
-    # |R - R'| = 2 sqrt(2) sin(angle / 2) in the Frobenius norm; exact for small angles, where acos(trace) is not.
-    chord = np.linalg.norm(made[:3, :3] - wanted[:3, :3]) / np.sqrt(8)
-    angle = 2 * np.arcsin(np.minimum(chord, 1.0))
-    if not angle <= ROTATION_TOLERANCE:
+    if not (angle := angle_between(own, camera)) <= ROTATION_TOLERANCE:
         return f"its pose is turned by {np.rad2deg(angle):.3g} degrees from the camera's"
-    moved = np.linalg.norm(made[:3, :3].T @ made[:3, 3] - wanted[:3, :3].T @ wanted[:3, 3])
+    moved = np.linalg.norm(positions([own])[0] - positions([camera])[0])
     if record.mean_depth is not None and not moved <= POSITION_TOLERANCE * record.mean_depth:
         return f"its camera stood {moved:.3g} scene units away (the view's mean depth is {record.mean_depth:.3g})"
     if (record.format, record.sources) != (FORMAT, sources):
