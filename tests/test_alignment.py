@@ -45,6 +45,8 @@ from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera
 from shellgs_method.synthetic.path import walk
 
+OPAQUE = Path(__file__).parents[1] / "docs/picture.jpg"
+"""Any photograph: validation looks whether it is transparent."""
 TRUTH = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
 AXES = SHELL_FROM_BUILDING[:3, :3] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).T  # columns: right, up, out
 
@@ -84,7 +86,7 @@ def points(mesh: ShellMesh, surface: ShellSurface, survey_from_scene: np.ndarray
 def views() -> list[View]:
     """Ten views of 96 x 64 pixels, without photographs."""
     cameras = walk(15.0, 10, 96, 64, np.random.default_rng(0))
-    return [View(f"images/{k}.png", Path(f"{k}.png"), scene_camera(camera)) for k, camera in enumerate(cameras)]
+    return [View(f"images/{k}.png", OPAQUE, scene_camera(camera)) for k, camera in enumerate(cameras)]
 
 
 def displaced(metres: float, degrees: float, growth: float, seed: int) -> np.ndarray:
