@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import KDTree
 
 from dataparsers.errors import SceneError
 from dataparsers.frames import first_slip, in_degrees
 from dataparsers.strays import sound
+from shellgs_method.nearest import point_tree
 from shellgs_method.shell.geometry.files import read_geometry
 from shellgs_method.triangles import area_vectors, sampled
 
@@ -52,7 +52,7 @@ class ShellPlace:
         points = np.random.default_rng(0).permutation(points)[:_SAMPLES]
         low, high = _box(points)
         self.path, self.middle, self.size = path, (low + high) / 2, float(np.linalg.norm(high - low))
-        self._surface = KDTree(points - self.middle)
+        self._surface = point_tree(points - self.middle)
 
     def check_picks(self, picks: Float64[np.ndarray, "N 3"], called: str) -> None:
         """Refuse picks of which less than half are on the shell, or which are all on one spot of it.
