@@ -28,6 +28,7 @@ _FORMATS = ((2, 24, 2), *((10, digits, 4) for digits in range(4, 10)))
 does, but only single precision has 24 of them."""
 _UNLIKE = 1000.0
 """Coarsest over finest of three different grids that no design has, but a floating format."""
+_SINGLE = 0.9  # share of points that have a cell of a raster for themselves
 _COLLAPSED, _OBLIQUE, _DIRECTIONS = 0.02, 0.5, 5  # of the triangles; of the area; directions of oblique ones
 
 
@@ -141,16 +142,28 @@ class _Values:
         return Step(np.maximum(grids, floating), rounded) if rounded or is_far else NO_STEP
 
     def _is_floating(self, grids: np.ndarray) -> bool:
-        """Whether each axis has another grid, in proportions that no design has, as if an offset was subtracted."""
+        """Whether each axis has another grid, in proportions that no design has, as if an offset was subtracted.
+
+        Steps of one format differ by powers of its base; millimetres of a plan and the heights of its storeys do not.
+        """
         fine, middle, coarse = np.sort(grids)
         if not (middle > 0 and 1.9 * fine <= middle and 1.9 * middle <= coarse):
             return False
-        return bool(coarse >= _UNLIKE * fine) if fine > 0 else self.is_far and self._varies(grids == 0)
+        if fine == 0:
+            return self.is_far and self._varies(grids == 0)
+        powers = np.log([middle / fine, coarse / fine])[:, None] / np.log([2, 10])
+        return bool(coarse >= _UNLIKE * fine and (np.abs(powers - np.rint(powers)) < 0.01).all(axis=0).any())
 
     def _is_raster(self, grids: np.ndarray) -> bool:
-        """Whether two axes have one grid and the third has none, as heights above a raster do."""
+        """Whether two axes have one grid and the third, heights, none or a finer one, with one value a cell."""
         fine, middle, coarse = np.sort(grids)
-        return bool(fine == 0 < middle and coarse < 1.9 * middle) and self._varies(grids == 0)
+        if not (1.9 * fine <= middle and middle > 0 and coarse < 1.9 * middle and self._varies(grids == fine)):
+            return False
+        if fine == 0:
+            return True
+        cells = np.rint(self.points[:, grids > fine] / middle)
+        points = len(np.unique(self.points, axis=0))  # a sample repeats some
+        return len(np.unique(cells, axis=0)) > _SINGLE * points
 
     def _varies(self, axis: np.ndarray) -> bool:
         return len(np.unique(self.points[:, axis])) >= _FEW

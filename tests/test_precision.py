@@ -99,6 +99,26 @@ def test_heights_above_a_raster_near_the_origin_have_no_step():
     assert cloud_step(relief).coarsest == 0
 
 
+@pytest.mark.parametrize("origin", [[0.0, 0, 0], [412350.0, 5123460, 212]])
+def test_heights_in_millimetres_above_a_raster_were_not_rounded(origin):
+    random = np.random.default_rng(0)
+    cells = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0)), axis=-1).reshape(-1, 2)
+    raster = np.column_stack([cells, random.uniform(0, 9, len(cells)).round(3)]) + origin
+    step = cloud_step(raster)
+    assert not (step.rounded and step.coarsest > 0)
+    walls = np.column_stack([random.integers(0, 20, (2000, 2)), random.uniform(0, 9, 2000).round(3)]) + origin
+    assert cloud_step(walls).rounded
+    np.testing.assert_allclose(cloud_step(walls).lengths, [1, 1, 0.001])
+
+
+def test_storeys_of_a_tower_in_millimetres_are_no_rounding():
+    random = np.random.default_rng(0)
+    corners = random.integers([0, 0, 0], [20000, 2000, 12], (500, 3)) * [1, 5, 3000]
+    windows = corners[:, None] + [[0, 0, 0], [1200, 0, 0], [0, 0, 3000]]
+    step = mesh_step(windows.reshape(-1, 3).astype(float), np.arange(1500).reshape(-1, 3))
+    assert step.coarsest == 0 or not step.rounded
+
+
 def test_a_building_on_whole_metres_of_national_coordinates_may_be_exact():
     corners, faces = bays()
     assert not mesh_step(corners + np.array([412_340, 5_123_460, 210]), faces).rounded
