@@ -98,7 +98,7 @@ def in_degrees(points: Float64[np.ndarray, "N 3"], size: float) -> bool:
     """Whether points, which spread over something of this size, are longitudes and latitudes, in either order."""
     flat = np.abs(points[:, :2])
     a_degree = 1.0  # a building is less than a hundredth of one wide
-    small = np.ptp(points[:, :2], axis=0).max() < min(0.01 * a_degree, 0.05 * size)
+    small = 0 < np.ptp(points[:, :2], axis=0).max() < min(0.01 * a_degree, 0.05 * size)  # 0: above each other
     return bool(small and flat.max() <= 180 and flat.min(axis=1).max() <= 90)
 
 

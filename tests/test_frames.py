@@ -209,6 +209,12 @@ def test_picks_on_the_shell_and_cameras_around_it_are_accepted(place, picks, sto
     place.check_positions(np.zeros((0, 3)), "no positions")
 
 
+def test_picks_up_one_edge_are_not_taken_for_degrees(tmp_path):
+    trimesh.creation.box(extents=[20, 10, 12]).export(tmp_path / "box.ply")
+    edge = np.array([[10.0, 5, -6], [10, 5, 0], [10, 5, 6]])
+    ShellPlace(tmp_path / "box.ply").check_picks(edge, "the picks")
+
+
 def test_a_cloud_of_points_has_a_place_too(place, picks, pristine_scene, tmp_path):
     mesh = load_shell(pristine_scene / "shell/facade.ply")
     cloud = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces), 3000, seed=0)[0]
