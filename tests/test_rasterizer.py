@@ -162,6 +162,16 @@ def test_gradients_are_finite_with_splats_at_the_camera_centre_or_fainter_than_a
     assert not splats[3].grad[1:4].any()
 
 
+@pytest.mark.parametrize("size", [1e12, 1e20, 1e38])
+def test_a_splat_too_large_for_single_precision_leaves_the_others_as_they_are(size):
+    """As a high learning rate leaves it: its ellipse is NaN, which is in no tile."""
+    splats, camera = [each.float() for each in make_splats(50, 3, seed=1)], make_camera(40, 30, torch.float32)
+    without, _, _ = rasterize(*(each[1:] for each in splats), camera=camera)
+    splats[2][0] = size
+    composited, _, _ = rasterize(*splats, camera=camera)
+    torch.testing.assert_close(composited, without)
+
+
 def test_alpha_is_the_composite_of_a_feature_of_one():
     *splats, features = make_splats(100, 1, seed=5)
     composited, alpha, _ = rasterize(*splats, features=torch.ones_like(features), camera=make_camera(33, 21))

@@ -122,7 +122,8 @@ def _project(
     cutoff = cutoffs(opacities)
     extent, reach = cutoff * determinant, [(cutoff * xx).sqrt(), (cutoff * yy).sqrt()]
     outline = torch.stack([*means2d.detach().unbind(-1), yy / extent, -xy / extent, xx / extent, *reach], dim=-1)
-    visible = in_front & (cutoff > 0) & touches(outline, size)
+    # The ellipse of a splat too large for single precision is NaN.
+    visible = in_front & (cutoff > 0) & extent.isfinite() & touches(outline, size)
     return means2d, shapes, depths, outline[..., None, :], torch.stack([xx, xy, yy], dim=-1), visible
 
 
