@@ -113,7 +113,6 @@ UNUSED = {
     "datamanager.eval_num_times_to_repeat_images": _VIEWS,
     "datamanager.eval_image_indices": _VIEWS,
     "datamanager.max_thread_workers": "nerfstudio reads photographs in two threads",
-    "optimizer.max_norm": "gradients are not clipped, as Adam divides them by their size",
 }
 """Settings of nerfstudio that would be ignored, by the end of their path, and why."""
 _HIDDEN = ("pipeline.model.", "optimizers.")

@@ -167,12 +167,22 @@ class _RunReader:
 
 
 def _resume_from(config: TrainerConfig, given: TrainerConfig) -> None:
-    """Take over which checkpoint to resume from, or a run would be trained anew over the one that was named."""
+    """Take over which checkpoint to resume from, or a run would be trained anew over the one that was named.
+
+    Raises:
+        SceneError: none is named, and the run has some.
+    """
     if given.load_dir or given.load_checkpoint:
         config.load_dir, config.load_checkpoint, config.load_step = (
             given.load_dir,
             given.load_checkpoint,
             given.load_step,
+        )
+    folder = config.get_checkpoint_dir()
+    if not (config.load_dir or config.load_checkpoint) and any(folder.glob("step-*.ckpt")):
+        raise SceneError(
+            f"{folder} has checkpoints, which training anew would replace: resume with --load-dir {folder}, or start "
+            f"another run with `ns-train {config.method_name} --data {config.pipeline.datamanager.data}`"
         )
 
 

@@ -37,7 +37,7 @@ USED = """
     pipeline.model.densify_grad_thresh pipeline.model.densify_size_thresh pipeline.model.sh_degree_interval
     pipeline.model.cull_screen_size pipeline.model.split_screen_size pipeline.model.stop_screen_size_at
     pipeline.model.ssim_lambda pipeline.model.stop_split_at pipeline.model.sh_degree
-    optimizer.lr optimizer.eps optimizer.weight_decay
+    optimizer.lr optimizer.eps optimizer.weight_decay optimizer.max_norm
 """
 """Inherited settings that change what a run does, by the end of their path."""
 MANAGED = ("_target", "method_name", "scheduler.max_steps", "optimizer.fused")

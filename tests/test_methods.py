@@ -159,7 +159,7 @@ def test_a_disc_splits_within_its_plane(discs):
     params = torch.nn.ParameterDict({name: value.detach().clone() for name, value in model.gauss_params.items()})
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
     n = model.num_points
-    ones = {name: torch.ones(n) for name in ("grad2d", "count", "widest")}
+    ones = {name: torch.ones(n) for name in ("grad2d", "count", "radii")}
     state = ones | {"scene_scale": 0.0}  # all are large: all split
     duplicated, split = model.strategy._grow_gs(params, optimizers, state, step=1)  # pyright: ignore
     assert (duplicated, split) == (0, n)

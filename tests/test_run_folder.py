@@ -243,6 +243,17 @@ def test_a_copy_of_a_run_is_trained_in_its_own_folder(two_projects, monkeypatch)
     assert (b / NAMES / "config.yml").stat() == before
 
 
+def test_a_run_with_checkpoints_is_not_trained_anew_over_them(two_projects, monkeypatch):
+    a, _ = two_projects
+    again = copy.deepcopy(all_methods["photo-gs"])
+    assert isinstance(again, TrainerConfig)
+    again.load_config = a / NAMES / "config.yml"
+    (a / NAMES / LAST).touch()
+    monkeypatch.setattr(train, "launch", lambda *_, **__: pytest.fail("training started"))
+    with pytest.raises(SystemExit, match=r"has checkpoints, which training anew would replace: resume with --load-dir"):
+        train.main(again)
+
+
 def test_a_copied_run_resumes_from_its_own_checkpoints(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene").mkdir()

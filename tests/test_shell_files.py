@@ -633,6 +633,19 @@ def test_text_clouds_may_have_headers_counts_and_any_separator(tmp_path: Path, l
         np.testing.assert_array_equal(read_geometry(tmp_path / f"a.{suffix}").vertices, SURVEYED)
 
 
+@pytest.mark.parametrize(
+    ("comments", "form"),
+    [
+        (["# Z Y X"], "{2} {1} {0}"),
+        (["//id,Y,X,Z", "// exported"], "7,{1},{0},{2}"),
+        (["# X Y Z of the wall by Foo"], "{0} {1} {2}"),  # words, not the names of columns
+    ],
+)
+def test_a_comment_may_name_the_columns(tmp_path: Path, comments: list[str], form: str):
+    (tmp_path / "a.xyz").write_text("\n".join([*comments, *(form.format(*point) for point in SURVEYED)]))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.xyz").vertices, SURVEYED)
+
+
 def test_a_column_of_points_numbers_is_said(tmp_path: Path, caplog):
     (tmp_path / "a.xyz").write_text("\n".join(f"{k + 1000} {line}" for k, line in enumerate(LINES)))
     read_geometry(tmp_path / "a.xyz")

@@ -319,7 +319,7 @@ def test_a_full_disk_is_reported_with_the_file_and_changes_no_existing_file(run,
     before = files(run)
     ball = trimesh.creation.icosphere()
     ball.metadata["voxel"] = 1.0
-    monkeypatch.setattr("shellgs_method.export.fuse", lambda *_: ball)
+    monkeypatch.setattr("shellgs_method.export.runs.fuse", lambda *_: ball)
     monkeypatch.setattr("shellgs_method.export.runs.mesh_errors", lambda *_: {})
     flag = "--output-path" if command == "evaluate" else "--output"
     with small_disk(2000):

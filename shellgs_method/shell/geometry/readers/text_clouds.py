@@ -23,7 +23,7 @@ _WHOLE = re.compile(r"[-+]?\d+")
 
 
 def read_text_cloud(path: Path) -> Geometry:
-    """Read X, Y and Z of each line: the first three columns, or those that a header names so.
+    """Read X, Y and Z of each line: the first three columns, or those that a header names so, also in a comment.
 
     Columns are separated by spaces, tabs, commas or semicolons. A line with one number counts the points after it.
     Where the first column numbers or names the points, X is the second.
@@ -43,7 +43,13 @@ def read_text_cloud(path: Path) -> Geometry:
         separator = _separator(first, path)
         rows = [_split(line, separator) for line in first]
         named = not any(map(_is_number, rows[0]))
-        columns = _named(rows, first[0], path) if named else _columns(rows, first[0], path)
+        header = _split(lines.header, separator)
+        if named:
+            columns = _named(rows, first[0], path)
+        elif len(header) == len(rows[0]) and _axes(header):
+            columns = _named([header, *rows], lines.header, path)
+        else:
+            columns = _columns(rows, first[0], path)
         data = chain(first[1:] if named else first, lines)
         points = np.loadtxt(data, usecols=columns, comments=None, ndmin=2, delimiter=separator, quotechar='"')
     if lines.claimed and lines.claimed != len(points):
@@ -56,16 +62,22 @@ class _Lines:
 
     Attributes:
         claimed: how many points the lines so far have counted.
+        header: last comment above the points that names X, Y and Z; empty if none does.
     """
 
     def __init__(self, file: TextIO) -> None:
-        self.file, self.claimed = file, 0
+        self.file, self.claimed, self.header = file, 0, ""
 
     def __iter__(self) -> Iterator[str]:
+        begun = False
         for line in self.file:
             line = line.strip()
             if not line or line.startswith(_COMMENTS):
+                comment = line.lstrip("#/ ")
+                if not begun and _axes(re.split(r"[\s,;]+", comment)):
+                    self.header = comment
                 continue
+            begun = True
             if _WHOLE.fullmatch(line):
                 self.claimed += int(line)
                 continue
@@ -98,15 +110,20 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def _axes(header: list[str]) -> list[int]:
+    """Columns that a header calls X, Y and Z, with a unit or without; none if it does not name each once."""
+    names = [re.split(r"[^a-z]", name.lower().strip("\"' "))[0] for name in header]
+    return [names.index(axis) for axis in "xyz"] if all(names.count(axis) == 1 for axis in "xyz") else []
+
+
 def _named(rows: list[list[str]], line: str, path: Path) -> list[int]:
-    """Columns that a header calls X, Y and Z, with a unit or without."""
-    names = [re.split(r"[^a-z]", name.lower().strip("\"' "))[0] for name in rows[0]]
-    if any(names.count(axis) != 1 for axis in "xyz"):
+    """Columns that the first row calls X, Y and Z."""
+    names, columns = rows[0], _axes(rows[0])
+    if not columns:
         raise SceneError(
             f"the shell {path} cannot be read: it begins with {_shown(line)}, which does not name one column each of "
             "X, Y and Z: name them in that line, or delete it if they are the first three columns"
         )
-    columns = [names.index(axis) for axis in "xyz"]
     for row in rows[1:]:
         if any(row[len(names) :]) and not all(map(_is_number, row[: max(columns)])):  # words of one name, perhaps
             raise SceneError(
