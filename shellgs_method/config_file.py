@@ -139,6 +139,10 @@ def _call(loader: Any, path: str, node: yaml.Node) -> Any:
         generic, parameters = arguments
         if isinstance(generic, type):
             return generic[parameters]  # pyright: ignore[reportIndexIssue]
+    if path == "builtins.getattr":  # an enumeration's value, as the first versions of Python 3.11 write it
+        kind, name = arguments
+        if isinstance(kind, type) and issubclass(kind, Enum) and name in kind.__members__:
+            return kind[name]
     kind = _find(path)
     if not (isinstance(kind, type) and issubclass(kind, Enum)):
         raise SceneError(f"it calls {path}")

@@ -1,8 +1,8 @@
 """Inputs with traits that public bug reports describe, run as a user would: each works, or one sentence says why not.
 
-The cases are not part of the project: `SHELLGS_CASES` is their folder. Each has a `run.sh` that makes inputs from a scene
-and runs commands on them; ``$ command`` precedes the output of each, ``== input`` how its maps differ from the ordinary
-ones. ``pytest -m slow -s tests/test_cases.py`` prints the table of all inputs.
+The cases are not part of the project: `SHELLGS_CASES` is their folder. Each has a `run.sh` that makes inputs from a
+scene and runs commands on them; ``$ command`` precedes the output of each, ``== input`` how its maps differ from the
+ordinary ones. ``pytest -m slow -s tests/test_cases.py`` prints the table of all inputs.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ RIGHT: dict[str, dict[str, str | float]] = {
     "31-georeferenced-colmap": {"align.*tj": refused("stored in steps of")},
     "32-vertex-at-the-origin": {"cast.*(triangle|spike)": r"absurdly far away"},
 }
-"""For each case what is right, by patterns of the command's end or of the input compared: a pattern of what it must say,
-or the largest difference of its maps in metres. Other commands must work, other maps be the ordinary ones."""
+"""For each case what is right, by patterns of the command or of the input compared: a pattern of what it must say, or the
+largest difference of its maps in metres. Other commands must work, other maps be the ordinary ones."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Outcome:
             return f"maps are {off} m off" if off is not None and not off <= self.right else ""
         if CRASH.search(self.text):
             return "crash"
-        return "" if re.search(self.right, self.text) else f"does not say {self.right!r}"
+        return "" if re.search(str(self.right), self.text) else f"does not say {self.right!r}"
 
     @property
     def words(self) -> str:

@@ -15,6 +15,7 @@ import pytest
 import torch
 import trimesh
 import yaml
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.base_config import LoggingConfig
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
@@ -24,7 +25,7 @@ from runs import Method, small_disk, trainer_of
 
 from dataparsers.errors import SceneError
 from shellgs_method import cli
-from shellgs_method.config_file import RENAMED, load_config
+from shellgs_method.config_file import RENAMED, _Loader, load_config
 
 LAST = "nerfstudio_models/step-000000001.ckpt"
 
@@ -114,6 +115,13 @@ def test_the_config_of_every_method_is_read_as_it_was_written(name, tmp_path):
     (tmp_path / "config.yml").write_text(yaml.dump(config))
     assert load_config(tmp_path / "config.yml") == config
     assert yaml.load((tmp_path / "config.yml").read_text(), Loader=yaml.Loader) == config  # as nerfstudio reads it
+
+
+def test_an_enumeration_is_read_as_the_first_versions_of_python_3_11_write_it():
+    text = "!!python/object/apply:builtins.getattr\n- !!python/name:nerfstudio.cameras.cameras.CameraType ''\n- {}\n"
+    assert yaml.load(text.format("PERSPECTIVE"), Loader=_Loader) is CameraType.PERSPECTIVE
+    with pytest.raises(SceneError, match=r"builtins\.getattr"):
+        yaml.load(text.format("mro"), Loader=_Loader)
 
 
 def test_an_older_config_has_defaults_for_new_settings_and_drops_those_that_are_gone(run):
