@@ -80,8 +80,8 @@ RIGHT: dict[str, dict[str, str | float]] = {
     "31-georeferenced-colmap": {"align.*tj": refused("stored in steps of")},
     "32-vertex-at-the-origin": {"cast.*(triangle|spike)": r"absurdly far away"},
 }
-"""For each case what is right, by patterns of the command or of the input compared: a pattern of what it must say, or the
-largest difference of its maps in metres. Other commands must work, other maps be the ordinary ones."""
+"""For each case what is right, by patterns of the command or input: what it must say, or the largest
+difference of its maps in metres. Other commands must work, other maps be the ordinary ones."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pickle
 import re
 import shutil
 from collections.abc import Callable
+from enum import Enum
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,6 @@ import pytest
 import torch
 import trimesh
 import yaml
-from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.base_config import LoggingConfig
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
@@ -25,7 +25,7 @@ from runs import Method, small_disk, trainer_of
 
 from dataparsers.errors import SceneError
 from shellgs_method import cli
-from shellgs_method.config_file import RENAMED, _Loader, load_config
+from shellgs_method.config_file import RENAMED, _known, _Loader, load_config
 
 LAST = "nerfstudio_models/step-000000001.ckpt"
 
@@ -118,10 +118,12 @@ def test_the_config_of_every_method_is_read_as_it_was_written(name, tmp_path):
 
 
 def test_an_enumeration_is_read_as_the_first_versions_of_python_3_11_write_it():
-    text = "!!python/object/apply:builtins.getattr\n- !!python/name:nerfstudio.cameras.cameras.CameraType ''\n- {}\n"
-    assert yaml.load(text.format("PERSPECTIVE"), Loader=_Loader) is CameraType.PERSPECTIVE
+    kind = next(each for each in _known().values() if isinstance(each, type) and issubclass(each, Enum))
+    text = f"!!python/object/apply:builtins.getattr\n- !!python/name:{kind.__module__}.{kind.__qualname__} ''\n- "
+    for member in kind:
+        assert yaml.load(text + member.name, Loader=_Loader) is member
     with pytest.raises(SceneError, match=r"builtins\.getattr"):
-        yaml.load(text.format("mro"), Loader=_Loader)
+        yaml.load(text + "mro", Loader=_Loader)
 
 
 def test_an_older_config_has_defaults_for_new_settings_and_drops_those_that_are_gone(run):
