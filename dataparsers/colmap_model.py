@@ -96,7 +96,7 @@ def find_folder(scene: Path, chosen: Path | None) -> Path | None:
     models = next(filter(None, ([f for f in folders if _is_model(scene / f)] for folders in ordered)), [])
     if len(models) < 2:
         return models[0] if models else None
-    sizes = {folder: _size(scene / folder) for folder in models}
+    sizes = {folder: len(_images(scene / folder)) for folder in models}
     largest = max(models, key=sizes.__getitem__)  # the first of equals
     others = ", ".join(f"{folder} has {size}" for folder, size in sizes.items() if folder != largest)
     notice(
@@ -113,10 +113,8 @@ def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
         FileNotFoundError: a file of the model is missing.
         SceneError: a file is damaged, or a camera is invalid.
     """
-    cameras, files = (
-        _read(scene / folder, "cameras", _binary_cameras, _text_cameras),
-        _files(scene, folder, images_path),
-    )
+    cameras = _read(scene / folder, "cameras", _binary_cameras, _text_cameras)
+    files = _files(scene, folder, images_path)
     images = _images(scene / folder)
     shots = [_shot(scene, _path(image.name, files), image, cameras, folder) for image in images.values()]
     listed = _listed(files)
@@ -144,11 +142,6 @@ def _numbered(scene: Path, place: Path) -> list[Path]:
 
 def _is_model(folder: Path) -> bool:
     return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
-
-
-def _size(folder: Path) -> int:
-    """Number of photographs of a model."""
-    return len(_images(folder))
 
 
 def _images(folder: Path) -> dict[int, _Image]:

@@ -7,24 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _TYPES = {
-    **{
-        name: f"{kind}{size}"
-        for names, kind, size in (
-            (("char", "int8"), "i", 1),
-            (("uchar", "uint8"), "u", 1),
-            (("short", "int16"), "i", 2),
-            (("ushort", "uint16"), "u", 2),
-            (("int", "int32"), "i", 4),
-            (("uint", "uint32"), "u", 4),
-            (("long", "int64"), "i", 8),
-            (("ulong", "uint64"), "u", 8),
-            (("half", "float16"), "f", 2),
-            (("float", "float32"), "f", 4),
-            (("double", "float64"), "f", 8),
-        )
-        for name in names
-    },
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("long", "int64"), "i8"),
+    **dict.fromkeys(("ulong", "uint64"), "u8"),
+    **dict.fromkeys(("half", "float16"), "f2"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
 }
+"""Numpy's types, without byte order, by their names in PLY."""
 _LONGEST_HEADER = 1 << 16
 
 
@@ -81,9 +76,8 @@ def read_ply_header(path: Path) -> PlyHeader:
     text, found, rest = start.partition(b"end_header")
     if not start.startswith(b"ply") or not found:
         raise ValueError("it does not begin with the header of a PLY")
-    line_end = rest[: len(rest) - len(rest.lstrip(b" \t"))]
-    rest = rest[len(line_end) :]
-    length = len(text) + len(found) + len(line_end) + (2 if rest.startswith(b"\r\n") else 1)
+    line_end = rest.lstrip(b" \t")
+    length = len(start) - len(line_end) + (2 if line_end.startswith(b"\r\n") else 1)
     order, elements = "", []
     for words in (line.split() for line in text.decode("latin-1").splitlines()):
         match words:

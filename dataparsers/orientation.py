@@ -86,7 +86,7 @@ def _by_colours(views: Sequence[View], points: SparsePoints) -> bool | None:
         return None
     differences, images = ([], []), []
     for view in views[:: max(1, len(views) // _COMPARED)]:
-        of = slice(None) if points.observed is None else points.observed.get(view.name, np.empty(0, int))
+        of = points.of(view)
         camera = view.camera.shrunk(_SIZE)
         inside, pixels, _ = in_view(camera, points.positions[of])
         columns, rows = pixels.astype(int).T

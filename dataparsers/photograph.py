@@ -52,16 +52,19 @@ def load_photograph(view: View) -> UInt8[np.ndarray, "H W 3"]:
     return _pixels(view)[..., :3]
 
 
-def load_mask(view: View) -> Bool[np.ndarray, "H W"] | None:
+def load_mask(view: View, also: Path | None = None) -> Bool[np.ndarray, "H W"] | None:
     """Pixels of the photograph that are kept: by the user's mask, and opaque; None where there is nothing to mask.
+
+    Args:
+        view: the photograph.
+        also: another mask file, if there is one, such as one painted for the shell.
 
     Raises:
         SceneError: an image cannot be read, its aspect ratio is not the camera's, the mask is not black and white, or
             the photograph is transparent everywhere.
     """
-    masks = []
-    if view.mask is not None:
-        masks.append(_undistorted(view, read_mask(view.mask).convert("RGB"), view.mask)[..., 0] > 127)
+    files = [path for path in (view.mask, also) if path is not None]
+    masks = [_undistorted(view, read_mask(path).convert("RGB"), path)[..., 0] > 127 for path in files]
     if has_alpha(view.image) and (pixels := _pixels(view)).shape[-1] == 4:
         opaque = pixels[..., 3] > OPAQUE
         masks += [] if opaque.all() else [opaque]

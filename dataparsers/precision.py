@@ -10,6 +10,7 @@ from jaxtyping import Float64, Int64
 
 from dataparsers.camera import Camera, positions
 from dataparsers.errors import SceneError, notice
+from dataparsers.strays import sound
 
 FINE = 0.05
 """Metres up to which a step does no harm: half of it, the largest error, is less than the scatter of SfM points."""
@@ -125,9 +126,7 @@ class _Values:
             points = points[np.random.default_rng(0).integers(len(points), size=_SAMPLE)]
         if len(points) < _FEW:
             return cls(np.zeros((1, 3)), 0.0)
-        with np.errstate(over="ignore"):
-            distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-        points = points[distance <= _STRAY * np.median(distance)] if np.median(distance) > 0 else points
+        points = points[sound(points, _STRAY)]
         return cls(points, 64 * float(np.spacing(np.abs(points).max())))
 
     def step(self, *, is_damaged: bool = False, is_far: bool | None = None) -> Step:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int, UInt8
@@ -34,7 +35,7 @@ class SparsePoints:
     colours: UInt8[np.ndarray, "N 3"] | None = None
     called: str = "the SfM points"
 
-    @property
+    @cached_property
     def step(self) -> Step:
         """Step of the positions as they are stored."""
         return cloud_step(self.positions)
@@ -45,9 +46,12 @@ class SparsePoints:
         The pixels are projections into the undistorted camera rather than the features that were matched in the
         distorted photograph. Without observations, points hidden behind a surface are included.
         """
-        observed = slice(None) if self.observed is None else self.observed.get(view.name, np.empty(0, int))
-        _, pixels, depth = in_view(view.camera, self.positions[observed])
+        _, pixels, depth = in_view(view.camera, self.positions[self.of(view)])
         return pixels, depth
+
+    def of(self, view: View) -> Int[np.ndarray, " M"] | slice:
+        """Indices of the points that a view observes; all where that is unknown."""
+        return slice(None) if self.observed is None else self.observed.get(view.name, np.empty(0, int))
 
 
 def read_sparse_points(layout: SceneLayout) -> SparsePoints:
@@ -79,7 +83,7 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
         positions, colours = transforms.read_cloud(layout.data)
         kept = _sound(positions, layout)
         called = f"the SfM points that {layout.data / transforms.NAME} names as ply_file_path"
-        return SparsePoints(positions[kept], None, colours[kept], called)
+        return _warned(SparsePoints(positions[kept], None, colours[kept], called), layout)
     points, names = colmap_model.read_points(layout.data, folder, layout.images_path)
     kept = _sound(points.positions, layout)
     observed: dict[str, list[int]] = {name: [] for name in names.values()}
@@ -88,7 +92,14 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
             observed[names[image]].append(index)
     positions, colours = points.positions[kept], points.colours[kept]
     seen = {name: np.array(of, dtype=int) for name, of in observed.items()} if any(observed.values()) else None
-    return SparsePoints(positions, seen, colours, f"the SfM points of {layout.data / folder}")
+    return _warned(SparsePoints(positions, seen, colours, f"the SfM points of {layout.data / folder}"), layout)
+
+
+def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:
+    """The points, after a warning if they are stored too coarsely."""
+    if len(points.positions):
+        warn_of_coarse(points.step, points.positions, f"the SfM points of {layout.data}")
+    return points
 
 
 def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:
@@ -99,6 +110,4 @@ def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np
             f"{(~near).sum()} of {len(positions)} SfM points of {layout.data} are NaN, infinite or absurdly far away, "
             "and are left out."
         )
-    if near.any():
-        warn_of_coarse(cloud_step(positions[near]), positions[near], f"the SfM points of {layout.data}")
     return np.flatnonzero(near)

@@ -173,11 +173,8 @@ def _resume_from(config: TrainerConfig, given: TrainerConfig) -> None:
         SceneError: none is named, and the run has some.
     """
     if given.load_dir or given.load_checkpoint:
-        config.load_dir, config.load_checkpoint, config.load_step = (
-            given.load_dir,
-            given.load_checkpoint,
-            given.load_step,
-        )
+        for name in ("load_dir", "load_checkpoint", "load_step"):
+            setattr(config, name, getattr(given, name))
     folder = config.get_checkpoint_dir()
     if not (config.load_dir or config.load_checkpoint) and any(folder.glob("step-*.ckpt")):
         raise SceneError(

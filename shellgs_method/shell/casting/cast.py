@@ -155,9 +155,7 @@ def _mask_sources(scene: Path, views: Sequence[View]) -> list[Path]:
 def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
     """Intersection of the photograph's mask and the shell's mask of a view; None if it has neither."""
     painted = scene / MASKS / f"{view.name}.png"
-    masks = [load_mask(replace(view, mask=path)) for path in (view.mask, painted if painted.is_file() else None)]
-    masks = [mask for mask in masks if mask is not None]
-    return np.logical_and.reduce(masks) if masks else None
+    return load_mask(view, painted if painted.is_file() else None)
 
 
 def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:

@@ -208,9 +208,10 @@ def _told_apart(
 
 def _shell_view(view: View, cue: CueMap) -> ShellView:
     camera = view.camera.shrunk(MAX_SIZE)
-    image = load_photograph(replace(view, camera=camera))[..., :3]
+    view = replace(view, camera=camera)
+    image = load_photograph(view)
     depth = _nearest(torch.from_numpy(cue.depth), (camera.height, camera.width))
-    kept = load_mask(replace(view, camera=camera))
+    kept = load_mask(view)
     if kept is None:
         return ShellView(camera, torch.from_numpy(image), depth)
     # Without the borders of what is ignored, whose gradients and interpolated colours are not of the photograph.

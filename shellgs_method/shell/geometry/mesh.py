@@ -15,6 +15,7 @@ from dataparsers.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_c
 from dataparsers.strays import sound
 from shellgs_method.shell.geometry.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.geometry.files import read_geometry
+from shellgs_method.triangles import area_vectors
 
 COMMENT = "comment shellgs "
 _FAR = 1e4
@@ -71,11 +72,12 @@ def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, 
     Their normals are not defined, and their points nearest to another are NaN. Their heights are within the rounding of
     their own corners, relative to the median vertex: a vertex far away makes no other triangle flat.
     """
-    corners = (vertices - np.median(vertices, axis=0))[faces].astype(np.float32)
-    step = np.spacing(np.abs(corners).max(axis=(1, 2))).astype(np.float64)
-    a, b, c = corners.astype(np.float64).transpose(1, 0, 2)
+    placed = (vertices - np.median(vertices, axis=0)).astype(np.float32)
+    step = np.spacing(np.abs(placed[faces]).max(axis=(1, 2))).astype(np.float64)
+    placed = placed.astype(np.float64)
+    a, b, c = placed[faces].transpose(1, 0, 2)
     longest = np.sqrt(np.max([((a - b) ** 2).sum(1), ((b - c) ** 2).sum(1), ((c - a) ** 2).sum(1)], axis=0))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 2 * step * longest  # area = height * longest / 2
+    return np.linalg.norm(area_vectors(placed, faces), axis=1) <= step * longest  # area = height * longest / 2
 
 
 def load_shell(

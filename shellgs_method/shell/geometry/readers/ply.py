@@ -70,7 +70,9 @@ _Column = tuple[Shaped[np.ndarray, " N"], Shaped[np.ndarray, " M"]]
 
 
 class _Numbers(Protocol):
-    """The data of a PLY, read from front to back."""
+    """The data of a PLY, read from front to back; ``at`` is where, and may be set back."""
+
+    at: int
 
     def take(self, kind: str, count: int) -> Shaped[np.ndarray, " C"]:
         """The next ``count`` numbers."""
@@ -79,12 +81,6 @@ class _Numbers(Protocol):
     def table(self, kinds: list[str], rows: int) -> list[Shaped[np.ndarray, " R"]]:
         """The columns of the next rows, of which each has these types."""
         ...
-
-    def seek(self, mark: int) -> None:
-        """Go back to where :attr:`at` was."""
-        ...
-
-    at: int
 
 
 class _Binary:
@@ -103,9 +99,6 @@ class _Binary:
         self.at += table.nbytes
         return [table[f"{k}"] for k in range(len(kinds))]
 
-    def seek(self, mark: int) -> None:
-        self.at = mark
-
 
 class _Text:
     def __init__(self, data: bytes) -> None:
@@ -121,9 +114,6 @@ class _Text:
     def table(self, kinds: list[str], rows: int) -> list[np.ndarray]:
         table = self.take("f8", rows * len(kinds)).reshape(rows, len(kinds))
         return [table[:, k] if kind.startswith("f") else table[:, k].astype(np.int64) for k, kind in enumerate(kinds)]
-
-    def seek(self, mark: int) -> None:
-        self.at = mark
 
 
 def _elements(path: Path, header: PlyHeader) -> Iterator[tuple[PlyElement, dict[str, _Column]]]:
@@ -141,7 +131,7 @@ def _columns(element: PlyElement, numbers: _Numbers) -> dict[str, _Column]:
         return {prop.name: (np.empty(0, np.int64), np.empty(0, prop.type)) for prop in element.properties}
     mark = numbers.at
     first = {p.name: len(column) for p, column in zip(element.properties, _row(element, numbers), strict=True)}
-    numbers.seek(mark)
+    numbers.at = mark
     kinds: list[str] = []
     for prop in element.properties:
         kinds += [prop.type] if prop.counted is None else [prop.counted, *[prop.type] * first[prop.name]]
@@ -159,7 +149,7 @@ def _columns(element: PlyElement, numbers: _Numbers) -> dict[str, _Column]:
                 return columns
         except ValueError:  # lists of other lengths, which may end earlier
             pass
-    numbers.seek(mark)
+    numbers.at = mark
     rows = [_row(element, numbers) for _ in range(element.count)]
     for prop, lists in zip(element.properties, zip(*rows, strict=True), strict=True):
         columns[prop.name] = np.array([len(values) for values in lists]), np.concatenate(lists)
