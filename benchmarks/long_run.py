@@ -31,10 +31,10 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
-from dataparsers.cue_maps import CueMaps
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from dataparsers.map_files import MapRecord
-from dataparsers.photograph import View
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.map_files import MapRecord
+from shellgs_method.files.photographs import View
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 

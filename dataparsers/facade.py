@@ -16,16 +16,17 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from dataparsers.camera import Camera, positions
-from dataparsers.cue_maps import CueMaps, find_cues
-from dataparsers.errors import SceneError, refusals_end_the_program
-from dataparsers.frames import check_points
-from dataparsers.layout import SceneLayout
+from dataparsers.cameras import pinhole_cameras
 from dataparsers.orientation import oriented
-from dataparsers.photograph import View, undistort
-from dataparsers.precision import camera_step, warn_of_coarse
-from dataparsers.shots import Recording, Shot
-from dataparsers.sparse_points import find_sparse_points
+from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.files.cue_maps import CueMaps, find_cues
+from shellgs_method.files.frames import Recording, Shot
+from shellgs_method.files.photographs import View, undistort
+from shellgs_method.files.scene import SceneLayout
+from shellgs_method.files.sparse_points import find_sparse_points
+from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.precision import camera_step, warn_of_coarse
+from shellgs_method.registration.sfm_frame import check_points
 
 ROUNDING = 1e-6
 """Harmless rounding of positions to float32, as a share of the cameras' spread."""
@@ -66,9 +67,9 @@ class FacadeDataParser(DataParser):
     georeferenced scene; here they are centred first, and ``dataparser_transform`` is in double precision.
 
     The outputs' cameras are pinhole cameras. Their metadata holds, in the order of the images, ``views`` (their
-    :class:`~dataparsers.photograph.View`), and for the whole scene ``cues`` (the :class:`CueMaps` found, by kind),
-    ``metres_per_unit`` (of nerfstudio's rescaled world) and ``shell_error`` (possible offset of the whole shell in
-    metres), both None without a shell alignment.
+    :class:`~shellgs_method.files.photographs.View`), and for the whole scene ``cues`` (the :class:`CueMaps` found, by
+    kind), ``metres_per_unit`` (of nerfstudio's rescaled world) and ``shell_error`` (possible offset of the whole shell
+    in metres), both None without a shell alignment.
     """
 
     config: FacadeDataParserConfig
@@ -200,21 +201,6 @@ def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) 
     if len(names) < 2:
         raise SceneError(f"{config.data} has one photograph: one is held out, and training needs at least one more")
     return [k for k in range(len(names)) if (k % interval == 0) != (split == "train")]
-
-
-def pinhole_cameras(poses: torch.Tensor, views: Sequence[View]) -> Cameras:
-    """Cameras with the given poses, and the intrinsics and image sizes of the views."""
-    Ks = torch.stack([view.camera.K for view in views]).float()
-    return Cameras(
-        camera_to_worlds=poses,
-        fx=Ks[:, 0, 0],
-        fy=Ks[:, 1, 1],
-        cx=Ks[:, 0, 2],
-        cy=Ks[:, 1, 2],
-        width=torch.tensor([view.camera.width for view in views]),
-        height=torch.tensor([view.camera.height for view in views]),
-        metadata={},  # ns-export cameras wants some
-    )
 
 
 def _refuse_missing_images(shots: Sequence[Shot], scene: Path) -> None:

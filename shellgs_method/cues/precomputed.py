@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, Shaped
 from PIL import Image
 
-from dataparsers.errors import SceneError
+from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
-    from dataparsers.photograph import View
     from shellgs_method.cues.source import Prediction, Predictor
+    from shellgs_method.files.photographs import View
 
 SUFFIXES = (".npy", ".npz", ".png")
 ASPECT_TOLERANCE = 0.02  # networks round sizes to multiples of 14 or 32
@@ -170,7 +170,7 @@ def _in_view(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) 
     """Undistort a map of the photograph and resize it to the view's camera; NaN where less than half is valid."""
     import torch
 
-    from dataparsers.photograph import undistort
+    from shellgs_method.files.photographs import undistort
 
     height, width = valid.shape
     calibrated = view.camera if view.lens is None else view.lens
