@@ -113,7 +113,6 @@ class FacadeTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up everything that training needs."""
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
-            check_training(self.config)
             _remove_leftovers(self.base_dir)
             super().setup(test_mode)
         after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
