@@ -24,13 +24,8 @@ from dataparsers.cameras import pinhole_camera, pinhole_cameras
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.evaluation.holdout import Bands, facade_bands
-from shellgs_method.evaluation.regions import (
-    REFERENCES,
-    contradicted,
-    kept_pixels,
-    reference_maps,
-    seen_through,
-)
+from shellgs_method.evaluation.pixels import kept_pixels, occluded, reference_maps, seen_through
+from shellgs_method.evaluation.regions import REFERENCES
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.gaussians.seeds import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
@@ -339,7 +334,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         image = _colours(batch)
         camera, shell = self.train_dataset.camera(index), reference_maps(batch, "shell", cpu, everywhere)
         if not everywhere and "other_depth" in batch:
-            before = contradicted(batch, cpu) & kept_pixels(batch, image)
+            before = occluded(batch, cpu) & kept_pixels(batch, image)
             shell = Reference(
                 torch.where(before, batch["other_depth"].to(cpu), shell.depth),
                 torch.where(before, _towards(camera), shell.normal),

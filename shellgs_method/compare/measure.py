@@ -22,12 +22,8 @@ from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig, FacadeDataset
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
-from shellgs_method.evaluation.regions import (
-    REFERENCES,
-    masked_image_errors,
-    reference_errors,
-    reference_maps,
-)
+from shellgs_method.evaluation.pixels import reference_maps
+from shellgs_method.evaluation.regions import REFERENCES, masked_image_errors, reference_errors
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import find_cues
