@@ -4,7 +4,7 @@
     SHELLGS_DATA=real-scenes/ python -m benchmarks.fill outputs/grid 'default/*/photo-gs/*' 'demo/*'
 
 The real scenes are folders of SHELLGS_DATA; without them, only the synthetic facade is run. Stop it at any time: the
-same command resumes. A run that other code began starts anew. To measure a run again, remove its file and its folder.
+same command resumes, and a run that other code began starts anew. To make a run again, remove its file.
 """
 
 from __future__ import annotations
@@ -60,16 +60,18 @@ def fill(
     # One thread, with which a seed gives the same result again.
     os.environ["OMP_NUM_THREADS"] = "1"
     data = Path(os.environ["SHELLGS_DATA"]) if "SHELLGS_DATA" in os.environ else None
-    here = origin()
+    here, failed = origin(), []
     for setting in GRID:
         cells = missing(setting.cells, only)
-        console.print(f"{setting.name}: {len(cells)} of {len(setting.cells)} are missing here.", highlight=False)
+        console.print(f"{setting.name}: {len(cells)} of {len(setting.cells)} runs to make.", highlight=False)
         for scene in sorted({cell.scene for cell in cells} & {*SHELLS}):
             if data is None or not (data / scene).is_dir():
                 console.print(f"{scene} is left out: SHELLGS_DATA names no folder with it.", highlight=False)
                 cells = [cell for cell in cells if cell.scene != scene]
         if cells:
-            measure_cells(setting, cells, work.resolve(), data, here)
+            failed += measure_cells(setting, cells, work.resolve(), data, here)
+    if failed:
+        raise SystemExit(f"{len(failed)} runs failed: {', '.join(cell.label for cell in failed)}")
 
 
 def missing(cells: Sequence[Cell], only: Sequence[str], results: Path = RESULTS) -> list[Cell]:
@@ -83,8 +85,10 @@ def missing(cells: Sequence[Cell], only: Sequence[str], results: Path = RESULTS)
 
 def measure_cells(
     setting: Setting, cells: Sequence[Cell], work: Path, data: Path | None, here: dict, results: Path = RESULTS
-) -> None:
+) -> list[Cell]:
     """Train and evaluate cells of one setting in ``work``, one after the other, and write each cell's file.
+
+    Those that failed are returned, and stop no other.
 
     Args:
         setting: their setting.
@@ -105,13 +109,16 @@ def measure_cells(
     }
     for run in runs:
         begun = run.folder / ORIGIN
-        if not run.finished and begun.exists() and json.loads(begun.read_text()) != here:
+        if begun.exists() and json.loads(begun.read_text()) != here:
             shutil.rmtree(run.folder)
-    if runs:
-        compare([*runs], partial(_launch, here=here, cells=runs, results=results), work / setting.name, console)
+    if not runs:
+        return []
+    launch = partial(_launch, here=here, cells=runs, results=results)
+    failures = compare([*runs], launch, work / setting.name, console).failures
     for run, cell in runs.items():  # those that a stopped command has finished
         if run.finished and not cell.file(results).exists():
             _save_run(run, cell, results)
+    return [runs[run] for run in failures]
 
 
 def _launch(runs: Sequence[Run], here: dict, cells: Mapping[Run, Cell], results: Path) -> dict[Run, str]:

@@ -76,11 +76,14 @@ class Trainings:
         self.names: list[str] = []
         self.resumed: list[bool] = []
         self.stop_after = math.inf
+        self.failing = ""
 
     def __call__(self, runs: list[Run], *_) -> dict[Run, str]:
         (run,) = runs
         self.names.append(run.variant.name)
         self.resumed.append(run.checkpoints.exists())
+        if run.variant.name == self.failing:
+            return {run: "it failed"}
         run.checkpoints.mkdir(parents=True, exist_ok=True)
         sizes = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "features_rest": (15, 3), "opacities": 1}
         gaussians = {f"_model.gauss_params.{name}": torch.ones(7, *np.atleast_1d(size)) for name, size in sizes.items()}
@@ -101,9 +104,9 @@ def trainings(monkeypatch, pristine_scene) -> Trainings:
     return made
 
 
-def measured(cells: tuple[Cell, ...], folder: Path, here: dict[str, str] = HERE) -> None:
+def measured(cells: tuple[Cell, ...], folder: Path, here: dict[str, str] = HERE) -> list[Cell]:
     left = fill.missing(cells, ["*"], folder / "results")
-    fill.measure_cells(TINY, left, folder / "work", None, here, folder / "results")
+    return fill.measure_cells(TINY, left, folder / "work", None, here, folder / "results")
 
 
 def test_a_stopped_grid_resumes_with_what_is_missing(trainings, tmp_path):
@@ -130,14 +133,19 @@ def test_the_settings_in_a_file_are_those_that_are_not_the_methods_own(trainings
     assert settings.keys() == {"cameras", "photographs", "masks", "shell maps", "truth maps"}
 
 
-def test_a_run_that_other_code_began_starts_anew(trainings, tmp_path):
-    trainings.stop_after = 1
-    with pytest.raises(KeyboardInterrupt):
-        measured(TINY.cells[:1], tmp_path, {**HERE, "commit": "older"})
-    trainings.stop_after = math.inf
+def test_a_run_of_other_code_starts_anew(trainings, tmp_path):
+    file = TINY.cells[0].file(tmp_path / "results")
+    measured(TINY.cells[:1], tmp_path, {**HERE, "commit": "older"})
+    file.unlink()
     measured(TINY.cells[:1], tmp_path)
     assert trainings.resumed == [False, False]
-    assert json.loads(TINY.cells[0].file(tmp_path / "results").read_text())["commit"] == HERE["commit"]
+    assert json.loads(file.read_text())["commit"] == HERE["commit"]
+
+
+def test_a_run_that_fails_stops_no_other_and_is_missing(trainings, tmp_path):
+    trainings.failing = "photo-gs"
+    assert measured(TINY.cells, tmp_path) == [TINY.cells[0]]
+    assert fill.missing(TINY.cells, ["*"], tmp_path / "results") == [TINY.cells[0]]
 
 
 def test_cells_are_chosen_by_patterns_of_their_labels():
