@@ -25,17 +25,17 @@ import torch
 import tyro
 
 from benchmarks.grid import GRID, RESULTS, SHELL, SHELLS, SYNTHETIC, Cell, Setting
-from dataparsers.errors import SceneError, refusals_end_the_program
-from dataparsers.files import atomic_write, unfinished
-from dataparsers.layout import ScenePaths
-from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.commands.common import console
-from shellgs_method.compare.launch import follow, launch_locally
 from shellgs_method.compare.measure import measure_shell
 from shellgs_method.compare.results import compare
 from shellgs_method.compare.runs import Run, grid
 from shellgs_method.compare.settings import default_settings
 from shellgs_method.compare.tables import read_metrics
+from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.files.atomic import atomic_write, unfinished
+from shellgs_method.files.scene import ScenePaths
+from shellgs_method.launch.local import follow, launch_locally
+from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 ROOT = Path(__file__).parents[1]
