@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +17,8 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli, fusion
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
+
+os.environ.setdefault("SHELLGS_COMPILE", "0")  # kernels take longer to compile, or to load, than these tests to run
 
 
 @pytest.fixture(autouse=True)
@@ -67,9 +70,8 @@ def compiler(monkeypatch) -> None:
 
 
 @pytest.fixture
-def eager(monkeypatch) -> None:
-    """Do not compile kernels, which takes long."""
-    monkeypatch.setenv("SHELLGS_COMPILE", "0")
+def eager() -> None:
+    pass
 
 
 @pytest.fixture
