@@ -8,9 +8,9 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.datamanager import FacadeDataManagerConfig
+from shellgs_method.losses.objective import ExtraLossConfig
 from shellgs_method.model import FacadeModelConfig
 from shellgs_method.pipeline import FacadePipelineConfig
-from shellgs_method.supervision import ExtraLossConfig
 from shellgs_method.trainer import FacadeTrainerConfig, FusedAdamConfig, RunLengthDecayConfig
 
 

@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from dataparsers.camera import Camera
-from dataparsers.photograph import View
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.shell import Alignment, ShellCaster, ShellMesh, cast_views
 from shellgs_method.synthetic.building import Layout, shell
 

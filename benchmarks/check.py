@@ -18,10 +18,11 @@ import tyro
 from jaxtyping import Bool
 from PIL import Image
 
-from dataparsers.cue_maps import CueMaps, Findings
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
-from dataparsers.photograph import View
-from shellgs_method.shell import ALIGNMENT, Alignment, cast_views, check_views
+from shellgs_method.files.cue_maps import CueMaps, Findings
+from shellgs_method.files.photographs import View
+from shellgs_method.occlusion import check_views
+from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 from shellgs_method.synthetic.appearance import Daylight, developed, exposed, rays
 from shellgs_method.synthetic.geometry import Material, Mesh, box, merge

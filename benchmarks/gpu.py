@@ -18,9 +18,9 @@ from gsplat import rasterization
 from torch import Tensor
 
 from benchmarks.scenes import Scene, make_camera, make_scene
-from dataparsers.camera import Camera
-from shellgs_method.rasterizer import quats_to_rotations, rasterize, spherical_harmonics
-from shellgs_method.rasterizer.gsplat_backend import Backend
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.render.rasterizer import quats_to_rotations, rasterize, spherical_harmonics
+from shellgs_method.render.rasterizer.gsplat_backend import Backend
 
 
 def parameters(scene: Scene) -> dict[str, Tensor]:

@@ -14,9 +14,9 @@ import tyro
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
 
-from dataparsers.errors import refusals_end_the_program
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.measure import Snapshot
+from shellgs_method.errors import refusals_end_the_program
 from shellgs_method.evaluation.colours import normal_colours
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh
 

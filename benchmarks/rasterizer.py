@@ -25,8 +25,8 @@ from torch import Tensor
 
 from benchmarks import naive
 from benchmarks.scenes import Scene, make_camera, make_scene
-from dataparsers.camera import Camera
-from shellgs_method.rasterizer import rasterize
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.render.rasterizer import rasterize
 
 BACKWARD_UP_TO = 960 * 540  # pixels; larger images are only rendered forward
 PROCESS = Path("/proc/self")  # Linux

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dataparsers.camera import Camera
+from shellgs_method.geometry.camera import Camera
 
 FIELD_OF_VIEW = math.radians(70)
 DISTANCE = 6.0  # of the facade

@@ -20,17 +20,17 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import KDTree
 
-from shellgs_method.shell.geometry.similarity import transformed
-from shellgs_method.sim import engine
-from shellgs_method.sim.collider import Collider, leaks, make_collider
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.sim.collision.collider import Collider, leaks, make_collider
+from shellgs_method.sim.collision.distances import both_ways
+from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.deviations import EDGE, along_normals
-from shellgs_method.sim.distances import both_ways
 from shellgs_method.sim.front import Front
-from shellgs_method.sim.parts import Part
 from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.report import Chapter, lidar_errors, text
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
+from shellgs_method.sim.trials import engine
 from shellgs_method.synthetic.building import Layout, building
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING
 from shellgs_method.synthetic.geometry import Material

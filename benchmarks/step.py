@@ -27,12 +27,12 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.scenes import Scene
-from dataparsers.camera import Camera
+from dataparsers.cameras import pinhole_camera
 from shellgs_method import model as model_module
-from shellgs_method.batches import pinhole_camera
-from shellgs_method.config_file import load_config
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.model import FacadeModel
-from shellgs_method.rasterizer import rasterize
+from shellgs_method.render.rasterizer import rasterize
+from shellgs_method.runs.config_file import load_config
 from shellgs_method.trainer import FacadeTrainer, FacadeTrainerConfig
 
 PARTS = {

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 from rich.progress import track
 
-from dataparsers.errors import check_output, refusals_end_the_program
+from shellgs_method.errors import check_output, refusals_end_the_program
 from shellgs_method.synthetic.appearance import developed, exposed
 from shellgs_method.synthetic.building import shell
 from shellgs_method.synthetic.scene import Facade, FacadeConfig, write_scan

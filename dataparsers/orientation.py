@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import ExifTags, Image
 
-from dataparsers.camera import in_view, upwards
-from dataparsers.errors import notice
-from dataparsers.frames import may_be_of
-from dataparsers.photograph import View, load_photograph
-from dataparsers.sparse_points import SparsePoints, find_sparse_points
+from shellgs_method.errors import notice
+from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
+from shellgs_method.geometry.camera import in_view, upwards
+from shellgs_method.registration.sfm_frame import may_be_of
 
 if TYPE_CHECKING:
-    from dataparsers.layout import SceneLayout
+    from shellgs_method.files.scene import SceneLayout
 
 _ROUNDING = 0.01  # of a photograph's sides, as a share
 _COMPARED, _SIZE = 4, 400  # photographs, and their longer side in pixels
@@ -33,7 +33,7 @@ _ALIKE, _UNLIKE = 0.7, 0.3  # cosines of mean up axes
 
 
 def oriented(views: Sequence[View], layout: SceneLayout) -> list[View]:
-    """The views, those :attr:`~dataparsers.photograph.View.turned` whose cameras are of the upright photograph.
+    """The views, those ``turned`` whose cameras are of the upright photograph.
 
     One program found all cameras, so that they are judged together: by the colours of the SfM points, else by the up
     axes of the cameras of photographs that are stored upright. What is found is told.

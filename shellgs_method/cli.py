@@ -6,7 +6,6 @@ import warnings
 
 import tyro
 
-from dataparsers.errors import refusals_end_the_program
 from shellgs_method.commands.align import align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
@@ -18,6 +17,7 @@ from shellgs_method.commands.mesh import mesh
 from shellgs_method.commands.mono import mono
 from shellgs_method.commands.sim import sim
 from shellgs_method.commands.splats import splats
+from shellgs_method.errors import refusals_end_the_program
 
 COMMANDS = (demo, capture, align, cast, mono, compare, evaluate, mesh, splats, sim, doctor)
 

@@ -20,18 +20,24 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMap, CueMaps, Findings
-from dataparsers.errors import SceneError, refusals_end_the_program
-from dataparsers.facade import pinhole_cameras
-from dataparsers.photograph import View, load_mask, load_photograph
-from shellgs_method.bands import Bands, facade_bands
-from shellgs_method.batches import REFERENCES, contradicted, kept_pixels, pinhole_camera, reference_maps, seen_through
-from shellgs_method.covisibility import MAX_SIZE, SeenBy
-from shellgs_method.host import NoPixelSampler
-from shellgs_method.memory import available_memory
-from shellgs_method.reference import Reference
-from shellgs_method.seeding import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
+from dataparsers.cameras import pinhole_camera, pinhole_cameras
+from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.evaluation.covisibility import MAX_SIZE, SeenBy
+from shellgs_method.evaluation.holdout import Bands, facade_bands
+from shellgs_method.evaluation.regions import (
+    REFERENCES,
+    contradicted,
+    kept_pixels,
+    reference_maps,
+    seen_through,
+)
+from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
+from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.gaussians.seeds import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.reference import Reference
+from shellgs_method.machine.memory import available_memory
+from shellgs_method.runs.host import NoPixelSampler
 
 logger = logging.getLogger(__name__)
 

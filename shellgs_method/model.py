@@ -23,20 +23,27 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor, nn
 from tyro.conf import Suppress
 
-from dataparsers.camera import Camera
-from dataparsers.errors import SceneError
-from shellgs_method.batches import (
+from dataparsers.cameras import pinhole_camera
+from shellgs_method.errors import SceneError
+from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
+from shellgs_method.evaluation.regions import (
     kept_pixels,
     masked_image_errors,
     photometric_pixels,
-    pinhole_camera,
     reference_errors,
     reference_maps,
     references,
 )
-from shellgs_method.densification import GradientStrategy, MCMCConfig, MCMCStrategy, SkyboxStrategy
-from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
-from shellgs_method.geometry import (
+from shellgs_method.gaussians.densification import GradientStrategy, MCMCConfig, MCMCStrategy, SkyboxStrategy
+from shellgs_method.gaussians.seeds import Seeds
+from shellgs_method.gaussians.surface_weights import SurfaceWeights
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.nearest import point_tree
+from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
+from shellgs_method.losses.objective import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
+from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.machine.threads import ThreadsByLoad
+from shellgs_method.render.maps import (
     DISC_LOG_THICKNESS,
     DepthKind,
     Geometry,
@@ -47,17 +54,10 @@ from shellgs_method.geometry import (
     rendered_geometry,
     squared_depths,
 )
-from shellgs_method.host import NO_FIELD, NO_RAYS, NO_RGBA, refuse
-from shellgs_method.limits import MIN_POINTS
-from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
-from shellgs_method.losses.reduction import weighted_mean
-from shellgs_method.nearest import point_tree
-from shellgs_method.panorama import is_pinhole, render_around
-from shellgs_method.rasterizer import rasterize, spherical_harmonics
-from shellgs_method.seeding import Seeds
-from shellgs_method.supervision import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
-from shellgs_method.surface_weights import SurfaceWeights
-from shellgs_method.threads import ThreadsByLoad
+from shellgs_method.render.panorama import is_pinhole, render_around
+from shellgs_method.render.rasterizer import rasterize, spherical_harmonics
+from shellgs_method.runs.host import NO_FIELD, NO_RAYS, NO_RGBA, refuse
+from shellgs_method.runs.limits import MIN_POINTS
 
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two opacity resets: opacities recover no faster in a short run."""

@@ -15,13 +15,13 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from rich.progress import track
 from torch import Tensor
 
-from dataparsers.errors import SceneError, refusals_end_the_program
-from shellgs_method.checkpoints import check_gaussians, guard_checkpoint_loading
 from shellgs_method.datamanager import FacadeDataManager
+from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
-from shellgs_method.host import mend_commands
+from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.model import FacadeModel
-from shellgs_method.surface_weights import SurfaceWeights
+from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
+from shellgs_method.runs.host import mend_commands
 from shellgs_method.viewer import ContradictedShell
 
 

@@ -21,13 +21,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.optim.lr_scheduler import LambdaLR
 from tyro.conf import Suppress
 
-from dataparsers.errors import SceneError, refusals_end_the_program
-from dataparsers.files import atomic_write
-from shellgs_method.checkpoints import find_checkpoint, load_checkpoint
-from shellgs_method.faults import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
-from shellgs_method.folders import held
-from shellgs_method.limits import check_settings, check_training
-from shellgs_method.run_folder import check_method, guard_nerfstudio, written_config
+from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.runs.folders import held
+from shellgs_method.runs.guard import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
+from shellgs_method.runs.limits import check_settings, check_training
+from shellgs_method.runs.run_folder import check_method, guard_nerfstudio, written_config
 
 if TYPE_CHECKING:
     from shellgs_method.pipeline import FacadePipeline

@@ -11,8 +11,8 @@ from jaxtyping import Float64
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
-from shellgs_method.shell import CONTRADICTED_PLACES
-from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.occlusion import CONTRADICTED_PLACES
 
 POINT = 0.004
 """Point size relative to the cloud's longest side."""

@@ -15,18 +15,19 @@ import numpy as np
 import trimesh
 from hypothesis import strategies as st
 from PIL import Image
-from test_facade_dataparser import write_colmap
+from scenes import write_colmap
 
-from dataparsers.cue_maps import CueMaps
-from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from dataparsers.photograph import View, load_photograph
-from dataparsers.sparse_points import SparsePoints, read_sparse_points
 from shellgs_method.datamanager import FacadeDataset
-from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface, load_shell, validate
-from shellgs_method.shell.geometry.similarity import transformed
-from shellgs_method.shell.registration.picks import align_picks, read_picks
-from shellgs_method.shell.registration.positions import align_positions, read_positions
+from shellgs_method.errors import SceneError
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.files.sparse_points import SparsePoints, read_sparse_points
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.registration import validate
+from shellgs_method.registration.picks import align_picks, read_picks
+from shellgs_method.registration.positions import align_positions, read_positions
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface, load_shell
 
 SECONDS = 20
 """Time after which a case counts as a hang."""

@@ -14,9 +14,9 @@ import pytest
 from torch._inductor.cpp_builder import get_cpp_compiler
 from torch._inductor.exc import InvalidCxxCompiler
 
-from dataparsers.errors import notice
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method import fusion
+from shellgs_method.errors import notice
+from shellgs_method.machine import compilation
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
@@ -76,7 +76,7 @@ def compiler(monkeypatch) -> None:
     except InvalidCxxCompiler as error:
         pytest.skip(f"no C++ compiler: {error}")
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
-    monkeypatch.setattr(fusion, "_failed", set())
+    monkeypatch.setattr(compilation, "_failed", set())
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dataparsers.camera import Camera
+from shellgs_method.geometry.camera import Camera
 
 NAMES = ("means", "quats", "scales", "opacities", "features")
 

@@ -12,8 +12,8 @@ import pytest
 import wandb
 from matplotlib import colormaps
 from PIL import Image
-from runs import trainer_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from training_runs import trainer_of
 from wandb.errors import UsageError
 from wandb.proto.wandb_internal_pb2 import Record
 from wandb.sdk.internal.datastore import DataStore

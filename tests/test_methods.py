@@ -14,23 +14,23 @@ import tyro
 import yaml
 from gsplat.strategy.ops import duplicate, remove
 from nerfstudio.scripts.exporter import ExportGaussianSplat
-from runs import data_of, held_out, model_of, render, trainer_of
 from torch.nn.functional import normalize
+from training_runs import data_of, held_out, model_of, render, trainer_of
 
 import method_configs
-from dataparsers.cue_maps import CueMap, CueMaps
+from dataparsers.cameras import pinhole_camera
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method.ablations import ABLATIONS
-from shellgs_method.batches import pinhole_camera
 from shellgs_method.compare.runs import PAPER
-from shellgs_method.densification import MCMCStrategy
-from shellgs_method.geometry import DISC_LOG_THICKNESS, depth_powers, geometry_channels, mode_of_depth
+from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.gaussians.densification import MCMCStrategy
+from shellgs_method.gaussians.seeds import Seeds
+from shellgs_method.gaussians.surface_weights import SurfaceWeights
+from shellgs_method.geometry.reference import Reference
 from shellgs_method.losses import ExponentialDecay
-from shellgs_method.rasterizer import quats_to_rotations, rasterize
-from shellgs_method.reference import Reference
-from shellgs_method.seeding import Seeds
-from shellgs_method.supervision import ExtraLossConfig, GeometryLossConfig, cue_losses
-from shellgs_method.surface_weights import SurfaceWeights
+from shellgs_method.losses.objective import ExtraLossConfig, GeometryLossConfig, cue_losses
+from shellgs_method.render.maps import DISC_LOG_THICKNESS, depth_powers, geometry_channels, mode_of_depth
+from shellgs_method.render.rasterizer import quats_to_rotations, rasterize
+from shellgs_method.runs.ablations import ABLATIONS
 
 pytestmark = pytest.mark.usefixtures("eager")
 

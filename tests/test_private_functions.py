@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DATAMANAGER = "nerfstudio.data.datamanagers.full_images_datamanager"
 PRIVATE = [
-    ("dataparsers/photograph.py", DATAMANAGER, "_undistort_image", "camera distortion_params data image K"),
+    ("shellgs_method/files/photographs.py", DATAMANAGER, "_undistort_image", "camera distortion_params data image K"),
     (
         "dataparsers/facade.py",
         "nerfstudio.data.dataparsers.base_dataparser",
@@ -35,23 +35,23 @@ PRIVATE = [
     ("shellgs_method/model.py", "nerfstudio.models.splatfacto", "SplatfactoModel._get_background_color", "self"),
     ("shellgs_method/viewer.py", "nerfstudio.viewer.viewer_elements", "ViewerControl._setup", "self viewer"),
     *(
-        ("shellgs_method/densification.py", "gsplat.strategy.default", f"DefaultStrategy.{name}", parameters)
+        ("shellgs_method/gaussians/densification.py", "gsplat.strategy.default", f"DefaultStrategy.{name}", parameters)
         for name, parameters in {
             "_grow_gs": "self params optimizers state step",
             "_prune_gs": "self params optimizers state step",
         }.items()
     ),
-    ("shellgs_method/densification.py", "gsplat.strategy.ops", "_multinomial_sample", "weights n"),
+    ("shellgs_method/gaussians/densification.py", "gsplat.strategy.ops", "_multinomial_sample", "weights n"),
     (
-        "shellgs_method/densification.py",
+        "shellgs_method/gaussians/densification.py",
         "gsplat.strategy.ops",
         "_update_param_with_optimizer",
         "param_fn optimizer_fn params optimizers names",
     ),
-    ("shellgs_method/fusion.py", "torch._dynamo", "mark_dynamic", "t index"),
-    ("shellgs_method/fusion.py", "torch._dynamo", "maybe_mark_dynamic", "t index"),
-    ("shellgs_method/fusion.py", "torch._inductor.cpp_builder", "get_cpp_compiler", ""),
-    ("shellgs_method/fusion.py", "torch._inductor.runtime.cache_dir_utils", "cache_dir", ""),
+    ("shellgs_method/machine/compilation.py", "torch._dynamo", "mark_dynamic", "t index"),
+    ("shellgs_method/machine/compilation.py", "torch._dynamo", "maybe_mark_dynamic", "t index"),
+    ("shellgs_method/machine/compilation.py", "torch._inductor.cpp_builder", "get_cpp_compiler", ""),
+    ("shellgs_method/machine/compilation.py", "torch._inductor.runtime.cache_dir_utils", "cache_dir", ""),
 ]
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from nerfstudio.data.utils.colmap_parsing_utils import read_points3D_binary
 
-from dataparsers.cue_maps import CueMaps
 from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.shell import Alignment, cast_views
 
 DATA = Path(os.environ.get("SHELLGS_DATA", Path(__file__).parents[2] / "shared" / "data"))

@@ -12,17 +12,17 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
-from runs import data_of, held_out, model_of, render, trainer_of
 from scipy.spatial.transform import Rotation
+from training_runs import data_of, held_out, model_of, render, trainer_of
 
 import benchmarks.step
 import shellgs_method.model
-from dataparsers.camera import Camera
-from dataparsers.errors import SceneError
-from shellgs_method import fusion
-from shellgs_method.batches import pinhole_camera
+from dataparsers.cameras import pinhole_camera
+from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
-from shellgs_method.geometry import geometry_channels
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine import compilation
+from shellgs_method.render.maps import geometry_channels
 from shellgs_method.trainer import FacadeTrainer
 
 
@@ -66,8 +66,8 @@ def test_held_out_views_are_rendered_by_the_kernels_of_training(pristine_scene, 
         return kernel
 
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
-    monkeypatch.setattr("shellgs_method.fusion._compiler_works", lambda: True)
-    monkeypatch.setattr("shellgs_method.fusion._compiled", record)
+    monkeypatch.setattr("shellgs_method.machine.compilation._compiler_works", lambda: True)
+    monkeypatch.setattr("shellgs_method.machine.compilation._compiled", record)
     trainer = trainer_of(pristine_scene, tmp_path, iterations=2)
     trainer.train()
     trainer.pipeline.eval()
@@ -219,7 +219,7 @@ def test_masked_out_pixels_supervise_nothing(trained):
 
 
 def test_a_compiled_step_is_that_of_plain_torch(compiler, pristine_scene, tmp_path, monkeypatch):
-    fusion._compiled.cache_clear()
+    compilation._compiled.cache_clear()
     losses, gradients = [], []
     for compiled in ("1", "0"):
         monkeypatch.setenv("SHELLGS_COMPILE", compiled)
@@ -232,8 +232,8 @@ def test_a_compiled_step_is_that_of_plain_torch(compiler, pristine_scene, tmp_pa
     torch.testing.assert_close(*losses)
     for actual, expected in zip(*gradients, strict=True):
         assert (actual - expected).norm() <= 1e-3 * expected.norm()
-    assert fusion._compiled.cache_info().currsize > 10
-    assert not fusion._failed
+    assert compilation._compiled.cache_info().currsize > 10
+    assert not compilation._failed
 
 
 def test_photo_gs_renders_no_geometry_while_it_trains(pristine_scene, tmp_path):

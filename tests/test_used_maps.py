@@ -12,16 +12,16 @@ import psutil
 import pytest
 import torch
 from PIL import Image
-from runs import data_of, model_of, render, trainer_of
+from training_runs import data_of, model_of, render, trainer_of
 
 import method_configs
-from dataparsers.cue_maps import CueMap, CueMaps
-from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from dataparsers.map_files import resampled
 from shellgs_method import cli
 from shellgs_method.datamanager import FacadeDataManagerConfig
-from shellgs_method.limits import check_settings
+from shellgs_method.errors import SceneError
+from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.map_files import resampled
+from shellgs_method.runs.limits import check_settings
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
 
 pytestmark = pytest.mark.usefixtures("eager")

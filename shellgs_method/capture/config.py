@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Optional
 
-from dataparsers.errors import SceneError
+from shellgs_method.errors import SceneError
 
 Matching = Literal["auto", "sequential", "exhaustive"]
 Cameras = Literal["auto", "single", "folder", "image"]

@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from rich.progress import Progress
 from scipy.ndimage import laplace, median_filter
 
-from dataparsers.errors import SceneError, notice
+from shellgs_method.errors import SceneError, notice
 
 FRAMES_PER_SECOND = 5
 """Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""

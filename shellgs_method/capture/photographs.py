@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from dataparsers.errors import SceneError, notice
-from dataparsers.scene_files import DEVELOP, PHOTOGRAPHS, RAW, mask_names, photographs_in, tell_of_masks
 from shellgs_method.capture.config import Cameras
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.paths import DEVELOP, PHOTOGRAPHS, RAW, mask_names, photographs_in, tell_of_masks
 
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv"}
 """Suffixes of videos, in lower case."""
@@ -73,7 +73,7 @@ def add_photograph(source: Path, target: Path) -> None:
     Raises:
         SceneError: it is not a readable image.
     """
-    from dataparsers.photograph import read_image, without_hidden  # imports torch, which is slow
+    from shellgs_method.files.photographs import read_image, without_hidden  # imports torch, which is slow
 
     target.parent.mkdir(parents=True, exist_ok=True)
     wanted = _FORMATS[target.suffix.lower()]
@@ -112,8 +112,8 @@ def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) ->
     Raises:
         SceneError: the mask is not a readable image, or has another size.
     """
-    from dataparsers.masks import OPAQUE
-    from dataparsers.photograph import read_image, read_mask
+    from shellgs_method.files.masks import OPAQUE
+    from shellgs_method.files.photographs import read_image, read_mask
 
     with Image.open(source) as stored, Image.open(photograph) as upright:
         stored_size, upright_size, exif = stored.size, upright.size, stored.getexif()
@@ -143,7 +143,7 @@ def _upright_mask(
 
 
 def find_masks(photographs: Mapping[str, Path], folder: Path, masks: Path) -> dict[str, Path]:
-    """The masks of the photographs that have one, by name: one of :func:`~dataparsers.scene_files.mask_names`.
+    """The masks of the photographs that have one, by name: one of :func:`~shellgs_method.files.paths.mask_names`.
 
     Raises:
         SceneError: no photograph has one.

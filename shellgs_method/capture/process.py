@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.progress import Progress
 
-from dataparsers.errors import SceneError
+from shellgs_method.errors import SceneError
 
 _SCRIPT = Path(__file__).with_name("sfm.py")  # run as a file, to import none of the package's libraries
 _POLL = 0.3  # seconds

@@ -16,8 +16,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from dataparsers.errors import SceneError
-from dataparsers.files import fingerprint, read_json
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
@@ -30,6 +28,8 @@ from shellgs_method.capture.photographs import (
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work, listing
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import fingerprint, read_json
 
 WORK = Path("capture")
 """Work folder in the scene folder."""

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write, read_json
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_write, read_json
 
 
 class Work:

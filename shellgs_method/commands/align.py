@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import tyro
 from rich.table import Table
 
-from dataparsers.errors import SceneError
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
+from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
-    from shellgs_method.shell.registration.align import Placement
-    from shellgs_method.shell.validation.validation import Validation
+    from shellgs_method.registration.align import Placement
+    from shellgs_method.registration.validation import Validation
 
 
 def align(
@@ -51,12 +51,10 @@ def align(
             else planes.
         paths: Paths of the scene's files.
     """
-    from dataparsers.cue_maps import relative_path
     from dataparsers.facade import read_views
-    from dataparsers.frames import check_points
-    from dataparsers.sparse_points import read_sparse_points
-    from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
-    from shellgs_method.shell.registration.align import (
+    from shellgs_method.files.cue_maps import relative_path
+    from shellgs_method.files.sparse_points import read_sparse_points
+    from shellgs_method.registration.align import (
         PROPOSAL,
         REPORT,
         Placement,
@@ -69,7 +67,9 @@ def align(
         refined,
         validate_placement,
     )
-    from shellgs_method.shell.registration.frames import ShellPlace
+    from shellgs_method.registration.frames import ShellPlace
+    from shellgs_method.registration.sfm_frame import check_points
+    from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
     starts = [start for start in (matrix, picks, positions) if start]
     if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
@@ -117,8 +117,8 @@ def align(
 
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
     """Print the result of the validation."""
-    from shellgs_method.shell.registration.align import REPORT
-    from shellgs_method.shell.validation.report import residual_table
+    from shellgs_method.registration.align import REPORT
+    from shellgs_method.registration.report import residual_table
 
     for sentence in placement.history:
         console.print(sentence, highlight=False)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Optional
 
-from dataparsers.errors import SceneError
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
 from shellgs_method.commands.panels import save_panel, views_with_maps
+from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from dataparsers.facade import FacadeDataParserConfig
-    from dataparsers.photograph import View
+    from shellgs_method.files.photographs import View
 
 
 def cast(
@@ -46,8 +46,8 @@ def cast(
         check: Compare the photographs to find what occludes the shell.
         paths: Paths of the scene's files.
     """
-    from dataparsers.cue_maps import CueMaps, relative_path
     from dataparsers.facade import FacadeDataParserConfig, read_views
+    from shellgs_method.files.cue_maps import CueMaps, relative_path
     from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 
     if (shell is None) != (matrix is None):
@@ -83,7 +83,7 @@ def cast(
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     """Compare the photographs, and print where and how much they contradict the shell."""
     from dataparsers.facade import held_out_names, read_views
-    from shellgs_method.shell import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
+    from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 
     views = read_views(config)
     found = check_views(scene, views, held_out_names(config))
@@ -113,10 +113,10 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
 
 def _save_check_panel(scene: Path, views: Sequence[View]) -> Path:
     """Save an image of some views and where photographs contradict or confirm the shell."""
-    from dataparsers.cue_maps import CueMaps
-    from dataparsers.photograph import load_photograph
     from shellgs_method.evaluation.figures import save_figure
-    from shellgs_method.shell import check_panel
+    from shellgs_method.evaluation.panels import check_panel
+    from shellgs_method.files.cue_maps import CueMaps
+    from shellgs_method.files.photographs import load_photograph
 
     checked, shell = CueMaps.open(scene, "checked"), CueMaps.open(scene, "shell")
     panel = checked.folder / "panel.png"

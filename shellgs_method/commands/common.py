@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from dataparsers.layout import ScenePaths
+from shellgs_method.files.scene import ScenePaths
 
 if TYPE_CHECKING:
-    from shellgs_method.export import Frame
+    from shellgs_method.export.frame import Frame
 
 # Without a terminal rich assumes 80 columns, which cut the tables of a log.
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160)

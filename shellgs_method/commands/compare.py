@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Optional
 
 import tyro
 
-from dataparsers.errors import SceneError
 from shellgs_method.commands.common import PATHS, Paths, console
+from shellgs_method.errors import SceneError
 
 
 def compare(
@@ -45,10 +45,10 @@ def compare(
     """
     from functools import partial
 
-    from shellgs_method.compare.launch import launch_locally
     from shellgs_method.compare.results import compare as compare_runs
     from shellgs_method.compare.runs import grid
     from shellgs_method.compare.wandb_report import log_comparison, log_in
+    from shellgs_method.launch.local import launch_locally
 
     if jobs < 1:
         raise SceneError(f"--jobs must be at least 1, not {jobs}")
@@ -56,7 +56,7 @@ def compare(
         log_in()
     runs = grid(scenes, methods, seeds, iterations, output, curve_points, paths)
     if launcher == "ray":
-        from shellgs_method.compare.cluster import launch_on_ray
+        from shellgs_method.launch.cluster import launch_on_ray
 
         launch = partial(launch_on_ray, address=address, console=console)
     else:

@@ -1,13 +1,23 @@
-"""`shellgs demo`: the whole pipeline on a synthetic facade."""
+"""`shellgs demo`: the whole pipeline on a synthetic facade, with the commands a user would type."""
 
 from __future__ import annotations
 
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from shellgs_method.commands.common import console
+from shellgs_method.errors import SceneError
+
+if TYPE_CHECKING:
+    from shellgs_method.synthetic import FacadeConfig
+
+METHODS = ("photo-gs", "shellgs-metric")
 
 
 def demo(
@@ -30,7 +40,60 @@ def demo(
         views: Number of photographs.
         seed: Seed of the facade and of the walk past it.
     """
-    from shellgs_method.demo import run_demo
+    import torch
+
+    from shellgs_method.launch.local import BIN, CommandError, follow, launch_locally
     from shellgs_method.synthetic import FacadeConfig
 
-    run_demo(folder, FacadeConfig(width, height, views, seed), iterations, console)
+    if iterations < 1:
+        raise SceneError(f"--iterations must be at least 1, not {iterations}")
+    scene = folder / "scene"
+    _make(scene, FacadeConfig(width, height, views, seed))
+    console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
+    with ThreadPoolExecutor() as pool:
+        cast = pool.submit(follow, [["shellgs", "cast", str(scene)]])
+        # Slow to import, so while the shell is cast; nerfstudio first, as its import takes longer from deep in others.
+        import nerfstudio.configs.method_configs  # noqa: F401
+
+        from shellgs_method.compare.results import compare
+        from shellgs_method.compare.runs import grid
+    try:
+        cast.result()
+    except CommandError as error:
+        raise SystemExit(f"shellgs: {error}") from error
+    runs = grid([scene], METHODS, [0], iterations, folder)
+    # On a CPU two runs at once are faster in total: much of each is single-threaded.
+    jobs = 1 if torch.cuda.is_available() else 2
+    if compare(runs, partial(launch_locally, jobs=jobs, console=console), folder, console).failures:
+        raise SystemExit("shellgs: a run of the demo failed; the end of its output is above.")
+    viewer = "ns-viewer" if shutil.which("ns-viewer") else BIN / "ns-viewer"
+    console.print(
+        "Look first at\n"
+        f"  1. {folder / 'strip.png'}: a held-out view of each method, its normals and their error\n"
+        f"  2. {folder / 'report.html'}: all held-out views with sliders between the methods\n"
+        f"  3. {viewer} --load-config {runs[-1].config}: walk around {runs[-1].variant.name} in a browser\n"
+        f"The tables above are in {folder / 'results.md'}, a view's shell maps in {scene / 'cues/shell/panel.png'}.",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _make(scene: Path, config: FacadeConfig) -> None:
+    """Write the facade, unless it is there.
+
+    Raises:
+        SceneError: there is another facade.
+    """
+    from shellgs_method.synthetic import settings_of, write_scene
+
+    if scene.exists():
+        made, asked = settings_of(scene), asdict(config)
+        if other := [name for name in asked if made.get(name, asked[name]) != asked[name]]:
+            what = ", ".join(f"--{name} {made[name]}, not {asked[name]}" for name in other)
+            raise SceneError(
+                f"{scene} was made with {what}: give another folder for this demo, or remove {scene.parent}"
+            )
+    else:
+        size = f"{config.width} x {config.height}"
+        console.print(f"A synthetic facade, {config.views} photographs of {size} pixels: {scene}", highlight=False)
+        write_scene(scene, config)

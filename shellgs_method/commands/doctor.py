@@ -15,7 +15,7 @@ def doctor(install_libraries: bool = False) -> None:
     Args:
         install_libraries: Install missing system libraries, if apt-get is available and permitted.
     """
-    from shellgs_method.environment import examine, install_system_libraries
+    from shellgs_method.machine.doctor import examine, install_system_libraries
 
     if install_libraries:
         install_system_libraries()

@@ -6,8 +6,8 @@ from math import inf
 from pathlib import Path
 from typing import Optional
 
-from dataparsers.errors import SceneError
 from shellgs_method.commands.common import RunConfig, UpAxis, console, place
+from shellgs_method.errors import SceneError
 
 
 def mesh(
@@ -33,8 +33,9 @@ def mesh(
         up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
-    from shellgs_method.export import METRE_FORMATS, check_mesh_format, decimate, write_mesh
+    from shellgs_method.export.meshes import METRE_FORMATS, check_mesh_format, write_mesh
     from shellgs_method.export.runs import TrainedRun, mesh_errors
+    from shellgs_method.geometry.tsdf import decimate
 
     output = output or config.with_name("mesh.ply")
     check_mesh_format(output)

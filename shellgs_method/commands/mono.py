@@ -6,10 +6,10 @@ from typing import Annotated, Optional, Union
 
 import tyro
 
-from dataparsers.errors import SceneError
 from shellgs_method.commands.common import PATHS, Paths, Scene, console
 from shellgs_method.commands.panels import save_panel
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
+from shellgs_method.errors import SceneError
 
 MonoSource = Annotated[
     Union[
@@ -35,11 +35,11 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
             the shell maps were cast at, else full size.
         paths: Paths of the scene's files.
     """
-    from dataparsers.cue_maps import CueMaps, find_cues
     from dataparsers.facade import read_views
-    from dataparsers.frames import check_points
-    from dataparsers.sparse_points import read_sparse_points
     from shellgs_method.cues.maps import make_maps
+    from shellgs_method.files.cue_maps import CueMaps, find_cues
+    from shellgs_method.files.sparse_points import read_sparse_points
+    from shellgs_method.registration.sfm_frame import check_points
 
     if max_image_size is not None and max_image_size < 1:
         raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dataparsers.cue_maps import CueMap, CueMaps
-    from dataparsers.photograph import View
+    from shellgs_method.files.cue_maps import CueMap, CueMaps
+    from shellgs_method.files.photographs import View
 
 
 def save_panel(maps: CueMaps, views: Sequence[View]) -> Path:
     """Save an image of the view whose map covers most pixels, among some spread over the scene; return its path."""
-    from dataparsers.photograph import load_photograph
     from shellgs_method.evaluation.figures import save_figure
-    from shellgs_method.shell import supervision_panel
+    from shellgs_method.evaluation.panels import supervision_panel
+    from shellgs_method.files.photographs import load_photograph
 
     view, cue = max(views_with_maps(maps, views, 8), key=lambda pair: pair[1].mask.mean())
     panel = maps.folder / "panel.png"

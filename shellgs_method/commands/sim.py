@@ -28,8 +28,8 @@ def sim(
         settings: Settings.
         up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
     """
-    from shellgs_method.extras import import_extra
-    from shellgs_method.sim.engine import import_mujoco
+    from shellgs_method.machine.extras import import_extra
+    from shellgs_method.sim.trials.engine import import_mujoco
 
     import_mujoco()
     for module, package in _PACKAGES.items():  # fail before hours of work

@@ -22,8 +22,8 @@ def splats(
         output: Output ply. If not set: splats.ply beside the config.
         up: Axis of the shell's frame that points up, written to the json. If not set: y for a glTF shell, else z.
     """
-    from shellgs_method.export import check_splats_format, write_splats
     from shellgs_method.export.runs import TrainedRun
+    from shellgs_method.export.splats import check_splats_format, write_splats
 
     output = output or config.with_name("splats.ply")
     check_splats_format(output)

@@ -16,20 +16,26 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from rich.progress import track
 from torch import Tensor
 
-from dataparsers.camera import Camera
-from dataparsers.cue_maps import find_cues
-from dataparsers.errors import SceneError, check_output
+from dataparsers.cameras import pinhole_camera
 from dataparsers.facade import FacadeDataParserConfig
-from dataparsers.files import atomic_write
-from dataparsers.layout import SceneLayout
-from shellgs_method.batches import REFERENCES, masked_image_errors, pinhole_camera, reference_errors, reference_maps
 from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig, FacadeDataset
-from shellgs_method.depth_normals import normals_from_depth
+from shellgs_method.errors import SceneError, check_output
 from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
+from shellgs_method.evaluation.regions import (
+    REFERENCES,
+    masked_image_errors,
+    reference_errors,
+    reference_maps,
+)
 from shellgs_method.evaluation.view import OPAQUE
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.cue_maps import find_cues
+from shellgs_method.files.scene import SceneLayout
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.depth_normals import normals_from_depth
 from shellgs_method.model import FacadeModel
-from shellgs_method.trained import load_run
+from shellgs_method.runs.trained import load_run
 
 IMAGE_SIZE = 640
 """Longer side of an image in a report, in pixels, at most."""

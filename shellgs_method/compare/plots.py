@@ -14,15 +14,15 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from dataparsers.camera import upwards
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.runs import Run
 from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
-from shellgs_method.nearest import point_tree
-from shellgs_method.voxels import voxel_means
+from shellgs_method.geometry.camera import upwards
+from shellgs_method.geometry.nearest import point_tree
+from shellgs_method.geometry.voxels import voxel_means
 
 CURVES = tuple(
     c for c in (*MAIN_COLUMNS, *SURFACE_COLUMNS) if c.key in ("psnr", "normal_deg", "depth_mae_m", "chamfer_m")

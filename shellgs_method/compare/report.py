@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from dataparsers.files import atomic_write
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.plots import REFERENCE, common_views
 from shellgs_method.compare.runs import Run
 from shellgs_method.compare.tables import MetricsTable
 from shellgs_method.evaluation.colours import error_colours, normal_colours
-from shellgs_method.html import data_uri, encoded
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.html import data_uri, encoded
 
 _PAGE = """<!doctype html>
 <meta charset="utf-8">

@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write
 from shellgs_method.compare.measure import Snapshot, measure_shell
 from shellgs_method.compare.plots import common_views, curves, strip, surfaces
 from shellgs_method.compare.report import write_report
 from shellgs_method.compare.runs import DamagedRunError, Run
 from shellgs_method.compare.tables import MetricsTable, read_metrics, tables
+from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.tables import rich_table
-from shellgs_method.folders import held
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.runs.folders import held
 
 Launcher = Callable[[Sequence[Run]], Mapping[Run, str]]
 """Finish runs; return those that failed, with the reason."""

@@ -6,7 +6,7 @@ import json
 import re
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -15,14 +15,14 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
-from dataparsers.cue_maps import CueMaps, find_cues
-from dataparsers.errors import SceneError
 from dataparsers.facade import read_views
-from dataparsers.files import atomic_write
-from dataparsers.layout import SceneLayout, ScenePaths
-from shellgs_method.ablations import ABLATIONS
 from shellgs_method.compare.settings import config_settings, default_settings, parsed, scene_settings
-from shellgs_method.folders import recover_folder
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_write, fingerprint
+from shellgs_method.files.cue_maps import CueMaps, find_cues
+from shellgs_method.files.scene import SceneLayout, ScenePaths
+from shellgs_method.runs.ablations import ABLATIONS
+from shellgs_method.runs.folders import recover_folder
 from shellgs_method.trainer import FacadeTrainerConfig
 
 METHODS = ("photo-gs", "mono-gs", "2dgs", "shellgs")
@@ -135,6 +135,11 @@ class Run:
         return self.output / "runs" / self.scene.name / name / method / f"seed-{self.seed}"
 
     @property
+    def key(self) -> str:
+        """Hash of its settings and its folder."""
+        return fingerprint(str(self.output), self.label, self.settings)
+
+    @property
     def config(self) -> Path:
         """Config of the trained run."""
         return self.folder / "config.yml"
@@ -162,6 +167,10 @@ class Run:
     def finished(self) -> bool:
         """Whether it is trained and all its metrics are measured."""
         return self.trained and all(self.metrics(half).exists() for half in (None, *self.halves))
+
+    def moved(self, scene: Path, output: Path) -> Run:
+        """The same run with other folders."""
+        return replace(self, scene=scene, output=output)
 
     def commands(self) -> list[list[str]]:
         """The remaining commands as lists of words."""

@@ -16,11 +16,11 @@ import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 
-from dataparsers.cue_maps import CueMaps, find_cues
-from dataparsers.errors import SceneError
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from dataparsers.files import content_hash, fingerprint
-from dataparsers.transforms import find_cloud
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import content_hash, fingerprint
+from shellgs_method.files.cue_maps import CueMaps, find_cues
+from shellgs_method.files.transforms import find_cloud
 
 _IRRELEVANT = re.compile(
     r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"

@@ -11,7 +11,6 @@ from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
 
-from dataparsers.files import atomic_write
 from shellgs_method.compare.runs import HALVES, Half, Run
 from shellgs_method.evaluation.tables import (
     MAIN_COLUMNS,
@@ -24,6 +23,7 @@ from shellgs_method.evaluation.tables import (
     latex_table,
     markdown_table,
 )
+from shellgs_method.files.atomic import atomic_write
 
 _BY_KEY = {column.key: column for column in (*MAIN_COLUMNS, *SURFACE_COLUMNS)}
 _GEOMETRY = ("depth_mae_m", "normal_deg", "normal_below_10deg", "normal_below_20deg", "depth_normal_deg", "chamfer_m")

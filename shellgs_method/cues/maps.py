@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from dataparsers.cue_maps import CueMap, CueMaps
-from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write
-from dataparsers.map_files import is_number
-from dataparsers.photograph import View
-from dataparsers.sparse_points import SparsePoints
 from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_disparity
 from shellgs_method.cues.normals import disagreement, facing, gradient_normals
 from shellgs_method.cues.source import Predictor
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.map_files import is_number
+from shellgs_method.files.photographs import View
+from shellgs_method.files.sparse_points import SparsePoints
 
 NO_PREDICTION = "there is no prediction for it"
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dataparsers.errors import SceneError
+from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
     import torch
 
-    from dataparsers.photograph import View
     from shellgs_method.cues.source import Prediction, Predictor
+    from shellgs_method.files.photographs import View
 
 ELSEWHERE = "or import maps made elsewhere with `shellgs mono SCENE from FOLDER`"
 
@@ -41,9 +41,9 @@ class MoGe2:
         import numpy as np
         import torch
 
-        from dataparsers.photograph import load_photograph
         from shellgs_method.cues.disparity import as_disparity
         from shellgs_method.cues.source import Prediction, Predictor
+        from shellgs_method.files.photographs import load_photograph
 
         try:
             from moge.model.v2 import MoGeModel  # pyright: ignore[reportMissingImports]  # on no package index
@@ -93,9 +93,9 @@ class DepthAnything:
         """
         import torch
 
-        from dataparsers.photograph import load_photograph
         from shellgs_method.cues.disparity import as_disparity
         from shellgs_method.cues.source import Prediction, Predictor
+        from shellgs_method.files.photographs import load_photograph
 
         try:
             from transformers import AutoImageProcessor, DepthAnythingForDepthEstimation

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Shaped
 
-from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMap
-from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.evaluation.geometry import angular_error
+from shellgs_method.files.cue_maps import CueMap
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.depth_normals import normals_from_depth
 
 Convention = Literal["opencv", "opengl", "dsine", "stablenormal", "metric3d", "omnidata"]
 """Axes of a normal map: opencv is x right, y down, z forward, facing the camera; opengl is x right, y up, z back."""

@@ -11,9 +11,9 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dataparsers.files import content_hash
-from dataparsers.photograph import View
 from shellgs_method.cues.normals import Convention
+from shellgs_method.files.atomic import content_hash
+from shellgs_method.files.photographs import View
 
 
 @dataclass(frozen=True)

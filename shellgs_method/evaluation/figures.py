@@ -13,8 +13,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dataparsers.files import atomic_write
 from shellgs_method.evaluation.colours import MAX_ERROR, error_colours, normal_colours
+from shellgs_method.files.atomic import atomic_write
 
 
 class Panel(NamedTuple):

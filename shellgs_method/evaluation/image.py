@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
+from shellgs_method.machine.doctor import lpips_weights
+
 if TYPE_CHECKING:
     from torchmetrics import Metric
 
@@ -76,14 +78,6 @@ def lpips_network() -> Metric | str:
             obstacle = f"the weights of AlexNet cannot be loaded from {cached}: {error}"
     logger.warning("LPIPS is not available: %s.", obstacle)
     return obstacle
-
-
-def lpips_weights() -> tuple[str, str]:
-    """URL of the weights of the LPIPS backbone, and the file that is tried first."""
-    from torchvision.models import AlexNet_Weights  # slow
-
-    url = AlexNet_Weights.DEFAULT.url
-    return url, os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
 
 
 def _reachable(url: str, seconds: float = 5.0) -> bool:

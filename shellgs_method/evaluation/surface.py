@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
 
-from dataparsers.camera import Camera
-from shellgs_method.nearest import point_tree
-from shellgs_method.voxels import voxel_means
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.nearest import point_tree
+from shellgs_method.geometry.voxels import voxel_means
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from dataparsers.camera import Camera
-from shellgs_method.depth_normals import normals_from_depth
 from shellgs_method.evaluation.geometry import depth_mae, normal_errors, share
 from shellgs_method.evaluation.image import image_errors
 from shellgs_method.evaluation.surface import back_project, compare_surfaces
-from shellgs_method.reference import Reference
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.depth_normals import normals_from_depth
+from shellgs_method.geometry.reference import Reference
 
 VOXEL_METRES = 0.02
 """Voxel size of both point clouds; 0.4 of the smallest threshold."""

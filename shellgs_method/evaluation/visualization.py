@@ -10,7 +10,7 @@ from torch import Tensor
 from shellgs_method.evaluation.colours import depth_colours, error_colours, normal_colours
 from shellgs_method.evaluation.geometry import angular_error
 from shellgs_method.evaluation.view import OPAQUE, Rendering
-from shellgs_method.reference import Reference
+from shellgs_method.geometry.reference import Reference
 
 
 def geometry_images(rendering: Rendering, reference: Reference | None = None) -> dict[str, Float[Tensor, "H _ 3"]]:

@@ -9,55 +9,17 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
-from dataparsers.camera import Camera
-from dataparsers.files import atomic_write
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.similarity import scale_of
 from shellgs_method.shell import Alignment, ShellMesh
-from shellgs_method.shell.geometry.similarity import scale_of
 
 UpAxis = Literal["y", "z"]
 
 FAR = 1000.0
 """Distance from the origin above which coordinates are shifted: there float32 has steps of 0.06 mm."""
-
-
-@dataclass(frozen=True, eq=False)
-class Box:
-    """An oriented box.
-
-    Attributes:
-        axes: orthonormal axes as rows.
-        low: lowest coordinate along each axis.
-        high: highest coordinate along each axis.
-    """
-
-    axes: Float64[np.ndarray, "3 3"]
-    low: Float64[np.ndarray, " 3"]
-    high: Float64[np.ndarray, " 3"]
-
-    @classmethod
-    def around(cls, points: Float64[np.ndarray, "N 3"], margin: float, trim: float = 0.0) -> Box:
-        """The box of points along their principal axes, wider by ``margin`` on each side.
-
-        Args:
-            points: at least one point.
-            margin: margin in the points' unit.
-            trim: share of the points that may lie beyond each face, before the margin is added.
-        """
-        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2] if len(points) > 2 else np.eye(3)
-        low, high = np.quantile(points @ axes.T, [trim, 1 - trim], axis=0)
-        return cls(axes, low - margin, high + margin)
-
-    @property
-    def size(self) -> float:
-        """Length of its longest side."""
-        return float((self.high - self.low).max())
-
-    def contains(self, points: Float64[np.ndarray, "*N 3"]) -> Bool[np.ndarray, " *N"]:
-        """Whether points lie in the box."""
-        along = points @ self.axes.T
-        return ((along >= self.low) & (along <= self.high)).all(axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

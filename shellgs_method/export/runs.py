@@ -13,20 +13,21 @@ import torch
 from jaxtyping import Float32, Float64
 from rich.progress import track
 
-from dataparsers.camera import in_view, positions
-from dataparsers.errors import SceneError
-from dataparsers.photograph import load_mask
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
+from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, mean_over_views
 from shellgs_method.evaluation.view import OPAQUE
-from shellgs_method.export.frame import Box, Frame, UpAxis, scene_frame, shell_frame
+from shellgs_method.export.frame import Frame, UpAxis, scene_frame, shell_frame
 from shellgs_method.export.splats import Splats
-from shellgs_method.export.tsdf import DepthView, fuse
+from shellgs_method.files.photographs import load_mask
+from shellgs_method.files.surfaces import up_axis
+from shellgs_method.geometry.box import Box
+from shellgs_method.geometry.camera import in_view, positions
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.tsdf import DepthView, fuse
 from shellgs_method.model import FacadeModel, reference_errors
+from shellgs_method.runs.trained import load_run
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
-from shellgs_method.shell.geometry.files import up_axis
-from shellgs_method.shell.geometry.similarity import transformed
-from shellgs_method.trained import load_run
 
 if TYPE_CHECKING:
     import trimesh

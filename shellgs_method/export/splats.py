@@ -12,10 +12,10 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dataparsers.errors import SceneError, check_output
-from dataparsers.files import atomic_write
-from shellgs_method.rasterizer import spherical_harmonics
-from shellgs_method.shell.geometry.similarity import scale_of
+from shellgs_method.errors import SceneError, check_output
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.similarity import scale_of
+from shellgs_method.render.rasterizer import spherical_harmonics
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import unfold
 
-from shellgs_method.fusion import run_fused
 from shellgs_method.losses.windows import shifted, window_sums
+from shellgs_method.machine.compilation import run_fused
 
 
 class NccLoss:

@@ -6,8 +6,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from shellgs_method.fusion import run_fused
 from shellgs_method.losses.reduction import mean_weights
+from shellgs_method.machine.compilation import run_fused
 
 
 def unit(normal: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:

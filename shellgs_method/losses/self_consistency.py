@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from shellgs_method.fusion import run_fused
 from shellgs_method.losses.reduction import mean_weights, weighted_mean
+from shellgs_method.machine.compilation import run_fused
 
 
 def normal_consistency_loss(

@@ -8,8 +8,8 @@ from kornia.filters import spatial_gradient
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from shellgs_method.fusion import run_fused
 from shellgs_method.losses.normal import unit
+from shellgs_method.machine.compilation import run_fused
 
 
 class SmoothnessLoss:

@@ -13,8 +13,8 @@ from kornia.filters import filter2d_separable
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from shellgs_method.fusion import run_fused
 from shellgs_method.losses.windows import window_sums
+from shellgs_method.machine.compilation import run_fused
 
 RADIUS = 5
 _GAUSSIAN = [math.exp(-0.5 * (i / 1.5) ** 2) for i in range(-RADIUS, RADIUS + 1)]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from shellgs_method.fusion import run_fused
 from shellgs_method.losses.normal import unit
 from shellgs_method.losses.reduction import mean_weights
+from shellgs_method.machine.compilation import run_fused
 
 BEHIND = 1.0
 """Distance behind the shell in metres at which the remaining transmittance is assumed to end."""

@@ -11,18 +11,19 @@ import trimesh
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
 
-from dataparsers.camera import Camera, positions
-from dataparsers.cue_maps import find_cues
-from dataparsers.errors import SceneError
-from dataparsers.photograph import View, load_mask, load_photograph
-from shellgs_method.export import DepthView, decimate
+from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
-from shellgs_method.shell import ShellCaster, shell_verdicts
-from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.files.cue_maps import find_cues
+from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.tsdf import DepthView, decimate
+from shellgs_method.occlusion import shell_verdicts
+from shellgs_method.shell import ShellCaster
 from shellgs_method.sim.frame import SimFrame, sim_frame
+from shellgs_method.sim.look.texture import Photo
 from shellgs_method.sim.rays import Surface
-from shellgs_method.sim.texture import Photo
 
 MARGIN = 0.5
 """Margin around the shell, in metres, within which the fused surface is kept."""

@@ -10,9 +10,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from dataparsers.camera import Camera, in_view
-from dataparsers.files import atomic_write
-from shellgs_method.sim.collider import connected
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.camera import Camera, in_view
+from shellgs_method.sim.collision.collider import connected
 from shellgs_method.sim.rays import Surface
 
 EDGE = 0.15

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from dataparsers.camera import Camera, positions, upwards
 from shellgs_method.export.frame import Frame
-from shellgs_method.shell.geometry.similarity import transformed
+from shellgs_method.geometry.camera import Camera, positions, upwards
+from shellgs_method.geometry.similarity import transformed
 
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """Turns y-up coordinates into z-up ones."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
-from shellgs_method.triangles import Triangles, area_vectors, rays_from, sampled
+from shellgs_method.geometry.triangles import Triangles, area_vectors, rays_from, sampled
 
 
 class Surface(Triangles):

@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write
-from shellgs_method.html import data_uri, encoded
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.html import data_uri, encoded
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collider import Collider, leaks
+from shellgs_method.sim.collision.collider import Collider, leaks
+from shellgs_method.sim.collision.distances import Distances
+from shellgs_method.sim.collision.parts import joined
 from shellgs_method.sim.deviations import Deviations
-from shellgs_method.sim.distances import Distances
-from shellgs_method.sim.engine import beams, lidar, warnings_kept
+from shellgs_method.sim.formats.world import Building
 from shellgs_method.sim.front import Front, places_before
-from shellgs_method.sim.parts import joined
+from shellgs_method.sim.look.renders import overlaid, rendered, shown
 from shellgs_method.sim.rays import Surface
-from shellgs_method.sim.renders import overlaid, rendered, shown
-from shellgs_method.sim.trials import throw, walk
-from shellgs_method.sim.world import Building
+from shellgs_method.sim.trials.engine import beams, lidar, warnings_kept
+from shellgs_method.sim.trials.trials import throw, walk
 
 IMAGES = 3
 """Number of photographs shown of each building."""

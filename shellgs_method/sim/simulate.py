@@ -10,24 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
-from dataparsers.errors import SceneError
-from dataparsers.files import atomic_write
-from shellgs_method.export import write_splats
+from shellgs_method.errors import SceneError
 from shellgs_method.export.frame import UpAxis
 from shellgs_method.export.runs import TrainedRun
+from shellgs_method.export.splats import write_splats
+from shellgs_method.files.atomic import atomic_write
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collider import GROUND, Collider, make_collider, standing_before
+from shellgs_method.sim.collision.collider import GROUND, Collider, make_collider, standing_before
+from shellgs_method.sim.collision.distances import both_ways
 from shellgs_method.sim.deviations import Deviations, find_deviations
-from shellgs_method.sim.distances import both_ways
-from shellgs_method.sim.engine import import_mujoco
+from shellgs_method.sim.formats.readme import write_readme
+from shellgs_method.sim.formats.usd import write_usd_layers, write_usd_world
+from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
+from shellgs_method.sim.look.texture import bake
+from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.rays import Surface, outward
-from shellgs_method.sim.readme import write_readme
 from shellgs_method.sim.report import Chapter, write_report
 from shellgs_method.sim.settings import SimSettings
-from shellgs_method.sim.texture import bake
-from shellgs_method.sim.usd import write_usd_layers, write_usd_world
-from shellgs_method.sim.visual import write_visual
-from shellgs_method.sim.world import Building, write_parts, write_worlds
+from shellgs_method.sim.trials.engine import import_mujoco
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""

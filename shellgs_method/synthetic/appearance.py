@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import map_coordinates
 
-from dataparsers.camera import Camera
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.synthetic.building import BAY, STOREY
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.street import CAR, HOUSE, KERB

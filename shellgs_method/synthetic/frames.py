@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from dataparsers.camera import Camera
+from shellgs_method.geometry.camera import Camera
 
 
 def _similarity(scale: float, turn: Rotation, shift: list[float]) -> Float64[np.ndarray, "4 4"]:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from dataparsers.camera import Camera
+from shellgs_method.geometry.camera import Camera
 
 FIELD_OF_VIEW = 67.0
 """Horizontal field of view of a phone's main camera, in degrees."""

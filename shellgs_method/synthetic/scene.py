@@ -13,29 +13,24 @@ import numpy as np
 from PIL import Image
 from rich.progress import track
 
-from dataparsers.bound_cameras import BoundCameras
-from dataparsers.camera import Camera
-from dataparsers.cue_maps import CueMap, CueMaps
-from dataparsers.errors import SceneError
-from dataparsers.files import unfinished
-from shellgs_method.open3d import import_open3d
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import unfinished
+from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.machine.open3d import import_open3d
+from shellgs_method.machine.threads import workers
 from shellgs_method.shell import ALIGNMENT, Alignment
-from shellgs_method.shell.geometry.similarity import transformed
 from shellgs_method.synthetic.appearance import Daylight, developed, exposed, rays
 from shellgs_method.synthetic.building import Layout, building, shell
-from shellgs_method.synthetic.frames import (
-    SCENE_FROM_BUILDING,
-    SHELL_FROM_BUILDING,
-    UNITS_PER_METRE,
-    scene_camera,
-)
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, UNITS_PER_METRE, scene_camera
 from shellgs_method.synthetic.geometry import Material, Mesh, merge
 from shellgs_method.synthetic.monocular import predicted_disparity
 from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.sfm import Points, features, triangulate
 from shellgs_method.synthetic.street import street
 from shellgs_method.synthetic.world import World
-from shellgs_method.threads import workers
 
 SHELL = "shell/facade.ply"
 RECORD = "facade.json"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from scipy.ndimage import gaussian_gradient_magnitude
 
-from dataparsers.camera import Camera
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.synthetic.appearance import rays
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.world import World

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from shellgs_method.geometry.triangles import Triangles, rays_from
 from shellgs_method.synthetic.geometry import Mesh
-from shellgs_method.triangles import Triangles, rays_from
 
 
 @dataclass(frozen=True)

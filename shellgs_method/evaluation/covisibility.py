@@ -1,0 +1,88 @@
+"""Pixels of a held-out view that the training views cover; elsewhere no method can be right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.nearest import point_tree
+
+MAX_SIZE = 320
+"""Longer side in pixels at which visibility is computed."""
+MIN_VIEWS = 2
+"""Minimum number of training views that see a pixel: one alone does not determine its depth."""
+BEHIND = 0.02
+"""Relative depth by which a point may lie behind a training view's shell without being hidden by it."""
+
+
+@dataclass(frozen=True)
+class SeenBy:
+    """Cameras and shell depths of the training views.
+
+    Attributes:
+        cameras: cameras of the training views.
+        depths: z-depth of the shell in each view, 0 where there is none; at the camera's size or thinned.
+        points: SfM points in the cameras' world.
+    """
+
+    cameras: Sequence[Camera]
+    depths: Sequence[Float[Tensor, "h w"]]
+    points: Float[Tensor, "N 3"]
+
+    def mask(self, camera: Camera, depth: Float[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
+        """Pixels of a view that lie in at least two training images, not hidden by the shell.
+
+        This is the co-visibility of Gao et al. 2022, from geometry instead of optical flow. A pixel has the depth of
+        the shell or, without shell, of the SfM point nearest in the image.
+
+        Args:
+            camera: camera of the view.
+            depth: z-depth of the shell, 0 where there is none.
+        """
+        step = camera.thinning(MAX_SIZE)
+        rays, thinned = camera.rays()[::step, ::step], depth[::step, ::step]
+        thinned = torch.where(thinned > 0, thinned, self._depth_of_points(camera, rays))
+        world = (thinned * rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+        count = sum(_sees(*each, world).int() for each in zip(self.cameras, self.depths, strict=True))
+        seen = torch.as_tensor(count, device=depth.device) >= MIN_VIEWS
+        seen = seen.expand(thinned.shape[:2]).repeat_interleave(step, 0).repeat_interleave(step, 1)
+        return seen[: camera.height, : camera.width, None]
+
+    def _depth_of_points(self, camera: Camera, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
+        """Depth of the SfM point nearest in the image; that of the sky, 1e6, if the image has none."""
+        pixels, z = _project(camera, self.points)
+        inside = _inside(camera, pixels, z)
+        if not inside.any():
+            return rays.new_full((*rays.shape[:2], 1), 1e6)
+        wanted = (rays @ camera.K.T)[..., :2].reshape(-1, 2)
+        nearest = point_tree(pixels[inside].cpu().numpy()).query(wanted.cpu().numpy(), workers=-1)[1]
+        return z[inside][torch.as_tensor(nearest, device=z.device)].view(*rays.shape[:2], 1)
+
+
+def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "*shape 3"]) -> Bool[Tensor, "*shape"]:
+    pixels, z = _project(camera, world)
+    inside = _inside(camera, pixels, z)
+    size = pixels.new_tensor([camera.width, camera.height])
+    thinned = pixels.new_tensor([depth.shape[1], depth.shape[0]])
+    columns, rows = (pixels.where(inside[..., None], 0.0) / size * thinned).long().unbind(dim=-1)
+    surface = depth[rows, columns]
+    return inside & ((surface <= 0) | (z < (1 + BEHIND) * surface))
+
+
+def _project(
+    camera: Camera, world: Float[Tensor, "*shape 3"]
+) -> tuple[Float[Tensor, "*shape 2"], Float[Tensor, "*shape"]]:
+    """Pixel coordinates and z-depths of points."""
+    points = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = points[..., 2]
+    return (points @ camera.K.T)[..., :2] / z.clamp_min(1e-9)[..., None], z
+
+
+def _inside(camera: Camera, pixels: Float[Tensor, "*shape 2"], z: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
+    size = pixels.new_tensor([camera.width, camera.height])
+    return (z > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)

@@ -1,0 +1,96 @@
+"""Vertical bands of a facade, alternately A and B, that separate supervised from evaluated surface.
+
+Bands are cut by planes fixed in the scene, perpendicular to the facade, so that each is the same piece of wall in every
+view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import Camera, upwards
+
+MAX_VIEWS = 32
+"""Maximum number of views, evenly spaced, used to find the facade's direction."""
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Every other vertical band of a facade: band k extends from k to k + 1 widths along the axis; even k are A.
+
+    Attributes:
+        axis: unit vector in the scene, horizontal along the facade.
+        width: width of a band, in scene units.
+        name: which of the two halves.
+    """
+
+    axis: Float[Tensor, "3"]
+    width: float
+    name: Literal["A", "B"]
+
+    @property
+    def others(self) -> Bands:
+        """The other half."""
+        return replace(self, name="B" if self.name == "A" else "A")
+
+    def index(self, depth: Float[Tensor, "H W"], camera: Camera) -> Int[Tensor, "H W"]:
+        """Index k of the band of each pixel's surface.
+
+        Args:
+            depth: z-depth of the shell, in scene units.
+            camera: camera of the view, in the scene's frame.
+        """
+        direction = camera.viewmat[:3, :3] @ self.axis.to(camera.viewmat)  # the axis in the camera frame
+        along = depth * (camera.rays() @ direction) + camera.position @ self.axis.to(camera.viewmat)
+        return (along / self.width).floor().long()
+
+    def mask(self, shell: CueMap, camera: Camera) -> Bool[np.ndarray, "H W"]:
+        """Pixels whose surface lies in this half; pixels without shell are in no band."""
+        odd = self.index(torch.from_numpy(shell.depth), camera).numpy() % 2 == 1
+        return shell.mask & (odd == (self.name == "B"))
+
+
+def facade_bands(maps: CueMaps, views: Sequence[View], width: float, name: Literal["A", "B"]) -> Bands:
+    """Find the bands of the facade in a shell's maps; deterministic for the same maps and views.
+
+    The facade's normal is the dominant horizontal direction of the shell's normals; up is the mean of the cameras'. If
+    all cameras look up at the facade, up tilts within the plane of the two, which does not change the axis.
+
+    Args:
+        maps: shell maps.
+        views: training views, with cameras of the maps' size.
+        width: width of a band in metres, or in scene units if the maps' metres are unknown.
+        name: which half.
+
+    Raises:
+        SceneError: If no view has a map, or the shell in the maps has no upright wall.
+    """
+    up = torch.from_numpy(upwards(view.camera for view in views))
+    upright = torch.eye(3).double() - torch.outer(up, up)
+    scatter, facing = torch.zeros(3, 3).double(), torch.zeros(3).double()
+    for view in views[:: -(-len(views) // MAX_VIEWS)]:
+        cue = maps.read(view.name, view.camera)
+        if cue is not None and cue.mask.any():
+            normals = torch.from_numpy(cue.normal[cue.mask]).double() @ view.camera.viewmat[:3, :3].double() @ upright
+            scatter += normals.mT @ normals / len(normals)
+            facing += normals.mean(dim=0)
+    strengths, directions = torch.linalg.eigh(scatter)
+    if strengths[-1] <= 0:
+        raise SceneError(
+            f"the shell maps of {maps.scene} show no upright wall to cut into bands: "
+            "run `shellgs cast SCENE`, or train without a holdout"
+        )
+    wall = directions[:, -1]
+    wall = wall if wall @ facing >= 0 else -wall  # towards the cameras: the sign of an eigenvector is arbitrary
+    axis = torch.linalg.cross(up, wall)
+    return Bands(axis / axis.norm(), width / (maps.manifest.metres_per_unit or 1.0), name)

@@ -1,0 +1,75 @@
+"""Plots of a view's supervision: photograph, depth, normals, mask."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from shellgs_method.evaluation.colours import GREY, normal_colours
+from shellgs_method.files.cue_maps import CueMap, Findings
+
+
+def supervision_panel(
+    image: UInt8[np.ndarray, "H W 3"], cue: CueMap, metres_per_unit: float | None = None, kind: str = "shell"
+) -> Figure:
+    """Plot the paper's supervision figure for one view; save it with ``.savefig(path)``.
+
+    Args:
+        image: the photograph.
+        cue: its maps.
+        metres_per_unit: scale of the scene, for depth in metres; None for scene units.
+        kind: source of the maps, for the titles.
+    """
+    height, width = cue.mask.shape
+    figure = Figure(figsize=(16, 4.2 * height / width + 0.9), dpi=120, layout="constrained")
+    axes = figure.subplots(1, 4)
+    titles = ("RGB", f"{kind} depth", "camera-space normal", f"valid mask ({cue.mask.mean():.0%})")
+    for ax, letter, title in zip(axes, "abcd", titles, strict=True):
+        ax.set_title(f"({letter}) {title}")
+        ax.set_axis_off()
+    axes[0].imshow(image)
+    depth = np.ma.masked_where(~cue.mask, cue.depth * (metres_per_unit or 1.0))
+    low, high = np.percentile(depth.compressed(), [1, 99]) if cue.mask.any() else (0.0, 1.0)
+    colours = matplotlib.colormaps["viridis"].with_extremes(bad=str(GREY / 255))
+    shown = axes[1].imshow(depth, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+    bar = figure.colorbar(shown, cax=axes[1].inset_axes((0.0, -0.09, 1.0, 0.05)), orientation="horizontal")
+    bar.set_label("metres" if metres_per_unit else "scene units")
+    axes[2].imshow(normal_colours(cue.normal, cue.mask), interpolation="nearest")
+    axes[3].imshow(cue.mask, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+    axes[3].set_axis_on()  # a frame, without which a mask that is white everywhere is not there on white paper
+    axes[3].set(xticks=[], yticks=[])
+    return figure
+
+
+def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:
+    """Plot what photographs show at the shell: occluders (red), what moved (blue), the background (yellow), it (green).
+
+    Magenta is what they show behind it, in windows.
+
+    Args:
+        views: photograph, map by :func:`~shellgs_method.shell.check_views` and shell map of each.
+
+    Returns:
+        The figure; save it with ``.savefig(path)``.
+    """
+    height, width = views[0][1].mask.shape
+    columns = 2
+    rows = -(-len(views) // columns)
+    figure = Figure(figsize=(16, (8 * height / width + 0.3) * rows), dpi=100, layout="constrained")
+    for ax in figure.subplots(rows, columns, squeeze=False).flat:
+        ax.set_axis_off()
+    for ax, (image, cue, shell) in zip(figure.axes, views, strict=False):
+        shown = image / 255
+        found = Findings.of(cue, shell)
+        for mask, colour, alpha in zip(found, "rbygm", (0.7, 0.7, 0.7, 0.25, 0.5), strict=True):
+            shown[mask] = (1 - alpha) * shown[mask] + alpha * np.array(to_rgb(colour))
+        ax.imshow(shown)
+        names = "occluders", "moved", "background", "confirmed", "behind it"
+        shares = (f"{name} {mask.mean():.1%}" for name, mask in zip(names, found, strict=True))
+        ax.set_title(", ".join(shares))
+    return figure

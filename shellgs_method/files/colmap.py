@@ -1,0 +1,349 @@
+"""Read COLMAP models, binary or text: cameras, images and points. What a file claims is checked against its size."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order
+from shellgs_method.files.paths import NamedFiles
+
+PLACES = (Path("colmap/sparse"), Path("sparse"))
+"""Folders of numbered models, or of one."""
+# From COLMAP's axes (-y is up) to nerfstudio's.
+APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, or their number if it is only named
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
+}
+_PARAMETERS = {name: known if isinstance(known, int) else len(known.split()) for name, known in _MODELS.items()}
+_PANORAMAS = {"EQUIRECTANGULAR", "SPHERICAL"}  # the same by the name of other programs
+
+T = TypeVar("T")
+
+
+class _Camera(NamedTuple):
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+class _Image(NamedTuple):
+    quaternion: tuple[float, ...]  # w x y z
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of a model.
+
+    Attributes:
+        positions: in the model's frame.
+        colours: RGB.
+        observers: ids of the images that observe each point.
+    """
+
+    positions: Float64[np.ndarray, "N 3"]
+    colours: UInt8[np.ndarray, "N 3"]
+    observers: list[Int64[np.ndarray, " M"]]
+
+
+def find_folder(scene: Path, chosen: Path | None) -> Path | None:
+    """Find the folder of the scene's model, relative to the scene; None where there is none.
+
+    COLMAP numbers the models into which photographs fall apart, and the first need not be the largest, which is used.
+
+    Args:
+        scene: the scene's folder.
+        chosen: folder of the model, or of numbered models; None for :data:`PLACES`.
+
+    Raises:
+        SceneError: there are several models, and one is damaged.
+    """
+    numbered = (_numbered(scene, place) for place in PLACES)
+    ordered = [[chosen], _numbered(scene, chosen)] if chosen else [*numbered, *([place] for place in PLACES)]
+    models = next(filter(None, ([f for f in folders if _is_model(scene / f)] for folders in ordered)), [])
+    if len(models) < 2:
+        return models[0] if models else None
+    sizes = {folder: len(_images(scene / folder)) for folder in models}
+    largest = max(models, key=sizes.__getitem__)  # the first of equals
+    others = ", ".join(f"{folder} has {size}" for folder, size in sizes.items() if folder != largest)
+    notice(
+        f"{scene} holds {len(models)} COLMAP models: {largest}, the largest, is used, with {sizes[largest]} "
+        f"photographs ({others}); another can be chosen by --colmap-path."
+    )
+    return largest
+
+
+def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
+    """Read the cameras of the model in ``scene/folder`` and their photographs in ``scene/images_path``.
+
+    Raises:
+        FileNotFoundError: a file of the model is missing.
+        SceneError: a file is damaged, or a camera is invalid.
+    """
+    cameras = _read(scene / folder, "cameras", _binary_cameras, _text_cameras)
+    files = _files(scene, folder, images_path)
+    images = _images(scene / folder)
+    frames = [_frame(scene, _path(image.name, files), image, cameras, folder) for image in images.values()]
+    listed = _listed(files)
+    files.tell_what_is_elsewhere()
+    return Recording(in_order(frames, str(scene / folder)), APPLIED, listed)
+
+
+def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, Mapping[int, str]]:
+    """Read the points of a model (none without a file of points) and the names of its photographs by id.
+
+    Raises:
+        SceneError: a file is damaged.
+    """
+    files = _files(scene, folder, images_path)
+    names = {number: _path(image.name, files) for number, image in _images(scene / folder).items()}
+    if not any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
+        return Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), []), names
+    return _read(scene / folder, "points3D", _binary_points, _text_points), names
+
+
+def _numbered(scene: Path, place: Path) -> list[Path]:
+    found = (path.name for path in (scene / place).glob("*") if path.name.isdecimal())
+    return [place / name for name in sorted(found, key=int)]
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
+
+
+def _images(folder: Path) -> dict[int, _Image]:
+    return _read(folder, "images", _binary_images, _text_images)
+
+
+def _files(scene: Path, folder: Path, images_path: Path) -> NamedFiles:
+    return NamedFiles(scene, images_path, scene / folder)
+
+
+def _path(name: str, files: NamedFiles) -> str:
+    """Path of a photograph of the model, relative to the scene."""
+    path = files.photograph((files.images_path / name).as_posix(), str(files.where))
+    return path.relative_to(files.scene).as_posix()
+
+
+def _frame(scene: Path, path: str, image: _Image, cameras: Mapping[int, _Camera], folder: Path) -> Frame:
+    where = str(scene / folder)
+    camera = cameras.get(image.camera)
+    if camera is None:
+        raise SceneError(f"{where}: the camera {image.camera} of {image.name} is not among its cameras")
+    quaternion = np.array(image.quaternion)
+    if not np.isfinite(quaternion).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
+        raise SceneError(f"{where}: the pose of {image.name} has no rotation: its quaternion is {image.quaternion}")
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
+    viewmat[:3, 3] = image.translation
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = viewmat[:3, :3].T, -viewmat[:3, :3].T @ viewmat[:3, 3]
+    return frame(scene, path, pose, _lens(camera, scene), where)
+
+
+def _lens(camera: _Camera, scene: Path) -> dict[str, Any]:
+    """Intrinsics and distortion by the names of transforms.json."""
+    parameters = _MODELS.get(camera.model)
+    if not isinstance(parameters, str):
+        panorama = camera.model in _PANORAMAS
+        remedy = "render perspective photographs from these panoramas first" if panorama else UNDISTORT
+        raise SceneError(
+            f"the cameras of {scene} are of the model {camera.model}, which cannot be undistorted; {remedy}"
+        )
+    values = dict(zip(parameters.split(), camera.params, strict=True))
+    fx = values.pop("f", values.pop("fx", None))
+    lens = {"fl_x": fx, "fl_y": values.pop("fy", fx), "w": camera.width, "h": camera.height}
+    return lens | values | {"camera_model": FISHEYE if "FISHEYE" in camera.model else "OPENCV"}
+
+
+def _listed(files: NamedFiles) -> dict[str, set[str]]:
+    """Splits listed in ``train_list.txt`` etc., as in nerfstudio."""
+    lists = {"train": "train_list.txt", "test": "test_list.txt", "val": "validation_list.txt"}
+    listed = {}
+    for split, file in ((split, files.scene / name) for split, name in lists.items()):
+        if file.is_file():
+            try:
+                names = file.read_text("utf-8-sig").splitlines()
+            except UnicodeDecodeError as error:
+                raise SceneError(f"{file} is not a text file: list one photograph in each line") from error
+            listed[split] = {_path(name, files) for name in map(str.strip, names) if name}
+    return listed
+
+
+def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable[[Iterator[str]], T]) -> T:
+    path = next((path for path in (folder / f"{name}.bin", folder / f"{name}.txt") if path.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(f"{folder} is not a COLMAP model: {name}.bin and {name}.txt are missing")
+    try:
+        if path.suffix == ".bin":
+            file = _Bytes(path.read_bytes())
+            read = binary(file)
+            if file.at != len(file.data):
+                raise ValueError(f"it goes on for {len(file.data) - file.at} bytes after its last entry")
+            return read
+        lines = map(str.strip, path.read_text("utf-8-sig").splitlines())
+        return text(line for line in lines if line and not line.startswith("#"))
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
+    except (ValueError, IndexError, OverflowError, struct.error, StopIteration) as error:
+        raise SceneError(
+            f"{path} is damaged ({str(error) or 'it ends too early'}): copy it again, or run COLMAP again"
+        ) from error
+
+
+class _Bytes:
+    """Read binary data from the front; reading past the end raises, whatever counts a file claims."""
+
+    def __init__(self, data: bytes):
+        self.data, self.at = data, 0
+
+    def take(self, form: str) -> tuple:
+        values = struct.unpack_from(form, self.data, self.at)
+        self.at += struct.calcsize(form)
+        return values
+
+    def text(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        text = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
+        return text
+
+    def array(self, dtype: str, count: int) -> np.ndarray:
+        array = np.frombuffer(self.data, dtype, count, self.at) if count else np.empty(0, dtype)
+        self.at += array.nbytes
+        return array
+
+    def records(self) -> range:
+        """Indices of the records of a file that begins with their number; each record takes at least 8 bytes."""
+        (count,) = self.take("<Q")
+        if 8 * count > len(self.data):
+            raise ValueError(f"it claims {count} entries in {len(self.data)} bytes")
+        return range(count)
+
+
+def _binary_cameras(file: _Bytes) -> dict[int, _Camera]:
+    cameras = {}
+    for _ in file.records():
+        number, model, width, height = file.take("<iiQQ")
+        if not 0 <= model < len(_MODELS):
+            raise SceneError(
+                f"its camera {number} has a model of the number {model}, which is unknown here: if it is not damaged "
+                f"but of a newer COLMAP or another program, {UNDISTORT}"
+            )
+        name = list(_MODELS)[model]
+        count = _PARAMETERS[name]
+        cameras[number] = _Camera(name, width, height, file.take(f"<{count}d"))
+    return cameras
+
+
+def _text_cameras(lines: Iterator[str]) -> dict[int, _Camera]:
+    cameras = {}
+    for words in map(str.split, lines):
+        params = tuple(map(float, words[4:]))
+        if len(params) != _PARAMETERS.get(words[1], len(params)):
+            raise ValueError(f"{words[1]} has {_PARAMETERS[words[1]]} parameters, not {len(params)}")
+        cameras[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), params)
+    return cameras
+
+
+def _binary_images(file: _Bytes) -> dict[int, _Image]:
+    images = {}
+    for _ in file.records():
+        number, *pose, camera = file.take("<i7di")
+        name = file.text()
+        (count,) = file.take("<Q")
+        file.array("V24", count)  # keypoints: x, y and point id
+        images[number] = _Image(tuple(pose[:4]), tuple(pose[4:]), camera, name)
+    return images
+
+
+def _text_images(lines: Iterator[str]) -> dict[int, _Image]:
+    """Images in lines that are not empty: the second line of an image, its keypoints, may be missing.
+
+    It is empty for an image without keypoints, and programs drop or add empty lines.
+    """
+    images = {}
+    may_be_keypoints = False  # they follow their image
+    for line in lines:
+        words = line.split(maxsplit=9)  # a name may have blanks
+        if may_be_keypoints and _are_keypoints(line):
+            may_be_keypoints = False
+            continue
+        pose = tuple(map(float, words[1:8]))
+        if len(words) < 10:
+            raise ValueError(f"a line of images is ID, 7 pose values, CAMERA, NAME, not {line[:40]!r}")
+        if int(words[0]) in images:
+            raise ValueError(f"two images have the number {words[0]}")
+        images[int(words[0])] = _Image(pose[:4], pose[4:], int(words[8]), words[9])
+        may_be_keypoints = True
+    return images
+
+
+def _are_keypoints(line: str) -> bool:
+    """Whether a line of images.txt holds keypoints: x, y and a point's id each."""
+    words = line.split()
+    try:
+        numbers = [float(word) for word in words[:10] + words[-1:]]  # an image's tenth word is its name
+    except ValueError:
+        return False
+    return len(words) % 3 == 0 and all(number.is_integer() for number in [*numbers[2:9:3], numbers[-1]])
+
+
+def _binary_points(file: _Bytes) -> Points:
+    positions, colours, observers = [], [], []
+    for _ in file.records():
+        _, *known, _, count = file.take("<Q3d3BdQ")
+        positions.append(known[:3])
+        colours.append(known[3:])
+        observers.append(file.array("<i4", 2 * count)[::2].astype(np.int64))
+    return _points(positions, colours, observers)
+
+
+def _text_points(lines: Iterator[str]) -> Points:
+    positions, colours, observers = [], [], []
+    for words in map(str.split, lines):
+        position = [float(word) for word in words[1:4]]
+        colour = [int(word) for word in words[4:7]]
+        if len(position) != 3 or len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
+            raise ValueError(f"a line of points is ID X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
+        positions.append(position)
+        colours.append(colour)
+        observers.append(np.array(words[8::2], dtype=np.int64))
+    return _points(positions, colours, observers)
+
+
+def _points(positions: list, colours: list, observers: list) -> Points:
+    return Points(
+        np.array(positions, dtype=np.float64).reshape(-1, 3),
+        np.array(colours, dtype=np.uint8).reshape(-1, 3),
+        observers,
+    )

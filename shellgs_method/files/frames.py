@@ -1,0 +1,146 @@
+"""Frames: photographs and cameras listed in a scene's files, validated and in double precision."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.paths import inside
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.lens import COEFFICIENTS, Lens
+
+UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
+MAX_PIXELS = 178_956_970
+"""Most pixels of a photograph: Pillow's limit for decompression bombs. Larger ones are never allocated."""
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE = "OPENCV_FISHEYE"
+"""Camera models that nerfstudio undistorts."""
+_ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A photograph and its camera, as given in the scene's files.
+
+    Attributes:
+        name: the image's path relative to the scene, with forward slashes.
+        image: the image file.
+        camera: calibrated camera without its distortion, in the scene's own frame and units.
+        lens: the camera with its distortion; None if it has none.
+        mask: the user's mask file, if the scene's files name one.
+    """
+
+    name: str
+    image: Path
+    camera: Camera
+    lens: Lens | None = None
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All photographs of a scene.
+
+    Attributes:
+        frames: sorted by name.
+        applied: rigid motion from the scene's frame to the one that nerfstudio would read.
+        listed: names of photographs by split, where the files list them; else the interval decides.
+        orientation: orientation method for the viewer, if the files set one.
+    """
+
+    frames: Sequence[Frame]
+    applied: Float64[np.ndarray, "4 4"]
+    listed: Mapping[str, set[str]] = field(default_factory=dict)
+    orientation: str | None = None
+
+
+def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping[str, Any], where: str) -> Frame:
+    """Validate a photograph and its camera.
+
+    Args:
+        scene: the scene's folder.
+        name: path of the photograph, relative to the scene.
+        pose: camera to scene, OpenCV axes.
+        lens: fl_x, fl_y, cx, cy, w, h and optionally distortion coefficients and camera_model, as in transforms.json.
+        where: file of the camera, for messages.
+
+    Raises:
+        SceneError: the camera is invalid, or the path leaves the scene.
+    """
+    image = inside(scene, name, where)
+    where = f"{where}: the camera of {name}"
+    width, height = (_number(lens, key, where) for key in ("w", "h"))
+    if not (width >= 1 and height >= 1 and width % 1 == height % 1 == 0):
+        raise SceneError(f"{where} has {width:g}x{height:g} pixels: both must be whole numbers, at least 1")
+    if width * height > MAX_PIXELS:
+        raise SceneError(
+            f"{where} has {width:.0f}x{height:.0f} pixels, more than can be read: make the photographs smaller"
+        )
+    fx, fy, cx, cy = (_number(lens, key, where) for key in ("fl_x", "fl_y", "cx", "cy"))
+    if fx <= 0 or fy <= 0:
+        raise SceneError(f"{where} has the focal lengths {fx:g} and {fy:g}, which must be positive: calibrate it again")
+    fisheye = _is_fisheye(lens, where)
+    distortion = tuple(_number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
+    if not fisheye and distortion[3] != 0:
+        raise SceneError(f"{where} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    camera = Camera(torch.from_numpy(np.linalg.inv(_rigid(pose, where))), K, int(width), int(height))
+    distorts = fisheye or any(distortion)
+    return Frame(name, image, camera, Lens(K, int(width), int(height), distortion, fisheye) if distorts else None)
+
+
+def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
+    """The frames sorted by name.
+
+    Raises:
+        SceneError: there are none, or two of the same photograph.
+    """
+    if not frames:
+        raise SceneError(f"{where} holds no photographs: it is empty")
+    frames = sorted(frames, key=lambda frame: frame.name)
+    for one, other in pairwise(frames):
+        if one.name == other.name:
+            raise SceneError(f"{where} has two cameras for the photograph {one.name}: leave one of them out")
+    return frames
+
+
+def _is_fisheye(lens: Mapping[str, Any], where: str) -> bool:
+    model = lens.get("camera_model", "OPENCV")
+    if model not in (*PERSPECTIVE, FISHEYE):
+        raise SceneError(f"{where} is {model}, but only perspective and fisheye ones work; {UNDISTORT}")
+    return model == FISHEYE
+
+
+def _rigid(pose: np.ndarray, where: str) -> Float64[np.ndarray, "4 4"]:
+    """The pose with an exact rotation."""
+    if not np.isfinite(pose).all():
+        raise SceneError(f"{where} has NaN or infinite values in its pose: leave the photograph out")
+    rotation = pose[:3, :3]
+    turned = np.abs(rotation.T @ rotation - np.eye(3)).max() <= _ORTHONORMAL and np.linalg.det(rotation) > 0
+    if pose.shape != (4, 4) or not turned or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise SceneError(f"{where} has a pose that is not a rotation and translation: it scales, shears or mirrors")
+    u, _, vt = np.linalg.svd(rotation)
+    exact = np.eye(4)
+    exact[:3, :3], exact[:3, 3] = u @ vt, pose[:3, 3]
+    return exact
+
+
+def _number(lens: Mapping[str, Any], key: str, where: str) -> float:
+    if key not in lens:
+        raise SceneError(f"{where} has no {key}: add it")
+    try:
+        value = float("nan") if isinstance(lens[key], bool) else float(lens[key])
+    except (TypeError, ValueError, OverflowError):
+        value = float("nan")
+    if not math.isfinite(value):
+        raise SceneError(f"{where} has {str(lens[key])[:40]!r} as its {key}, which is not a finite number")
+    return value

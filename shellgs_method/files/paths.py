@@ -1,0 +1,149 @@
+"""Find the files that a scene's cameras name, as other programs and machines spell them, and count those not named."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
+
+from pi_heif import register_heif_opener
+
+from shellgs_method.errors import SceneError, notice
+
+register_heif_opener()  # Pillow reads those of phones (.heic) from here on
+
+PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".hif", ".avif"))
+"""Suffixes of photographs, in lower case."""
+RAW = frozenset(
+    f".{kind}"
+    for kind in (
+        *("3fr", "arw", "cr2", "cr3", "crw", "dcr", "dng", "erf", "fff", "gpr", "iiq", "kdc", "mef", "mos", "mrw"),
+        *("nef", "nrw", "orf", "pef", "raf", "raw", "rw2", "rwl", "sr2", "srf", "srw", "x3f"),
+    )
+)
+"""Suffixes of what sensors recorded, in lower case: Pillow reads a thumbnail of some, and nothing of others."""
+DEVELOP = "export it as JPEG, or as PNG or TIFF of 8 or 16 bits, with the program that develops it"
+
+
+def inside(scene: Path, name: str, where: str) -> Path:
+    """Path of a file named in a scene's file, checked to lie in the scene.
+
+    Raises:
+        SceneError: the path leads out of the scene.
+    """
+    path = PurePosixPath(str(name))
+    for folder in (scene.absolute().as_posix(), scene.resolve().as_posix()):
+        path = path.relative_to(folder) if path.is_relative_to(folder) else path
+    if path.is_absolute() or ".." in path.parts or not path.parts or not str(path).isprintable():
+        raise SceneError(f"{where} names the file {str(name)!r}, which is not inside the scene: move it there")
+    return scene / path
+
+
+class NamedFiles:
+    """The files of a scene that one of its files names, whatever the system, machine and folder it was written on.
+
+    A path is taken as it is written if a file is there. Else Windows' separators, other cases and compositions of
+    letters and a missing suffix are understood, and leading folders that the scene does not have are dropped, until
+    exactly one file fits.
+    """
+
+    def __init__(self, scene: Path, images_path: Path, where: Path):
+        self.scene, self.images_path, self.where = scene, images_path, where
+        self._entries: dict[Path, list[Path]] = {}
+        self._elsewhere: dict[str, Path] = {}  # files found under other paths
+
+    def photograph(self, name: str, where: str) -> Path:
+        """Find a photograph; where none fits, the path as it is written.
+
+        Args:
+            name: its path relative to the scene, or of another machine.
+            where: what names it, for messages.
+
+        Raises:
+            SceneError: the path leads out of the scene, or several files fit.
+        """
+        return self._find(name, where, dict.fromkeys((self.scene, self.scene / self.images_path)))
+
+    def other(self, name: str, where: str) -> Path:
+        """Find another file, as :meth:`photograph`, but not among the photographs."""
+        return self._find(name, where, [self.scene])
+
+    def tell_what_is_elsewhere(self) -> None:
+        """Tell the user which files were found under other paths than those written."""
+        if self._elsewhere:
+            name, found = next(iter(self._elsewhere.items()))
+            notice(
+                f"{len(self._elsewhere)} of the files that {self.where} names have other paths in the scene: "
+                f"{name} is {found.relative_to(self.scene).as_posix()}, for example."
+            )
+
+    def _find(self, name: str, where: str, roots: Iterable[Path]) -> Path:
+        try:
+            written = inside(self.scene, name, where)
+        except SceneError:
+            if ".." in PureWindowsPath(name).parts or not name.isprintable():
+                raise
+            written = None
+        if written and written.exists():
+            return written
+        parts = [part for part in PureWindowsPath(name).parts if part.rstrip("\\/") and not part.endswith(":\\")]
+        in_scene = written is not None and len(parts) > 1 and (self.scene / Path(*parts[:-1])).is_dir()
+        for dropped in range(1 if in_scene else len(parts)):
+            found = {path for root in roots for path in self._spelt(root, parts[dropped:])}
+            if len(found) > 1:
+                several = " or ".join(sorted(path.relative_to(self.scene).as_posix() for path in found))
+                raise SceneError(f"{where} names the file {name!r}, which may be {several}: write which")
+            if found:
+                (path,) = found
+                if path != self.scene / Path(*parts):
+                    self._elsewhere[name] = path
+                return path
+        return written or inside(self.scene, name, where)
+
+    def _spelt(self, folder: Path, parts: Sequence[str]) -> list[Path]:
+        """Files whose path below a folder differs at most in spelling; as it is written, if there."""
+        if not parts:
+            return [folder] if folder.is_file() else []
+        exact = [folder / parts[0]] if (folder / parts[0]).exists() else []
+        entries = exact or [entry for entry in self._in(folder) if _alike(entry.name, parts[0])]
+        if len(parts) == 1 and not entries and PurePosixPath(parts[0]).suffix.lower() not in PHOTOGRAPHS:
+            photographs = (entry for entry in self._in(folder) if entry.suffix.lower() in PHOTOGRAPHS)
+            entries = [entry for entry in photographs if _alike(entry.stem, parts[0])]
+        return [path for entry in entries for path in self._spelt(entry, parts[1:])]
+
+    def _in(self, folder: Path) -> list[Path]:
+        if folder not in self._entries:
+            self._entries[folder] = list(folder.iterdir()) if folder.is_dir() else []
+        return self._entries[folder]
+
+
+def _alike(one: str, other: str) -> bool:
+    return one == other or _folded(one) == _folded(other)
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def mask_names(photograph: PurePath) -> list[PurePath]:
+    """Names that the mask of a photograph may have, the usual ones first: its own, with and without its suffix."""
+    stems = [f"{name}{end}" for name in (photograph.name, photograph.stem) for end in ("", "_mask", ".mask")]
+    suffixes = (".png", *sorted(PHOTOGRAPHS - {".png"}))
+    return [photograph.with_name(stem + suffix) for suffix in suffixes for stem in stems]
+
+
+def tell_of_masks(masks: Mapping[str, Path | None], there: Collection[Path], folder: Path) -> None:
+    """Tell the user which photographs have no mask, if some have one, and which files of the folder are no masks."""
+    without = sorted(name for name, path in masks.items() if path is None)
+    strays = sorted(path for path in there if path not in masks.values() and not path.name.startswith("."))
+    if strays or 0 < len(without) < len(masks):
+        stray = f"; {len(strays)} files there belong to no photograph, {strays[0].name} for example" if strays else ""
+        kept = f", {without[0]} for example, and are kept whole" if without else ""
+        notice(f"{len(without)} of {len(masks)} photographs have no mask in {folder}{kept}{stray}.")
+
+
+def photographs_in(folder: Path, *, deep: bool) -> list[Path]:
+    """Photographs in a folder, by their suffixes, or also in its sub-folders; hidden ones are left out."""
+    found = sorted(folder.rglob("*") if deep else folder.glob("*"))
+    below = ((path, path.relative_to(folder).parts) for path in found if path.suffix.lower() in PHOTOGRAPHS)
+    return [path for path, parts in below if not any(part.startswith(".") for part in parts)]

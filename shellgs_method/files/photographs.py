@@ -1,0 +1,211 @@
+"""Load photographs and user masks, undistorted to their pinhole cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+from PIL import Image, ImageOps
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.frames import MAX_PIXELS
+from shellgs_method.files.masks import OPAQUE, kept_pixels
+from shellgs_method.files.paths import DEVELOP, RAW
+from shellgs_method.files.undistortion import undistort, undistort_pixels
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.lens import Lens
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph of a scene.
+
+    Attributes:
+        name: the image's path relative to the scene folder, by which its maps are found.
+        image: the image file.
+        camera: the undistorted camera of the photograph, in the scene's own frame and units.
+        lens: the calibrated camera, if it has lens distortion.
+        mask: the user's mask file (white is kept), if there is one.
+        turned: whether the camera is of the photograph turned by its EXIF orientation, though the shape does not tell.
+    """
+
+    name: str
+    image: Path
+    camera: Camera
+    lens: Lens | None = None
+    mask: Path | None = None
+    turned: bool = False
+
+
+def load_photograph(view: View) -> UInt8[np.ndarray, "H W 3"]:
+    """The photograph as 8-bit RGB: upright, undistorted, at the size of its camera; black where it is transparent.
+
+    Raises:
+        SceneError: the image cannot be read, its aspect ratio is not the camera's, or it is transparent everywhere.
+    """
+    return _pixels(view)[..., :3]
+
+
+def load_mask(view: View, also: Path | None = None) -> Bool[np.ndarray, "H W"] | None:
+    """Pixels of the photograph that are kept: by the user's mask, and opaque; None where there is nothing to mask.
+
+    Args:
+        view: the photograph.
+        also: another mask file, if there is one, such as one painted for the shell.
+
+    Raises:
+        SceneError: an image cannot be read, its aspect ratio is not the camera's, the mask is not black and white, or
+            the photograph is transparent everywhere.
+    """
+    files = [path for path in (view.mask, also) if path is not None]
+    masks = [_undistorted(view, read_mask(path).convert("RGB"), path)[..., 0] > 127 for path in files]
+    if has_alpha(view.image) and (pixels := _pixels(view)).shape[-1] == 4:
+        opaque = pixels[..., 3] > OPAQUE
+        masks += [] if opaque.all() else [opaque]
+    return np.logical_and.reduce(masks) if masks else None
+
+
+def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+    """Map pixels of the photograph's file to the view's undistorted camera.
+
+    Where the EXIF orientation rotates the image, and the camera is of the rotated one, they are pixels of that, which
+    is what an image viewer shows.
+
+    Raises:
+        SceneError: the image cannot be read, or its aspect ratio is not the camera's.
+    """
+    width, height = _calibrated_size(view)
+    image = _upright(view, read_image(view.image), view.image)
+    pixels = pixels * [width / image.width, height / image.height]
+    if view.lens is None:
+        return pixels
+    return undistort_pixels(view.lens, pixels, view.camera.K.cpu().double().numpy())
+
+
+def read_image(path: Path) -> Image.Image:
+    """Read an image file as 8-bit RGB or RGBA; EXIF data are kept, the orientation is not applied.
+
+    Raises:
+        SceneError: the image cannot be read, or holds floating-point numbers.
+    """
+    with opened(path) as image:
+        exif = image.getexif()
+        if image.mode.startswith("I"):  # 16 bits
+            image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
+        image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+    image.info["exif"] = exif.tobytes()
+    return image
+
+
+def read_mask(path: Path) -> Image.Image:
+    """Read a mask as 8-bit grey, white where it keeps a pixel, else black; EXIF data are kept, as of photographs.
+
+    Raises:
+        SceneError: the image cannot be read, or is not black and white.
+    """
+    with opened(path) as image:
+        exif = image.getexif()
+        mask = Image.fromarray(np.where(kept_pixels(image, path), 255, 0).astype(np.uint8))
+    mask.info["exif"] = exif.tobytes()
+    return mask
+
+
+def without_hidden(image: Image.Image) -> Image.Image:
+    """The image, black where it is transparent: the colours that are stored there are nobody's."""
+    return image.convert("RGBa").convert("RGBA") if image.mode == "RGBA" else image
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether a photograph has an alpha channel or a transparent colour, by its header.
+
+    Raises:
+        SceneError: the image cannot be read.
+    """
+    with opened(path, whole=False) as image:
+        return image.has_transparency_data
+
+
+@contextmanager
+def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
+    """Open an image file, decoded unless ``whole`` is false.
+
+    Raises:
+        SceneError: the image cannot be read, is raw, or holds floating-point numbers.
+    """
+    if path.suffix.lower() in RAW:
+        raise SceneError(f"{path} is raw, of which only a thumbnail can be read: {DEVELOP}")
+    try:
+        image = Image.open(path)
+        if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
+            raise ValueError(f"it claims {image.width}x{image.height} pixels")
+        if whole:
+            image.load()
+    except Exception as error:  # each decoder raises its own errors for a damaged file
+        reason = " ".join(str(error).split())
+        raise SceneError(f"{path} cannot be read as an image ({reason}): put the whole file back") from error
+    with image:
+        if whole and image.mode == "F":
+            broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""
+            raise SceneError(
+                f"{path} holds floating-point numbers{broken}, whose white is undefined: save it with 8 or 16 bits"
+            )
+        yield image
+
+
+def _pixels(view: View) -> UInt8[np.ndarray, "H W C"]:
+    """The photograph as 8-bit RGB or RGBA, upright, undistorted, at the size of its camera.
+
+    What transparent pixels hide is neither shown nor mixed into the colours of others.
+    """
+    image = read_image(view.image)
+    if image.mode == "RGB":
+        return _undistorted(view, image, view.image)
+    if image.getchannel("A").getextrema() == (0, 0):
+        raise SceneError(
+            f"{view.image} is transparent everywhere: remove its alpha channel, or leave the photograph out"
+        )
+    premultiplied = _undistorted(view, image.convert("RGBa"), view.image)
+    return np.array(_image(premultiplied, "RGBa").convert("RGBA"))
+
+
+def _image(pixels: UInt8[np.ndarray, "H W C"], mode: str) -> Image.Image:
+    return Image.frombytes(mode, (pixels.shape[1], pixels.shape[0]), np.ascontiguousarray(pixels).tobytes())
+
+
+def _undistorted(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray, "H W C"]:
+    upright = _upright(view, image, path)
+    if view.lens is not None:
+        if upright.size != _calibrated_size(view):
+            upright = upright.resize(_calibrated_size(view), Image.Resampling.BOX)
+        upright = _image(undistort(view.lens, np.asarray(upright))[1], upright.mode)
+    size = (view.camera.width, view.camera.height)
+    return np.array(upright if upright.size == size else upright.resize(size, Image.Resampling.BOX))
+
+
+def _calibrated_size(view: View) -> tuple[int, int]:
+    calibrated = view.lens or view.camera
+    return calibrated.width, calibrated.height
+
+
+def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:
+    """Apply the EXIF orientation if SfM did, which the shape of its camera shows, or what is known of the view."""
+    width, height = _calibrated_size(view)
+    turned = ImageOps.exif_transpose(image)
+    for candidate in (turned, image) if view.turned else (image, turned):
+        aspect = candidate.width / candidate.height
+        rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which matters in thumbnails
+        if abs(width - height * aspect) < max(0.01 * width, rounding):
+            return candidate
+    if path != view.image:
+        raise SceneError(
+            f"the mask {path} is {image.width}x{image.height} pixels, but the camera of {view.name} is "
+            f"{width}x{height}: paint it on that photograph"
+        )
+    raise SceneError(
+        f"{path} is {image.width}x{image.height} pixels, but its camera is {width}x{height}: "
+        "the photographs and the cameras do not belong together"
+    )

@@ -1,0 +1,102 @@
+"""Read OBJ, STL and OFF: trimesh loses what follows a cut, and takes negative indices of OBJ from the file's end."""
+
+from __future__ import annotations
+
+import re
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.readers.contents import NO_POINTS, Geometry, drawing, left_out, numbers_in, polygon_triangles
+
+_CURVED = ("curv", "surf", "bsp", "bzp", "cdc", "cdp", "res ")
+
+
+def read_obj(path: Path) -> Geometry:
+    """Read the vertices and faces of a Wavefront OBJ; without faces, its vertices are a cloud.
+
+    Raises:
+        SceneError: it holds lines only.
+        Exception: it is damaged; of any kind.
+    """
+    text = path.read_text("utf-8-sig", errors="replace").replace("\\\n", " ")
+    vertices: list[str] = []
+    faces: list[str] = []
+    above: list[int] = []  # number of vertices before each face
+    curved = lines = 0
+    for line in map(str.lstrip, text.splitlines()):
+        key = line[:2].rstrip()
+        if key == "v":
+            vertices.append(line)
+        elif key in ("f", "fo"):
+            faces.append(line.partition("#")[0].lstrip("fo"))
+            above.append(len(vertices))
+        elif key == "l":
+            lines += 1
+        elif line.startswith(_CURVED):
+            curved += 1
+    left_out(path, curved, curved + len(faces), "elements, which are curves or curved surfaces")
+    if lines and not faces:
+        raise drawing(path)
+    points = np.loadtxt(vertices, usecols=(1, 2, 3), ndmin=2) if vertices else NO_POINTS
+    sizes = np.array([len(face.split()) for face in faces], np.int64)
+    stored = numbers_in(re.sub(r"/\S*", "", " ".join(faces)), int)
+    corners = np.where(stored > 0, stored - 1, stored + np.repeat(np.array(above, np.int64), sizes))
+    if (stored == 0).any() or (corners < 0).any():  # counted from 1, or backwards from the last vertex before the face
+        raise ValueError("a face has a vertex before the first")
+    return Geometry(points, polygon_triangles(points, sizes, corners, path))
+
+
+_STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_START = 84
+
+
+def read_stl(path: Path) -> Geometry:
+    """Read the triangles of a binary or an ASCII STL, of all its solids.
+
+    Raises:
+        ValueError: it is cut off or damaged.
+    """
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) >= _STL_START and len(data) == _STL_START + count * _STL.itemsize:
+        return _soup(np.frombuffer(data, _STL, count, _STL_START)["corners"].astype(np.float64))
+    words = [line.split() for line in data.decode("latin-1").lower().splitlines()]
+    solids, ends, facets = (sum(line[:1] == [word] for line in words) for word in ("solid", "endsolid", "facet"))
+    if not solids or b"\0" in data:
+        raise ValueError(f"its header claims {count} triangles, but it has {len(data)} bytes")
+    corners = np.array([line[1:4] for line in words if line[:1] == ["vertex"]], np.float64).reshape(-1, 3)
+    if solids != ends or len(corners) != 3 * facets:
+        raise ValueError(f"it holds {len(corners)} corners of {facets} triangles, and {ends} ends of {solids} solids")
+    return _soup(corners.reshape(-1, 3, 3))
+
+
+def _soup(corners: Float64[np.ndarray, "F 3 3"]) -> Geometry:
+    return Geometry(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+
+
+def read_off(path: Path) -> Geometry:
+    """Read the vertices and faces of an OFF; colours, normals and texture coordinates may be there.
+
+    Raises:
+        SceneError: it is binary, or has other than three coordinates.
+        Exception: it is damaged; of any kind.
+    """
+    text = re.sub(r"#.*", "", path.read_text("utf-8-sig", errors="replace"))
+    form, _, rest = text.lstrip().partition("OFF")
+    if not re.fullmatch(r"(ST)?C?N?", form) or re.match(r"\s+BINARY", rest):
+        raise SceneError(f"the shell {path} is no OFF of text with three coordinates: export it as PLY or OBJ")
+    lines = [line.split() for line in rest.splitlines() if line.strip()]
+    vertex_count, face_count = (int(word) for word in lines[0][:2])
+    vertices, faces = lines[1 : 1 + vertex_count], lines[1 + vertex_count : 1 + vertex_count + face_count]
+    if (len(vertices), len(faces)) != (vertex_count, face_count):
+        raise ValueError(f"it holds {len(vertices)} of {vertex_count} vertices and {len(faces)} of {face_count} faces")
+    points = np.array([line[:3] for line in vertices], np.float64).reshape(-1, 3)
+    sizes = np.array([int(line[0]) for line in faces], np.int64)
+    corners = [line[1 : 1 + size] for line, size in zip(faces, sizes, strict=True)]
+    if any(len(row) != size for row, size in zip(corners, sizes, strict=True)):
+        raise ValueError("a face has fewer corners than it claims")
+    return Geometry(points, polygon_triangles(points, sizes, np.array(list(chain(*corners)), np.int64), path))

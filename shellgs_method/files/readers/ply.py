@@ -1,0 +1,163 @@
+"""Read PLY: triangles, polygons, triangle strips and points, which trimesh reads without the strips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Shaped
+
+from shellgs_method.files.headers import PlyElement, PlyHeader, read_ply_header
+from shellgs_method.files.readers.contents import (
+    NO_FACES,
+    Geometry,
+    drawing,
+    left_out,
+    numbers_in,
+    polygon_triangles,
+    splats,
+    strip_triangles,
+)
+
+_KNOWN = ("vertex", "face", "tristrips", "edge", "range_grid", "material", "camera")
+_SPLAT = ({"opacity", "scale_0", "rot_0"}, {"packed_position", "packed_rotation"})
+_STRIP_END = -1
+
+
+def read_ply(path: Path) -> Geometry:
+    """Read the vertices, and the triangles of its faces and strips.
+
+    Raises:
+        SceneError: it holds Gaussian splats, or edges without faces.
+        Exception: it is damaged; of any kind.
+    """
+    header = read_ply_header(path)
+    names = {prop.name for element in header.elements for prop in element.properties}
+    if any(splat <= names for splat in _SPLAT):
+        raise splats(path)
+    read = {element.name: columns for element, columns in _elements(path, header) if element.count}
+    if "edge" in read and not read.keys() & {"face", "tristrips"}:
+        raise drawing(path)
+    vertices = np.empty((0, 3))
+    if "vertex" in read:
+        if missing := [axis for axis in "xyz" if axis not in read["vertex"]]:
+            raise ValueError(f"its vertices have {', '.join(read['vertex'])}, but no {missing[0]}")
+        vertices = np.stack([read["vertex"][axis][1].astype(np.float64) for axis in "xyz"], axis=1)
+    faces = [NO_FACES]
+    if "face" in read:
+        faces.append(polygon_triangles(vertices, *_corners(read["face"]), path))
+    if "tristrips" in read:
+        sizes, indices = _corners(read["tristrips"])
+        strips = np.insert(indices.astype(np.int64), np.cumsum(sizes)[:-1], _STRIP_END)
+        faces.append(strip_triangles(strips, strips == _STRIP_END))
+    for element in header.elements:
+        if element.name not in _KNOWN:
+            left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
+    return Geometry(vertices, np.concatenate(faces))
+
+
+def _corners(columns: dict[str, _Column]) -> _Column:
+    name = next((name for name in ("vertex_indices", "vertex_index") if name in columns), None)
+    if name is None:
+        raise ValueError(f"its faces have {', '.join(columns)}, but no vertex_indices")
+    return columns[name]
+
+
+_Column = tuple[Shaped[np.ndarray, " N"], Shaped[np.ndarray, " M"]]
+"""Lengths of the lists of a property, one for each row, and the values of all; of other properties, each is 1."""
+
+
+class _Numbers(Protocol):
+    """The data of a PLY, read from front to back; ``at`` is where, and may be set back."""
+
+    at: int
+
+    def take(self, kind: str, count: int) -> Shaped[np.ndarray, " C"]:
+        """The next ``count`` numbers."""
+        ...
+
+    def table(self, kinds: list[str], rows: int) -> list[Shaped[np.ndarray, " R"]]:
+        """The columns of the next rows, of which each has these types."""
+        ...
+
+
+class _Binary:
+    def __init__(self, data: bytes, order: str, at: int) -> None:
+        self.data, self.order, self.at = data, order, at
+
+    def take(self, kind: str, count: int) -> np.ndarray:
+        if count < 0:
+            raise ValueError("it holds a list of negative length")
+        values = np.frombuffer(self.data, self.order + kind, count, self.at)
+        self.at += values.nbytes
+        return values
+
+    def table(self, kinds: list[str], rows: int) -> list[np.ndarray]:
+        table = np.frombuffer(self.data, [(f"{k}", self.order + kind) for k, kind in enumerate(kinds)], rows, self.at)
+        self.at += table.nbytes
+        return [table[f"{k}"] for k in range(len(kinds))]
+
+
+class _Text:
+    def __init__(self, data: bytes) -> None:
+        self.numbers, self.at = numbers_in(data.decode("latin-1")), 0
+
+    def take(self, kind: str, count: int) -> np.ndarray:
+        values = self.numbers[self.at : self.at + count]
+        if len(values) < count or count < 0:
+            raise ValueError("it holds fewer numbers than its header claims")
+        self.at += count
+        return values if kind.startswith("f") else values.astype(np.int64)
+
+    def table(self, kinds: list[str], rows: int) -> list[np.ndarray]:
+        table = self.take("f8", rows * len(kinds)).reshape(rows, len(kinds))
+        return [table[:, k] if kind.startswith("f") else table[:, k].astype(np.int64) for k, kind in enumerate(kinds)]
+
+
+def _elements(path: Path, header: PlyHeader) -> Iterator[tuple[PlyElement, dict[str, _Column]]]:
+    data, start = path.read_bytes(), header.length
+    numbers: _Numbers = _Text(data[start:]) if header.order is None else _Binary(data, header.order, start)
+    for element in header.elements:
+        yield element, _columns(element, numbers)
+    if isinstance(numbers, _Text) and numbers.at < len(numbers.numbers):
+        raise ValueError(f"it holds {len(numbers.numbers) - numbers.at} numbers more than its header claims")
+
+
+def _columns(element: PlyElement, numbers: _Numbers) -> dict[str, _Column]:
+    """The properties of an element: at once if all lists of a property are as long as its first, else row by row."""
+    if element.count == 0:
+        return {prop.name: (np.empty(0, np.int64), np.empty(0, prop.type)) for prop in element.properties}
+    mark = numbers.at
+    first = {p.name: len(column) for p, column in zip(element.properties, _row(element, numbers), strict=True)}
+    numbers.at = mark
+    kinds: list[str] = []
+    for prop in element.properties:
+        kinds += [prop.type] if prop.counted is None else [prop.counted, *[prop.type] * first[prop.name]]
+    columns: dict[str, _Column] = {}
+    if len(kinds) < 1000:
+        try:
+            table = numbers.table(kinds, element.count)
+            for prop in element.properties:
+                sizes = np.full(element.count, first[prop.name]) if prop.counted is None else table.pop(0)
+                if (sizes != first[prop.name]).any():
+                    break
+                values = [table.pop(0) for _ in range(first[prop.name])]
+                columns[prop.name] = sizes, np.stack(values, axis=1).reshape(-1) if values else np.empty(0, prop.type)
+            else:
+                return columns
+        except ValueError:  # lists of other lengths, which may end earlier
+            pass
+    numbers.at = mark
+    rows = [_row(element, numbers) for _ in range(element.count)]
+    for prop, lists in zip(element.properties, zip(*rows, strict=True), strict=True):
+        columns[prop.name] = np.array([len(values) for values in lists]), np.concatenate(lists)
+    return columns
+
+
+def _row(element: PlyElement, numbers: _Numbers) -> list[np.ndarray]:
+    return [
+        numbers.take(prop.type, 1 if prop.counted is None else int(numbers.take(prop.counted, 1)[0]))
+        for prop in element.properties
+    ]

@@ -1,0 +1,155 @@
+"""Read point clouds of text: columns with or without a header, a number of points, and separators."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections.abc import Iterator
+from itertools import chain, islice
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.readers.contents import NO_POINTS, Geometry
+
+_COMMENTS = ("#", "//")
+_BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_SAMPLE = 100  # lines that decide on the layout
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_WHOLE = re.compile(r"[-+]?\d+")
+
+
+def read_text_cloud(path: Path) -> Geometry:
+    """Read X, Y and Z of each line: the first three columns, or those that a header names so, also in a comment.
+
+    Columns are separated by spaces, tabs, commas or semicolons. A line with one number counts the points after it.
+    Where the first column numbers or names the points, X is the second.
+
+    Raises:
+        SceneError: the first lines are no such columns.
+        ValueError: a later line is not, or points are missing.
+    """
+    with path.open("rb") as file:
+        start = file.read(4)
+    encoding = next((name for bom, name in _BOMS.items() if start.startswith(bom)), "utf-8")
+    with path.open(encoding=encoding, errors="replace") as file:
+        lines = _Lines(file)
+        first = list(islice(lines, _SAMPLE))
+        if not first:
+            return Geometry(NO_POINTS)
+        separator = _separator(first, path)
+        rows = [_split(line, separator) for line in first]
+        named = not any(map(_is_number, rows[0]))
+        header = _split(lines.header, separator)
+        if named:
+            columns = _named(rows, first[0], path)
+        elif len(header) == len(rows[0]) and _axes(header):
+            columns = _named([header, *rows], lines.header, path)
+        else:
+            columns = _columns(rows, first[0], path)
+        data = chain(first[1:] if named else first, lines)
+        points = np.loadtxt(data, usecols=columns, comments=None, ndmin=2, delimiter=separator, quotechar='"')
+    if lines.claimed and lines.claimed != len(points):
+        raise ValueError(f"it holds {len(points)} of {lines.claimed} points")
+    return Geometry(points)
+
+
+class _Lines:
+    """The lines of a file, without comments, empty lines, and those that count points.
+
+    Attributes:
+        claimed: how many points the lines so far have counted.
+        header: last comment above the points that names X, Y and Z; empty if none does.
+    """
+
+    def __init__(self, file: TextIO) -> None:
+        self.file, self.claimed, self.header = file, 0, ""
+
+    def __iter__(self) -> Iterator[str]:
+        begun = False
+        for line in self.file:
+            line = line.strip()
+            if not line or line.startswith(_COMMENTS):
+                comment = line.lstrip("#/ ")
+                if not begun and _axes(re.split(r"[\s,;]+", comment)):
+                    self.header = comment
+                continue
+            begun = True
+            if _WHOLE.fullmatch(line):
+                self.claimed += int(line)
+                continue
+            yield line
+
+
+def _separator(lines: list[str], path: Path) -> str | None:
+    """What separates the columns of the last line; None for spaces."""
+    line = lines[-1]
+    other = ";" if ";" in line else None
+    if any(_DECIMAL_COMMA.fullmatch(word) for word in line.replace(";", " ").split()) and (
+        other or len(line.split()) > 2
+    ):
+        raise SceneError(f"the shell {path} has decimal commas ({_shown(line)}): export it with decimal points")
+    return other or ("," if "," in line else None)
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    """The words of a line; a quoted one may hold separators, and there may be empty ones between them."""
+    if separator is None:
+        return line.split()
+    return [word.strip() for word in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _axes(header: list[str]) -> list[int]:
+    """Columns that a header calls X, Y and Z, with a unit or without; none if it does not name each once."""
+    names = [re.split(r"[^a-z]", name.lower().strip("\"' "))[0] for name in header]
+    return [names.index(axis) for axis in "xyz"] if all(names.count(axis) == 1 for axis in "xyz") else []
+
+
+def _named(rows: list[list[str]], line: str, path: Path) -> list[int]:
+    """Columns that the first row calls X, Y and Z."""
+    names, columns = rows[0], _axes(rows[0])
+    if not columns:
+        raise SceneError(
+            f"the shell {path} cannot be read: it begins with {_shown(line)}, which does not name one column each of "
+            "X, Y and Z: name them in that line, or delete it if they are the first three columns"
+        )
+    for row in rows[1:]:
+        if any(row[len(names) :]) and not all(map(_is_number, row[: max(columns)])):  # words of one name, perhaps
+            raise SceneError(
+                f"the shell {path} cannot be read: its header names {len(names)} columns, and a line has {len(row)} "
+                f"({_shown(' '.join(row))}): name them all, and quote names that hold separators"
+            )
+    return columns
+
+
+def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
+    """The first three columns, or those after one that numbers or names the points."""
+    width = min(len(row) for row in rows)
+    numeric = [all(_is_number(row[k]) for row in rows) for k in range(min(width, 4))]
+    if width >= 4 and all(numeric[1:]):
+        whole = [all(_WHOLE.fullmatch(row[k]) for row in rows) for k in range(4)]
+        varies = len({row[0] for row in rows}) > 1
+        if not numeric[0] or (varies and whole[0] and not any(whole[1:])):
+            notice(f"{path}: its first column ({rows[0][0]}) is taken for the points' numbers, and X for the second.")
+            return [1, 2, 3]
+    if width < 3 or not all(numeric[:3]):
+        raise SceneError(
+            f"the shell {path} cannot be read: it begins with {_shown(line)} where X, Y and Z are expected: export "
+            "it with these in each line, after a line that names the columns, if they are not the first three"
+        )
+    return [0, 1, 2]
+
+
+def _shown(line: str) -> str:
+    return repr(line if len(line) <= 60 else f"{line[:57]}...")

@@ -1,0 +1,113 @@
+"""Points from structure from motion, and the views that observe them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float64, Int, UInt8
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files import colmap, transforms
+from shellgs_method.files.photographs import View
+from shellgs_method.files.scene import SceneLayout
+from shellgs_method.geometry.camera import in_view
+from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.precision import Step, cloud_step, warn_of_coarse
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """SfM points of a scene.
+
+    Attributes:
+        positions: in the scene's own frame and units.
+        observed: indices of the points that each view observes, by the view's name; None where unknown, as with a
+            transforms.json.
+        colours: RGB, where known.
+        called: the points and their file, for messages.
+    """
+
+    positions: Float64[np.ndarray, "N 3"]
+    observed: Mapping[str, Int[np.ndarray, " M"]] | None = None
+    colours: UInt8[np.ndarray, "N 3"] | None = None
+    called: str = "the SfM points"
+
+    @cached_property
+    def step(self) -> Step:
+        """Step of the positions as they are stored."""
+        return cloud_step(self.positions)
+
+    def seen_in(self, view: View) -> tuple[Float64[np.ndarray, "M 2"], Float64[np.ndarray, " M"]]:
+        """Pixels and z-depths of the view's points: those it observes, or else all that project into it.
+
+        The pixels are projections into the undistorted camera rather than the features that were matched in the
+        distorted photograph. Without observations, points hidden behind a surface are included.
+        """
+        _, pixels, depth = in_view(view.camera, self.positions[self.of(view)])
+        return pixels, depth
+
+    def of(self, view: View) -> Int[np.ndarray, " M"] | slice:
+        """Indices of the points that a view observes; all where that is unknown."""
+        return slice(None) if self.observed is None else self.observed.get(view.name, np.empty(0, int))
+
+
+def read_sparse_points(layout: SceneLayout) -> SparsePoints:
+    """Read the SfM points of a scene: its COLMAP model's with tracks, or the cloud named in transforms.json.
+
+    Raises:
+        SceneError: the scene has no points, or their file is damaged.
+    """
+    points = find_sparse_points(layout)
+    if len(points.positions) == 0:
+        raise SceneError(
+            f"{layout.data} has no SfM points, which monocular depth and the shell are compared with: put points3D.bin "
+            "beside the COLMAP cameras, or name a cloud as ply_file_path in transforms.json"
+        )
+    return points
+
+
+def find_sparse_points(layout: SceneLayout) -> SparsePoints:
+    """Read the SfM points of a scene, if any.
+
+    Points that are NaN, infinite or absurdly far away are left out, with a warning. Coordinates that are stored too
+    coarsely are warned of.
+
+    Raises:
+        SceneError: their file is damaged.
+    """
+    folder = layout.colmap_folder()
+    if folder is None:
+        positions, colours = transforms.read_cloud(layout.data)
+        kept = _sound(positions, layout)
+        called = f"the SfM points that {layout.data / transforms.NAME} names as ply_file_path"
+        return _warned(SparsePoints(positions[kept], None, colours[kept], called), layout)
+    points, names = colmap.read_points(layout.data, folder, layout.images_path)
+    kept = _sound(points.positions, layout)
+    observed: dict[str, list[int]] = {name: [] for name in names.values()}
+    for index, point in enumerate(kept):
+        for image in set(points.observers[point].tolist()) & names.keys():
+            observed[names[image]].append(index)
+    positions, colours = points.positions[kept], points.colours[kept]
+    seen = {name: np.array(of, dtype=int) for name, of in observed.items()} if any(observed.values()) else None
+    return _warned(SparsePoints(positions, seen, colours, f"the SfM points of {layout.data / folder}"), layout)
+
+
+def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:
+    """The points, after a warning if they are stored too coarsely."""
+    if len(points.positions):
+        warn_of_coarse(points.step, points.positions, f"the SfM points of {layout.data}")
+    return points
+
+
+def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:
+    """Indices of the points that are finite and near the others."""
+    near = sound(positions)
+    if not near.all():
+        notice(
+            f"{(~near).sum()} of {len(positions)} SfM points of {layout.data} are NaN, infinite or absurdly far away, "
+            "and are left out."
+        )
+    return np.flatnonzero(near)

@@ -1,0 +1,148 @@
+"""Read nerfstudio's transforms.json: cameras, and the point cloud that it names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import read_json
+from shellgs_method.files.frames import Frame, Recording, frame, in_order
+from shellgs_method.files.headers import read_ply_header
+from shellgs_method.files.paths import NamedFiles
+from shellgs_method.geometry.lens import COEFFICIENTS
+
+NAME = "transforms.json"
+GREY = 128
+"""Colour of points whose file has none."""
+# Applied to COLMAP's frame by old versions of ns-process-data, without being recorded.
+_UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *COEFFICIENTS)
+
+
+def read_recording(scene: Path, images_path: Path) -> Recording:
+    """Read the photographs listed in the scene's transforms.json.
+
+    Args:
+        scene: the scene's folder.
+        images_path: folder in it in which photographs are looked for that are not where the file says.
+
+    Raises:
+        SceneError: the file is damaged, or a camera is invalid.
+    """
+    path = scene / NAME
+    meta = read_json(path)
+    listed_frames = meta.get("frames")
+    if not isinstance(listed_frames, list):
+        raise SceneError(f"{path} has no list of frames: make it again")
+    applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
+    frames = [_frame(files, each, meta, applied, f"{path}, frame {k}") for k, each in enumerate(listed_frames, start=1)]
+    listed = {s: _names(meta[f"{s}_filenames"], files, path) for s in _SPLITS if f"{s}_filenames" in meta}
+    files.tell_what_is_elsewhere()
+    orientation = meta.get("orientation_override")
+    if orientation not in (None, "pca", "up", "vertical", "none"):
+        raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
+    return Recording(in_order(frames, str(path)), applied, listed, orientation)
+
+
+_SPLITS = ("train", "val", "test")
+
+
+def find_cloud(scene: Path) -> Path | None:
+    """Path of the point cloud named in transforms.json, which may not exist; None if it names none.
+
+    Raises:
+        SceneError: the path leads out of the scene.
+    """
+    name, where = read_json(scene / NAME).get("ply_file_path"), scene / NAME
+    return None if name is None else NamedFiles(scene, Path(), where).other(str(name), str(where))
+
+
+def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
+    """Positions, in the scene's frame, and colours of the point cloud named in transforms.json; empty if it names none.
+
+    Raises:
+        FileNotFoundError: the cloud is missing.
+        SceneError: it is damaged.
+    """
+    path = find_cloud(scene)
+    if path is None:
+        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}, the SfM points that {scene / NAME} names, does not exist")
+    import trimesh
+
+    try:
+        read_ply_header(path)
+        cloud = trimesh.load(path, process=False)
+        positions = np.asarray(cloud.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+        colours = np.asarray(cloud.visual.vertex_colors, np.uint8)  # pyright: ignore[reportAttributeAccessIssue]
+    except Exception as error:  # trimesh raises errors of any kind for a damaged file
+        reason = " ".join(str(error).split())
+        raise SceneError(f"the SfM points {path} cannot be read ({reason}): make them again") from error
+    undo = np.linalg.inv(_applied(read_json(scene / NAME), scene))
+    colours = colours[:, :3] if len(colours) == len(positions) else np.full(positions.shape, GREY, np.uint8)
+    return positions @ undo[:3, :3].T + undo[:3, 3], colours
+
+
+def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Frame:
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        raise SceneError(f"{where}: there is no file_path that names its photograph")
+    try:
+        pose = np.array(entry.get("transform_matrix"), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape != (4, 4):
+        raise SceneError(f"{where} ({entry['file_path']}): its transform_matrix is not a 4x4 matrix of numbers")
+    lens = {key: source[key] for key in _LENS for source in (entry, meta) if key in source}
+    for key in COEFFICIENTS if _has_distortion(meta) else ():  # as in nerfstudio, the file's own take precedence
+        lens.pop(key, None)
+    lens |= _distortion(meta if _has_distortion(meta) else entry, where)
+    fisheye = entry.get("is_fisheye", meta.get("is_fisheye"))
+    if fisheye is True and lens.get("camera_model") != "OPENCV_FISHEYE":  # instant-ngp's
+        raise SceneError(
+            f"{where}: is_fisheye is set, which counts only with the camera_model OPENCV_FISHEYE: set it too"
+        )
+    name = files.photograph(entry["file_path"], where).relative_to(files.scene).as_posix()
+    found = frame(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
+    if entry.get("mask_path") is None:
+        return found
+    return replace(found, mask=files.other(str(entry["mask_path"]), where))
+
+
+def _has_distortion(meta: Mapping[str, Any]) -> bool:
+    return any(key in meta for key in (*COEFFICIENTS, "distortion_params"))
+
+
+def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
+    listed = source.get("distortion_params")
+    if listed is None:
+        return {key: source[key] for key in COEFFICIENTS if key in source}
+    if not isinstance(listed, list) or len(listed) != len(COEFFICIENTS):
+        raise SceneError(f"{where}: distortion_params are {', '.join(COEFFICIENTS)}, not {str(listed)[:40]}")
+    return dict(zip(COEFFICIENTS, listed, strict=True))
+
+
+def _applied(meta: Mapping[str, Any], scene: Path) -> Float64[np.ndarray, "4 4"]:
+    """Transform applied to the scene's own frame before the poses were written."""
+    applied = meta.get("applied_transform", _UNRECORDED if (scene / "colmap/sparse/0").exists() else np.eye(4)[:3])
+    try:
+        matrix = np.array(applied, dtype=np.float64)[:3]
+    except (TypeError, ValueError, OverflowError, IndexError):
+        matrix = np.empty(0)
+    gram = matrix[:, :3].T @ matrix[:, :3] if matrix.shape == (3, 4) else np.zeros((3, 3))
+    if not np.isfinite(matrix).all() or not np.abs(gram - np.eye(3)).max() < 1e-3:
+        raise SceneError(f"{scene / NAME}: its applied_transform is not a 3x4 matrix of a rotation and a translation")
+    return np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+
+
+def _names(listed: Any, files: NamedFiles, path: Path) -> set[str]:
+    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+        raise SceneError(f"{path}: a list of filenames holds something other than names")
+    return {files.photograph(name, f"{path}, a list").relative_to(files.scene).as_posix() for name in listed}

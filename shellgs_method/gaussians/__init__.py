@@ -1,0 +1,1 @@
+"""Which Gaussians there are and when they change."""

@@ -1,0 +1,193 @@
+"""Initial points on the shell, as dense as the photographs resolve, and on a skybox."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from torch import Tensor
+
+from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.nearest import point_tree
+from shellgs_method.geometry.reference import Reference
+from shellgs_method.geometry.voxels import cell_means, voxel_cells
+
+GRAZING = 0.2
+"""Smallest cosine of the shell's normal and the ray of a sampled pixel: below it, colours and depth smear."""
+MAX_SAMPLES = 8_000_000
+"""Maximum number of pixels of all views that seeds are made from."""
+SKYBOX_RADIUS = 1.5
+"""Radius of the skybox, in units of the 99th percentile of the SfM points' distances from the cameras' centre. A radius
+of ten medians cost 0.8 dB on Herz-Jesu, where most of what is off the shell is near."""
+SKYBOX_OVERLAP = 1.6
+"""Size of the skybox's Gaussians against that of other seeds of the same spacing; smaller ones leave gaps."""
+MAX_SKY_PIXELS = 1_000_000
+"""Maximum number of pixels of all views that colour the skybox."""
+PIXELS_PER_COLOUR = 32
+"""Number of pixels, nearest in direction, whose median colours a point of the skybox."""
+
+
+class SeededView(NamedTuple):
+    """A training view to make seeds from."""
+
+    camera: Camera
+    image: Float[Tensor, "H W 3"]
+    """Colours in [0, 1]."""
+    shell: Reference
+    """Shell in units of the camera's world, or what photographs show in front of it; the mask is where seeds may be."""
+
+
+class SkyView(NamedTuple):
+    """A training view to colour the skybox from."""
+
+    camera: Camera
+    image: Float[Tensor, "H W 3"]
+    """Colours in [0, 1]."""
+    mask: Bool[Tensor, "H W 1"]
+    """Pixels that may show what is far away."""
+
+
+class Seeds(NamedTuple):
+    """Initial points that lie on a surface."""
+
+    points: Float[ndarray, "N 3"]
+    normals: Float[ndarray, "N 3"]
+    """Unit normals in the world."""
+    colours: Float[ndarray, "N 3"]
+    """Median over the views that show the point, in [0, 1]."""
+    spacing: Float[ndarray, " N"]
+    """Distance to neighbouring seeds, in the units of the points."""
+
+
+class _Samples(NamedTuple):
+    points: Float[ndarray, "S 3"]
+    normals: Float[ndarray, "S 3"]
+    colours: Float[ndarray, "S 3"]
+    footprint: Float[ndarray, " S"]  # size of a pixel on the shell, as if seen from the front
+    view: Int[ndarray, " S"]
+
+    def select(self, kept: Bool[ndarray, " S"]) -> _Samples:
+        return _Samples(*(each[kept] for each in self))
+
+
+def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, most: int) -> Seeds:
+    """Make seeds about ``spacing`` pixels apart in the view closest to them.
+
+    The pixels of all views are lifted to the shell and thinned to one point per voxel. Voxel sides are the smallest one
+    times powers of two: surface seen from close up is thinned first, finely, then what farther views add.
+
+    Args:
+        views: training views.
+        num_pixels: number of pixels of all views together.
+        spacing: distance between seeds in pixels.
+        most: maximum number of seeds; the spacing is increased to stay below it.
+
+    Returns:
+        Seeds; none if no view has a pixel on the shell that is neither masked nor grazing.
+    """
+    stride = max(1, int(np.ceil((num_pixels / MAX_SAMPLES) ** 0.5)))
+    lifted = [_lift(view, index, stride) for index, view in enumerate(views)]
+    if not any(len(samples.points) for samples in lifted):
+        return Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    samples = _Samples(*map(np.concatenate, zip(*lifted, strict=True)))
+    while True:
+        points, normals, apart = _thinned(samples, spacing)
+        if len(points) <= most:
+            break
+        spacing *= 1.05 * (len(points) / most) ** 0.5
+    distance, nearest = map(np.asarray, point_tree(points).query(samples.points, workers=-1))
+    near = distance < apart[nearest]
+    by_view, pairs = np.unique(nearest[near] * (samples.view.max() + 1) + samples.view[near], return_inverse=True)
+    shown = by_view // (samples.view.max() + 1)  # the seed of each (seed, view) pair
+    colours, known = _medians(cell_means(samples.colours[near], pairs), shown, len(points))
+    return Seeds(points[known], normals[known], colours[known], apart[known])
+
+
+def skybox_seeds(views: Iterable[SkyView], num_pixels: int, sfm_points: Float[ndarray, "P 3"], count: int) -> Seeds:
+    """Make seeds all around the scene, for the sky and what is too far for SfM points.
+
+    They are spread evenly over a sphere around the cameras' centre; those that no training view shows are removed after
+    training, as all such Gaussians are. The skybox is that of Hierarchical 3D Gaussians (Kerbl et al. 2024), with
+    colours from the photographs.
+
+    Args:
+        views: training views.
+        num_pixels: number of pixels of all views together.
+        sfm_points: points in the world, which the sphere encloses.
+        count: number of seeds.
+
+    Returns:
+        Seeds; none if no view has a pixel that may show what is far away.
+    """
+    stride = max(1, int(np.ceil((num_pixels / MAX_SKY_PIXELS) ** 0.5)))
+    cameras, directions, colours = [], [np.empty((0, 3))], [np.empty((0, 3))]
+    for view in views:
+        mask, image, rays = (each[::stride, ::stride] for each in (view.mask[..., 0], view.image, view.camera.rays()))
+        rays = torch.nn.functional.normalize(rays[mask], dim=-1) @ view.camera.viewmat[:3, :3]
+        cameras.append(view.camera)
+        directions.append(rays.double().cpu().numpy())
+        colours.append(image[mask].double().cpu().numpy())
+    directions, colours = np.concatenate(directions), np.concatenate(colours)
+    if not len(directions):
+        return Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    centre, towards = positions(cameras).mean(axis=0), _fibonacci_sphere(count)
+    radius = SKYBOX_RADIUS * np.percentile(np.linalg.norm(sfm_points - centre, axis=1), 99)
+    k = min(PIXELS_PER_COLOUR, len(directions))
+    _, nearest = point_tree(directions).query(towards, k, workers=-1)
+    spacing = np.full(count, SKYBOX_OVERLAP * radius * np.sqrt(4 * np.pi / count))
+    return Seeds(centre + radius * towards, -towards, np.median(colours[nearest.reshape(count, k)], axis=1), spacing)
+
+
+def _fibonacci_sphere(count: int) -> Float[ndarray, "N 3"]:
+    """Unit vectors spread evenly over the sphere (Swinbank and Purser 2006)."""
+    i = np.arange(count)
+    z, turn = 1 - (2 * i + 1) / count, np.pi * (3 - np.sqrt(5)) * i
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+
+
+def _lift(view: SeededView, index: int, stride: int) -> _Samples:
+    """Lift every ``stride``-th pixel of a view, in both directions, to the shell."""
+    depth, normal, mask = (each[::stride, ::stride] for each in view.shell)
+    rays, image = view.camera.rays()[::stride, ::stride], view.image[::stride, ::stride]
+    facing = -(normal * torch.nn.functional.normalize(rays, dim=-1)).sum(dim=-1)
+    kept = mask[..., 0] & (facing > GRAZING)
+    rotation = view.camera.viewmat[:3, :3]
+    points = (depth * rays)[kept] @ rotation + view.camera.position
+    focal = view.camera.K[[0, 1], [0, 1]].mean()
+    fields = points, normal[kept] @ rotation, image[kept], (depth / focal)[kept].squeeze(-1)
+    points, normals, colours, footprint = (each.double().cpu().numpy() for each in fields)
+    return _Samples(points, normals, colours, footprint, np.full(len(points), index))
+
+
+def _thinned(
+    samples: _Samples, spacing: float
+) -> tuple[Float[ndarray, "N 3"], Float[ndarray, "N 3"], Float[ndarray, " N"]]:
+    """Thinned points, their unit normals, and the voxel side of each."""
+    wanted = spacing * samples.footprint
+    finest = np.percentile(wanted, 1)
+    levels = np.floor(np.log2(wanted / finest)).clip(0).astype(int)
+    points, normals, apart = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
+    for level in np.unique(levels):
+        voxel = finest * 2.0**level
+        new = samples.select(levels == level)
+        if len(points):
+            new = new.select(point_tree(points).query(new.points, distance_upper_bound=voxel, workers=-1)[0] == np.inf)
+        means = cell_means(np.concatenate([new.points, new.normals], axis=1), voxel_cells(new.points, voxel))
+        points, normals = np.concatenate([points, means[:, :3]]), np.concatenate([normals, means[:, 3:]])
+        apart = np.concatenate([apart, np.full(len(means), voxel)])
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12), apart
+
+
+def _medians(
+    values: Float[ndarray, "S 3"], groups: Int[ndarray, " S"], num_groups: int
+) -> tuple[Float[ndarray, "G 3"], Bool[ndarray, " G"]]:
+    """Median of each group's values per channel, and which groups have values."""
+    counts = np.bincount(groups, minlength=num_groups)
+    middle = (np.cumsum(counts) - counts + (counts - 1) // 2).clip(0, len(values) - 1)
+    medians = [channel[np.lexsort((channel, groups))][middle] for channel in values.T]
+    return np.stack(medians, axis=1), counts > 0

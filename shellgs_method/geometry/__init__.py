@@ -1,0 +1,1 @@
+"""Plain geometry of the world: cameras, similarities, planes, triangles, nearest points, voxels."""

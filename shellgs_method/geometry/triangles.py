@@ -1,0 +1,118 @@
+"""Ray casting against triangles and distances from them: Embree, through Open3D."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
+
+from shellgs_method.machine.open3d import import_open3d
+
+_FEW = 2000
+"""Number of points below which waking other threads costs more than it saves, many times over on busy cores."""
+
+
+class Hits(NamedTuple):
+    """First hits of rays.
+
+    Attributes:
+        t: multiple of the ray's direction at the hit; inf where the ray misses.
+        triangle: index of the triangle; -1 where the ray misses.
+        normal: unit normal of the triangle, by its winding; 0 where the ray misses.
+    """
+
+    t: Float32[np.ndarray, " *N"]
+    triangle: Int32[np.ndarray, " *N"]
+    normal: Float32[np.ndarray, "*N 3"]
+
+
+class Closest(NamedTuple):
+    """Points of the surface that are nearest to given points.
+
+    Attributes:
+        point: the nearest point.
+        triangle: index of its triangle.
+        normal: unit normal of the triangle, by its winding.
+    """
+
+    point: Float32[np.ndarray, "N 3"]
+    triangle: Int32[np.ndarray, " N"]
+    normal: Float32[np.ndarray, "N 3"]
+
+
+class Triangles:
+    """Triangles prepared for queries.
+
+    Embree computes in float32: coordinates must be relative to an origin near the triangles.
+
+    Args:
+        vertices: in any unit.
+        faces: indices of three vertices each.
+
+    Attributes:
+        scene: Open3D's ray casting scene.
+
+    Raises:
+        ImportError: Open3D cannot be loaded.
+    """
+
+    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
+        o3d = import_open3d()
+        self._tensor = o3d.core.Tensor.from_numpy
+        self.scene = o3d.t.geometry.RaycastingScene()
+        self.scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices, np.float32)),
+            self._tensor(np.ascontiguousarray(faces, np.uint32)),
+        )
+
+    def cast_rays(self, rays: Float32[np.ndarray, "*N 6"]) -> Hits:
+        """First hits of rays, made by :func:`rays_from`."""
+        answer = self.scene.cast_rays(self._tensor(rays))
+        return Hits(answer["t_hit"].numpy(), _index(answer), answer["primitive_normals"].numpy())
+
+    def blocked(self, rays: Float32[np.ndarray, "*N 6"]) -> Bool[np.ndarray, " *N"]:
+        """Whether rays hit anything at all."""
+        return self.scene.test_occlusions(self._tensor(rays)).numpy()
+
+    def closest(self, points: Float[np.ndarray, "N 3"]) -> Closest:
+        """The nearest point of the surface to each point."""
+        threads = 1 if len(points) < _FEW else 0  # 0: all
+        answer = self.scene.compute_closest_points(self._tensor(np.ascontiguousarray(points, np.float32)), threads)
+        return Closest(answer["points"].numpy(), _index(answer), answer["primitive_normals"].numpy())
+
+    def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
+        """Unsigned distance of each point from the surface."""
+        return self.scene.compute_distance(self._tensor(np.ascontiguousarray(points, np.float32))).numpy()
+
+
+def _index(answer) -> Int32[np.ndarray, " *N"]:
+    """Triangles of an answer of Open3D's, which marks a miss by 2³² - 1: as signed integers, without a copy, by -1."""
+    return answer["primitive_ids"].numpy().view(np.int32)
+
+
+def area_vectors(vertices: Float64[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float64[np.ndarray, "F 3"]:
+    """Normals of triangles, by their winding, with the triangles' areas as lengths."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    vectors = np.cross(b - a, c - a)
+    vectors /= 2  # in place: shells have millions of triangles
+    return vectors
+
+
+def sampled(
+    vertices: Float64[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], areas: Float64[np.ndarray, " F"], count: int
+) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
+    """Random points on triangles, uniform by area, and the triangle of each; the same in each call."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(areas), count, p=areas / areas.sum())
+    weights = rng.dirichlet(np.ones(3), count)
+    return np.einsum("nk,nkd->nd", weights, vertices[faces[chosen]]), chosen
+
+
+def rays_from(
+    origins: Float[np.ndarray, "*#N 3"], directions: Float[np.ndarray, "*#N 3"]
+) -> Float32[np.ndarray, "*N 6"]:
+    """Origins and directions of rays side by side, in float32; both are broadcast."""
+    rays = np.empty((*np.broadcast_shapes(origins.shape, directions.shape)[:-1], 6), np.float32)
+    rays[..., :3], rays[..., 3:] = origins, directions
+    return rays

@@ -1,0 +1,1 @@
+"""Start runs: here, or on a Ray cluster."""

@@ -1,0 +1,1 @@
+"""What this machine can run: compiled kernels, threads, memory, optional packages."""

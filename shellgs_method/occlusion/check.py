@@ -1,0 +1,247 @@
+"""Make maps of where a scene's photographs confirm or contradict its shell."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from rich.progress import track
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint
+from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.machine.threads import workers
+from shellgs_method.occlusion.colours import ColourModel
+from shellgs_method.occlusion.contradiction import (
+    ALONE,
+    CONFIRMED,
+    CONTRADICTED,
+    OFFSETS_BEHIND,
+    REFLECTED,
+    ShellView,
+    Sweep,
+    agreement,
+    sides,
+    sweep,
+)
+
+MAX_SIZE = 640
+"""Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
+NEIGHBOURS = 6
+"""Neighbours on either side of a view that are compared with it."""
+VERSION = 8
+"""Version of the maps: maps of another version are made again."""
+
+_COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
+
+
+@dataclass(frozen=True)
+class CheckSummary:
+    """Summary of :func:`check_views`.
+
+    Attributes:
+        checked: number of views whose map was made.
+        skipped: number of views that already had a map.
+        contradicted: share of the shell's pixels in all views that show something else.
+        seconds: wall time.
+    """
+
+    checked: int
+    skipped: int
+    contradicted: float
+    seconds: float
+
+
+def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -> CheckSummary:
+    """Compare the photographs on the shell and in front of it, and store the maps in ``scene/cues/checked``.
+
+    The maps are those that :class:`~shellgs_method.files.cue_maps.Findings` decodes. Photographs are inconclusive on
+    plain or reflecting walls, and where few views overlap.
+
+    Held-out photographs are compared with the training photographs, but not the other way round, so that the maps of
+    training views contain nothing of the held-out ones.
+
+    Args:
+        scene: the scene's folder.
+        views: the photographs, with full-size cameras.
+        held_out: names of the held-out views.
+
+    Raises:
+        FileNotFoundError: the scene has no shell maps.
+        SceneError: a photograph or a map cannot be read.
+    """
+    start = time.monotonic()
+    shell = CueMaps.open(scene, "shell")
+    inputs = _digest(views, held_out)
+    maps = CueMaps.create(
+        scene,
+        "checked",
+        command=shell.manifest.command,
+        sources=[path for source in shell.manifest.sources if (path := scene / source).exists()],
+        revisions={"photographs": inputs, "check": str(VERSION)},
+        metres_per_unit=shell.manifest.metres_per_unit,
+        max_image_size=shell.manifest.max_image_size,
+    )
+    views = [view for view in views if shell.record(view.name)]
+    cameras = {view.name: view.camera.shrunk(shell.manifest.max_image_size) for view in views}
+    missing = [view for view in views if not maps.current(view.name, cameras[view.name])]
+    if missing:
+        training = _TrainingViews.of(
+            [view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}"
+        )
+
+        def compare(view: View) -> CueMap:
+            return training.compare(view, shell.require(view.name, cameras[view.name]))
+
+        with workers() as pool:
+            made = track(pool.map(compare, missing), "comparing the photographs", len(missing))
+            for view, cue in zip(missing, made, strict=True):
+                maps.write(view.name, cue, cameras[view.name])
+    for unfinished in maps.folder.glob(".*/"):
+        shutil.rmtree(unfinished)
+    records = [(shell.record(view.name), maps.record(view.name)) for view in views]
+    supported = sum(on_shell.supported for on_shell, _ in records if on_shell)
+    contradicted = sum(occluded.supported for _, occluded in records if occluded)
+    return CheckSummary(
+        len(missing), len(views) - len(missing), contradicted / max(supported, 1e-9), time.monotonic() - start
+    )
+
+
+@dataclass(frozen=True)
+class _TrainingViews:
+    """The training views, their sweeps, and the colours in front of the shell and on it."""
+
+    views: dict[str, ShellView]
+    sweeps: dict[str, Sweep]
+    colours: ColourModel
+
+    @classmethod
+    def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
+        """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
+        size = shell.manifest.max_image_size
+        shell_views = {
+            view.name: _shell_view(view, shell.require(view.name, view.camera.shrunk(size))) for view in views
+        }
+        files = {name: unfinished / f"{index}.npy" for index, name in enumerate(shell_views)}
+        missing = [name for name, file in files.items() if not file.is_file()]
+
+        def look(name: str) -> Sweep:
+            return sweep(shell_views[name], [view for other, view in shell_views.items() if other != name])
+
+        unfinished.mkdir(exist_ok=True)
+        with workers() as pool:
+            made = track(pool.map(look, missing), "looking before the shell", len(missing), disable=not missing)
+            for name, found in zip(missing, made, strict=True):
+                content = io.BytesIO()  # on a full disk, numpy's own writing raises an error that does not say so
+                np.save(content, torch.stack(found).numpy(), allow_pickle=False)
+                with atomic_write(files[name]) as stream:
+                    stream.write(content.getvalue())
+        sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
+        return cls(shell_views, sweeps, ColourModel(shell_views.values(), sweeps.values()))
+
+    def compare(self, view: View, cue: CueMap) -> CueMap:
+        """Make the map of a view."""
+        if view.name in self.views:
+            seen, found = self.views[view.name], self.sweeps[view.name]
+        else:
+            seen = _shell_view(view, cue)
+            found = sweep(seen, list(self.views.values()))
+        names = self._neighbours(seen)
+        others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
+        agreed = agreement(seen, found, others, found_there)
+        coloured = agreed.score + _COLOUR * (self.colours.log_ratio(seen.image) - _NEUTRAL)
+        size = cue.depth.shape
+        hit = cue.depth > 0
+        if seen.kept is not None:
+            hit = hit & (_nearest(seen.kept.float(), size).numpy() > 0)
+        score, alone = (_resized(scores, size).numpy() for scores in (coloured, agreed.alone))
+        beyond = _resized(agreed.beyond.float(), size).numpy() > 0.5
+        static, moved = _told_apart((score > CONTRADICTED) & ~beyond, (alone > ALONE) & ~beyond)
+        hidden = static | moved | beyond
+        confirmed = _resized(found.score.float(), size).numpy() < CONFIRMED
+        score_behind, farther = self._behind(seen, size)
+        kinds = [static, beyond, moved, score_behind > REFLECTED, confirmed]
+        depth = cue.depth * np.select(kinds, [_relative_depth(found, size), 2.0, 1.0, farther, 1.0], 0.0)
+        return CueMap(np.where(hit, depth, 0).astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
+
+    def _behind(
+        self, seen: ShellView, size: tuple[int, ...]
+    ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+        """Score of the best depth behind the shell, and this depth relative to the shell's."""
+        found = sweep(seen, [view for view in self.views.values() if view is not seen], OFFSETS_BEHIND)
+        return _resized(found.score.float(), size).numpy(), _relative_depth(found, size)
+
+    def _neighbours(self, seen: ShellView) -> list[str]:
+        """Names of the nearest training views on either side that look in about the same direction."""
+        if not (seen.depth > 0).any():
+            return []
+        reach = 0.9 * float(seen.depth[seen.depth > 0].median())
+        names = [name for name, other in self.views.items() if other is not seen]
+        found = sides(seen.camera, [self.views[name].camera for name in names])
+        near = [sorted(each for each in side if each[0] < reach)[:NEIGHBOURS] for side in found]
+        return [names[index] for side in near for _, index in side]
+
+
+def _told_apart(
+    static: Bool[np.ndarray, "h w"], alone: Bool[np.ndarray, "h w"]
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Masks of what stands in front of the shell and of what moved there: an object is the one or the other.
+
+    Parts of a plain car may match others by chance, and parts of a lamp post may be visible in too few views.
+    """
+    found = static | alone
+    objects = cv2.connectedComponents(found.astype(np.uint8))[1]
+    sizes, alone_sizes = np.bincount(objects.ravel()), np.bincount(objects.ravel(), (alone & ~static).ravel())
+    moved = found & (alone_sizes > sizes / 2)[objects]
+    return static & ~moved, moved
+
+
+def _shell_view(view: View, cue: CueMap) -> ShellView:
+    camera = view.camera.shrunk(MAX_SIZE)
+    view = replace(view, camera=camera)
+    image = load_photograph(view)
+    depth = _nearest(torch.from_numpy(cue.depth), (camera.height, camera.width))
+    kept = load_mask(view)
+    if kept is None:
+        return ShellView(camera, torch.from_numpy(image), depth)
+    # Without the borders of what is ignored, whose gradients and interpolated colours are not of the photograph.
+    counts = torch.from_numpy(cv2.erode(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+    return ShellView(camera, torch.from_numpy(image), depth.where(counts, 0.0), counts)
+
+
+def _relative_depth(found: Sweep, size: tuple[int, ...]) -> Float[np.ndarray, "H W"]:
+    return 1 / (1 + _nearest(found.offset.float(), size).numpy())
+
+
+def _nearest(values: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tensor, "H W"]:
+    return interpolate(values[None, None], size, mode="nearest")[0, 0]
+
+
+def _resized(values: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[Tensor, "H W"]:
+    return interpolate(values[None, None], size, mode="bilinear", antialias=True)[0, 0]
+
+
+def _digest(views: Sequence[View], held_out: Collection[str]) -> str:
+    """Fingerprint of the maps' inputs besides the shell: photographs, cameras, and which are held out."""
+    return fingerprint(
+        [
+            [
+                view.name,
+                view.name in held_out,
+                content_hash(view.image),
+                view.camera.K.tolist(),
+                view.camera.viewmat.tolist(),
+            ]
+            for view in views
+        ]
+    )

@@ -1,0 +1,337 @@
+"""Decide whether photographs show the shell, something in front of it, or the background.
+
+A plane sweep between the shell and the cameras, per pixel of each view. Its costs are smoothed with the edges of the
+photograph preserved (cost-volume filtering, Hosni et al. 2013, with the guided filter of He et al. 2010); a second pass
+makes the views consistent. Reflections in glass appear farther away than the shell, never nearer: another sweep, behind
+the shell, finds them. The background behind the borders of a shell that reaches too far is found by its colours, and
+by the silhouettes of other views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from inspect import signature
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Float16, Int64, UInt8
+from kornia.filters import guided_blur
+from scipy.ndimage import binary_fill_holes
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from shellgs_method.geometry.camera import Camera
+
+_NEAREST, _STEP = 0.0125, 1.4
+OFFSETS = tuple(_NEAREST * _STEP**k for k in range(15))
+"""Tried depths, as the relative excess of their inverse over the shell's: from 10 cm in front of a wall that is 8 m
+away to a third of its depth."""
+OFFSETS_BEHIND = tuple(-_NEAREST * 2.0**k for k in range(7))
+"""The same behind the shell, to five times its depth: coarser, since what is found there need not be accurate."""
+MOVES = 5.5
+"""Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and much more needs
+finer steps of depth than the offsets have."""
+PER_SIDE = 4
+"""Neighbours on either side of a view: what is occluded on one side is visible from the other."""
+CONTRADICTED = 0.14
+"""Score above which a pixel is contradicted, if its colour counts neither way. With 0.08 more are found, and renders of
+what is in front of the shell improve, but mirrors contradict the shell too, and surfaces left to the photographs alone
+are less accurate."""
+ALONE = 0.12
+"""Difference from the colours that other photographs agree on above which a pixel shows something that moved."""
+CONFIRMED = -0.03
+"""Score of the best nearer depth below which the shell is confirmed."""
+REFLECTED = 0.02
+"""Score of the best farther depth above which a pixel counts as a window that shows something behind the shell."""
+
+Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
+"""Distances and indices of cameras on the left and on the right of a view."""
+
+_WINDOW, _EDGES = 13, 1e-3  # guided filter: window side in pixels, regularisation (variance of an edge)
+# Separable, with coefficients subsampled by 2 (He and Sun 2015), it is 7 times faster; recall and precision stay
+# within 0.01. Before kornia 0.9, it is not separable, and fails to subsample odd sizes.
+_FAST: Any = {"separable": True, "subsample": 2} if "separable" in signature(guided_blur).parameters else {}
+_FEATHERED = 4  # times the silhouette is feathered
+_COLOUR, _GRADIENT = 0.12, 0.06  # truncation of colour and gradient differences, for values in [0, 1]
+_SUPPORT = 0.2  # weight of the other views' scores relative to the photographs
+
+
+@dataclass(frozen=True)
+class ShellView:
+    """A photograph and the shell's depth in it.
+
+    Attributes:
+        camera: camera at the size at which views are compared.
+        image: photograph at that size.
+        depth: z-depth of the shell in scene units, 0 where there is none, or where the photograph does not count.
+        kept: pixels of the photograph that count; None for all.
+    """
+
+    camera: Camera
+    image: UInt8[Tensor, "h w 3"]
+    depth: Float[Tensor, "h w"]
+    kept: Bool[Tensor, "h w"] | None = None
+
+    @cached_property
+    def silhouette(self) -> Bool[Tensor, "h w"]:
+        """Pixels inside the building's silhouette, by the photograph: at its borders, a shell may reach too far.
+
+        The mask of the shell, without its holes, is feathered with the photograph as guide (He et al., Guided Image
+        Filtering, 2010): a pixel is outside if those of its colour around it are. Repeated for wider strips.
+        """
+        known = self.depth > 0 if self.kept is None else (self.depth > 0) | ~self.kept
+        pixels, inside = _Pixels(self), torch.from_numpy(binary_fill_holes(known.numpy()))
+        for _ in range(_FEATHERED):
+            inside &= _smooth(pixels, inside.float()[None])[0] > 0.5
+        return inside
+
+
+class Sweep(NamedTuple):
+    """The best depth in front of the shell, or behind it, by one view and its neighbours."""
+
+    score: Float16[Tensor, "h w"]
+    """How much better photographs agree at this depth than on the shell, relative to the worst disagreement; -1 where
+    there is no shell."""
+    offset: Float16[Tensor, "h w"]
+    """Relative excess of the inverse depth over the shell's, interpolated between those that were tried."""
+
+
+def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
+    """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES` pixels.
+
+    Args:
+        view: the view's camera.
+        others: cameras to choose from, by :func:`sides`.
+        depth: typical depth of the shell in the view.
+        offset: one of :data:`OFFSETS` or :data:`OFFSETS_BEHIND`.
+
+    Returns:
+        Index and side of each camera: 0 on the left, 1 on the right.
+    """
+    wanted = MOVES * depth / (abs(offset) * float(view.K[0, 0]))
+    found = [
+        sorted(
+            (max(baseline / wanted, wanted / baseline), index) for baseline, index in side if baseline > 1e-6 * depth
+        )
+        for side in others
+    ]
+    return [(index, side) for side in (0, 1) for _, index in found[side][:PER_SIDE]]
+
+
+def sides(view: Camera, others: Sequence[Camera]) -> Sides:
+    """Distances and indices of the cameras left and right of a view that look in about the same direction."""
+    found: Sides = ([], [])
+    for index, other in enumerate(others):
+        step = other.position - view.position
+        if float(view.viewmat[2, :3] @ other.viewmat[2, :3]) > 0.5:
+            found[int(view.viewmat[0, :3] @ step > 0)].append((float(step.norm()), index))
+    return found
+
+
+def sweep(view: ShellView, others: Sequence[ShellView], offsets: Sequence[float] = OFFSETS) -> Sweep:
+    """Find the best depth in front of the shell, by the photographs of a view and its neighbours.
+
+    Costs are averaged over the neighbours of a side; the side with the lower cost counts.
+
+    Args:
+        view: the view.
+        others: all other views.
+        offsets: a geometric sequence of depths to try; :data:`OFFSETS_BEHIND` for those behind the shell.
+    """
+    pixels, near = _Pixels(view), sides(view.camera, [other.camera for other in others])
+    depth = float(pixels.surface.median())
+    roles: dict[int, list[tuple[int, int]]] = {}
+    for step, offset in enumerate(offsets):
+        for index, side in neighbours(view.camera, near, depth, offset):
+            roles.setdefault(index, []).append((step, side))
+    sums = torch.zeros(len(offsets), 2, 3, *view.depth.shape)
+    for index, asked in roles.items():
+        neighbour = _Neighbour(pixels, others[index])
+        for step, side in asked:
+            look = neighbour.look(pixels.surface / (1 + offsets[step]))
+            nearer, counts = neighbour.disagreement(look), neighbour.visible * neighbour.kept(look)
+            sums[step, side] += counts * torch.stack([neighbour.visible, neighbour.on_shell, nearer])
+    weight, on_shell, nearer = sums.unbind(dim=2)
+    on_shell, nearer = ((each / weight).nan_to_num(1.0).amin(dim=1) for each in (on_shell, nearer))
+    scores = _smooth(pixels, on_shell - nearer)
+    score, best = scores.max(dim=0)
+    offset = offsets[0] * (offsets[1] / offsets[0]) ** (best + _vertex(scores, best))
+    return Sweep(score.where(view.depth > 0, -1.0).half(), offset.half())
+
+
+class Agreement(NamedTuple):
+    """What the photographs of a view and its neighbours agree on; scores are -1 where there is no shell."""
+
+    score: Float[Tensor, "h w"]
+    """How much better they agree in front of the shell than on it, above :data:`CONTRADICTED` for an occluder."""
+    alone: Float[Tensor, "h w"]
+    """Difference of the view's colours from its neighbours' on the shell, less twice what these differ by."""
+    beyond: Bool[Tensor, "h w"]
+    """The shell is outside of the silhouette, in this view or in most of its neighbours that see it."""
+
+
+def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_there: Sequence[Sweep]) -> Agreement:
+    """Judge a view's sweep in the light of its neighbours' sweeps.
+
+    Where a neighbour's sweep finds an occluder, the shell is hidden from it, so its photograph does not count for the
+    shell; and an occluder in one view should be an occluder in the others.
+
+    Args:
+        view: the view.
+        found: its sweep.
+        others: its nearest neighbours on either side.
+        found_there: their sweeps.
+    """
+    pixels = _Pixels(view)
+    shell, shown, nearer, trust, support, outside = [], [], [], [], [], []
+    for other, sweep_there in zip(others, found_there, strict=True):
+        neighbour = _Neighbour(pixels, other)
+        look = neighbour.look(pixels.surface / (1 + found.offset.float()))
+        hidden = (neighbour.visible == 0) | ~look.inside | (neighbour.kept(look) == 0)
+        probability = torch.sigmoid((sweep_there.score.float() - 0.4 * CONTRADICTED) / 0.02)
+        of_shell = _sampled(probability, neighbour.shell.grid)
+        of_nearer = _sampled(probability, look.grid)
+        offset = _sampled(other.depth, look.grid, "nearest") / look.z - 1
+        found_offset = _sampled(sweep_there.offset.float(), look.grid, "nearest")
+        alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
+        shell.append(neighbour.on_shell.masked_fill(hidden, torch.nan))
+        unseen = (neighbour.visible == 0) | (of_shell > 0.5)
+        shown.append(neighbour.shown[:3].masked_fill(unseen, torch.nan))
+        nearer.append(neighbour.disagreement(look).masked_fill(hidden, torch.nan))
+        trust.append(1 - of_shell)
+        out = _sampled((~other.silhouette).float(), neighbour.shell.grid, "nearest")
+        outside.append(out.masked_fill(neighbour.visible == 0, torch.nan))
+        support.append((of_nearer * torch.where(alike, 1.0, 0.4)).masked_fill(hidden, torch.nan))
+    if len(shell) < 2:
+        nothing = torch.full_like(view.depth, -1.0)
+        return Agreement(nothing, nothing, ~view.silhouette)
+    shell, nearer, trust, support, outside = map(torch.stack, (shell, nearer, trust, support, outside))
+    agreed = support.nanmean(dim=0).nan_to_num(0.0)
+    trusted = (trust * shell.isfinite()).sum(dim=0) > 1
+    better = _better_half(shell, trust) - _better_half(nearer, torch.ones_like(trust))
+    better = torch.where(trusted, better, 0.3 * (agreed - 0.3))  # hidden from the neighbours: only their sweeps count
+    score = _smooth(pixels, (better + _SUPPORT * agreed)[None])[0]
+    alone = _alone(pixels, torch.stack(shown))
+    elsewhere = (outside.isfinite().sum(dim=0) > 1) & (outside.nanmean(dim=0) > 0.5)
+    score, alone = (each.where(view.depth > 0, -1.0) for each in (score, alone))
+    return Agreement(score, alone, ~view.silhouette | elsewhere)
+
+
+class _Look(NamedTuple):
+    """Position of a view's pixels in another view, at some depth."""
+
+    grid: Float[Tensor, "1 h w 2"]  # from -1 to 1
+    z: Float[Tensor, "h w"]
+    inside: Bool[Tensor, "h w"]
+
+
+class _Pixels:
+    """A view's features and rays, and the shell's depth, filled in where there is none."""
+
+    def __init__(self, view: ShellView) -> None:
+        hit = view.depth > 0
+        self.camera, self.rays = view.camera, view.camera.rays().float()
+        self.features = _features(view)
+        self.surface = view.depth.where(hit, view.depth[hit].median() if hit.any() else view.depth.new_tensor(1.0))
+
+
+class _Neighbour:
+    """A neighbour of a view; the epipolar lines of the view's pixels in it are computed once."""
+
+    def __init__(self, pixels: _Pixels, other: ShellView) -> None:
+        motion = other.camera.viewmat.double() @ torch.linalg.inv(pixels.camera.viewmat.double())
+        K = other.camera.K.double()
+        self._direction = torch.einsum("ij,hwj->ihw", (K @ motion[:3, :3]).float(), pixels.rays)
+        self._start = (K @ motion[:3, 3]).float()
+        self._size = other.camera.width, other.camera.height
+        self._features, self._there = pixels.features, _features(other)
+        self.shell = self.look(pixels.surface)
+        """Position of the pixels if they lie on the shell."""
+        surface = _sampled(other.depth, self.shell.grid, "nearest")
+        hidden = ~self.shell.inside | ((surface > 0) & (self.shell.z > 1.01 * surface))
+        self._kept = None if other.kept is None else other.kept.float()
+        self.visible = (~hidden).float() * self.kept(self.shell)
+        """1 where the shell is visible in the other view: inside what counts of its image, not behind other parts."""
+        self.shown = self._at(self.shell)
+        """The other photograph's features on the shell."""
+        self.on_shell = self._disagreement(self.shown)
+        """Disagreement of the two photographs on the shell."""
+
+    def look(self, depth: Float[Tensor, "h w"]) -> _Look:
+        """Project the pixels, at these depths, into the other view."""
+        x, y, z = (direction * depth + start for direction, start in zip(self._direction, self._start, strict=True))
+        near = z.clamp_min(1e-9)
+        u, v = (2 / size * along / near - 1 for size, along in zip(self._size, (x, y), strict=True))
+        return _Look(torch.stack([u, v], dim=-1)[None], z, (z > 0) & (u.abs() < 1) & (v.abs() < 1))
+
+    def kept(self, look: _Look) -> Float[Tensor, "h w"] | float:
+        """1 where the other photograph counts at these positions."""
+        return 1.0 if self._kept is None else _sampled(self._kept, look.grid, "nearest")
+
+    def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
+        """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
+        return self._disagreement(self._at(look))
+
+    def _at(self, look: _Look) -> Float[Tensor, "5 h w"]:
+        return grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
+
+    def _disagreement(self, there: Float[Tensor, "5 h w"]) -> Float[Tensor, "h w"]:
+        difference = (self._features - there).abs_()
+        colours, gradients = difference[:3].mean(dim=0) / _COLOUR, difference[3:].mean(dim=0) / _GRADIENT
+        return (colours.clamp_max_(1) + gradients.clamp_max_(1)) / 2
+
+
+def _alone(pixels: _Pixels, shown: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "h w"]:
+    """How much more a view differs from others on the shell than these do from each other; 0 where one or none sees it.
+
+    A view's exposure and white balance may differ: its colours are scaled by the median ratio to the others'.
+
+    Args:
+        pixels: the view's.
+        shown: the others' colours on the shell; NaN where it is hidden from them.
+    """
+    typical = shown.nanmedian(dim=0).values
+    spread = (shown - typical).abs().mean(dim=1).nanquantile(0.75, dim=0)
+    known = shown[:, 0].isfinite().sum(dim=0) >= 2
+    own = pixels.features[:3]
+    gain = (typical / own.clamp_min(0.01)).where(known, torch.nan).flatten(1).nanmedian(dim=1).values
+    alone = (gain.nan_to_num(1.0)[:, None, None] * own - typical).abs().mean(dim=0) - 2 * spread
+    alone, weight = _smooth(pixels, torch.stack([alone.where(known, 0.0), known.float()]))
+    return alone / weight.clamp_min(0.05)
+
+
+def _sampled(
+    values: Float[Tensor, "H W"], grid: Float[Tensor, "1 h w 2"], mode: str = "bilinear"
+) -> Float[Tensor, "h w"]:
+    return grid_sample(values[None, None], grid, mode, align_corners=False)[0, 0]
+
+
+def _features(view: ShellView) -> Float[Tensor, "5 h w"]:
+    """Features for comparison: colours in [0, 1], and both gradients of their mean."""
+    colours = view.image.permute(2, 0, 1).float() / 255
+    down, across = torch.gradient(colours.mean(dim=0))
+    return torch.cat([colours, across[None], down[None]])
+
+
+def _vertex(scores: Float[Tensor, "K h w"], best: Int64[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Vertex of the parabola through the best score and its two neighbours, from -1/2 to 1/2 steps from the best."""
+    inside = best.clamp(1, len(scores) - 2)
+    below, at, above = (scores.gather(0, (inside + k)[None])[0] for k in (-1, 0, 1))
+    top = 0.5 * (below - above) / (below - 2 * at + above).clamp_max(-1e-6)
+    return top.clamp(-0.5, 0.5).where(inside == best, 0.0)
+
+
+def _better_half(costs: Float[Tensor, "V h w"], weights: Float[Tensor, "V h w"]) -> Float[Tensor, "h w"]:
+    """Weighted mean of the lowest costs that make up half of the weight; NaN is ignored, 0 where all are NaN."""
+    weights = weights.where(costs.isfinite(), 0.0)
+    costs, order = costs.nan_to_num(2.0).sort(dim=0)
+    weights = weights.gather(0, order)
+    before = weights.cumsum(dim=0) - weights
+    used = torch.minimum((weights.sum(dim=0) / 2 - before).clamp_min(0), weights)
+    return (used * costs).sum(dim=0) / used.sum(dim=0).clamp_min(1e-6)
+
+
+def _smooth(pixels: _Pixels, maps: Float[Tensor, "C h w"]) -> Float[Tensor, "C h w"]:
+    return guided_blur(pixels.features[None, :3], maps[None], _WINDOW, _EDGES, "replicate", **_FAST)[0]

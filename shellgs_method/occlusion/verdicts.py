@@ -1,0 +1,132 @@
+"""Combine the checks of all views at points on the shell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float64, Int64
+
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.cue_maps import CueMaps, Findings
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import in_view
+from shellgs_method.geometry.voxels import cell_means, voxel_cells
+
+CONTRADICTED_PLACES = "cues/checked/contradicted.ply"
+"""File in the scene's folder for :meth:`Verdicts.write`, shown by viewers."""
+MANY = 6
+"""Photographs that must contradict a point, and be half of those that see it, for the building to differ from its shell
+there. An occluder farther in front of the shell hides different points in each photograph."""
+MOVED = 0.004
+"""Share of a view's shell above which what moved is worth mentioning."""
+_STEP = 4  # stride in pixels of the lifted points
+_ACROSS = 300  # points along the longest side of the shell
+_SAME = 0.01  # relative difference of depth within which a point is visible in a view's shell map
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """Verdicts of the photographs on points of the shell, in the scene's frame and units.
+
+    Attributes:
+        places: the points.
+        seen: number of views in which each is visible.
+        contradicted: number of these views that show something in front of it, other than what moved.
+        distance: median distance of that from the point; NaN where no view contradicts it.
+        views: names of all views.
+        differs: mask of the points where the building differs from the shell, by :data:`MANY`.
+        by_view: number of these points that each view contradicts.
+        moved: share of each view's shell that is hidden by something that moved, since no other view shows it.
+    """
+
+    places: Float64[np.ndarray, "N 3"]
+    seen: Int64[np.ndarray, " N"]
+    contradicted: Int64[np.ndarray, " N"]
+    distance: Float64[np.ndarray, " N"]
+    views: list[str]
+    differs: Bool[np.ndarray, " N"]
+    by_view: Int64[np.ndarray, " V"]
+    moved: Float64[np.ndarray, " V"]
+
+    @property
+    def share(self) -> float:
+        """Share of the visible points where the building differs."""
+        return float(self.differs.sum() / max((self.seen > 0).sum(), 1))
+
+    @property
+    def witness(self) -> str:
+        """Name of the view that contradicts most of these points."""
+        return self.views[int(self.by_view.argmax())]
+
+    @property
+    def moved_in(self) -> list[str]:
+        """Names of the views in which more than :data:`MOVED` of the shell is hidden by what moved, the most first."""
+        return [self.views[i] for i in np.argsort(-self.moved) if self.moved[i] > MOVED]
+
+    def write(self, path: Path) -> None:
+        """Write the points as a ply, redder where a larger share of the views contradicts them."""
+        red = self.contradicted / np.maximum(self.seen, 1)
+        colours = 255 - 255 * red[:, None] * [0.1, 1, 1]
+        content = trimesh.PointCloud(self.places, colours.round().astype(np.uint8)).export(file_type="ply")
+        with atomic_write(path) as file:
+            file.write(content if isinstance(content, bytes) else str(content).encode())
+
+
+def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarray, "N 3"] | None = None) -> Verdicts:
+    """Sum the maps of :func:`~shellgs_method.shell.check_views` over the views.
+
+    Args:
+        scene: the scene's folder.
+        views: its photographs, of any size.
+        places: points on the shell, in the scene's frame; None for evenly spread points that the views see.
+
+    Raises:
+        FileNotFoundError: the scene has no such maps.
+        SceneError: a map is damaged, or of another camera or shell.
+    """
+    shell, checked = CueMaps.open(scene, "shell"), CueMaps.open(scene, "checked")
+    sized = [view for view in views if shell.record(view.name) and checked.record(view.name)]
+    if places is None:
+        places = _seen_places(sized, shell)
+    seen, distances = np.zeros(len(places), np.int64), np.full((len(sized), len(places)), np.nan, np.float32)
+    moved = []
+    for distance, view in zip(distances, sized, strict=True):
+        camera = view.camera.shrunk(shell.manifest.max_image_size)
+        cue, check = shell.require(view.name, camera), checked.require(view.name, camera)
+        inside, pixels, z = in_view(camera, places)
+        k = np.flatnonzero(inside)
+        columns, rows = pixels.astype(int).T
+        visible = np.abs(cue.depth[rows, columns] / z - 1) < _SAME
+        seen[k] += visible
+        found = Findings.of(check, cue)
+        moved.append(found.moved.sum() / max((cue.depth > 0).sum(), 1))
+        occluded = visible & found.occluder[rows, columns]
+        along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
+        distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
+    contradicted = np.isfinite(distances).sum(axis=0)
+    median = np.full(len(places), np.nan)
+    some = contradicted > 0
+    median[some] = np.nanmedian(distances[:, some], axis=0)
+    differs = (contradicted >= MANY) & (2 * contradicted >= seen)
+    by_view = np.isfinite(distances[:, differs]).sum(axis=1)
+    names = [view.name for view in sized]
+    return Verdicts(places, seen, contradicted, median, names, differs, by_view, np.array(moved))
+
+
+def _seen_places(views: Sequence[View], shell: CueMaps) -> Float64[np.ndarray, "N 3"]:
+    """Evenly spread points of the shell that are visible in the views."""
+    lifted = []
+    for view in views:
+        camera = view.camera.shrunk(shell.manifest.max_image_size).to(torch.float64)
+        depth = shell.require(view.name, camera).depth[::_STEP, ::_STEP, None].astype(np.float64)
+        points = (depth * camera.rays().numpy()[::_STEP, ::_STEP])[depth[..., 0] > 0]
+        lifted.append((points - camera.viewmat[:3, 3].numpy()) @ camera.viewmat[:3, :3].numpy())
+    points = np.concatenate([*lifted, np.empty((0, 3))])
+    if not len(points):
+        return points
+    return cell_means(points, voxel_cells(points, float(np.ptp(points, axis=0).max()) / _ACROSS or 1.0))

@@ -1,0 +1,221 @@
+"""Find an alignment from picks, camera positions or coarse registration, refine it, and validate it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.cue_maps import CueMaps, source_hash
+from shellgs_method.files.photographs import View
+from shellgs_method.files.surfaces import up_axis
+from shellgs_method.geometry.camera import positions, upwards
+from shellgs_method.geometry.precision import FINE, REMEDY
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.registration.correspondences import Correspondence, measured_again
+from shellgs_method.registration.frames import ShellPlace, apart
+from shellgs_method.registration.picks import align_picks, read_picks
+from shellgs_method.registration.positions import align_positions, read_positions
+from shellgs_method.registration.proposal import propose
+from shellgs_method.registration.refinement import refine
+from shellgs_method.registration.repetition import facade_axes
+from shellgs_method.registration.report import write_report
+from shellgs_method.registration.validation import Validation, rounding_of, steps_in_metres, validate
+from shellgs_method.shell.alignment import Alignment
+from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.surface import ShellSurface
+
+if TYPE_CHECKING:
+    from shellgs_method.files.sparse_points import SparsePoints
+
+# In the scene's folder:
+PROPOSAL = Path("shell/proposal.json")
+REPORT = Path("shell/report")
+
+_MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An alignment and how it was found.
+
+    Attributes:
+        alignment: the alignment.
+        history: one sentence per step, for the report.
+        correspondences: picks or camera positions with their residuals, if any.
+        proposed: whether it comes from coarse registration and the user has not accepted it yet.
+    """
+
+    alignment: Alignment
+    history: Sequence[str] = ()
+    correspondences: Sequence[Correspondence] = ()
+    proposed: bool = False
+
+
+def place_as_before(path: Path, views: Sequence[View]) -> Placement:
+    """The alignment of a file, to be validated again, possibly with other cameras than it was found for.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is damaged.
+    """
+    alignment = Alignment.load(path)
+    changed = alignment.cameras.changed(views)
+    return Placement(alignment, [f"It was found for other cameras than these: {changed}."] if changed else [])
+
+
+def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placement:
+    """The proposal of a file, which the user accepts.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is damaged, or the proposal was made for other cameras than the user's.
+    """
+    alignment = Alignment.load(path)
+    if changed := alignment.cameras.changed(views):
+        raise SceneError(
+            f"{path} was proposed for other cameras than those of {scene}: {changed}; propose again, with "
+            f"`shellgs align {shlex.quote(str(scene))} {shlex.quote(alignment.shell)}`"
+        )
+    return Placement(alignment)
+
+
+def place_by_picks(
+    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+) -> Placement:
+    """Align the shell by a file of picks.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the picks cannot be read, triangulated or trusted, or are not in the shell's frame.
+    """
+    picks = read_picks(path, views)
+    place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
+    matrix, picked = align_picks(picks, views, metres_per_shell_unit)
+    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
+    return Placement(alignment, [_residuals_in_words(picked, "picks")], picked)
+
+
+def place_by_positions(
+    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+) -> Placement:
+    """Align the shell by a file of surveyed camera positions.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the positions cannot be read or trusted, or are not in the shell's frame.
+    """
+    surveyed = read_positions(path, views)
+    place.check_positions(surveyed.shell, f"the camera positions of {path}")
+    matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
+    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
+    history = [_residuals_in_words(cameras, "camera positions")]
+    if surveyed.unknown:
+        history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.unknown)}.")
+    if play > _MAX_PLAY:
+        history.append(f"The rotation about the cameras' path is uncertain by about {play:.1f}°: use --refine.")
+    return Placement(alignment, history, cameras)
+
+
+def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
+    used = [point.residual for point in points if point.is_used]
+    mean = np.sqrt(np.mean(np.square(used)))
+    return f"{len(used)} of {len(points)} {called} are used; their residual is {mean:.3f} m (root mean square)."
+
+
+def place_by_guess(
+    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shell: str, metres_per_shell_unit: float
+) -> Placement:
+    """Propose an alignment by coarse registration, from the outline of the main wall.
+
+    The shell's up axis is y in glTF, by that format's convention, and z in all other formats, unless its walls
+    are not aligned with it.
+
+    Raises:
+        SceneError: the points show no wall, or it fits nowhere.
+    """
+    surface = ShellSurface(mesh, metres_per_shell_unit)
+    up = np.array([0.0, 1.0, 0.0] if up_axis(shell) == "y" else [0.0, 0.0, 1.0])
+    cameras = [view.camera for view in views]
+    best, *rivals = propose(surface, points.positions, positions(cameras), upwards(cameras), up)
+    history = ["Proposed from the outline of the main wall; not yet confirmed."]
+    history += [
+        f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
+        for rival in rivals
+    ]
+    matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
+    return Placement(Alignment(matrix, shell, metres_per_shell_unit, source="proposal"), history, proposed=True)
+
+
+def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:
+    """How a placement puts the shell elsewhere, or makes it larger or smaller, than what cameras see; None if not."""
+    seen = np.concatenate([points.positions, positions(view.camera for view in views)])
+    return apart(transformed(mesh.vertices, placement.alignment.shell_to_scene), seen)
+
+
+def refined(
+    placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, reach: float
+) -> Placement:
+    """Refine a placement against the SfM points.
+
+    Raises:
+        SceneError: ``reach`` is not a positive number, the coordinates of the points or the shell are too coarse to
+            follow, or too few points are within ``reach`` metres of the shell.
+    """
+    if not 0 < reach < np.inf:
+        raise SceneError(f"--refine must be the largest error of the start in metres, more than 0, not {reach:g}")
+    alignment = placement.alignment
+    steps = steps_in_metres(mesh, alignment, views, points)
+    for what, step in steps.items():
+        if step.rounded and step.coarsest > FINE:
+            raise SceneError(
+                f"--refine would follow a rounding: {what} are stored in steps of {step.in_words()}; {REMEDY}"
+            )
+    surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
+    start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
+    result = refine(surface, points.positions, start, reach, rounding_of(steps))
+    up = start[:3, :3] @ upwards(view.camera for view in views)
+    axes = facade_axes(surface.samples(5000)[1], up / np.linalg.norm(up))
+    sentence = f"Refined against {result.evidence.points} SfM points, which moved by {result.moved:.3f} m."
+    if words := result.evidence.in_words(axes):
+        sentence += f" Left unchanged, as the points do not determine it: {'; '.join(words)}."
+    matrix = np.linalg.inv(result.survey_from_scene) @ surface.survey_from_shell
+    moved = replace(alignment, shell_to_scene=matrix, source=f"{alignment.source}, refined")
+    return replace(
+        placement,
+        alignment=moved,
+        history=[*placement.history, sentence],
+        correspondences=measured_again(placement.correspondences, moved),
+    )
+
+
+def validate_placement(
+    scene: Path, placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, target: Path
+) -> Validation:
+    """Validate a placement, write the report, and write the alignment with its metrics to ``target`` unless refused.
+
+    Maps cast with the same alignment stay valid: they are bound to its matrix, and get the new error.
+    """
+    validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
+    write_report(scene / REPORT, mesh, validation, placement.history)
+    if validation.verdict == "refused":
+        return validation
+    validated = replace(
+        placement.alignment,
+        verdict=validation.verdict,
+        metrics=validation.metrics(),
+        cameras=BoundCameras.of(views),
+    )
+    validated.save(target)
+    with suppress(FileNotFoundError, SceneError):  # no maps, or damaged ones, which is reported when they are read
+        maps = CueMaps.open(scene, "shell")
+        if maps.manifest.sources.get(target.relative_to(scene).as_posix()) == source_hash(target):
+            maps.with_error(validated.error)
+    return validation

@@ -1,0 +1,229 @@
+"""Robust fit of a similarity to points known in the shell's frame and in the scene's, some of them wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import comb
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.similarity import centred, fit_similarity, transformed
+from shellgs_method.shell.alignment import Alignment
+
+MAX_ERROR = 0.15
+"""Residual in metres from which a point is an outlier: five times the scatter of careful picks (1 cm on a scan, 3 cm
+from photographs) and of RTK positions (2 to 3 cm)."""
+LARGEST = 1e12
+"""Largest coordinate, in any unit."""
+_WORD = re.compile(r"""(?P<comment>\#.*)|"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<bare>\S+)""")
+_DEGREES = {"epsg:4326", "epsg:4979", "epsg:4258", "epsg:4269", "+proj=longlat", "+proj=latlong"}
+_DEGREES |= {"lat", "lon", "latitude", "longitude"}
+_THIN = 0.02  # breadth over length below which points are on one line
+_MAX_TRIPLES = 2000
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """A point in both frames and its residuals.
+
+    Attributes:
+        name: name in the user's file.
+        shell: coordinates in the shell's own frame.
+        scene: coordinates in the scene's frame.
+        held_out: whether it only checks the fit.
+        is_used: whether it is fitted; outliers and check points are not.
+        residual: distance between the two after alignment, in metres.
+        left_out_residual: residual under a fit without this point; NaN if the others do not determine a fit.
+    """
+
+    name: str
+    shell: Float64[np.ndarray, " 3"]
+    scene: Float64[np.ndarray, " 3"]
+    held_out: bool
+    is_used: bool
+    residual: float
+    left_out_residual: float
+
+
+@dataclass(frozen=True)
+class RobustFit:
+    """A similarity fitted to points with outliers.
+
+    Attributes:
+        shell_to_scene: the similarity.
+        used: mask of the points that are fitted.
+        residuals: residuals of all points, in metres.
+        left_out: residual of each point under a fit without it; NaN if the others do not determine a fit.
+    """
+
+    shell_to_scene: Float64[np.ndarray, "4 4"]
+    used: Bool[np.ndarray, " N"]
+    residuals: Float64[np.ndarray, " N"]
+    left_out: Float64[np.ndarray, " N"]
+
+
+Point = TypeVar("Point", bound=Correspondence)
+
+
+def fit_robustly(
+    shell: Float64[np.ndarray, "N 3"],
+    scene: Float64[np.ndarray, "N 3"],
+    candidates: Bool[np.ndarray, " N"],
+    metres_per_shell_unit: float,
+    called: str,
+    remedy: str,
+) -> RobustFit:
+    """Fit a similarity by least squares to the largest set of candidates that agree within :data:`MAX_ERROR`.
+
+    Args:
+        shell: points in the shell's frame, possibly georeferenced.
+        scene: the same points in the scene's frame.
+        candidates: mask of the points that may be fitted.
+        metres_per_shell_unit: 1 for a shell in metres.
+        called: plural name of the points, for messages.
+        remedy: advice if they lie on one line, for messages.
+
+    Raises:
+        SceneError: fewer than 3 points, or only points on one line, can be trusted.
+    """
+    survey_from_shell = centred(shell.mean(axis=0), metres_per_shell_unit)
+    shell = transformed(shell, survey_from_shell)
+    _check_spread(scene[candidates], shell[candidates], called, remedy)
+    used = _consensus(scene, shell, candidates)
+    _check_spread(scene[used], shell[used], called, remedy)
+    survey_from_scene = fit_similarity(scene[used], shell[used])
+    residuals = np.linalg.norm(transformed(scene, survey_from_scene) - shell, axis=1)
+    left_out = np.array([_left_out(k, scene, shell, used) for k in range(len(shell))])
+    matrix = np.linalg.inv(survey_from_scene) @ survey_from_shell
+    return RobustFit(matrix, used, residuals, left_out)
+
+
+def measured_again(points: Sequence[Point], alignment: Alignment) -> list[Point]:
+    """Recompute the residuals of points under another alignment; worst first."""
+    again = []
+    for point in points:
+        offset = alignment.apply(point.shell[None])[0] - point.scene
+        again.append(replace(point, residual=alignment.metres_per_unit * float(np.linalg.norm(offset))))
+    return worst_first(again)
+
+
+def worst_first(points: Sequence[Point]) -> list[Point]:
+    """Sort points by residual, largest first."""
+    return sorted(points, key=lambda point: -point.residual)
+
+
+def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the position, for messages, and the words of each line of a text file.
+
+    A header is skipped: a first line without numbers. So are comments after a # that begins a word. Words with spaces
+    are quoted; an apostrophe inside a word is part of it.
+
+    Args:
+        path: the file.
+        contents: name of its contents, for messages.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is not text, its header says that it is in degrees, or a quote is not closed.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"the file of {contents} {path} does not exist")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
+    lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
+    worded = [(where, words) for where, line in lines if (words := _words(line, where))]
+    if worded and _is_header(header := worded[0][1]):
+        if any(piece.lower() in _DEGREES for word in header for piece in re.split("[,;]", word)):
+            raise SceneError(f"{path} is in degrees ({' '.join(header)}): convert it to the shell's coordinates")
+        del worded[0]
+    yield from worded
+
+
+def _words(line: str, where: str) -> list[str]:
+    words = []
+    for word in _WORD.finditer(line):
+        if word["bare"] and word["bare"][0] in "\"'":
+            raise SceneError(f"{where}: the quote before {word['bare'][1:]} is not closed")
+        if not word["comment"]:
+            words.append(next(text for text in word.group("double", "single", "bare") if text is not None))
+    return words
+
+
+def _is_header(words: Sequence[str]) -> bool:
+    """Whether nothing is a number, also where commas separate them; definitions (+zone=32, WKT) may hold some."""
+    names = [word for word in words if "=" not in word and "[" not in word]
+    return not any(are_numbers([piece]) for word in names for piece in re.split("[,;]", word))
+
+
+def view_named(name: str, views: Sequence[View], where: str) -> View | None:
+    """Find a view by its image's path in the scene or its file name; None if there is none.
+
+    Raises:
+        SceneError: several images have this file name.
+    """
+    matches = [view for view in views if name in (view.name, view.image.name)]
+    if len(matches) > 1:
+        raise SceneError(f"{where}: {name} is the name of several photographs: add folders")
+    return matches[0] if matches else None
+
+
+def are_numbers(words: Sequence[str]) -> bool:
+    """Whether all words are finite numbers below :data:`LARGEST`."""
+    try:
+        return all(abs(float(word)) < LARGEST for word in words)
+    except ValueError:
+        return False
+
+
+def _consensus(scene: np.ndarray, shell: np.ndarray, candidates: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+    """Inliers of the best triple of points (MSAC, Torr and Zisserman 2000), over all triples if they are few."""
+    indices = np.flatnonzero(candidates)
+    thin = min(0.1, _thinness(scene[candidates]) / 2)  # all triples of a walk along a facade are thin
+    best, cost = candidates, np.inf
+    for triple in _triples(indices):
+        if _thinness(shell[triple]) < thin:
+            continue
+        residual = np.linalg.norm(transformed(scene, fit_similarity(scene[triple], shell[triple])) - shell, axis=1)
+        total = np.minimum(residual[indices], MAX_ERROR) ** 2
+        if total.sum() < cost:
+            best, cost = candidates & (residual < MAX_ERROR), total.sum()
+    return best
+
+
+def _triples(indices: np.ndarray) -> np.ndarray:
+    if comb(len(indices), 3) <= _MAX_TRIPLES:
+        return np.array(list(combinations(indices, 3)))
+    random = np.random.default_rng(0)
+    return np.stack([random.choice(indices, 3, replace=False) for _ in range(_MAX_TRIPLES)])
+
+
+def _left_out(k: int, scene: np.ndarray, shell: np.ndarray, used: np.ndarray) -> float:
+    others = used.copy()
+    others[k] = False
+    if others.sum() < 3 or _thinness(shell[others]) < _THIN:
+        return float("nan")
+    similarity = fit_similarity(scene[others], shell[others])
+    return float(np.linalg.norm(transformed(scene[k : k + 1], similarity) - shell[k]))
+
+
+def _thinness(points: np.ndarray) -> float:
+    """Breadth over length of points: 0 on a line."""
+    extents = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return float(extents[1] / max(extents[0], 1e-30))
+
+
+def _check_spread(scene: np.ndarray, shell: np.ndarray, called: str, remedy: str) -> None:
+    if len(shell) < 3:
+        raise SceneError(f"{len(shell)} {called} can be trusted, at least 3 are needed (6 or more are better)")
+    if min(_thinness(scene), _thinness(shell)) < _THIN:
+        raise SceneError(f"the {called} lie on one line, about which the shell can turn: {remedy}")

@@ -1,0 +1,133 @@
+"""Refuse picks and camera positions that are not in the shell's frame, rather than to place the shell by them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.surfaces import read_geometry
+from shellgs_method.geometry.nearest import point_tree
+from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.triangles import area_vectors, sampled
+from shellgs_method.registration.sfm_frame import first_slip, in_degrees
+
+_SAMPLES = 100_000
+# Distances from the shell, relative to its size:
+_ON = 0.05  # of picks, which are on it
+_AROUND = 20.0  # of cameras, which photograph it
+_NARROW = 0.005  # extent of either, below which they are in another unit
+_SURELY = 0.5  # of these, once a slip is corrected
+# Sizes of the shell relative to what the cameras see, which is a part of a building, or more than that:
+_LARGEST = 20.0
+
+
+class ShellPlace:
+    """Where a shell is, in its own frame.
+
+    Args:
+        path: the shell's file.
+
+    Attributes:
+        middle: centre of the shell.
+        size: diagonal of its box.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        geometry = read_geometry(path)
+        points = geometry.vertices
+        if len(geometry.faces) and geometry.faces.max() < len(points):
+            areas = np.linalg.norm(area_vectors(points, geometry.faces), axis=1)
+            if np.isfinite(areas).all() and areas.any():
+                points = sampled(points, geometry.faces, areas, _SAMPLES)[0]
+        points = points[sound(points)]
+        if len(points) == 0:
+            raise SceneError(f"the shell {path} has no points")
+        points = np.random.default_rng(0).permutation(points)[:_SAMPLES]
+        low, high = _box(points)
+        self.path, self.middle, self.size = path, (low + high) / 2, float(np.linalg.norm(high - low))
+        self._surface = point_tree(points - self.middle)
+
+    def check_picks(self, picks: Float64[np.ndarray, "N 3"], called: str) -> None:
+        """Refuse picks of which less than half are on the shell, or which are all on one spot of it.
+
+        Raises:
+            SceneError: they are not, and why.
+        """
+        self._check(picks, called, "on it", _ON)
+
+    def check_positions(self, cameras: Float64[np.ndarray, "N 3"], called: str) -> None:
+        """Refuse positions of cameras that are too far from the shell to photograph it.
+
+        Raises:
+            SceneError: they are, and why.
+        """
+        self._check(cameras, called, "near it", _AROUND)
+
+    def _check(self, points: np.ndarray, called: str, where: str, reach: float) -> None:
+        if len(points) == 0 or self.size == 0:
+            return
+        if in_degrees(points, self.size):
+            raise SceneError(
+                f"{called} are in degrees: their first two columns, such as {points[0, 0]:.6g} {points[0, 1]:.6g}, are "
+                f"longitude and latitude; convert them to the coordinates of {self.path}, which are around "
+                f"{_numbers(self.middle)}"
+            )
+        if self._reaches(points, reach):
+            return
+        apart = np.median(points, axis=0) - self.middle
+        slip = first_slip(points, lambda corrected: self._reaches(corrected, _SURELY * reach))
+        if slip:
+            why = f"they {slip.words}"
+        elif np.linalg.norm(apart) > self.size:
+            why = f"they are {_numbers(apart)} away from it, perhaps by a shift that one of the two files lacks"
+        else:
+            why = "neither other axes nor another unit nor a shift explain it"
+        raise SceneError(
+            f"{called} are not in the frame of the shell {self.path}, as they are not {where}: they are around "
+            f"{_numbers(np.median(points, axis=0))} and {np.linalg.norm(np.ptp(points, axis=0)):.3g} wide, the shell "
+            f"around {_numbers(self.middle)} and {self.size:.3g} wide; "
+            f"{why}: correct the coordinates"
+        )
+
+    def _reaches(self, points: np.ndarray, reach: float) -> bool:
+        spread = np.linalg.norm(np.ptp(points, axis=0)) >= _NARROW * self.size or len(points) == 1
+        return bool(spread and np.median(self._surface.query(points - self.middle)[0]) <= reach * self.size)
+
+
+def apart(shell: Float64[np.ndarray, "V 3"], seen: Float64[np.ndarray, "N 3"]) -> str | None:
+    """How a shell is elsewhere, or larger or smaller, than what cameras see, in words; None if it is not.
+
+    Args:
+        shell: vertices of the shell, placed in the scene's frame by an alignment.
+        seen: SfM points and positions of cameras, in the same frame.
+    """
+    (low, high), (bottom, top) = _box(shell), _box(seen)
+    size, extent = (float(np.linalg.norm(corner - other)) for corner, other in ((high, low), (top, bottom)))
+    if not extent < _LARGEST * size < _LARGEST**2 * extent:
+        return (
+            f"it makes the shell {size:.3g} scene units wide, and what the cameras see is {extent:.3g} wide: look for "
+            "another unit of length"
+        )
+    gap = float(np.linalg.norm(np.maximum(low - top, 0) + np.maximum(bottom - high, 0)))
+    if gap > size + extent:
+        return (
+            f"it puts the shell, which is {size:.3g} scene units wide, {gap:.3g} away from what the cameras see: a "
+            "shift (such as CloudCompare's --global-shift) is missing, or has the other sign"
+        )
+    return None
+
+
+def _box(points: np.ndarray) -> np.ndarray:
+    """Lowest and highest corner of the box around most points."""
+    return np.percentile(points, [2, 98], axis=0)
+
+
+def _numbers(point: np.ndarray) -> str:
+    return " ".join(f"{value:.6g}" if abs(value) < 1000 else f"{value:.0f}" for value in point)

@@ -1,0 +1,190 @@
+"""Align the shell by picks: a text file of points picked on the shell and in photographs.
+
+The file is a `gcp_list.txt` in OpenDroneMap's format, which several picking tools write: one line per point and
+photograph, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in the shell's file, x y the pixel (from
+the top left corner of the image). Lines with the same name, or without a name with the same X Y Z, are one point,
+which needs two photographs. A first line without numbers (the projection) and comments after # are skipped; quote image
+names with spaces. Points whose name begins with "check" are not fitted, only measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.photographs import View, to_camera
+from shellgs_method.registration.correspondences import (
+    Correspondence,
+    are_numbers,
+    fit_robustly,
+    read_lines,
+    view_named,
+    worst_first,
+)
+
+MAX_REPROJECTION = 4.0
+"""Largest distance of a picked pixel from the triangulated point, in pixels of a photograph 1000 pixels wide."""
+_MIN_ANGLE = 1.0  # degrees between two rays, for a point to have a depth
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A point on the shell and its pixels in photographs.
+
+    Attributes:
+        name: name in the file.
+        shell: coordinates in the shell's own frame.
+        pixels: pixel in the photograph as stored on disk, by the view's name.
+    """
+
+    name: str
+    shell: Float64[np.ndarray, " 3"]
+    pixels: Mapping[str, tuple[float, float]]
+
+    @property
+    def held_out(self) -> bool:
+        """Whether it only checks the fit."""
+        return self.name.lower().startswith("check")
+
+
+@dataclass(frozen=True)
+class PickedPoint(Correspondence):
+    """A pick and its residuals; its point in the scene is triangulated from the photographs.
+
+    Attributes:
+        reprojection: largest reprojection error of the triangulated point, in pixels.
+        worst_view: name of the view with that error.
+        is_sharp: whether the picked pixels agree on one point.
+    """
+
+    reprojection: float
+    worst_view: str
+    is_sharp: bool
+
+
+def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
+    """Read a file of picks.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is in degrees, or a line cannot be read, names an image that is not in the scene, or
+            contradicts another line.
+    """
+    shell: dict[str, np.ndarray] = {}
+    pixels: dict[str, dict[str, tuple[float, float]]] = {}
+    for where, words in read_lines(path, "picks"):
+        if len(words) < 6 or not are_numbers(words[:5]):
+            raise SceneError(
+                f"{where}: expected X Y Z of the shell, x y in the photograph, the image, a name, separated by spaces"
+            )
+        point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
+        view = view_named(words[5], views, where)
+        if view is None:
+            raise SceneError(f"{where}: {words[5]} is not a photograph of the scene")
+        name = words[6] if len(words) > 6 else " ".join(words[:3])
+        if not np.array_equal(shell.setdefault(name, point), point):
+            raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")
+        if view.name in pixels.setdefault(name, {}):
+            raise SceneError(f"{where}: the point {name} is picked twice in {words[5]}")
+        pixels[name][view.name] = pixel
+    if not shell:
+        raise SceneError(f"{path} holds no picks")
+    return [Pick(name, point, pixels[name]) for name, point in shell.items()]
+
+
+def triangulate(
+    viewmats: Float64[np.ndarray, "M 4 4"], Ks: Float64[np.ndarray, "M 3 3"], pixels: Float64[np.ndarray, "M 2"]
+) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " M"]]:
+    """Triangulate a point from its pixels in several views; return it and its reprojection errors, in pixels.
+
+    Starts at the point closest to all rays and minimises the squared reprojection errors by Gauss-Newton.
+
+    Raises:
+        ValueError: the rays are parallel, or they meet behind a camera.
+    """
+    rays = np.linalg.solve(Ks, np.append(pixels, np.ones((len(pixels), 1)), axis=1)[..., None])[..., 0]
+    directions = np.einsum("mji,mj->mi", viewmats[:, :3, :3], rays)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    centres = -np.einsum("mji,mj->mi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    cosines = directions @ directions.T
+    if cosines.min() > np.cos(np.radians(_MIN_ANGLE)):
+        raise ValueError("its photographs were taken from almost the same direction: pick it in one farther off")
+    across = np.eye(3) - np.einsum("mi,mj->mij", directions, directions)
+    point = np.linalg.solve(across.sum(axis=0), np.einsum("mij,mj->i", across, centres))
+    error = np.empty((len(pixels), 2))
+    for _ in range(10):
+        in_camera = viewmats[:, :3, :3] @ point + viewmats[:, :3, 3]
+        if (in_camera[:, 2] <= 0).any():
+            raise ValueError("its rays meet behind a camera: a pixel belongs to something else")
+        homogeneous = np.einsum("mij,mj->mi", Ks, in_camera)
+        depth = homogeneous[:, 2:]
+        error = homogeneous[:, :2] / depth - pixels
+        gradient = np.einsum("mij,mjk->mik", Ks, viewmats[:, :3, :3])
+        J = (gradient[:, :2] - (homogeneous[:, :2] / depth)[..., None] * gradient[:, 2:]) / depth[..., None]
+        step = np.linalg.lstsq(J.reshape(-1, 3), error.reshape(-1), rcond=None)[0]
+        point = point - step
+        if np.abs(step).max() <= 1e-12 * np.abs(point).max():
+            break
+    return point, np.linalg.norm(error, axis=1)
+
+
+def align_picks(
+    picks: Sequence[Pick], views: Sequence[View], metres_per_shell_unit: float = 1.0
+) -> tuple[Float64[np.ndarray, "4 4"], list[PickedPoint]]:
+    """Fit the similarity from the shell to the scene to picks; return it and each pick's residuals, worst first.
+
+    Points whose pixels disagree are left out, and so are outliers among the others.
+
+    Raises:
+        SceneError: a point cannot be triangulated, or fewer than 3 points off one line can be trusted.
+    """
+    scene, reprojection, worst_view, sharp = _triangulate_all(picks, views)
+    candidates = sharp & ~np.array([pick.held_out for pick in picks])
+    shell = np.stack([pick.shell for pick in picks])
+    fit = fit_robustly(shell, scene, candidates, metres_per_shell_unit, "picks", "pick a point beside it")
+    points = [
+        PickedPoint(
+            pick.name,
+            pick.shell,
+            scene[k],
+            pick.held_out,
+            bool(fit.used[k]),
+            float(fit.residuals[k]),
+            float(fit.left_out[k]),
+            reprojection[k],
+            worst_view[k],
+            bool(sharp[k]),
+        )
+        for k, pick in enumerate(picks)
+    ]
+    return fit.shell_to_scene, worst_first(points)
+
+
+def _triangulate_all(
+    picks: Sequence[Pick], views: Sequence[View]
+) -> tuple[np.ndarray, list[float], list[str], Bool[np.ndarray, " N"]]:
+    by_name = {view.name: view for view in views}
+    scene, reprojection, worst_view, sharp = [], [], [], []
+    for pick in picks:
+        if len(pick.pixels) < 2:
+            raise SceneError(f"the pick {pick.name} is seen in one photograph only: pick it in another as well")
+        seen = [by_name[name] for name in pick.pixels]
+        pixels = np.concatenate([to_camera(v, np.array([pick.pixels[v.name]], dtype=np.float64)) for v in seen])
+        viewmats, Ks = (
+            np.stack([getattr(view.camera, name).cpu().double().numpy() for view in seen]) for name in ("viewmat", "K")
+        )
+        try:
+            point, error = triangulate(viewmats, Ks, pixels)
+        except ValueError as error:
+            raise SceneError(f"the pick {pick.name} cannot be triangulated: {error}") from error
+        limits = [MAX_REPROJECTION * max(1.0, max(v.camera.width, v.camera.height) / 1000) for v in seen]
+        scene.append(point)
+        reprojection.append(float(error.max()))
+        worst_view.append(seen[int(error.argmax())].name)
+        sharp.append(bool((error <= limits).all()))
+    return np.stack(scene), reprojection, worst_view, np.array(sharp)

@@ -1,0 +1,239 @@
+"""The validation report: a self-contained HTML file, its plots also as PNG files, its metrics as json."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
+
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.cue_maps import CueMap
+from shellgs_method.files.html import data_uri, encoded
+from shellgs_method.files.photographs import load_photograph
+from shellgs_method.registration.correspondences import Correspondence
+from shellgs_method.registration.picks import PickedPoint
+from shellgs_method.registration.repetition import RIVALRY
+from shellgs_method.registration.support import representative
+from shellgs_method.registration.validation import Validation
+from shellgs_method.shell.mesh import ShellMesh
+from shellgs_method.shell.raycast import ShellCaster
+
+COLOURS = {"good": "#1a7f37", "doubtful": "#9a6700", "refused": "#cf222e"}
+_EDGE = (255, 0, 140)
+_OVERLAY = 1280  # pixels of the longer side
+_BLUR = 2  # pixels
+_STYLE = """
+:root { color-scheme: light }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1f2328; max-width: 68rem; margin: 2rem auto; padding: 0 1rem }
+h1 { font-size: 1.6rem } h2 { font-size: 1.2rem; margin-top: 2.5rem }
+.good { color: #1a7f37 } .doubtful { color: #9a6700 } .refused { color: #cf222e }
+.verdict { font-size: 1.3rem; border-left: .4rem solid; padding: .2rem 1rem; margin: 1rem 0 }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100% }
+th, td { text-align: left; padding: .3rem .7rem .3rem 0; border-bottom: 1px solid #d1d9e0; vertical-align: top }
+th { font-weight: 600 } small, .why { color: #59636e }
+.views { display: grid; grid-template-columns: repeat(auto-fill, minmax(30rem, 1fr)); gap: 1rem }
+img { max-width: 100% } figure { margin: 0 }
+figure > div { position: relative } figure img { width: 100%; display: block }
+figure img + img { position: absolute; inset: 0 } figure div:hover img + img { opacity: 0 }
+@media (max-width: 34rem) { .views { grid-template-columns: 1fr } }
+"""
+
+
+def shell_edges(cue: CueMap, metres_per_unit: float) -> Bool[np.ndarray, "H W"]:
+    """Edges of the cast shell, two pixels wide: outlines, steps of more than 3 cm, and bends of more than 25°.
+
+    A bend must also show in normals blurred over a few pixels: neighbouring triangles of a photogrammetric shell can
+    differ by as much, but in random directions.
+    """
+    with np.errstate(divide="ignore"):
+        inverse = np.where(cue.mask, 1 / cue.depth, 0.0)
+    edges = np.zeros_like(cue.mask)
+    normal = cue.normal.astype(np.float32)
+    blurred = gaussian_filter(normal, (_BLUR, _BLUR, 0))
+    blurred /= np.maximum(np.linalg.norm(blurred, axis=2, keepdims=True), 1e-9)
+    for axis in (0, 1):
+        index = np.arange(cue.mask.shape[axis])
+        back, here, ahead = (np.roll(index, k) for k in (1, 0, -1))
+        before, after = inverse.take(back, axis), inverse.take(ahead, axis)
+        # The inverse depth of a plane is linear in the image; a step of h metres bends it by h / z².
+        bend = np.abs(before - 2 * inverse.take(here, axis) + after) * cue.depth**2 * metres_per_unit
+        turn = _turns(normal, here, ahead, axis) & _turns(blurred, np.roll(index, _BLUR), np.roll(index, -_BLUR), axis)
+        both = cue.mask & cue.mask.take(ahead, axis) & cue.mask.take(back, axis)
+        found = (cue.mask != cue.mask.take(ahead, axis)) | (both & ((bend > 0.03) | turn))
+        inside = (index > 0) & (index < len(index) - 1)
+        edges |= found & (inside[:, None] if axis == 0 else inside)
+    return edges
+
+
+def _turns(normal: np.ndarray, one: np.ndarray, other: np.ndarray, axis: int) -> Bool[np.ndarray, "H W"]:
+    """Mask of pixels where the normals at two indices along an axis differ by more than 25°."""
+    return np.einsum("hwc,hwc->hw", normal.take(one, axis), normal.take(other, axis)) < np.cos(np.radians(25))
+
+
+def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history: Sequence[str] = ()) -> Path:
+    """Write ``index.html``, ``validation.json`` and the PNG files; return the path of the HTML file.
+
+    Args:
+        folder: output folder; an older report there is replaced.
+        mesh: the shell in its own frame.
+        validation: the validation to report.
+        history: how the alignment was found, one sentence per step.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for stale in folder.glob("*.png"):
+        stale.unlink()
+    plots = {}
+    for name, figure in (("distances", _histogram(validation)), ("shifts", _shifts(validation))):
+        if figure is not None:
+            plots[name] = _png(figure)
+            _write(folder / f"{name}.png", plots[name])
+    overlays = list(_overlays(folder, mesh, validation))
+    record = {
+        "verdict": validation.verdict,
+        "checks": [vars(check) for check in validation.checks],
+        "metrics": validation.metrics(),
+    }
+    _write(folder / "validation.json", (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
+    _write(folder / "index.html", "".join(_page(validation, history, plots, overlays)).encode())
+    return folder / "index.html"
+
+
+def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator[str]:
+    """Yield the HTML of each representative view, and write its overlay as PNG."""
+    caster = ShellCaster(mesh, validation.alignment.shell_to_scene)
+    for number, support in enumerate(representative(validation.views, validation.axes[0]), start=1):
+        view = replace(support.view, camera=support.view.camera.shrunk(_OVERLAY))
+        photograph = np.ascontiguousarray(load_photograph(view))
+        edges = shell_edges(caster.cast(view.camera), validation.alignment.metres_per_unit)
+        composite = photograph.copy()
+        composite[edges] = _EDGE
+        name = f"view_{number}_{Path(view.name).stem}.png"
+        _write(folder / name, encoded(composite))
+        lines = np.zeros((*edges.shape, 4), np.uint8)
+        lines[edges] = (*_EDGE, 255)
+        layers = _img(encoded(photograph, "JPEG"), view.name) + _img(encoded(lines), "the shell's edges")
+        caption = f"{escape(view.name)} <small>{support.supported:.0%} on the shell</small>"
+        yield f"<figure><div>{layers}</div><figcaption>{caption}</figcaption></figure>"
+
+
+def _page(
+    validation: Validation, history: Sequence[str], plots: Mapping[str, bytes], overlays: Sequence[str]
+) -> Iterator[str]:
+    alignment, verdict = validation.alignment, validation.verdict
+    title = f"Alignment of {escape(alignment.shell)}: {verdict}"
+    yield f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
+    yield f'<h1>Alignment of {escape(alignment.shell)}</h1><p class="verdict {verdict}">Verdict: <b>{verdict}</b></p>'
+    yield "".join(f"<p>{escape(sentence)}</p>" for sentence in (f"From: {alignment.source}.", *history))
+    yield f"<p>One scene unit is {alignment.metres_per_unit:.6g} m; {validation.near:.0%} of the SfM points are within "
+    yield "1 m of the shell.</p>"
+    yield "<h2>Checks behind the verdict</h2>"
+    checks = (
+        (f'<span class="{c.verdict}">{c.verdict}</span>', escape(c.name), escape(c.value), escape(c.limits),
+         f'<span class="why">{escape(c.why)}</span>') for c in validation.checks
+    )  # fmt: skip
+    yield _table(("", "metric", "value", "limits", "because"), checks)
+    if overlays:
+        yield "<h2>The shell's edges on the photographs</h2><p>They must lie on the photographed edges, also at both "
+        yield "ends of the building. Hover over an image to hide them.</p>"
+        yield f'<div class="views">{"".join(overlays)}</div>'
+    if "distances" in plots:
+        shares = ", ".join(f"{validation.share_within(d):.0%} within {100 * d:.0f} cm" for d in (0.05, 0.10, 0.20))
+        yield f"<h2>Distance of the SfM points from the shell</h2><p>Of those within 1 m: {shares}; median "
+        yield f"{100 * validation.bias:+.1f} cm along the normal, positive in front of the shell.</p>"
+        yield _img(plots["distances"], "histogram of the distances")
+    if "shifts" in plots:
+        yield "<h2>Bay test</h2><p>Fit of the shell to the points when it is shifted along the facade and upwards. "
+        yield f"Another peak of {RIVALRY:.0%} or more of the one at 0 makes the alignment ambiguous.</p>"
+        yield _img(plots["shifts"], "fit by shift")
+        rows = (
+            (scan.name, f"{k:+d} × {scan.period:.2f} m", f"{fit:.2f}")
+            for scan in validation.scans if scan.period for k, fit in scan.at_periods().items()
+        )  # fmt: skip
+        yield _table(("direction", "shift", "fit, relative"), rows)
+    if validation.test is not None:
+        evidence = validation.test.evidence
+        yield f"<h2>What the points determine</h2><p>Condition number of the fit {evidence.condition:.3g} over "
+        yield f"{evidence.points} points; strengths of its seven directions: "
+        yield ", ".join(f"{strength:.2g}" for strength in evidence.strengths) + ".</p>"
+    if validation.correspondences:
+        head, *rows = residual_table(validation.correspondences)
+        yield "<h2>Points known in both frames, worst first</h2>" + _table(head, map(_escaped, rows))
+    yield "<h2>All views</h2>"
+    rows = (
+        (escape(s.view.name), f"{s.supported:.0%}", len(s.errors), f"{100 * s.error:.1f} cm", f"{s.occluded:.0%}")
+        for s in validation.views
+    )
+    yield _table(("view", "on the shell", "SfM points there", "median depth error", "occluded"), rows)
+
+
+def residual_table(points: Sequence[Correspondence]) -> list[tuple[str, ...]]:
+    """Header and one row per point: its residuals, and for a pick its reprojection error."""
+    picked = [point for point in points if isinstance(point, PickedPoint)]
+    table = [("point", "residual", "leave-one-out", *(("reprojection", "worst photograph") if picked else ()), "")]
+    for point in points:
+        remark = "check point" if point.held_out else "" if point.is_used else "left out"
+        without = "–" if np.isnan(point.left_out_residual) else f"{point.left_out_residual:.3f} m"
+        pixels: tuple[str, ...] = ()
+        if isinstance(point, PickedPoint):
+            pixels = (f"{point.reprojection:.1f} px", point.worst_view)
+            remark += "" if point.is_sharp else ": its pixels disagree"
+        table.append((point.name, f"{point.residual:.3f} m", without, *pixels, remark))
+    return table
+
+
+def _escaped(row: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(map(escape, row))
+
+
+def _table(head: Sequence[str], rows) -> str:
+    cells = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><tr>{''.join(f'<th>{word}</th>' for word in head)}</tr>{cells}</table>" if cells else ""
+
+
+def _histogram(validation: Validation) -> Figure | None:
+    if len(validation.signed) == 0:
+        return None
+    figure = Figure(figsize=(9, 2.8), dpi=110, layout="constrained")
+    axes = figure.subplots()
+    axes.hist(np.clip(100 * validation.signed, -50, 50), bins=100, color="#4493f8")
+    axes.axvline(100 * validation.bias, color=COLOURS["refused"], linewidth=1, label="median")
+    axes.set(xlabel="distance from the shell (cm), positive in front of it", ylabel="SfM points", xlim=(-51, 51))
+    axes.legend(frameon=False)
+    return figure
+
+
+def _shifts(validation: Validation) -> Figure | None:
+    if not validation.scans:
+        return None
+    figure = Figure(figsize=(9, 2.8), dpi=110, layout="constrained")
+    for axes, scan in zip(figure.subplots(1, len(validation.scans), sharey=True), validation.scans, strict=True):
+        axes.plot(scan.shifts, scan.fits / max(scan.in_place, 1e-9), color="#1f2328", linewidth=1)
+        axes.axhline(RIVALRY, color=COLOURS["doubtful"], linewidth=1, linestyle="--")
+        for k in scan.at_periods():
+            axes.axvline(k * (scan.period or 0), color="#d1d9e0", linewidth=1, zorder=0)
+        axes.set(title=f"shifted {scan.name}", xlabel="metres", ylim=(0, None))
+    figure.axes[0].set_ylabel("fit, relative")
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def _img(data: bytes, text: str) -> str:
+    return f'<img alt="{escape(text)}" src="{data_uri(data)}">'
+
+
+def _write(path: Path, data: bytes) -> None:
+    with atomic_write(path) as file:
+        file.write(data)

@@ -1,0 +1,231 @@
+"""Whether points lie in the frame of something else, and which slip explains it if they do not.
+
+Files are exported with other axes, in other units, or without a shift. Each of these is one of the :func:`slips`, which
+are tried one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from jaxtyping import Float64, Shaped
+from PIL import Image
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.geometry.camera import Camera, in_view, positions
+
+UNITS = {
+    0.001: "are in millimetres instead of metres",
+    1000.0: "are in metres instead of millimetres",
+    0.01: "are in centimetres instead of metres",
+    100.0: "are in metres instead of centimetres",
+    0.3048: "are in feet instead of metres",
+    1 / 0.3048: "are in metres instead of feet",
+    0.0254: "are in inches instead of metres",
+    0.1: "are ten times too large",
+    10.0: "are ten times too small",
+}
+"""Mistaken units, by the factor that corrects them."""
+_AXES: dict[tuple[int, ...], str] = {
+    (1, -2, -3): "have OpenGL's axes instead of OpenCV's, or these instead of those",
+    (2, 1, 3): "have x and y (easting and northing) swapped",
+    (1, 3, -2): "have y up instead of z, or z instead of y",
+    (1, -3, 2): "have z up instead of y, or y instead of z",
+}
+"""Axes that are usually confused, by the numbers and signs of those that correct it."""
+_FEW = 10  # points that show nothing
+_POINTS, _PHOTOGRAPHS, _SIZE = 1000, 6, 400  # that suffice
+_OBSERVATIONS = 50  # that suffice to compare colours
+_OF_PHOTOGRAPHS = 3.0
+"""Contrast of hues in which points and their photographs differ less: .5 to 1.3 in three scenes, 0 for heights and
+intensities in grey, 5 and more for those in colours and for classes."""
+# Cameras see nearly all points of their own frame, whose colours correlate with the photographs' by 0.6 and more. In a
+# wrong frame it is 0.35 at most, though cameras often see most of them (three scenes, ten wrong frames of each).
+_SEEN, _ALIKE = 0.5, 0.4
+_UNSEEN, _HARDLY, _WELL, _UNLIKE = 0.02, 0.1, 0.8, 0.15
+_FAR = 100.0  # times the extent of the cameras, from where they cannot triangulate
+
+
+@dataclass(frozen=True)
+class Slip:
+    """A mistake in the export of points.
+
+    Attributes:
+        words: what is wrong with them.
+        correction: linear map that corrects it.
+    """
+
+    words: str
+    correction: Float64[np.ndarray, "3 3"]
+
+    def corrected(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """The points without the mistake."""
+        return points @ self.correction.T
+
+
+def slips() -> Iterator[Slip]:
+    """Usual mistakes, likelier ones first: axes that are usually confused, units, any axes, axes with units."""
+    axes = {tuple(s * (k + 1) for s, k in zip(signs, order, strict=True)): _signed(order, signs)
+            for order in permutations(range(3)) for signs in product((1, -1), repeat=3)}  # fmt: skip
+    del axes[1, 2, 3]
+    turned = {numbers: Slip(_axes_in_words(numbers), matrix) for numbers, matrix in axes.items()}
+    scaled = [Slip(words, factor * np.eye(3)) for factor, words in UNITS.items()]
+    yield from (turned[numbers] for numbers in _AXES)
+    yield from scaled
+    yield from (slip for numbers, slip in turned.items() if numbers not in _AXES)
+
+
+def _signed(order: Sequence[int], signs: Sequence[int]) -> np.ndarray:
+    return np.diag(signs) @ np.eye(3)[list(order)]
+
+
+def _axes_in_words(numbers: tuple[int, ...]) -> str:
+    name = " ".join(("-" if number < 0 else "") + "xyz"[abs(number) - 1] for number in numbers)
+    return f"{_AXES.get(numbers, 'have other axes')}: as {name} they fit"
+
+
+def first_slip(points: Float64[np.ndarray, "N 3"], fits: Callable[[np.ndarray], bool]) -> Slip | None:
+    """The likeliest mistake whose correction makes the points fit; None if none does."""
+    return next((slip for slip in slips() if fits(slip.corrected(points))), None)
+
+
+def in_degrees(points: Float64[np.ndarray, "N 3"], size: float) -> bool:
+    """Whether points, which spread over something of this size, are longitudes and latitudes, in either order."""
+    flat = np.abs(points[:, :2])
+    a_degree = 1.0  # a building is less than a hundredth of one wide
+    small = 0 < np.ptp(points[:, :2], axis=0).max() < min(0.01 * a_degree, 0.05 * size)  # 0: above each other
+    return bool(small and flat.max() <= 180 and flat.min(axis=1).max() <= 90)
+
+
+def check_points(points: SparsePoints, views: Sequence[View]) -> None:
+    """Refuse SfM points that are not in the frame of the cameras; warn if that is likely.
+
+    Cameras see the points of their own frame, which have the colours of the photographs there.
+
+    Args:
+        points: the SfM points.
+        views: photographs of the scene, of any size.
+
+    Raises:
+        SceneError: no camera sees them, or with other axes or in another unit, they would fit.
+    """
+    if len(points.positions) < _FEW or not views:
+        return
+    sight = _Sight.of(points, views)
+    seen, alike, away = sight.seen(sight.points), sight.alike(sight.points), sight.away(sight.points)
+    if away <= _FAR and (seen >= _SEEN or alike >= _SEEN) and not alike < _ALIKE:
+        return
+    apart = f"cameras see {seen:.0%} of them, and their centre is {away:.2g} times as far as the cameras are apart"
+    remedy = "export cameras and points from one program, in one frame"
+    if slip := sight.explanation(seen, away):
+        sure = "they" if sight.photographs else "perhaps they"
+        raise SceneError(f"{points.called} are not in the frame of the cameras: {sure} {slip.words}; {remedy}")
+    if seen < _UNSEEN or away > _FAR:
+        raise SceneError(
+            f"{points.called} are not in the frame of the cameras: {apart}, which neither other axes nor another unit "
+            f"explain, but a shift or a rotation; {remedy}"
+        )
+    if alike < _UNLIKE or seen < _ALIKE:
+        colours = ", and they have other colours than the photographs there" if alike < _UNLIKE else ""
+        notice(f"{points.called} may be in another frame than the cameras: {apart}{colours}; if so, {remedy}.")
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """Some points, the cameras that may see them, and some small photographs, to compare colours with."""
+
+    points: Float64[np.ndarray, "N 3"]
+    colours: Float64[np.ndarray, "N 3"]
+    cameras: Sequence[Camera]
+    photographs: Sequence[tuple[Camera, Float64[np.ndarray, "H W 3"]]]
+
+    @classmethod
+    def of(cls, points: SparsePoints, views: Sequence[View]) -> _Sight:
+        some = np.random.default_rng(0).permutation(len(points.positions))[:_POINTS]
+        colours = np.zeros((len(some), 3))
+        if points.colours is not None and points.observed is None:  # with tracks, they are of one model
+            colours = points.colours[some].astype(np.float64)
+        shown = _spread(views, _PHOTOGRAPHS) if np.ptp(colours, axis=0).max() > 0 else []
+        photographs = [photograph for view in shown for photograph in _small(view)]
+        if not may_be_of(colours, [image for _, image in photographs]):
+            photographs = []
+        return cls(points.positions[some], colours, [view.camera for view in views], photographs)
+
+    def seen(self, points: np.ndarray) -> float:
+        """Share of the points that a camera sees; each of many cameras may see a small part of a street."""
+        unseen = points
+        for camera in self.cameras:
+            unseen = unseen[~in_view(camera, unseen)[0]]
+            if len(unseen) == 0:
+                break
+        return 1 - len(unseen) / len(points)
+
+    def alike(self, points: np.ndarray) -> float:
+        """Correlation of the points' colours with those of the photographs, in each; NaN if too few are compared."""
+        own, shown = [np.empty((0, 3))], [np.empty((0, 3))]
+        for camera, image in self.photographs:
+            inside, pixels, _ = in_view(camera, points)
+            if inside.sum() > 1:
+                columns, rows = pixels.astype(int).T
+                for found, colours in ((own, self.colours[inside]), (shown, image[rows, columns])):
+                    found.append(colours - colours.mean(axis=0))
+        one, other = np.concatenate(own), np.concatenate(shown)
+        norm = np.linalg.norm(one) * np.linalg.norm(other)
+        return float((one * other).sum() / norm) if len(one) >= _OBSERVATIONS and norm > 0 else float("nan")
+
+    def away(self, points: np.ndarray) -> float:
+        """Distance of the points' centre from the cameras', relative to the extent of these; 0 for a single one."""
+        cameras = positions(self.cameras)
+        extent = float(np.linalg.norm(np.ptp(cameras, axis=0)))
+        distance = float(np.linalg.norm(np.median(points, axis=0) - np.median(cameras, axis=0)))
+        return distance / extent if extent > 0 else 0.0
+
+    def explanation(self, seen: float, away: float) -> Slip | None:
+        """The mistake whose correction gives the most likeness; without colours, one that brings them into view."""
+        if not self.photographs:
+            return first_slip(self.points, self._in_view) if seen < _HARDLY or away > _FAR else None
+        found = [(self.alike(slip.corrected(self.points)), slip) for slip in slips()]
+        likeness, slip = max(found, key=lambda pair: np.nan_to_num(pair[0]))
+        return slip if likeness >= _SEEN and self.seen(slip.corrected(self.points)) >= _SEEN else None
+
+    def _in_view(self, points: np.ndarray) -> bool:
+        return self.seen(points) > _WELL and self.away(points) < _FAR / 5
+
+
+def may_be_of(colours: Shaped[np.ndarray, "N 3"], images: Sequence[Shaped[np.ndarray, "H W 3"]]) -> bool:
+    """Whether colours of points may be of these photographs, by the contrast of hues, not of heights or classes.
+
+    Args:
+        colours: RGB, up to 255.
+        images: photographs, likewise.
+    """
+    if not images or len(colours) == 0:
+        return False
+    points, photographs = _contrast(colours), _contrast(np.concatenate([image.reshape(-1, 3) for image in images]))
+    return points < _OF_PHOTOGRAPHS * photographs and photographs < _OF_PHOTOGRAPHS * points
+
+
+def _contrast(colours: np.ndarray) -> float:
+    """Deviation of red and blue from green; at least 1, of which compression makes a part."""
+    red, green, blue = np.asarray(colours, dtype=np.float64).T
+    return max(1.0, float(np.hypot(np.std(red - green), np.std(blue - green))))
+
+
+def _spread(views: Sequence[View], count: int) -> list[View]:
+    """Up to ``count`` views, evenly spread."""
+    return [views[k] for k in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))]
+
+
+def _small(view: View) -> list[tuple[Camera, np.ndarray]]:
+    """A view's photograph, small, and its camera; none if it is damaged, which is reported where it is used."""
+    camera = view.camera.shrunk(_SIZE)
+    try:
+        image = Image.fromarray(load_photograph(view))
+    except (SceneError, OSError):
+        return []
+    return [(camera, np.asarray(image.resize((camera.width, camera.height), Image.Resampling.BOX), np.float64))]

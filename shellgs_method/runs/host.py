@@ -1,0 +1,101 @@
+"""Nerfstudio's commands on runs of these methods: what they cannot do there ends in one sentence.
+
+They are not ours to change, and with these methods end in a traceback, or write something else than what was asked
+for. Where a model, a data manager or a config is asked for what it has not, it refuses by :func:`refuse`; the rest is
+mended in the modules of the commands, in processes that run one of them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, NoReturn
+
+from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.render.panorama import check_camera_type
+from shellgs_method.runs.limits import check_viewer
+
+NO_RAYS = (
+    "these methods render whole images, not single rays as ns-export pointcloud, tsdf and poisson and "
+    "--render-nearest-camera ask for: `shellgs mesh CONFIG` writes a mesh, `shellgs splats CONFIG` or "
+    "`ns-export gaussian-splat` the Gaussians"
+)
+NO_FIELD = "ns-export marching-cubes needs a signed distance field, and these methods have none: `shellgs mesh CONFIG`"
+NO_RGBA = (
+    "these methods render no rgba image: name rgb and accumulation, or raw-rgb and raw-accumulation of ns-render "
+    "dataset, in --rendered-output-names"
+)
+
+
+def refuse(sentence: str) -> NoReturn:
+    """End a command of nerfstudio with a sentence."""
+    with refusals_end_the_program():
+        raise SceneError(sentence)
+    raise AssertionError
+
+
+class NoPixelSampler:
+    """A data manager's sampler of rays, which ns-export configures: that ends it, but not a viewer that looks at it."""
+
+    def __setattr__(self, _name: str, _value: object) -> NoReturn:
+        refuse(NO_RAYS)
+
+
+def mend_commands() -> None:
+    """Mend the command of nerfstudio that this process runs, if any."""
+    for module, mend in _MENDS.items():
+        if module in sys.modules:
+            mend(sys.modules[module])
+
+
+def _mend_render(render: Any) -> None:
+    """Ns-render takes an unknown type of camera for perspective, and starts spirals from listed data managers alone."""
+    from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
+    from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+
+    render.get_path_from_json = _before(
+        render.get_path_from_json, lambda path: check_camera_type(str(path.get("camera_type") or "perspective"))
+    )
+    render.VanillaDataManager = (VanillaDataManager, FullImageDatamanager)
+
+
+def _mend_exporter(exporter: Any) -> None:
+    """Ns-export writes no empty file of Gaussians."""
+
+    def refuse_none(filename: str, count: int, _columns: Any) -> None:
+        if count == 0:
+            raise SceneError(
+                f"{filename} would be empty: no Gaussian is inside the box of --obb-center, --obb-rotation and "
+                "--obb-scale: give another one, in nerfstudio's frame, or none"
+            )
+
+    exporter.ExportGaussianSplat.write_ply = staticmethod(_before(exporter.ExportGaussianSplat.write_ply, refuse_none))
+
+
+def _mend_viewer(run_viewer: Any) -> None:
+    """Ns-viewer has an address of its own."""
+    run_viewer._start_viewer = _before(
+        run_viewer._start_viewer, lambda config, _pipeline, _step: check_viewer(config.viewer)
+    )
+
+
+_MENDS = {
+    "nerfstudio.scripts.render": _mend_render,
+    "nerfstudio.scripts.exporter": _mend_exporter,
+    "nerfstudio.scripts.viewer.run_viewer": _mend_viewer,
+}
+
+
+def _before(function: Callable, check: Callable) -> Callable:
+    """The function, once, after a check of its arguments that may end the program."""
+    if hasattr(function, "__wrapped__"):
+        return function
+
+    @wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        with refusals_end_the_program():
+            check(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return checked

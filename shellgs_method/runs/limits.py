@@ -1,0 +1,254 @@
+"""Settings of a run: values out of range, and settings that would be ignored, are refused."""
+
+from __future__ import annotations
+
+import errno
+import math
+import socket
+from collections.abc import Iterator
+from dataclasses import MISSING, Field, fields, is_dataclass
+from typing import Any, NamedTuple
+
+import torch
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+
+from dataparsers.facade import FacadeDataParserConfig
+from shellgs_method.errors import SceneError
+
+
+class Limits(NamedTuple):
+    """Range of a setting."""
+
+    least: float
+    most: float = math.inf
+    kind: type = float
+    odd: bool = False
+
+    def __str__(self) -> str:
+        what = {int: "an odd whole number" if self.odd else "a whole number", float: "a number"}[self.kind]
+        least = "above 0" if self.least == TINY else f"from {self.least:g}"
+        return f"{what} {least}" + (f" to {self.most:g}" if self.most < math.inf else "")
+
+    def hold(self, value: Any) -> bool:
+        """Whether a value is in the range."""
+        if not isinstance(value, int if self.kind is int else (int, float)) or isinstance(value, bool):
+            return False
+        return self.least <= value <= self.most and math.isfinite(value) and not (self.odd and value % 2 == 0)
+
+
+TINY = 1e-30
+MIN_POINTS = 4
+"""Fewest points to start from: a point and its three neighbours, whose distance is its scale."""
+COUNT, FROM_ONE = Limits(0, 1e9, int), Limits(1, 1e9, int)
+WEIGHT, SHARE, LENGTH, RATE = Limits(0, 1e6), Limits(0, 1), Limits(TINY, 1e6), Limits(TINY, 1e3)
+PORT = Limits(1, 65535, int)
+
+LIMITS = {
+    "max_num_iterations": FROM_ONE,
+    "steps_per_log": FROM_ONE,
+    "steps_per_save": COUNT,
+    "steps_per_eval_batch": COUNT,
+    "steps_per_eval_image": COUNT,
+    "steps_per_eval_all_images": COUNT,
+    "max_buffer_size": FROM_ONE,
+    "max_log_size": COUNT,
+    "seed": Limits(0, 2**32 - 1, int),
+    "train_cameras_sampling_seed": Limits(0, 2**32 - 1, int),
+    "fps_reset_every": FROM_ONE,
+    "websocket_port": PORT,
+    "websocket_port_default": PORT,
+    "max_num_display_images": Limits(-1, 1e9, int),
+    "jpeg_quality": Limits(1, 100, int),
+    "camera_frustum_scale": LENGTH,
+    "lr": RATE,
+    "lr_final": RATE,
+    "eps": RATE,
+    "weight_decay": WEIGHT,
+    "band_width": LENGTH,
+    "camera_res_scale_factor": Limits(TINY, 1),
+    "warmup_length": COUNT,
+    "stop_split_at": COUNT,
+    "stop_screen_size_at": COUNT,
+    "refine_every": FROM_ONE,
+    "reset_alpha_every": FROM_ONE,
+    "densify_grad_thresh": WEIGHT,
+    "densify_size_thresh": WEIGHT,
+    "wide_gradient": WEIGHT,
+    "split_screen_size": WEIGHT,
+    "cull_scale_thresh": WEIGHT,
+    "cull_screen_size": WEIGHT,
+    "cull_alpha_thresh": SHARE,
+    "ssim_lambda": SHARE,
+    "sh_degree": Limits(0, 3, int),
+    "sh_degree_interval": FROM_ONE,
+    "seed_spacing": LENGTH,
+    "max_seeds": FROM_ONE,
+    "skybox_seeds": Limits(0, 1e6, int),
+    "init_opacity": Limits(0.01, 0.99),
+    "cap_max": Limits(MIN_POINTS, 1e9, int),
+    "noise": Limits(0, 1e12),
+    "ncc_window": Limits(3, 101, int, odd=True),
+    "ncc_eps": Limits(TINY, 1),
+}
+"""Ranges by the name of a setting; other numbers of the losses are weights and lengths from 0, ``…_from`` are steps."""
+_LOSSES = ("pipeline.model.geometry.", "pipeline.model.extra.", "pipeline.model.mcmc.")
+
+_ONE_DEVICE = "a run is trained on one device, and `shellgs compare --jobs` trains several runs at a time"
+_VIEWS = "in training, held-out views are drawn one at a time, and `ns-eval` measures all of them"
+_STORE = "photographs and masks are kept where datamanager.cache-images says"
+UNUSED = {
+    "machine.num_devices": _ONE_DEVICE,
+    "machine.num_machines": _ONE_DEVICE,
+    "machine.machine_rank": _ONE_DEVICE,
+    "machine.dist_url": _ONE_DEVICE,
+    "mixed_precision": "these methods are trained in single precision",
+    "use_grad_scaler": "scaled gradients would change which Gaussians are divided",
+    "prompt": "these methods take no text",
+    "viewer.relative_log_filename": "the viewer writes no log",
+    "viewer.num_rays_per_chunk": "images are rendered whole",
+    "datamanager.masks_on_gpu": _STORE,
+    "datamanager.images_on_gpu": _STORE,
+    "datamanager.eval_num_images_to_sample_from": _VIEWS,
+    "datamanager.eval_num_times_to_repeat_images": _VIEWS,
+    "datamanager.eval_image_indices": _VIEWS,
+    "datamanager.max_thread_workers": "nerfstudio reads photographs in two threads",
+}
+"""Settings of nerfstudio that would be ignored, by the end of their path, and why."""
+_HIDDEN = ("pipeline.model.", "optimizers.")
+"""Where settings that the command line does not show would be ignored too."""
+_AVAILABLE = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
+
+
+class Setting(NamedTuple):
+    """A setting in a config."""
+
+    path: str
+    value: Any
+    field: Field
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether it differs from its class's default."""
+        default = self.field.default
+        if default is MISSING and self.field.default_factory is not MISSING:
+            default = self.field.default_factory()
+        return default is not MISSING and self.value != default
+
+    @property
+    def why_unused(self) -> str | None:
+        """Why it would be ignored; None if it is used."""
+        if "Suppress" in str(self.field.type) and self.path.startswith(_HIDDEN):
+            return "these methods do not use it"
+        return next((why for end, why in UNUSED.items() if f".{self.path}".endswith(f".{end}")), None)
+
+
+def settings(config: Any, path: str = "") -> Iterator[Setting]:
+    """All settings in a config, and the configs in it."""
+    if isinstance(config, dict):
+        for key, value in config.items():
+            yield from settings(value, f"{path}{key}.")
+    elif is_dataclass(config) and not isinstance(config, type):
+        for field in fields(config):
+            value = getattr(config, field.name)
+            yield Setting(path + field.name, value, field)
+            yield from settings(value, f"{path}{field.name}.")
+
+
+def check_settings(config: Any) -> None:
+    """Refuse a trainer's config with a number out of range.
+
+    Raises:
+        SceneError: names the first such setting and its range.
+    """
+    for path, value, _ in settings(config):
+        limits = _limits(path)
+        if limits and isinstance(value, (int, float)) and not limits.hold(value):
+            raise SceneError(f"{path} cannot be {value}: give {limits}")
+
+
+def _limits(path: str) -> Limits | None:
+    name = path.rpartition(".")[2]
+    others = (COUNT if name.endswith("_from") else WEIGHT) if path.startswith(_LOSSES) else None
+    return LIMITS.get(name, others)
+
+
+def check_training(config: TrainerConfig) -> None:
+    """Refuse to train with settings that would be ignored, or that nothing here can follow.
+
+    Not part of :func:`check_settings`, which a trained run must pass on any machine.
+
+    Raises:
+        SceneError: names the first such setting, why, and what to give.
+    """
+    for setting in settings(config):
+        if (why := setting.why_unused) and setting.is_changed:
+            value = " ".join(str(setting.value).split())
+            raise SceneError(f"{setting.path} cannot be {value}: {why}; leave it out")
+    _check_scene(config)
+    device = config.machine.device_type
+    if device in _AVAILABLE and not _AVAILABLE[device]():
+        raise SceneError(
+            f"machine.device_type cannot be {device}: torch finds no such device here: leave it out, or give "
+            "--machine.device-type cpu"
+        )
+    for group, steps in config.gradient_accumulation_steps.items():
+        if group not in config.optimizers or not FROM_ONE.hold(steps):
+            groups = ", ".join(config.optimizers)
+            raise SceneError(f"gradient_accumulation_steps cannot be {group} {steps}: give one of {groups}, and steps")
+    if config.load_dir is not None and config.load_checkpoint is not None:
+        raise SceneError("load_dir and load_checkpoint name two checkpoints: give one of them")
+    if config.load_step is not None and config.load_dir is None:
+        raise SceneError(f"load_step cannot be {config.load_step} alone: give the --load-dir that holds this step")
+    if config.is_comet_enabled():
+        _check_comet()
+    if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
+        check_viewer(config.viewer)
+    elif config.start_paused:
+        raise SceneError(f"start_paused needs the viewer, whose button starts the training: --vis viewer+{config.vis}")
+
+
+def _check_scene(config: TrainerConfig) -> None:
+    from nerfstudio.configs.dataparser_configs import all_dataparsers  # it imports our parser, and so this package
+
+    data = config.pipeline.datamanager
+    parser = getattr(data, "dataparser", None)
+    if not isinstance(parser, FacadeDataParserConfig):
+        named = [name for name, known in all_dataparsers.items() if type(known) is type(parser)]
+        raise SceneError(
+            f"{config.method_name} does not read scenes by {(named or [type(parser).__name__])[0]}, which knows no "
+            "maps of a shell: leave it out, and facade-data reads transforms.json or a COLMAP model"
+        )
+    if data.data is not None and parser.data not in (FacadeDataParserConfig.data, data.data):
+        raise SceneError(f"two scenes are given, {data.data} and {parser.data}: give one of them, by --data")
+
+
+def _check_comet() -> None:
+    try:
+        from comet_ml import get_config  # slow to import  # pyright: ignore[reportPrivateImportUsage]
+    except ImportError as error:
+        raise SceneError(f"comet cannot be imported ({error}): pip install comet_ml, or another --vis") from error
+    if get_config("comet.api_key") is None:
+        raise SceneError("comet has no key: set COMET_API_KEY, run `comet login`, or give another --vis")
+
+
+def check_viewer(viewer: ViewerConfig) -> None:
+    """Refuse an address that the viewer cannot listen at; where only the port is taken, it takes another one.
+
+    Raises:
+        SceneError: there is no such port or host, or it is not allowed.
+    """
+    host, port = viewer.websocket_host, viewer.websocket_port
+    for name in ("websocket_port", "websocket_port_default"):
+        value = getattr(viewer, name)
+        if value is not None and not PORT.hold(value):
+            raise SceneError(f"viewer.{name} cannot be {value}: give {PORT}")
+    try:
+        family = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM)[0][0]
+        socket.create_server((host, port or 0), family=family).close()
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            raise SceneError(
+                f"the viewer cannot listen at {host}{f':{port}' if port else ''} ({error.strerror or error}): give "
+                "--viewer.websocket-host 127.0.0.1, or a --viewer.websocket-port above 1023"
+            ) from error

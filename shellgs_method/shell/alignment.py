@@ -1,0 +1,257 @@
+"""The similarity from the shell's frame to the scene's, and its file."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_write, read_json, remove_leftovers
+from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import positions
+from shellgs_method.geometry.similarity import scale_of, transformed
+from shellgs_method.shell.clouds import Mesher
+from shellgs_method.shell.mesh import ShellMesh, load_shell
+
+ALIGNMENT = Path("shell/alignment.json")
+"""Alignment file, in the scene's folder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A similarity from the shell's frame to the scene's, and how it was found.
+
+    Attributes:
+        shell_to_scene: uniform scale, rotation and translation.
+        shell: the shell's file, relative to the scene's folder (or absolute).
+        metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
+        source: how the alignment was found, for people.
+        verdict: verdict of the validation, "good" or "doubtful"; empty if not validated.
+        metrics: main metrics behind the verdict.
+        mesher: method that meshes a point cloud.
+        cameras: cameras it was found for, in whose frame alone it is valid; none in files of older versions.
+
+    Raises:
+        SceneError: the matrix is not a similarity, or mirrors, or the mesher is unknown.
+    """
+
+    shell_to_scene: Float64[np.ndarray, "4 4"]
+    shell: str
+    metres_per_shell_unit: float = 1.0
+    source: str = "matrix"
+    verdict: str = ""
+    metrics: Mapping[str, float | None] = field(default_factory=dict)
+    mesher: Mesher = "planes"
+    cameras: BoundCameras = field(default_factory=BoundCameras)
+
+    def __post_init__(self) -> None:
+        """Check the matrix, the unit and the mesher."""
+        matrix = np.array(self.shell_to_scene, dtype=np.float64)
+        matrix.setflags(write=False)
+        object.__setattr__(self, "shell_to_scene", matrix)
+        _check_similarity(matrix)
+        if not 0 < self.metres_per_shell_unit < np.inf:
+            raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
+        if self.mesher not in get_args(Mesher):
+            raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields."""
+        return isinstance(other, Alignment) and self._fields() == other._fields()
+
+    @property
+    def scale(self) -> float:
+        """Scene units in one shell unit."""
+        return scale_of(self.shell_to_scene)
+
+    @property
+    def rotation(self) -> Float64[np.ndarray, "3 3"]:
+        """The rotation from the shell's axes to the scene's, exactly orthonormal."""
+        u, _, vt = np.linalg.svd(self.shell_to_scene[:3, :3])
+        return u @ vt
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Metres in one scene unit."""
+        return self.metres_per_shell_unit / self.scale
+
+    @property
+    def error(self) -> float | None:
+        """Error of the alignment as a whole, in metres; None if it was not validated.
+
+        It is the largest of the magnitude of the SfM points' median signed distance, the motion of a fit to them, and
+        what coordinates are rounded by.
+        """
+        names = ("bias_m", "pull_m", "rounding_m")
+        known = [abs(metric) for name in names if (metric := self.metrics.get(name)) is not None]
+        return max(known, default=None)
+
+    def places_like(self, other: Alignment) -> bool:
+        """Whether both place the same surface identically, however they were found."""
+        return (
+            np.array_equal(self.shell_to_scene, other.shell_to_scene)
+            and self.shell == other.shell
+            and self.metres_per_shell_unit == other.metres_per_shell_unit
+            and self.mesher == other.mesher
+        )
+
+    def check_cameras(self, scene: Path, views: Sequence[View]) -> None:
+        """Refuse photographs whose cameras are not those that the alignment was found for.
+
+        Raises:
+            SceneError: they are others.
+        """
+        if changed := self.cameras.changed(views):
+            raise SceneError(
+                f"the alignment of {self.shell} was found for other cameras than those of {scene}: {changed}; run "
+                f"`shellgs align {shlex.quote(str(scene))}` to validate it with these, or align the shell to them again"
+            )
+
+    def meshed_by(self, mesher: Mesher | None) -> Alignment:
+        """Return the same alignment with another mesher, without a verdict; None keeps the mesher."""
+        if mesher is None or mesher == self.mesher:
+            return self
+        return replace(self, mesher=mesher, verdict="", metrics={})
+
+    def load_shell(self, scene: Path, views: Sequence[View]) -> ShellMesh:
+        """Load the shell's mesh, in its own frame; the mesh of a point cloud is cached in ``scene/shell``.
+
+        Args:
+            scene: the scene's folder.
+            views: photographs of the shell, whose cameras orient the normals of a point cloud.
+
+        Raises:
+            FileNotFoundError: the shell is missing.
+            SceneError: the shell cannot be used, or its coordinates were rounded by decimetres.
+        """
+        cameras = positions(view.camera for view in views)
+        viewpoints = transformed(cameras, np.linalg.inv(self.shell_to_scene))
+        return load_shell(
+            scene / self.shell,
+            cache=scene / "shell",
+            viewpoints=viewpoints,
+            mesher=self.mesher,
+            metres_per_unit=self.metres_per_shell_unit,
+        )
+
+    def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Transform points of the shell to the scene's frame, in double precision."""
+        return transformed(np.asarray(points, dtype=np.float64), self.shell_to_scene)
+
+    def save(self, path: Path) -> None:
+        """Write the alignment as json."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(path.parent)
+        with atomic_write(path) as file:
+            lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
+            file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
+
+    @classmethod
+    def load(cls, path: Path) -> Alignment:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: the file does not exist.
+            SceneError: the file is damaged or its matrix is not a similarity.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{path} does not exist: align the shell with `shellgs align {path.parent.parent} SHELL …`"
+            )
+        try:
+            fields = read_json(path)
+            matrix = np.array(fields["shell_to_scene"], dtype=np.float64)
+            unit, source = fields.get("metres_per_shell_unit", 1.0), fields.get("source", "matrix")
+            verdict, mesher = str(fields.get("verdict", "")), fields.get("mesher", "planes")
+            known = dict(fields.get("metrics", fields.get("figures", {})))  # older files say figures
+            metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
+            cameras = BoundCameras.from_json(fields.get("cameras", {}))
+            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, metrics, mesher, cameras)
+        except KeyError as error:
+            raise SceneError(f"{path}: the entry {error} is missing") from error
+        except SceneError as error:
+            raise SceneError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            raise SceneError(f"{path} is damaged ({error}): align the shell again") from error
+
+    @classmethod
+    def from_matrix_file(
+        cls,
+        path: Path,
+        shell: str,
+        metres_per_shell_unit: float = 1.0,
+        global_shift: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> Alignment:
+        """Read a row-major 4x4 matrix from a file: text as CloudCompare saves it, json or npy.
+
+        Args:
+            path: the file.
+            shell: the shell's file, relative to the scene's folder (or absolute).
+            metres_per_shell_unit: 1 for a shell in metres.
+            global_shift: CloudCompare's "global shift", which it adds to a cloud's coordinates on loading, so that its
+                matrices apply to the shifted coordinates.
+
+        Raises:
+            FileNotFoundError: the file does not exist.
+            SceneError: the file does not hold a 4x4 matrix, or one that is not a similarity.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(f"the matrix file {path} does not exist")
+        shift = np.eye(4)
+        shift[:3, 3] = global_shift
+        try:
+            return cls(_read_matrix(path) @ shift, shell, metres_per_shell_unit, source=f"matrix file {path.name}")
+        except ValueError as error:
+            raise SceneError(f"{path}: {error}") from error
+
+    def _fields(self) -> dict:
+        return {
+            **vars(self),
+            "shell_to_scene": self.shell_to_scene.tolist(),
+            "metrics": dict(self.metrics),
+            "cameras": self.cameras.to_json(),
+        }
+
+
+def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
+    try:
+        if path.suffix == ".npy":
+            matrix = np.load(path, allow_pickle=False, mmap_mode="r")  # a false size in the header allocates nothing
+        elif path.suffix == ".json":
+            matrix = json.loads(path.read_bytes())
+        else:
+            matrix = [line.replace(",", " ").split() for line in path.read_text().splitlines() if line.strip()]
+        matrix = np.array(matrix, dtype=np.float64)
+    except Exception as error:  # each format's reader raises errors of its own for a damaged file
+        raise SceneError(f"this is not a 4x4 matrix ({' '.join(str(error).split())})") from error
+    if matrix.shape != (4, 4):
+        raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")
+    return matrix
+
+
+def _check_similarity(matrix: np.ndarray) -> None:
+    if matrix.shape != (4, 4):
+        raise SceneError(f"the alignment must be a 4x4 matrix, not {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise SceneError("the alignment's matrix holds NaN or infinite values")
+    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        row = " ".join(f"{value:g}" for value in matrix[3])
+        raise SceneError(f"the alignment's last row is {row} instead of 0 0 0 1: is the matrix column-major?")
+    scales = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if scales[2] <= 1e-12 * scales[0]:
+        raise SceneError("the alignment's matrix is singular: it flattens the shell")
+    if scales[0] - scales[2] > 1e-3 * scales[0]:
+        raise SceneError(
+            f"the alignment scales by {scales[0]:.6g} in one direction and by {scales[2]:.6g} in another: only a "
+            "rotation, a translation and one uniform scale are allowed"
+        )
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        raise SceneError("the alignment mirrors the shell (negative determinant): one axis has the wrong sign")

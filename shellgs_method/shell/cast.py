@@ -1,0 +1,201 @@
+"""Cast the shell maps of all views of a scene."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+from rich.progress import track
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.photographs import View, load_mask
+from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.precision import FINE, camera_step, refuse_coarse
+from shellgs_method.shell.alignment import ALIGNMENT, Alignment
+from shellgs_method.shell.clouds import VERSION, Meshing
+from shellgs_method.shell.raycast import ShellCaster
+
+log = logging.getLogger(__name__)
+
+MASKS = Path("shell/masks")
+"""Folder of the shell's masks, in the scene's folder."""
+
+
+@dataclass(frozen=True)
+class CastSummary:
+    """Summary of :func:`cast_views`.
+
+    Attributes:
+        cast: number of views whose map was made.
+        skipped: number of views that already had a map for this camera, shell and alignment.
+        seeing: number of views with at least one pixel on the shell.
+        supported: share of the pixels of all views that lie on the shell.
+        seconds: wall time.
+        meshing: how a point cloud was meshed; None if the shell is a mesh.
+    """
+
+    cast: int
+    skipped: int
+    seeing: int
+    supported: float
+    seconds: float
+    meshing: Meshing | None
+
+
+def cast_views(
+    scene: Path,
+    views: Sequence[View],
+    alignment: Alignment,
+    *,
+    max_image_size: int | None = None,
+    flags: str = "",
+) -> CastSummary:
+    """Cast the scene's shell into views and store the maps in ``scene/cues/shell``.
+
+    Views with an intact map for the same camera, shell and alignment are skipped, so that an interrupted run resumes
+    where it stopped. ``scene/shell/alignment.json``, which the maps are bound to, is written if it holds another
+    alignment. Nothing is written unless the shell is visible in some view.
+
+    The shell lacks trees, cars and whatever else stands in front of it: :func:`check_views` finds such occluders, and
+    black pixels of ``scene/shell/masks/<image's name>.png``, if that file exists, are removed from the view's mask, as
+    are those of the photograph's own mask.
+
+    Args:
+        scene: the scene's folder.
+        views: the photographs, with full-size cameras.
+        alignment: the shell's file, its similarity to the scene, and the mesher of a point cloud.
+        max_image_size: longer side of the photographs to cast for; None for their own size.
+        flags: command-line flags that select the same photographs, with a leading blank.
+
+    Raises:
+        FileNotFoundError: the shell is missing.
+        SceneError: the alignment was found for other cameras, the shell cannot be used, or no camera sees it.
+    """
+    start = time.monotonic()
+    if max_image_size is not None and max_image_size < 1:
+        raise SceneError(f"the longer side of the maps must be at least 1 pixel, not {max_image_size}")
+    alignment.check_cameras(scene, views)
+    shell = scene / alignment.shell
+    cameras = [view.camera for view in views]
+    mesh = alignment.load_shell(scene, views)
+    refuse_coarse(camera_step(cameras).scaled(alignment.metres_per_unit), f"the cameras of {scene}")
+    step = mesh.step.scaled(alignment.metres_per_shell_unit)
+    if step.coarsest > FINE:
+        log.warning(
+            "the coordinates of %s are stored in steps of %s: the maps are up to half of that off",
+            shell,
+            step.in_words(),
+        )
+    caster = ShellCaster(mesh, alignment.shell_to_scene)
+    _check_placement(caster, cameras, shell)
+    if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):
+        raise SceneError(f"the masks of {scene} are black everywhere in every view: white is kept")
+    saved = scene / ALIGNMENT
+    known = Alignment.load(saved) if saved.is_file() else None
+    if known is None or not known.places_like(alignment) or known.cameras.changed(views):  # else it keeps its verdict
+        replace(alignment, cameras=BoundCameras.of(views)).save(saved)
+    (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a source of the maps: a mask painted later makes them stale
+    maps = CueMaps.create(
+        scene,
+        "shell",
+        command=_command(max_image_size, mesh.meshing) + flags,
+        sources=[shell, saved, scene / MASKS, *_mask_sources(scene, views)],
+        revisions={"mesher": f"{mesh.meshing.mesher} {VERSION}"} if mesh.meshing else {},
+        metres_per_unit=alignment.metres_per_unit,
+        max_image_size=max_image_size,
+        error=Alignment.load(saved).error,
+    )
+    cast = 0
+    with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast: at most two are in memory
+        written: Future[None] | None = None
+        for full_size in track(views, description="casting the shell"):
+            view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
+            if maps.current(view.name, view.camera):
+                continue
+            cue = _unoccluded(caster.cast(view.camera), view, scene)
+            if written:
+                written.result()
+            written = writer.submit(maps.write, view.name, cue, view.camera)
+            cast += 1
+        if written:
+            written.result()
+    supported = [record.supported for view in views if (record := maps.record(view.name))]
+    return CastSummary(
+        cast=cast,
+        skipped=len(views) - cast,
+        seeing=int(np.count_nonzero(supported)),
+        supported=float(np.mean(supported)),
+        seconds=time.monotonic() - start,
+        meshing=mesh.meshing,
+    )
+
+
+def _command(max_image_size: int | None, meshing: Meshing | None) -> str:
+    command = "shellgs cast {scene}"
+    if max_image_size:
+        command += f" --max-image-size {max_image_size}"
+    if meshing and meshing.mesher != "planes":
+        command += f" --mesher {meshing.mesher}"
+    return command
+
+
+def _mask_sources(scene: Path, views: Sequence[View]) -> list[Path]:
+    """Top-level files or folders of the scene that hold the photographs' masks."""
+    return sorted({scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask})
+
+
+def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
+    """Intersection of the photograph's mask and the shell's mask of a view; None if it has neither."""
+    painted = scene / MASKS / f"{view.name}.png"
+    return load_mask(view, painted if painted.is_file() else None)
+
+
+def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
+    mask = _load_masks(view, scene)
+    return cue if mask is None else replace(cue, mask=cue.mask & mask)
+
+
+def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path) -> None:
+    """Refuse a shell that no camera sees; warn if its size is out of proportion to the camera path."""
+    if not cameras:
+        raise SceneError("there are no views to cast the shell into")
+    path = positions(cameras)
+    span = float(np.linalg.norm(np.ptp(path, axis=0)))
+    depth = _median_depth(caster, cameras)
+    if depth is None:
+        distance = np.linalg.norm(path - caster.origin, axis=1).min()
+        raise SceneError(
+            f"no camera sees the shell {shell}: it is {caster.extent:.3g} scene units wide and its centre is "
+            f"{distance:.3g} from the nearest camera, while the cameras span {span:.3g}; check the alignment and the "
+            "shell's units"
+        )
+    if span > 0 and (caster.extent < span / 100 or not span / 100 < depth < span * 100):
+        log.warning(
+            "the shell %s is %.3g scene units wide and %.3g away, the cameras span %.3g: check the alignment's scale "
+            "and the shell's units (millimetres taken for metres are 1000 times off)",
+            shell,
+            caster.extent,
+            depth,
+            span,
+        )
+
+
+def _median_depth(caster: ShellCaster, cameras: Sequence[Camera]) -> float | None:
+    """Median depth of the shell in a few thumbnails spread over the views; None if no view sees it."""
+    step = -(-len(cameras) // 16)
+    seen: list[np.ndarray] = []
+    for k in sorted(range(len(cameras)), key=lambda k: k % step):
+        if seen and k % step:
+            break
+        cue = caster.cast(cameras[k].shrunk(128))
+        if cue.mask.any():
+            seen.append(cue.depth[cue.mask])
+    return float(np.median(np.concatenate(seen))) if seen else None

@@ -1,1 +1,0 @@
-"""Cast the shell into each camera."""

@@ -1,1 +1,0 @@
-"""Check the shell against the photographs."""

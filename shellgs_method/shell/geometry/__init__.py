@@ -1,1 +1,0 @@
-"""Shell geometry: files, point clouds, meshes and ray casting."""

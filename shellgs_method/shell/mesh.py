@@ -1,0 +1,212 @@
+"""Load the shell as a triangle mesh; a point cloud is meshed once, and its mesh is cached."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.files.surfaces import read_geometry
+from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
+from shellgs_method.geometry.triangles import area_vectors
+from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
+
+COMMENT = "comment shellgs "
+_FAR = 1e4
+"""Times the median distance from the median vertex beyond which a vertex is not the building's, but at the origin of
+national coordinates, for example. It would stretch every box and take most of the area."""
+SCANNER = "scanner"
+"""Source of the viewpoints: scanner positions in the file."""
+
+
+@dataclass(frozen=True)
+class ShellMesh:
+    """A triangle mesh with at least one triangle, finite vertices and indices in range.
+
+    Attributes:
+        vertices: positions in the shell's own frame and units, possibly georeferenced.
+        faces: three vertex indices per triangle.
+        meshing: how a point cloud was meshed; None if the file holds a mesh.
+        step: step of the coordinates in the file.
+
+    Raises:
+        SceneError: the arrays are not such a mesh.
+    """
+
+    vertices: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    meshing: Meshing | None = None
+    step: Step = NO_STEP
+
+    def __post_init__(self) -> None:
+        """Check what Open3D does not: it accepts indices out of range."""
+        if len(self.faces) == 0:
+            raise SceneError("the shell has no triangles")
+        if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
+            raise SceneError(f"the shell's triangles have vertex indices outside its {len(self.vertices)} vertices")
+        if not np.isfinite(self.vertices).all():
+            raise SceneError("the shell has NaN or infinite vertices")
+        if without_area(self.vertices, self.faces).all():
+            raise SceneError("all triangles of the shell are degenerate: their areas are 0")
+
+    @property
+    def bounds(self) -> Float64[np.ndarray, "2 3"]:
+        """Lowest and highest corner of the bounding box."""
+        return np.stack([self.vertices.min(0), self.vertices.max(0)])
+
+    @property
+    def centre(self) -> Float64[np.ndarray, " 3"]:
+        """Median vertex. What is in float32 is relative to it, so that no vertex far away costs the others theirs."""
+        return np.median(self.vertices, axis=0)
+
+
+def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
+    """Mask of the triangles that have no area in single precision, in which rays are cast and distances measured.
+
+    Their normals are not defined, and their points nearest to another are NaN. Their heights are within the rounding of
+    their own corners, relative to the median vertex: a vertex far away makes no other triangle flat.
+    """
+    placed = (vertices - np.median(vertices, axis=0)).astype(np.float32)
+    step = np.spacing(np.abs(placed[faces]).max(axis=(1, 2))).astype(np.float64)
+    placed = placed.astype(np.float64)
+    a, b, c = placed[faces].transpose(1, 0, 2)
+    longest = np.sqrt(np.max([((a - b) ** 2).sum(1), ((b - c) ** 2).sum(1), ((c - a) ** 2).sum(1)], axis=0))
+    return np.linalg.norm(area_vectors(placed, faces), axis=1) <= step * longest  # area = height * longest / 2
+
+
+def load_shell(
+    path: Path,
+    *,
+    cache: Path | None = None,
+    viewpoints: Float64[np.ndarray, "V 3"] | None = None,
+    mesher: Mesher = "planes",
+    metres_per_unit: float = 1.0,
+) -> ShellMesh:
+    """Load a shell, a triangle mesh or a point cloud, in double precision if the file has it.
+
+    Points and vertices that are NaN, infinite or absurdly far away are dropped, with their triangles, as are triangles
+    without area; what is dropped is counted. Vertices of no triangle are dropped. A point cloud is meshed by
+    :func:`~shellgs_method.shell.clouds.mesh_cloud`; its mesh is cached as
+    ``<cache>/<file name>.<mesher>.ply`` until the cloud changes.
+
+    Args:
+        path: a mesh (ply, obj, glb, gltf, stl, off) or a cloud (ply, pcd, xyz, pts, txt, asc, csv, las, laz, e57; the
+            last three need the extras ``las`` and ``e57``).
+        cache: folder for the mesh of a point cloud; None for no cache.
+        viewpoints: positions that see the surface, in the shell's frame. They orient the normals of a cloud whose file
+            has no scanner positions. A mesh cached for other viewpoints is made again.
+        mesher: method that meshes a point cloud.
+        metres_per_unit: 1 for a shell in metres.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is empty or damaged, its reader is not installed, it holds no surface, or its coordinates
+            were rounded by decimetres.
+    """
+    path = Path(path)
+    cached = None if cache is None else cache / f"{path.name}.{mesher}.ply"
+    if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, viewpoints)):
+        refuse_coarse(mesh.step.scaled(metres_per_unit), f"the coordinates of {path}")
+        return mesh
+    geometry = read_geometry(path)
+    try:
+        if len(geometry.faces) or not len(geometry.vertices):
+            used = _referenced(geometry.vertices, geometry.faces)
+            mesh = ShellMesh(*_referenced(*_without_strays(*used, path)))
+            step = mesh_step(mesh.vertices, mesh.faces)
+            refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
+            return replace(_with_area(mesh, path), step=step)
+        step = cloud_step(geometry.vertices)
+        refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
+        seen_from = viewpoints if viewpoints is not None and not len(geometry.scanners) else geometry.scanners
+        mesh = _with_area(ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher), step))
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
+    if cached is not None:
+        _write_cached(mesh, cached, path, SCANNER if len(geometry.scanners) else _seen_from(viewpoints))
+    return mesh
+
+
+def _seen_from(viewpoints: np.ndarray | None) -> list[float] | None:
+    return None if viewpoints is None or not len(viewpoints) else viewpoints.mean(axis=0).tolist()
+
+
+def _seen_alike(before: list[float] | str | None, now: list[float] | None, mesh: ShellMesh) -> bool:
+    """Whether the viewpoints orient the normals as before: an alignment's last centimetres flip none."""
+    if before is None or now is None or before == SCANNER:
+        return now is None or before == SCANNER
+    return bool(np.linalg.norm(np.subtract(before, now)) <= 0.1 * np.ptp(mesh.bounds, axis=0).max())
+
+
+def _write_cached(mesh: ShellMesh, cached: Path, source: Path, seen_from: list[float] | str | None) -> None:
+    """Write the mesh as a PLY of doubles, with a comment that identifies its source."""
+    assert mesh.meshing is not None
+    made = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
+    step = {"lengths": mesh.step.lengths.tolist(), "rounded": mesh.step.rounded}
+    record = json.dumps(made | {"seen_from": seen_from, "step": step})
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
+    faces["count"], faces["indices"] = 3, mesh.faces
+    header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]
+    header += [*(f"property double {axis}" for axis in "xyz"), f"element face {len(faces)}"]
+    header += ["property list uchar int vertex_indices", "end_header\n"]
+    cached.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(cached) as file:
+        file.write("\n".join(header).encode() + mesh.vertices.astype("<f8").tobytes() + faces.tobytes())
+
+
+def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> ShellMesh | None:
+    """Read a cached mesh; None if it is damaged or was made from another cloud or for other viewpoints."""
+    try:
+        with cached.open("rb") as file:
+            comment = file.read(4096).decode(errors="replace").splitlines()[2]
+        record = json.loads(comment.removeprefix(COMMENT))
+        if (record["version"], record["sha256"]) != (VERSION, content_hash(source)):
+            return None
+        geometry = read_geometry(cached)
+        step = Step(np.array(record["step"]["lengths"], np.float64), record["step"]["rounded"])
+        mesh = ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]), step)
+        return mesh if _seen_alike(record["seen_from"], _seen_from(viewpoints), mesh) else None
+    except (OSError, IndexError, KeyError, TypeError, ValueError):  # missing or damaged: it is made again
+        return None
+
+
+def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Drop vertices that are not finite or absurdly far away, and their triangles."""
+    kept = sound(vertices, _FAR)
+    if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
+        return vertices, faces
+    usable = kept[faces].all(axis=1)
+    if not usable.any():
+        raise SceneError("every triangle of the shell has a NaN or infinite vertex")
+    place = " ".join(f"{value:g}" for value in vertices[~kept][0])
+    notice(
+        f"{path}: dropped {(~usable).sum()} of {len(faces)} triangles with a NaN or infinite vertex, or one absurdly "
+        f"far away, at {place}."
+    )
+    return vertices, faces[usable]
+
+
+def _referenced(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Drop vertices of no triangle; indices that are out of range are left for :class:`ShellMesh` to refuse."""
+    if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+        return vertices, faces
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
+    """Drop triangles without area; those of a file are counted, those that a mesher leaves are nobody's loss."""
+    flat = without_area(mesh.vertices, mesh.faces)
+    if not flat.any():
+        return mesh
+    if path is not None:
+        notice(f"{path}: dropped {flat.sum()} of {len(flat)} triangles, which have no area.")
+    vertices, faces = _referenced(mesh.vertices, mesh.faces[~flat])
+    return replace(mesh, vertices=vertices, faces=faces)

@@ -1,0 +1,82 @@
+"""Cast a camera's rays against the shell."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float16, Float32, Float64
+
+from shellgs_method.files.cue_maps import CueMap
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.triangles import Triangles, area_vectors
+from shellgs_method.shell.mesh import ShellMesh
+
+
+class ShellCaster:
+    """A shell aligned to the scene, to be cast into any camera.
+
+    Args:
+        mesh: the shell in its own frame.
+        shell_to_scene: similarity from that frame to the scene's.
+
+    Attributes:
+        triangles: the shell relative to :attr:`origin`.
+        origin: median vertex of the shell, in the scene's frame.
+        extent: longest side of the bounding box, in scene units.
+
+    Raises:
+        ImportError: Open3D cannot be loaded.
+    """
+
+    def __init__(self, mesh: ShellMesh, shell_to_scene: Float64[np.ndarray, "4 4"]) -> None:
+        placed = transformed(mesh.vertices, shell_to_scene)
+        # Embree computes in float32, whose steps are 3 cm at 4e5: its coordinates are relative to the shell's centre.
+        self.origin = transformed(mesh.centre, shell_to_scene)
+        self.extent = float(np.ptp(placed, axis=0).max())
+        placed -= self.origin
+        self.triangles = Triangles(placed, mesh.faces)
+        normals = area_vectors(placed, mesh.faces)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+        offsets = np.einsum("fc,fc->f", normals, placed[mesh.faces[:, 0]])
+        self._planes = np.concatenate([normals, offsets[:, None]], axis=1)  # n · x = d
+        self._rays = np.empty((0, 0, 6), np.float32)
+
+    def rays(self, camera: Camera) -> Float32[np.ndarray, "H W 6"]:
+        """Origin and direction of each pixel's ray in the frame of :attr:`triangles`, valid until the next call.
+
+        Directions have z = 1 in the camera's frame, so that the ray parameter of a hit is its z-depth.
+        """
+        position, rotation = self._pose(camera)
+        step_u, step_v, first = (rotation.T @ np.linalg.inv(camera.K.detach().cpu().double().numpy())).T
+        u, v = (np.arange(count)[:, None] + 0.5 for count in (camera.width, camera.height))
+        if self._rays.shape[:2] != (camera.height, camera.width):  # allocating costs more than writing
+            self._rays = np.empty((camera.height, camera.width, 6), np.float32)
+        rays = self._rays
+        across, down = (u * step_u).astype(np.float32), (v * step_v + first).astype(np.float32)
+        for axis in range(3):  # so that numpy's inner loop is over pixels
+            rays[..., axis] = position[axis]
+            np.add.outer(down[:, axis], across[:, axis], out=rays[..., 3 + axis])
+        return rays
+
+    def cast(self, camera: Camera) -> CueMap:
+        """Cast the shell into a camera: z-depth in scene units, normals facing the camera, and the mask of hits."""
+        hits = self.triangles.cast_rays(self.rays(camera))
+        mask = hits.triangle >= 0
+        hits.t[~mask] = 0
+        return CueMap(hits.t, self._facing(camera).take(hits.triangle, axis=0, mode="wrap"), mask)  # -1: the last row
+
+    def _facing(self, camera: Camera) -> Float16[np.ndarray, "F+1 3"]:
+        """Normal of each triangle in the camera's frame, facing the camera; the last row is zero, for misses.
+
+        The winding of shells is not consistent; but a triangle shows a camera the same side in all pixels.
+        """
+        position, rotation = self._pose(camera)
+        normals, offsets = self._planes[:, :3], self._planes[:, 3]
+        facing = np.where((normals @ position < offsets)[:, None], -normals, normals) @ rotation.T
+        return np.concatenate([facing, np.zeros((1, 3))]).astype(np.float16)
+
+    def _pose(self, camera: Camera) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"]]:
+        """Camera centre in the frame of :attr:`triangles`, and rotation from world to camera."""
+        viewmat = camera.viewmat.detach().cpu().double().numpy()
+        rotation = viewmat[:3, :3]
+        return -rotation.T @ viewmat[:3, 3] - self.origin, rotation

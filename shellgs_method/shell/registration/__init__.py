@@ -1,1 +1,0 @@
-"""Align the shell to the scene."""

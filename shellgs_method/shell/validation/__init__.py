@@ -1,1 +1,0 @@
-"""Validate an alignment and report the verdict."""

@@ -1,0 +1,1 @@
+"""What a building looks like: texture, visual mesh, renders."""

@@ -1,0 +1,188 @@
+"""Bake a texture for a mesh from photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64, UInt8
+from PIL import Image
+from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.sparse import coo_matrix, csc_array, hstack
+
+from shellgs_method.geometry.camera import Camera, project
+from shellgs_method.machine.extras import import_extra
+from shellgs_method.sim.rays import Surface
+
+SHARPNESS = 6.0
+"""Exponent of the view weights: the best views of a point dominate, yet blend into each other."""
+SLACK = 0.05
+"""Metres that a point may lie behind the first surface in a view and still count as visible."""
+LARGEST = 8192
+"""Largest side of a texture in pixels that all graphics cards support."""
+FINER = 0.6
+"""Size of a texel in pixels of the photographs, which together resolve more than one does."""
+GUTTER = 4
+"""Padding between the charts of an atlas, in pixels."""
+
+
+class Photo(NamedTuple):
+    """A photograph and its camera, in the frame of the mesh."""
+
+    image: UInt8[np.ndarray, "H W 3"]
+    camera: Camera
+    mask: np.ndarray | None
+    """True where a pixel counts; None if all do."""
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """Triangles with a texture.
+
+    Attributes:
+        vertices: vertices in metres, one for each texture coordinate.
+        faces: vertex indices.
+        uv: texture coordinates in [0, 1], v upwards.
+        image: texture.
+        seen: share of the vertices that are visible in some photograph.
+    """
+
+    vertices: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    uv: Float64[np.ndarray, "V 2"]
+    image: Image.Image
+    seen: float
+
+
+def bake(
+    surface: Surface, colours: Float64[np.ndarray, "V 3"], photos: Sequence[Photo], texel: float | None = None
+) -> TexturedMesh:
+    """Unwrap a surface and texture it from photographs, or with its own colours where no photograph sees it.
+
+    A view's weight at a vertex is its pixels per square metre of surface, 0 where the vertex is hidden. Weights are
+    raised to a power and interpolated over triangles, so that views blend across the seams between them.
+
+    Args:
+        surface: mesh.
+        colours: vertex colours in [0, 255].
+        photos: photographs with cameras in the mesh's frame; each is asked for twice, and not kept.
+        texel: size of the texture's pixels, in metres; a little finer than the photographs' on the mesh if None.
+    """
+    # Sparse: a photograph of many sees a small part of the surface.
+    weights = csc_array(hstack([csc_array(_weights(surface, photo)[:, None]) for photo in photos]))
+    best = weights.max(axis=1).toarray().ravel()
+    if texel is None:  # a weight is pixels per square metre
+        texel = float(FINER / np.sqrt(np.median(best[best > 0]))) if (best > 0).any() else 0.02
+    vertex, uv, faces, size = _atlas(surface, texel)
+    pixels, corners, barycentric = _texels(uv, faces, size)
+    at = vertex[faces[corners]]  # the mesh's vertices around each texel
+    points = np.einsum("nk,nkc->nc", barycentric, surface.vertices[at])
+    own = 1e-3  # what no photograph sees keeps its own colour, and what hardly any sees blends into it
+    total = np.full(len(points), own)
+    blend = own * np.einsum("nk,nkc->nc", barycentric, colours[at])
+    for number, photo in enumerate(photos):
+        sharp = (weights[:, [number]].toarray().ravel() / np.maximum(best, 1e-12)) ** SHARPNESS
+        weight = np.einsum("nk,nk->n", barycentric, sharp[at])
+        seeing = np.flatnonzero(weight > 1e-4)
+        total[seeing] += weight[seeing]
+        blend[seeing] += weight[seeing, None] * _sample(photo, points[seeing])
+    texture, known = np.zeros((*size, 3)), np.zeros(size, bool)
+    rows, columns = pixels.T
+    texture[rows, columns], known[rows, columns] = blend / total[:, None], True
+    nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    assert isinstance(nearest, np.ndarray)
+    filled = texture[nearest[0], nearest[1]].round().clip(0, 255).astype(np.uint8)
+    image = Image.fromarray(filled[::-1])  # its first row is at the top, and v points up
+    return TexturedMesh(surface.vertices[vertex], faces, uv, image, float((best > 0).mean()))
+
+
+def _weights(surface: Surface, photo: Photo) -> Float64[np.ndarray, " V"]:
+    """Pixels per square metre of the surface at each vertex in a photograph, 0 where it is not visible."""
+    camera, vertices = photo.camera, surface.vertices
+    pixels, depth = project(camera, vertices)
+    height, width = photo.image.shape[:2]
+    edge = np.minimum.reduce([*pixels.T, *([width, height] - pixels).T]) / (0.05 * min(width, height))
+    seen = np.flatnonzero((depth > 0.1) & (edge > 0))
+    eye = camera.position.double().numpy()
+    seen = seen[surface.sees(np.broadcast_to(eye, (len(seen), 3)), vertices[seen], SLACK)]
+    if photo.mask is not None:
+        row, column = np.minimum(pixels[seen][:, ::-1].astype(int), np.array([height, width]) - 1).T
+        seen = seen[photo.mask[row, column]]
+    away = eye - vertices[seen]
+    distance = np.linalg.norm(away, axis=1)
+    cosine = np.abs(np.einsum("nc,nc->n", away, _vertex_normals(surface)[seen])) / distance
+    weights = np.zeros(len(vertices))
+    focal = float(camera.K[0, 0] * camera.K[1, 1])
+    weights[seen] = cosine * focal / distance**2 * np.minimum(edge[seen], 1.0)
+    # A vertex gets the least weight around it, so that no triangle is partly textured with what hides it.
+    lowest = np.full(len(vertices), np.inf)
+    least = weights[surface.faces].min(axis=1)
+    np.minimum.at(lowest, surface.faces.ravel(), np.repeat(least, 3))
+    return np.where(np.isfinite(lowest), lowest, 0.0)
+
+
+def _vertex_normals(surface: Surface) -> Float64[np.ndarray, "V 3"]:
+    count = len(surface.vertices)
+    rows, columns = surface.faces.ravel(), np.repeat(np.arange(len(surface.faces)), 3)
+    gather = coo_matrix((np.repeat(surface.areas, 3), (rows, columns)), shape=(count, len(surface.faces)))
+    normals = gather @ surface.normals
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _sample(photo: Photo, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    """The photograph's colours at points, interpolated bilinearly."""
+    pixels, _ = project(photo.camera, points)
+    where = pixels.T[::-1] - 0.5
+    return np.stack(
+        [map_coordinates(photo.image[..., k].astype(np.float32), where, order=1, mode="nearest") for k in range(3)], -1
+    )
+
+
+def _atlas(
+    surface: Surface, texel: float
+) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, "M 2"], Int64[np.ndarray, "F 3"], tuple[int, int]]:
+    """For each atlas vertex its mesh vertex and its UV in [0, 1]², the faces, and the texture's height and width."""
+    xatlas = import_extra("xatlas", "xatlas", "sim", "a texture")
+    size = float(np.sqrt(surface.areas.sum()) / texel)
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))
+    charts, pack = xatlas.ChartOptions(), xatlas.PackOptions()
+    charts.max_iterations, charts.max_cost = 1, 4.0
+    pack.padding, pack.bilinear, pack.rotate_charts = GUTTER, True, True
+    pack.texels_per_unit = 1 / texel * min(1.0, 0.8 * LARGEST / size)
+    atlas.generate(charts, pack)
+    vertex, faces, uv = atlas.get_mesh(0)
+    return vertex.astype(np.int64), uv.astype(np.float64), faces.astype(np.int64), (atlas.height, atlas.width)
+
+
+def _texels(
+    uv: Float[np.ndarray, "M 2"], faces: Int64[np.ndarray, "F 3"], size: tuple[int, int]
+) -> tuple[Int64[np.ndarray, "N 2"], Int64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
+    """Row and column of each texel in a triangle, that triangle, and the texel's centre in barycentric coordinates."""
+    found = list(_texels_of(uv * [size[1], size[0]], faces, size))
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def _texels_of(places: np.ndarray, faces: np.ndarray, size: tuple[int, int], chunk: int = 20_000) -> Iterator[tuple]:
+    for first in range(0, len(faces), chunk):
+        corners = places[faces[first : first + chunk]]
+        low = np.floor(corners.min(axis=1) - 0.5).astype(int).clip(0)
+        high = (np.ceil(corners.max(axis=1) + 0.5).astype(int)).clip(max=[size[1], size[0]])
+        extent = (high - low).clip(0)
+        counts = extent.prod(axis=1)
+        triangle = np.repeat(np.arange(len(corners)), counts)
+        place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        column = low[triangle, 0] + place % extent[triangle, 0].clip(1)
+        row = low[triangle, 1] + place // extent[triangle, 0].clip(1)
+        a, b, c = (corners[:, k] for k in range(3))
+        doubled = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+        x, y = column + 0.5 - a[triangle, 0], row + 0.5 - a[triangle, 1]
+        area = np.where(np.abs(doubled) > 1e-12, doubled, 1e-12)[triangle]
+        first_edge, second_edge = (b - a)[triangle], (c - a)[triangle]
+        v = (x * second_edge[:, 1] - y * second_edge[:, 0]) / area
+        w = (first_edge[:, 0] * y - first_edge[:, 1] * x) / area
+        weights = np.stack([1 - v - w, v, w], axis=1)
+        inside = (weights > -1e-6).all(axis=1)
+        yield np.stack([row, column], axis=1)[inside], triangle[inside] + first, weights[inside]

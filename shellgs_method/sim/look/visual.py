@@ -1,0 +1,71 @@
+"""Write the textured mesh: glb for browsers, obj with its texture for simulators."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from shellgs_method.export.meshes import Y_UP
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.sim.look.texture import TexturedMesh
+
+TEXTURE = "visual.png"
+
+
+def write_visual(folder: Path, mesh: TexturedMesh, megabytes: float) -> dict:
+    """Write ``visual.glb`` (y-up, as glTF requires), and ``visual.obj`` with ``visual.mtl`` and ``visual.png``.
+
+    Args:
+        folder: output folder.
+        mesh: textured mesh, z up.
+        megabytes: maximum size of the glb; the texture is scaled down to fit.
+
+    Returns:
+        Size of the glb in bytes and of the texture in pixels.
+    """
+    image = mesh.image
+    while True:
+        content = _glb(mesh, image)
+        if len(content) <= 1e6 * megabytes or min(image.size) < 64:
+            break
+        shrink = min(0.9, float(np.sqrt(1e6 * megabytes / len(content))))
+        width, height = (max(1, int(side * shrink)) for side in image.size)
+        image = image.resize((width, height), Image.Resampling.BOX)
+    with atomic_write(folder / "visual.glb") as file:
+        file.write(content)
+    with atomic_write(folder / TEXTURE) as file:
+        image.save(file, "PNG")
+    with atomic_write(folder / "visual.mtl") as file:
+        file.write(f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {TEXTURE}\n".encode())
+    with atomic_write(folder / "visual.obj") as file:
+        file.write(_obj(mesh).encode())
+    return {"glb_bytes": len(content), "texture": list(image.size), "triangles": len(mesh.faces)}
+
+
+def _glb(mesh: TexturedMesh, image: Image.Image) -> bytes:
+    """The glb with its texture as JPEG; matt, since the lighting is in the photographs."""
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=90)
+    material = PBRMaterial(
+        baseColorTexture=Image.open(buffer), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+    )
+    visual = TextureVisuals(uv=mesh.uv, material=material)
+    turned = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False).apply_transform(Y_UP)
+    content = turned.export(file_type="glb")
+    assert isinstance(content, bytes)
+    return content
+
+
+def _obj(mesh: TexturedMesh) -> str:
+    """The obj, with one texture coordinate for each vertex."""
+    lines = ["mtllib visual.mtl", "o visual", "usemtl visual"]
+    lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in mesh.uv.tolist()]
+    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,1 @@
+"""Trials of a world in MuJoCo."""

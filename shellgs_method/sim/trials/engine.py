@@ -1,0 +1,105 @@
+"""Load worlds in MuJoCo without warnings, and simulate a lidar in them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.machine.extras import import_extra
+
+BEAMS = -22.5, 22.5
+"""Vertical field of view of the lidar in degrees: that of an Ouster OS1."""
+
+
+def import_mujoco() -> ModuleType:
+    """Import MuJoCo.
+
+    Raises:
+        SceneError: MuJoCo is not installed, or too old.
+    """
+    if not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # read once, when MuJoCo is imported
+    return import_extra("mujoco", "mujoco", "sim", "a trial")
+
+
+def read_spec(path: Path):
+    """Read a model into MuJoCo's editable form; its files are found from any working directory."""
+    mujoco = import_mujoco()
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except (ValueError, OSError) as error:
+        raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
+
+
+@contextmanager
+def warnings_kept() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, which otherwise go to MUJOCO_LOG.TXT in the working directory.
+
+    When nested, as where a trial compiles its model, only the inner one collects them.
+    """
+    mujoco, warnings = import_mujoco(), []
+    outer = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield warnings
+    finally:
+        mujoco.set_mju_user_warning(outer)
+
+
+def compiled(spec, path: Path):
+    with warnings_kept() as warnings:
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise SceneError(f"{path}: MuJoCo refuses it ({' '.join(str(error).split())})") from error
+    if warnings:
+        raise SceneError(f"{path}: MuJoCo warns: {warnings[0]}")
+    return model
+
+
+def load(path: Path):
+    """Load and compile an MJCF file.
+
+    Raises:
+        SceneError: MuJoCo refuses it, or warns.
+    """
+    return compiled(read_spec(path), path)
+
+
+def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarray, "R 3"], group: int) -> np.ndarray:
+    """Distances [P, R] in metres that a lidar measures in MuJoCo; inf where nothing is hit.
+
+    Args:
+        path: model file.
+        places: positions of the lidar.
+        rays: unit directions.
+        group: group of the geoms to hit: 3 for collision geometry, 2 for visual meshes.
+    """
+    mujoco, model = import_mujoco(), load(path)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    groups = np.zeros(6, np.uint8)
+    groups[group] = 1
+    distances = np.empty((len(places), len(rays)))
+    geoms, normals = np.empty(len(rays), np.int32), np.empty((len(rays), 3))
+    for place, row in zip(places, distances, strict=True):
+        mujoco.mj_multiRay(
+            model, data, place[:, None], rays.reshape(-1, 1), groups, 1, -1, geoms, row, normals.reshape(-1, 1),
+            len(rays), 1e3,
+        )  # fmt: skip
+    return np.where(distances < 0, np.inf, distances)
+
+
+def beams(elevations: int = 24, azimuths: int = 180) -> Float64[np.ndarray, "R 3"]:
+    """Unit directions of a lidar with a horizontal field of view of 360 degrees."""
+    up, around = np.meshgrid(
+        np.radians(np.linspace(*BEAMS, elevations)), np.linspace(0, 2 * np.pi, azimuths, endpoint=False), indexing="ij"
+    )
+    return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1).reshape(-1, 3)

@@ -1,0 +1,216 @@
+"""Trials of a world in MuJoCo: bodies thrown at it, and a walk along it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.sim.front import Front
+from shellgs_method.sim.rays import Surface
+from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
+
+GRAVITY = 9.81
+PROJECTILES = 2, 1
+"""contype and conaffinity of thrown bodies: they collide with the world, but not with each other."""
+SINKING = 0.01
+"""Penetration in metres above which a body counts as stuck: contacts are soft."""
+GAIN = 0.02
+"""Share of its energy that a body may gain from rounding."""
+
+
+@dataclass(frozen=True)
+class Throws:
+    """Results of throwing bodies at a world.
+
+    Attributes:
+        thrown: number of bodies.
+        hits: bodies that touched a building.
+        through: bodies whose centre crossed a surface.
+        stuck: bodies held at the end by something not below them, or penetrating it by more than a centimetre.
+        gained: bodies with more energy after a contact than when they were thrown.
+        deepest: largest penetration at a contact, in metres.
+    """
+
+    thrown: int
+    hits: int
+    through: int
+    stuck: int
+    gained: int
+    deepest: float
+
+    def __str__(self) -> str:
+        """One sentence."""
+        return (
+            f"{self.thrown} spheres and boxes thrown, {self.hits} hit: {self.through} got through, {self.stuck} stuck, "
+            f"{self.gained} gained energy; penetration of at most {100 * self.deepest:.1f} cm."
+        )
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Results of pushing a capsule against the facade and along it.
+
+    Attributes:
+        metres: distance that it covered.
+        length: length of the facade, in metres.
+        touching: share of the steps in contact with a building.
+        deepest: largest penetration at a contact, in metres.
+        faster: simulated seconds per second.
+        microseconds: time of a step.
+    """
+
+    metres: float
+    length: float
+    touching: float
+    deepest: float
+    faster: float
+    microseconds: float
+
+    def __str__(self) -> str:
+        """One sentence."""
+        return (
+            f"A capsule walked {self.metres:.1f} m along {self.length:.1f} m of facade, {self.touching:.0%} of the "
+            f"steps in contact, penetration of at most {100 * self.deepest:.1f} cm; {self.faster:.0f} times real time "
+            f"({self.microseconds:.0f} µs a step)."
+        )
+
+
+def throw(
+    path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 200, seconds: float = 4
+) -> Throws:
+    """Throw spheres and boxes at 5 to 15 m/s at the visible surface of a world: half at any point, half at corners.
+
+    Args:
+        path: model file.
+        surface: its collision geometry.
+        eyes: positions outside, such as those of cameras.
+        count: number of bodies, which do not collide with each other.
+        seconds: simulated time.
+    """
+    mujoco, spec = import_mujoco(), read_spec(path)
+    rng = np.random.default_rng(0)
+    starts, velocities = _launches(surface, eyes, count, rng)
+    for number, start in enumerate(starts):
+        body = spec.worldbody.add_body(pos=start, name=f"thrown_{number}")
+        body.add_freejoint()
+        kind = mujoco.mjtGeom.mjGEOM_SPHERE if number % 2 else mujoco.mjtGeom.mjGEOM_BOX
+        contype, conaffinity = PROJECTILES
+        size = rng.uniform(0.05, 0.15, 3)
+        body.add_geom(type=kind, size=size, density=300, contype=contype, conaffinity=conaffinity, group=1)
+    model = compiled(spec, path)
+    data = mujoco.MjData(model)
+    bodies = np.array([model.body(f"thrown_{number}").id for number in range(count)])
+    data.qvel.reshape(-1, 6)[:, :3] = velocities
+    data.qvel.reshape(-1, 6)[:, 3:] = rng.normal(0, 3, (count, 3))
+    mujoco.mj_forward(model, data)
+    launched, energy = _energy(model, data, bodies), np.zeros(count)
+    hit, through, deepest = np.zeros(count, bool), np.zeros(count, bool), 0.0
+    ground, before = model.geom("ground").id, data.xpos[bodies].copy()
+    depth, support = np.zeros(count), np.zeros((count, 3))
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        energy = np.maximum(energy, _energy(model, data, bodies) - launched)
+        now = data.xpos[bodies].copy()
+        through |= (surface.cast(before, now - before)[0] <= 1) | (now[:, 2] < 0)
+        before = now
+        depth[:], support[:] = 0, 0
+        touching = model.geom_bodyid[data.contact.geom]
+        mover, into = touching.max(axis=1) - bodies[0], -data.contact.dist
+        towards = np.where(touching[:, :1] < touching[:, 1:], 1, -1) * data.contact.frame[:, :3]
+        np.maximum.at(depth, mover, into)
+        np.add.at(support, mover, towards)
+        building = (data.contact.geom != ground).all(axis=1)
+        hit[mover[building]] = True
+        deepest = max([deepest, *into[building]])
+    speed = np.linalg.norm(data.qvel.reshape(-1, 6)[:, :3], axis=1)
+    held = (speed < 0.05) & (before[:, 2] > 0.3) & (support[:, 2] < 0.3 * np.linalg.norm(support, axis=1))
+    gained = energy > GAIN * launched
+    return Throws(
+        count, int(hit.sum()), int(through.sum()), int((held | (depth > SINKING)).sum()), int(gained.sum()), deepest
+    )
+
+
+def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4) -> Walk:
+    """Push an upright capsule against a facade and along it; where something stops it, it steps back.
+
+    Args:
+        path: model file.
+        surface: its collision geometry.
+        front: facade.
+        speed: target speed along the facade, in metres per second; towards it, it is 0.5.
+    """
+    mujoco, spec = import_mujoco(), read_spec(path)
+    body = spec.worldbody.add_body(pos=front.before(surface, 0.05, 0.35, 0.91), name="walker")
+    for name, axis in (("along", front.along), ("out", front.outwards), ("up", np.array([0.0, 0, 1]))):
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, name=name)
+    capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+    body.add_geom(type=capsule, size=[0.25, 0.65, 0], mass=70, friction=[0.3, 0.005, 0.0001], group=1)
+    model = compiled(spec, path)
+    data = mujoco.MjData(model)
+    steps = round(2 * front.length / speed / model.opt.timestep)
+    ground, touching, deepest, back = model.geom("ground").id, 0, 0.0, 0
+    stepping, done = 0.0, 0
+    for step in range(steps):
+        along, out, _ = data.qvel
+        if back == 0 and step > 500 and along < 0.1 * speed:
+            back = 150
+        back = max(back - 1, 0)
+        data.qfrc_applied[0] = 2000 * ((0.0 if back > 75 else speed) - along)
+        data.qfrc_applied[1] = 2000 * (0.8 - out) if back else -2000 * (0.5 + out)
+        started = time.perf_counter()
+        mujoco.mj_step(model, data)
+        stepping += time.perf_counter() - started
+        done += 1
+        others = (data.contact.geom != ground).all(axis=1)
+        touching += bool(others.any())
+        deepest = max(deepest, *(-data.contact.dist[others]), 0.0)
+        if data.qpos[0] > 0.9 * front.length:
+            break
+    second = stepping / done
+    return Walk(
+        float(data.qpos[0]), front.length, touching / done, float(deepest), model.opt.timestep / second, 1e6 * second
+    )
+
+
+def _energy(model, data, bodies: np.ndarray) -> Float64[np.ndarray, " N"]:
+    """Kinetic and potential energy of free bodies, in joules."""
+    velocity = data.qvel.reshape(-1, 6)
+    mass, inertia = model.body_mass[bodies], model.body_inertia[bodies]
+    kinetic = mass * (velocity[:, :3] ** 2).sum(1) + (inertia * velocity[:, 3:] ** 2).sum(1)
+    return kinetic / 2 + mass * GRAVITY * data.xipos[bodies, 2]
+
+
+def _launches(
+    surface: Surface, eyes: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
+    """Positions to throw from, 1.5 to 4 m from a visible target, and velocities."""
+    starts, velocities = [], []
+    areas = surface.areas / surface.areas.sum()
+    for _ in range(100 * count):
+        if len(starts) == count:
+            break
+        corner = len(starts) % 4 > 1
+        face = rng.choice(len(areas), p=areas)
+        weights = np.eye(3)[rng.integers(3)] if corner else rng.dirichlet(np.ones(3))
+        target = weights @ surface.vertices[surface.faces[face]]
+        eye = eyes[rng.integers(len(eyes))]
+        if target[2] < 0.1 or not surface.sees(eye[None], target[None], 0.02)[0]:
+            continue
+        towards = (eye - target) / np.linalg.norm(eye - target) + rng.normal(0, 0.5, 3)
+        start = target + rng.uniform(1.5, 4) * towards / np.linalg.norm(towards)
+        if (
+            start[2] > 0.3
+            and surface.sees(start[None], target[None], 0.02)[0]
+            and surface.distance(start[None])[0] > 0.3
+        ):
+            away = target - start
+            starts.append(start)
+            velocities.append(rng.uniform(5, 15) * away / np.linalg.norm(away))
+    if len(starts) < count:
+        raise SceneError("there is no place in front of the building to throw from: are the cameras outside?")
+    return np.array(starts), np.array(velocities)

@@ -1,0 +1,587 @@
+"""Capture: frames, photographs, masks and pairs, then structure from motion against true cameras."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from av.stream import Disposition
+from PIL import ExifTags, Image, ImageFilter
+from rich.progress import Progress
+from scenes import photograph, write_video
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.capture import CaptureConfig, capture, stages
+from shellgs_method.capture.frames import extract_frames, sharpest
+from shellgs_method.capture.pairs import choose_matching, image_pairs
+from shellgs_method.capture.photographs import (
+    add_mask,
+    add_photograph,
+    find_masks,
+    find_photographs,
+    group_by_lens,
+    has_transparency,
+)
+from shellgs_method.capture.process import run_step
+from shellgs_method.capture.work import Work
+from shellgs_method.errors import SceneError
+from shellgs_method.files.photographs import load_mask, load_photograph
+from shellgs_method.synthetic import FacadeConfig, write_scene
+
+QUIET = Progress(disable=True)
+PHONE = Path(__file__).parents[1] / "phone.heic"
+"""48 x 32 pixels, red in the upper left corner."""
+
+
+def is_red(image: Image.Image, x: int, y: int) -> bool:
+    red, green, blue = image.convert("RGB").getpixel((x, y))  # pyright: ignore[reportGeneralTypeIssues]
+    return red > 200 and green < 80 and blue < 80
+
+
+def save_rotated(image: Image.Image, path: Path) -> None:
+    """Save an upright image as a camera held on its side does: rotated, with the orientation in EXIF."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # to be rotated clockwise
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+    image.rotate(90, expand=True).save(path, exif=exif, quality=95)
+
+
+def turn_video(path: Path) -> None:
+    """Set the display matrix of an mp4 to a clockwise rotation by 90 degrees, as phones held upright do."""
+    data = bytearray(path.read_bytes())
+    matrix = data.index(b"tkhd") + 4 + 40  # after version, flags, times, track, duration, layer and volume
+    one = (1 << 16).to_bytes(4, "big")
+    minus_one = (-(1 << 16)).to_bytes(4, "big", signed=True)
+    zero = bytes(4)
+    data[matrix : matrix + 24] = zero + one + zero + minus_one + zero + zero
+    path.write_bytes(data)
+
+
+def numbers(folder: Path) -> list[int]:
+    return sorted(int(path.stem.removeprefix("frame_")) for path in folder.iterdir())
+
+
+# Frames
+
+
+def test_no_blurred_frame_of_a_video_is_extracted(tmp_path):
+    blurred = {k for k in range(40) if k % 4 != k // 10}
+    frames = [photograph(seed=k) for k in range(40)]
+    write_video(
+        tmp_path / "walk.mp4",
+        [f.filter(ImageFilter.GaussianBlur(3)) if k in blurred else f for k, f in enumerate(frames)],
+    )
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 8, QUIET)
+    taken = numbers(tmp_path / "frames")
+    assert len(taken) == 8
+    assert not blurred & set(taken)
+
+
+def test_sharpness_is_relative_to_the_neighbourhood():
+    # A textured stretch, then a plain one; every frame of the first is sharper than any of the second.
+    sharpnesses = np.concatenate([np.full(50, 100.0), np.full(50, 1.0)])
+    sharpnesses[[20, 70]] *= 1.5
+    assert sharpest(sharpnesses, np.arange(100) / 10, 2) == {20, 70}
+
+
+def test_a_video_gives_at_most_five_frames_a_second():
+    assert len(sharpest(np.ones(60), np.arange(60) / 30, 200)) == 10
+
+
+def test_frames_of_a_rotated_video_are_upright(tmp_path):
+    write_video(tmp_path / "walk.mp4", [photograph(64, 48)] * 3, rate=2)
+    turn_video(tmp_path / "walk.mp4")
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 3, QUIET)
+    with Image.open(next((tmp_path / "frames").iterdir())) as frame:
+        assert frame.size == (48, 64)
+        assert is_red(frame, 44, 4)
+
+
+def add_streams(path: Path, *streams: tuple[tuple[int, int], int, dict[str, object]]) -> None:
+    """A file of several video streams: size, number of frames and properties of each; blue but for the last, red."""
+    with av.open(str(path), "w") as container:
+        made = []
+        for size, count, properties in streams:
+            is_cover = "disposition" in properties
+            stream = container.add_stream("mjpeg" if is_cover else "mpeg4", rate=5)
+            stream.width, stream.height, stream.pix_fmt = *size, "yuvj420p" if is_cover else "yuv420p"
+            for name, value in properties.items():
+                setattr(stream if name == "disposition" else stream.codec_context, name, value)
+            made.append((stream, size, count))
+        for stream, size, count in made:
+            colour = "red" if stream is made[-1][0] else "blue"
+            for _ in range(count):
+                container.mux(stream.encode(av.VideoFrame.from_image(Image.new("RGB", size, colour))))
+            container.mux(stream.encode())
+
+
+@pytest.mark.parametrize(
+    "first",
+    [((32, 24), 5, {}), ((128, 96), 1, {}), ((128, 96), 1, {"disposition": Disposition.attached_pic})],
+    ids=["proxy", "picture", "cover"],
+)
+def test_frames_are_of_the_largest_video_not_of_a_proxy_or_cover(tmp_path, caplog, first):
+    add_streams(tmp_path / "walk.mp4", first, ((64, 48), 5, {}))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 3, QUIET)
+    with Image.open(next((tmp_path / "frames").iterdir())) as frame:
+        assert frame.size == (64, 48)
+        assert is_red(frame, 30, 30)
+    assert ("holds 2 videos of 32x24, 64x48 pixels: 64x48 is used" in caplog.text) == (first[0] == (32, 24))
+
+
+def test_a_file_of_a_cover_alone_is_refused(tmp_path):
+    add_streams(tmp_path / "song.mp4", ((64, 48), 1, {}))
+    with pytest.raises(SceneError, match=r"song.mp4 holds no video, but 1 pictures"):
+        extract_frames(tmp_path / "song.mp4", tmp_path, 3, QUIET)
+
+
+@pytest.mark.parametrize(("characteristic", "name"), [(18, "HLG"), (16, "PQ"), (1, None)])
+def test_the_flat_colours_of_an_hdr_video_are_told(tmp_path, caplog, characteristic, name):
+    add_streams(tmp_path / "walk.mkv", ((64, 48), 5, {"color_trc": characteristic}))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mkv", tmp_path / "frames", 3, QUIET)
+    assert ("without tone mapping" in caplog.text) == (name is not None)
+    assert f"is HDR ({name})" in caplog.text or name is None
+
+
+@pytest.mark.parametrize("content", [b"", b"this is no video" * 100])
+def test_a_file_that_is_no_video_is_refused_by_name(tmp_path, content):
+    (tmp_path / "walk.mp4").write_bytes(content)
+    with pytest.raises(SceneError, match=r"walk\.mp4 cannot be read as a video"):
+        capture(tmp_path / "walk.mp4", tmp_path / "scene")
+    assert not (tmp_path / "scene" / "images").exists()
+
+
+# Photographs
+
+
+def test_photographs_are_found_below_a_folder_and_named_without_blanks(tmp_path):
+    for name in ("a b/façade 1.jpg", "c.tif", ".hidden.jpg", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_photographs(tmp_path) == {
+        "a_b/façade_1.jpg": tmp_path / "a b/façade 1.jpg",
+        "c.png": tmp_path / "c.tif",
+    }
+
+
+def test_photographs_that_would_share_a_name_are_refused(tmp_path):
+    (tmp_path / "a b.jpg").touch()
+    (tmp_path / "a_b.jpg").touch()
+    with pytest.raises(SceneError, match=r"would both become a_b\.jpg"):
+        find_photographs(tmp_path)
+
+
+def test_photographs_of_a_phone_are_read_in_any_case_of_their_suffix(tmp_path):
+    for name in ("IMG_1.HEIC", "img_2.heif", "IMG_3.hif"):
+        shutil.copy(PHONE, tmp_path / name)
+    found = find_photographs(tmp_path)
+    assert list(found) == ["IMG_1.png", "IMG_3.png", "img_2.png"]
+    add_photograph(found["IMG_1.png"], tmp_path / "work" / "IMG_1.png")
+    with Image.open(tmp_path / "work" / "IMG_1.png") as image:
+        assert image.size == (48, 32)
+        assert is_red(image, 4, 4)
+        assert image.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] == 26
+
+
+@pytest.mark.parametrize("name", ["a.NEF", "b/c.dng", "IMG_1.CR3", "x.arw"])
+def test_raw_photographs_are_refused_at_once(tmp_path, name):
+    photograph().save(tmp_path / "developed.jpg")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    with pytest.raises(SceneError, match=rf"1 files of .* are raw photographs, {Path(name).name} .*export it as JPEG"):
+        find_photographs(tmp_path)
+
+
+def test_what_is_no_photograph_is_counted_but_not_a_developed_raw(tmp_path, caplog):
+    photograph().save(tmp_path / "IMG_1.JPG")
+    for name in ("IMG_1.CR2", "IMG_1.MOV", "notes.txt", ".hidden"):
+        (tmp_path / name).touch()
+    assert list(find_photographs(tmp_path)) == ["IMG_1.JPG"]
+    assert "3 files of" in caplog.text
+    assert "(1 .cr2, 1 .mov, 1 .txt)" in caplog.text
+
+
+def test_a_folder_of_videos_is_refused_with_what_it_holds(tmp_path):
+    (tmp_path / "a.MP4").touch()
+    with pytest.raises(SceneError, match=r"no photographs in .*, but 1 \.mp4; of videos, give one file"):
+        find_photographs(tmp_path)
+
+
+def test_an_ordinary_photograph_is_kept_byte_for_byte(tmp_path):
+    photograph().save(tmp_path / "a.jpg")
+    add_photograph(tmp_path / "a.jpg", tmp_path / "copy" / "a.jpg")
+    assert (tmp_path / "copy" / "a.jpg").read_bytes() == (tmp_path / "a.jpg").read_bytes()
+
+
+def test_a_photograph_is_rotated_by_exif_and_keeps_its_focal_length(tmp_path):
+    save_rotated(photograph(), tmp_path / "a.jpg")
+    add_photograph(tmp_path / "a.jpg", tmp_path / "b.jpg")
+    with Image.open(tmp_path / "b.jpg") as image:
+        assert image.size == (64, 48)
+        assert is_red(image, 4, 4)
+        assert ExifTags.Base.Orientation not in image.getexif()
+        assert image.getexif().get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] == 26
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "I;16", "P"])
+def test_photographs_of_any_mode_become_8_bits(tmp_path, mode):
+    grey = np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1))
+    stored = Image.fromarray(grey.astype(np.uint16) * 257) if mode == "I;16" else Image.fromarray(grey).convert(mode)
+    stored.save(tmp_path / "a.png")
+    add_photograph(tmp_path / "a.png", tmp_path / "b.png")
+    with Image.open(tmp_path / "b.png") as stored:
+        assert stored.mode in ("L", "RGB")
+        np.testing.assert_array_equal(np.asarray(stored.convert("L")), grey)
+
+
+def test_an_unreadable_photograph_is_refused_by_name(tmp_path):
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for name in "abc":
+        photograph().save(photographs / f"{name}.jpg")
+    (photographs / "b.jpg").write_bytes((photographs / "a.jpg").read_bytes()[:500])
+    with pytest.raises(SceneError, match=r"b\.jpg cannot be read as an image"):
+        capture(photographs, tmp_path / "scene")
+    assert not (tmp_path / "scene" / "images").exists()
+
+
+def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "another phone"
+    for name, size in {"a.jpg": (64, 48), "b.jpg": (64, 48), "c.jpg": (48, 64)}.items():
+        photograph(*size).save(tmp_path / name)
+    photograph().save(tmp_path / "d.jpg", exif=exif)
+    groups = group_by_lens(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"], "auto")
+    assert [lens.names for lens in groups] == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"]]
+
+
+@pytest.mark.parametrize(("cameras", "count"), [("single", 1), ("folder", 2), ("image", 3)])
+def test_the_sharing_of_cameras_can_be_chosen(tmp_path, cameras, count):
+    names = ["left/a.jpg", "left/b.jpg", "right/a.jpg"]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        photograph().save(tmp_path / name)
+    assert len(group_by_lens(tmp_path, names, cameras)) == count
+
+
+def test_photographs_of_two_sizes_cannot_share_a_camera(tmp_path):
+    photograph().save(tmp_path / "a.jpg")
+    photograph(48, 64).save(tmp_path / "b.jpg")
+    with pytest.raises(SceneError, match=r"a\.jpg \(64x48\) and b\.jpg \(48x64\) cannot share a camera"):
+        group_by_lens(tmp_path, ["a.jpg", "b.jpg"], "single")
+
+
+# Masks
+
+
+def test_what_is_transparent_in_a_photograph_is_masked_and_black(tmp_path):
+    pixels = np.array(photograph().convert("RGBA"))
+    pixels[:12] = (255, 0, 255, 0)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert has_transparency(tmp_path / "a.png")
+    add_photograph(tmp_path / "a.png", tmp_path / "work.png")
+    add_mask(None, tmp_path / "a.png", tmp_path / "work.png", tmp_path / "kept.png")
+    with Image.open(tmp_path / "work.png") as image, Image.open(tmp_path / "kept.png") as kept:
+        assert image.mode == "RGB"
+        assert np.asarray(image)[:12].max() == 0
+        np.testing.assert_array_equal(np.asarray(image)[12:], pixels[12:, :, :3])
+        np.testing.assert_array_equal(np.asarray(kept), pixels[..., 3])
+
+
+def test_a_mask_of_a_capture_may_hold_ones_or_be_transparent(tmp_path):
+    keep = np.zeros((48, 64), np.uint8)
+    keep[:12] = 1
+    for mask in (
+        Image.fromarray(keep),
+        Image.merge("LA", [Image.new("L", (64, 48), 255), Image.fromarray(255 * keep)]),
+    ):
+        np.testing.assert_array_equal(np.asarray(masked(tmp_path, mask)), 255 * keep)
+
+
+def test_the_usual_names_of_masks_are_found_and_others_counted(tmp_path, caplog):
+    photographs = {name: tmp_path / name for name in ("a.jpg", "b.jpg", "c.jpg", "d.jpg")}
+    (tmp_path / "masks").mkdir()
+    names = ["a.jpg.png", "b_mask.png", "c.jpg", "dd.png"]
+    for name in names:
+        (tmp_path / "masks" / name).touch()
+    found = find_masks(photographs, tmp_path, tmp_path / "masks")
+    assert found == {f"{name[0]}.jpg": tmp_path / "masks" / name for name in names[:3]}
+    assert "1 of 4 photographs have no mask" in caplog.text
+    assert "dd.png for example" in caplog.text
+
+
+def masked(tmp_path: Path, mask: Image.Image) -> Image.Image:
+    """The mask that the work folder gets for a photograph with an EXIF rotation."""
+    save_rotated(photograph(), tmp_path / "a.jpg")
+    add_photograph(tmp_path / "a.jpg", tmp_path / "upright.jpg")
+    mask.save(tmp_path / "a.jpg.png")
+    add_mask(tmp_path / "a.jpg.png", tmp_path / "a.jpg", tmp_path / "upright.jpg", tmp_path / "kept.png")
+    with Image.open(tmp_path / "kept.png") as kept:
+        kept.load()
+    return kept
+
+
+@pytest.mark.parametrize("as_stored", [True, False])
+def test_a_mask_is_rotated_with_its_photograph(tmp_path, as_stored):
+    upright = np.zeros((48, 64), np.uint8)
+    upright[:12, :16] = 255
+    mask = Image.fromarray(upright)
+    kept = masked(tmp_path, mask.rotate(90, expand=True) if as_stored else mask)
+    np.testing.assert_array_equal(np.asarray(kept), upright)
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path):
+    with pytest.raises(SceneError, match=r"a\.jpg\.png is 32x32 pixels, its photograph 64x48"):
+        masked(tmp_path, Image.new("L", (32, 32)))
+
+
+def test_masks_that_belong_to_no_photograph_are_refused(tmp_path):
+    photographs = {"a.jpg": tmp_path / "a.jpg"}
+    (tmp_path / "masks").mkdir()
+    with pytest.raises(SceneError, match=r"masks.a\.jpg\.png"):
+        find_masks(photographs, tmp_path, tmp_path / "masks")
+
+
+# Pairs
+
+
+@pytest.mark.parametrize(
+    ("asked", "count", "is_video", "chosen"),
+    [
+        ("auto", 25, False, "exhaustive"),
+        ("auto", 61, False, "sequential"),
+        ("auto", 25, True, "sequential"),
+        ("exhaustive", 500, True, "exhaustive"),
+        ("sequential", 5, False, "sequential"),
+    ],
+)
+def test_matching_depends_on_the_input_unless_it_is_chosen(asked, count, is_video, chosen):
+    assert choose_matching(asked, count, is_video) == chosen
+
+
+def test_sequential_pairs_reach_as_far_as_the_overlap():
+    assert image_pairs(4, "sequential", 2) == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
+    assert len(image_pairs(20, "exhaustive", 2)) == 20 * 19 // 2
+
+
+# Work folder
+
+
+def test_an_interrupted_stage_leaves_no_product(tmp_path):
+    making = Work(tmp_path).making("model", "key")
+    (making.__enter__() / "half").touch()
+    making.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert not Work(tmp_path).has("model", "key")
+
+
+def test_a_product_is_kept_until_it_is_made_with_another_key(tmp_path):
+    with Work(tmp_path).making("model", "old") as folder:
+        (folder / "old").touch()
+    assert Work(tmp_path).has("model", "old")
+    with Work(tmp_path).making("model", "new"):
+        pass
+    assert not Work(tmp_path).has("model", "old")
+    assert list((tmp_path / "model").iterdir()) == []
+
+
+def test_counting_rows_leaves_no_files_beside_the_database(tmp_path):
+    database = tmp_path / "database.db"
+    with closing(sqlite3.connect(database)) as connection:
+        connection.executescript("PRAGMA journal_mode = WAL; CREATE TABLE cameras (id); INSERT INTO cameras VALUES (1)")
+    assert stages._rows(database, "cameras") == 1
+    stages._tidy(database)
+    assert list(tmp_path.iterdir()) == [database]
+
+
+def test_a_growing_product_is_kept_only_for_the_same_key(tmp_path):
+    (Work(tmp_path).growing("features", "old") / "database").touch()
+    assert (Work(tmp_path).growing("features", "old") / "database").exists()
+    assert not (Work(tmp_path).growing("features", "new") / "database").exists()
+
+
+# The whole capture
+
+
+@pytest.mark.parametrize(
+    ("prepare", "message"),
+    [
+        (lambda folder: None, "there are no photographs in"),
+        (lambda folder: [photograph().save(folder / f"{k}.jpg") for k in range(2)], "at least 3 photographs, not 2"),
+    ],
+)
+def test_too_few_photographs_are_refused(tmp_path, prepare, message):
+    (tmp_path / "photographs").mkdir()
+    prepare(tmp_path / "photographs")
+    with pytest.raises(SceneError, match=message):
+        capture(tmp_path / "photographs", tmp_path / "scene")
+
+
+def test_a_missing_source_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
+        capture(tmp_path / "nowhere", tmp_path / "scene")
+
+
+def test_a_scene_inside_the_folder_of_photographs_is_refused(tmp_path):
+    photograph().save(tmp_path / "a.jpg")
+    with pytest.raises(SceneError, match="outside of it"):
+        capture(tmp_path, tmp_path / "scene")
+
+
+@pytest.mark.parametrize("name", ["images", "colmap", "transforms.json"])
+def test_an_existing_scene_is_refused_and_undisturbed(tmp_path, name):
+    (tmp_path / "photographs").mkdir()
+    photograph().save(tmp_path / "photographs" / "a.jpg")
+    (tmp_path / "scene" / name).mkdir(parents=True)
+    with pytest.raises(SceneError, match=f"{name} already exists"):
+        capture(tmp_path / "photographs", tmp_path / "scene")
+    assert [path.name for path in (tmp_path / "scene").iterdir()] == [name]
+
+
+def test_photographs_that_do_not_belong_together_are_refused_with_advice(tmp_path):
+    folder = tmp_path / "fotos från gården"
+    folder.mkdir()
+    for k in range(3):
+        photograph(200, 150, seed=k).save(folder / f"{k}.png")
+    Image.new("RGB", (200, 150), "grey").save(folder / "plain.png")  # has no features
+    with pytest.raises(SceneError, match=r"only 0 of 4 photographs were found.*--matching exhaustive"):
+        capture(folder, tmp_path / "scen å")
+    assert [path.name for path in (tmp_path / "scen å").iterdir()] == ["capture"]
+
+
+def test_a_failure_of_colmap_is_reported_in_one_sentence(tmp_path):
+    (tmp_path / "database.db").write_bytes(b"this is no database" * 100)
+    with pytest.raises(SceneError, match=r"finding features failed in COLMAP \(.+\); all its messages are in"):
+        run_step(
+            "match",
+            {"database": str(tmp_path / "database.db"), "pairs": str(tmp_path / "pairs.txt")},
+            log=tmp_path / "log",
+            progress=QUIET,
+            description="finding features",
+            total=1,
+        )
+
+
+def test_a_full_disk_is_reported_in_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "photographs").mkdir()
+    photograph().save(tmp_path / "photographs" / "a.jpg")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("shellgs_method.capture.stages.add_photograph", full)
+    with pytest.raises(SceneError, match=r"disk of .* is full"):
+        capture(tmp_path / "photographs", tmp_path / "scene")
+
+
+@pytest.fixture
+def without_colmap(monkeypatch) -> list[str]:
+    """Fake structure from motion that finds every camera; returns the list of steps run."""
+    steps: list[str] = []
+
+    def run_step(step: str, arguments: dict, **_):
+        steps.append(step)
+        names = sorted(path.name for path in Path(arguments.get("photographs", "")).glob("*.jpg"))
+        if step == "undistort":
+            output = Path(arguments["output"])
+            (output / "sparse").mkdir()
+            (output / "images").mkdir()
+            for name in names:
+                (output / "images" / name).write_bytes(b"undistorted")
+        return [{"names": names, "points": 9, "reprojection_error": 0.5, "track_length": 3.0}]
+
+    monkeypatch.setattr("shellgs_method.capture.stages.run_step", run_step)
+    return steps
+
+
+@pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])
+def test_deleted_parts_of_a_captured_scene_are_made_again(tmp_path, without_colmap, deleted):
+    for k in range(3):
+        (tmp_path / "photographs").mkdir(exist_ok=True)
+        photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
+    scene = tmp_path / "scene"
+    for _ in range(2):  # the second time too
+        capture(tmp_path / "photographs", scene)
+        for name in deleted:
+            shutil.rmtree(scene / name)
+        summary = capture(tmp_path / "photographs", scene)
+        assert len(summary.registered) == 3
+        assert sorted(path.name for path in (scene / "images").iterdir()) == ["0.jpg", "1.jpg", "2.jpg"]
+        assert (scene / "colmap" / "sparse" / "0").is_dir()
+    without_colmap.clear()
+    capture(tmp_path / "photographs", scene)
+    assert without_colmap == []
+
+
+# Structure from motion
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Fit the source points to the target by a similarity (Umeyama 1991) and return them."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    U, S, Vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    return (S @ signs) / (a**2).sum() * a @ (U * signs @ Vt).T + target.mean(axis=0)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory) -> Path:
+    """A synthetic facade with true cameras."""
+    scene = tmp_path_factory.mktemp("capture") / "truth"
+    write_scene(scene, FacadeConfig(width=640, height=360, views=24, bays=3, storeys=2, points=50, supersampling=2))
+    return scene
+
+
+@pytest.fixture(scope="module")
+def captured(truth) -> Path:
+    """A scene captured from the photographs of the synthetic facade."""
+    scene = truth.parent / "scene"
+    capture(truth / "images", scene)
+    return scene
+
+
+@pytest.mark.slow
+def test_cameras_of_the_synthetic_facade_are_found(truth, captured):
+    true = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=truth))}
+    found = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=captured))}
+    assert len(found) >= 22
+    positions = np.stack([true[name].camera.position.numpy() for name in found])
+    errors = similarity(np.stack([view.camera.position.numpy() for view in found.values()]), positions) - positions
+    # A pixel is 2 cm of the wall; with steps of 0.7 m past identical windows the error was 0.7 % of the path.
+    assert np.median(np.linalg.norm(errors, axis=1)) < 0.02 * np.ptp(positions, axis=0).max()
+    focal = next(iter(true.values())).camera.K[0, 0].item()
+    assert next(iter(found.values())).camera.K[0, 0].item() == pytest.approx(focal, rel=0.03)
+
+
+@pytest.mark.slow
+def test_a_finished_capture_is_not_repeated_and_other_settings_are_refused(truth, captured):
+    before = (captured / "colmap" / "sparse" / "0" / "images.bin").stat()
+    capture(truth / "images", captured)
+    assert (captured / "colmap" / "sparse" / "0" / "images.bin").stat() == before
+    with pytest.raises(SceneError, match="already exists"):
+        capture(truth / "images", captured, CaptureConfig(quality="high"))
+
+
+@pytest.mark.slow
+def test_a_scene_captured_with_masks_loads_with_them(truth, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for path in (truth / "images").iterdir():
+        with Image.open(path) as photo:
+            mask = np.full((photo.height, photo.width), 255, np.uint8)
+        mask[:, : mask.shape[1] // 8] = 0
+        Image.fromarray(mask).save(tmp_path / "masks" / f"{path.name}.png")
+    capture(truth / "images", tmp_path / "scene", CaptureConfig(masks=tmp_path / "masks"))
+    for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene", masks_path=Path("masks")))[:3]:
+        mask = load_mask(view)
+        assert mask is not None
+        assert mask.shape == load_photograph(view).shape[:2] == (view.camera.height, view.camera.width)
+        assert 0.5 < mask.mean() < 1.0

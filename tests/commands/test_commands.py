@@ -1,0 +1,188 @@
+"""The commands as a user types them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from shellgs_method.cli import main
+from shellgs_method.machine import doctor
+
+DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20)
+
+
+def start(*words: object, cwd: Path, status: int = 0) -> str:
+    """Output of `shellgs` in a process of its own, without the terminal's line breaks."""
+    environment = os.environ | {"OMP_WAIT_POLICY": "passive", "COLUMNS": "200"}
+    command = [str(Path(sys.executable).with_name("shellgs")), *map(str, words)]
+    done = subprocess.run(command, cwd=cwd, env=environment, text=True, capture_output=True)
+    output = done.stdout + done.stderr
+    assert done.returncode == status, output
+    return output
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small `shellgs demo`; its output is in log.txt beside it."""
+    folder = tmp_path_factory.mktemp("demo")
+    (folder / "log.txt").write_text(start(*DEMO, cwd=folder))
+    return folder / "demo"
+
+
+def config(demo: Path) -> Path:
+    return demo / "runs" / "scene" / "shellgs-metric" / "shellgs-metric" / "seed-0" / "config.yml"
+
+
+def test_the_demo_writes_a_table_and_images(demo):
+    table = (demo / "results.md").read_text()
+    assert all(word in table for word in ("photo-gs", "shellgs-metric", "PSNR", "Normal (°)", "CD (m)"))
+    for path in (demo / "strip.png", demo / "contradicted.png", demo / "scene" / "cues" / "shell" / "panel.png"):
+        with Image.open(path) as image:
+            assert np.asarray(image).std() > 10
+
+
+def test_the_demo_prints_its_progress_and_what_to_look_at_first(demo):
+    output = demo.with_name("log.txt").read_text()
+    assert "A synthetic facade, 10 photographs of 64 x 48 pixels: demo/scene" in output
+    assert "seed-0 finished, 2 of 2." in output
+    first = output[output.index("Look first at") :].splitlines()[1:4]
+    assert [(demo.parent / line.split(": ")[0].split()[-1]).exists() for line in first[:2]] == [True, True]
+    assert "ns-viewer --load-config" in first[2]
+
+
+def test_a_second_demo_keeps_what_the_first_finished(demo, shellgs, monkeypatch):
+    finished = [next(config(demo).parent.glob("nerfstudio_models/*.ckpt")), *demo.glob("scene/cues/shell/images/*.npz")]
+    before = [path.stat().st_mtime_ns for path in finished]
+    monkeypatch.chdir(demo.parent)
+    output = shellgs(*DEMO)
+    assert "Look first at" in output
+    assert "$ ns-train" not in output
+    assert [path.stat().st_mtime_ns for path in finished] == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (["--width", 640], "was made with --width 64, not 640: give another folder"),
+        (["--views", 12, "--seed", 3], "--views 10, not 12, --seed 0, not 3"),
+        (["--iterations", -5], "--iterations must be at least 1, not -5"),
+        (["--width", 0], "width must be at least 16, not 0"),
+    ],
+)
+def test_a_demo_with_other_settings_is_refused_and_changes_nothing(demo, monkeypatch, flags, sentence):
+    before = {path: path.stat().st_mtime_ns for path in demo.rglob("*")}
+    monkeypatch.chdir(demo.parent)
+    monkeypatch.setattr("sys.argv", ["shellgs", *map(str, [*DEMO, *flags])])
+    with pytest.raises(SystemExit, match=rf"^shellgs: .*{sentence}"):
+        main()
+    assert {path: path.stat().st_mtime_ns for path in demo.rglob("*")} == before
+
+
+def test_ns_eval_writes_all_metrics(demo):
+    metrics = json.loads((config(demo).parent / "eval.json").read_text())["results"]
+    assert {
+        "psnr",
+        "ssim",
+        "normal_deg",
+        "depth_mae_m",
+        "chamfer_m",
+        "f_score_10cm",
+        "truth_normal_deg",
+    } <= metrics.keys()
+
+
+def test_ns_export_writes_the_gaussians(demo, run, tmp_path):
+    run("ns-export", "gaussian-splat", "--load-config", config(demo), "--output-dir", tmp_path)
+    cloud = trimesh.load(tmp_path / "splat.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert len(cloud.vertices) > 100
+
+
+def test_ns_render_writes_images_of_every_output(demo, run, tmp_path):
+    outputs = ("rgb", "depth", "normal", "accumulation")
+    command = ("ns-render", "dataset", "--load-config", config(demo), "--output-path", tmp_path, "--split", "test")
+    run(*command, "--rendered-output-names", *outputs)
+    for output in outputs:
+        assert len(list((tmp_path / "test" / output).iterdir())) == 2
+
+
+def test_a_reader_that_stops_early_gets_no_error(tmp_path):
+    """As in `shellgs --help | head`."""
+    script = "from shellgs_method.errors import *\nwith refusals_end_the_program():\n  for k in range(10**6): print(k)"
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout
+        assert process.stderr
+        assert process.stdout.readline() == b"0\n"
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+def test_ns_train_lists_the_methods_and_describes_their_settings(run, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert {"shellgs", "mono-gs", "photo-gs", "2dgs"} <= set(run("ns-train", "--help").split())
+    described = run("ns-train", "shellgs", "--help")
+    assert {"--pipeline.model.geometry.depth.initial", "--pipeline.model.primitive"} <= set(described.split())
+    assert "facade-data" in described
+
+
+def test_a_missing_shell_ends_ns_train_with_one_sentence(demo, run, tmp_path, monkeypatch):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    for name in ("images", "transforms.json", "sparse_pc.ply"):
+        (scene / name).symlink_to(demo / "scene" / name)
+    monkeypatch.chdir(tmp_path)
+    output = run("ns-train", "shellgs", "--data", scene, "--vis", "tensorboard")
+    assert output.startswith("refused: shellgs: shellgs needs the shell maps")
+
+
+def test_shellgs_cast_takes_a_shell_and_its_matrix(demo, shellgs, tmp_path):
+    scene = tmp_path / "eine Szene – 場面"
+    scene.mkdir()
+    for name in ("images", "transforms.json", "sparse_pc.ply"):
+        (scene / name).symlink_to(demo / "scene" / name)
+    alignment = json.loads((demo / "scene" / "shell" / "alignment.json").read_text())
+    (tmp_path / "matrix.txt").write_text("\n".join(" ".join(map(repr, row)) for row in alignment["shell_to_scene"]))
+    shell = demo / "scene" / "shell" / "facade.ply"
+    assert "10 views cast" in shellgs("cast", scene, "--shell", shell, "--matrix", tmp_path / "matrix.txt")
+    assert "10 views cast" in shellgs("cast", scene, "--max-image-size", 32)
+    assert "10 views cast" in shellgs("cast", scene)  # in full size again
+
+
+def test_a_users_mistake_ends_the_command_with_one_sentence(tmp_path):
+    output = start("cast", "nowhere", cwd=tmp_path, status=1)
+    assert output.startswith("shellgs: ")
+    assert "nowhere" in output
+    assert output.count("\n") == 1
+
+
+def test_a_shell_without_its_matrix_is_refused(shellgs):
+    assert shellgs("cast", ".", "--shell", "scan.ply") == (
+        "refused: shellgs: --shell and --matrix go together: give both or neither"
+    )
+
+
+def test_doctor_lists_the_parts_of_this_machine(tmp_path):
+    output = start("doctor", cwd=tmp_path)
+    assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_doctor_runs_apt_get_when_asked_and_names_it_otherwise(shellgs, monkeypatch, asked):
+    commands = []
+    missing = doctor.Finding("Open3D", False, "no libGL; remedy: as root, apt-get install libgl1")
+    monkeypatch.setattr(doctor, "_open3d", lambda: missing)
+    monkeypatch.setattr(doctor.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(doctor.shutil, "which", lambda _: "/usr/bin/apt-get")
+    monkeypatch.setattr(doctor.subprocess, "run", lambda words, **_: commands.append(words[:2]))
+    output = shellgs("doctor", *["--install-libraries"] * asked)
+    assert commands == [["apt-get", "update"], ["apt-get", "install"]] * asked
+    assert output.startswith("refused: shellgs: nothing runs here until this is fixed: Open3D: no libGL")
+    assert "as root, apt-get install libgl1" in output

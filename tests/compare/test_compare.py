@@ -1,0 +1,801 @@
+"""`shellgs compare`: tables, resumed runs, and the report."""
+
+from __future__ import annotations
+
+import csv
+import filecmp
+import io
+import json
+import os
+import re
+import shutil
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import torch
+import trimesh
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+from rich.console import Console
+from rich.progress import Progress
+from training_runs import Method, trainer_of
+
+from shellgs_method import cli
+from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_metrics
+from shellgs_method.compare.plots import DOT, dotted, recorded_metrics
+from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
+from shellgs_method.compare.runs import Run, Variant, grid
+from shellgs_method.compare.tables import tables
+from shellgs_method.compare.wandb_report import log_comparison
+from shellgs_method.errors import SceneError
+from shellgs_method.evaluation import regions
+from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.scene import SceneLayout, ScenePaths
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.launch import cluster, local
+from shellgs_method.launch.local import CommandError, follow, launch_locally
+from shellgs_method.pipeline import FacadePipeline
+from shellgs_method.runs.folders import held, recover_folder, replace_folder
+
+COLUMNS = (Column("psnr", "PSNR", max, ".1f"), Column("normal_deg", "Normal (°)", min, ".2f"))
+SEEDS = {"shellgs_&_all": {"psnr": [25.0, 27.0], "normal_deg": [9.0, 11.0]}, "photo-gs": {"psnr": [26.6, 27.0]}}
+
+
+# tables
+
+
+def test_a_cell_is_mean_and_sample_deviation_over_the_seeds():
+    values = np.random.default_rng(0).normal(24, 2, 5).tolist()
+    table = markdown_table({"shellgs": {"psnr": values}}, COLUMNS[:1])
+    assert f"{np.mean(values):.1f} ± {np.std(values, ddof=1):.1f}" in table
+
+
+def test_the_best_mean_is_bold_whichever_way_is_better():
+    # Means: PSNR 26.0 and 26.8, more is better; normals 10 and 12, less is better.
+    rows = {"a": {"psnr": [25.0, 27.0], "normal_deg": [9.0, 11.0]}, "b": {"psnr": [26.6, 27.0], "normal_deg": 12.0}}
+    a, b = markdown_table(rows, COLUMNS).splitlines()[2:]
+    assert a == "| a | 26.0 ± 1.4 | **10.00 ± 1.41** |"
+    assert b == "| b | **26.8 ± 0.3** | 12.00 |"
+
+
+def test_quoted_rows_are_never_bold():
+    paper = {"paper": {"psnr": 99.0, "normal_deg": 0.0}}
+    ours, quoted = markdown_table({"ours": {"psnr": 20.0, "normal_deg": 30.0}}, COLUMNS, paper).splitlines()[2:]
+    assert ours == "| ours | **20.0** | **30.00** |"
+    assert quoted == "| paper | 99.0 | 0.00 |"
+
+
+def test_latex_escapes_names_and_signs():
+    table = latex_table(SEEDS, (*COLUMNS, Column("share", "<10° %", max, ".0%")))
+    assert r"shellgs\_\&\_all & 26.0 $\pm$ 1.4 & \textbf{10.00 $\pm$ 1.41} & -- \\" in table
+    assert r"Method & PSNR $\uparrow$ & Normal ($^\circ$) $\downarrow$ & $<$10$^\circ$ \% $\uparrow$ \\" in table
+    assert r"\begin{tabular}{lccc}" in table
+    assert table.isascii()
+
+
+def test_html_escapes_names():
+    assert "<td>shellgs_&amp;_all" in html_table(SEEDS, COLUMNS)
+
+
+def test_csv_has_all_digits():
+    shellgs, photo_gs = csv.DictReader(csv_table(SEEDS, COLUMNS).splitlines())
+    assert float(shellgs["psnr_std"]) == np.std([25.0, 27.0], ddof=1)
+    assert photo_gs["normal_deg"] == photo_gs["normal_deg_std"] == ""
+    assert shellgs["seeds"] == "2"
+
+
+# the grid
+
+
+def fabricate(run: Run, half=None, **metrics: float) -> None:
+    run.folder.mkdir(parents=True, exist_ok=True)
+    run.metrics(half).write_text(json.dumps({"results": metrics}))
+
+
+def fake_grid(scenes: list[Path], names: list[str], folder: Path, seeds=(0,), iterations: int = 20) -> list[Run]:
+    return grid(scenes, names, seeds, iterations, folder)
+
+
+def test_tables_gather_the_seeds_and_leave_out_the_spread_over_views(pristine_scene, tmp_path):
+    for run in fake_grid([pristine_scene], ["shellgs"], tmp_path, seeds=(0, 1)):
+        fabricate(run, psnr=20.0 + run.seed, psnr_std=3.0, normal_deg=10.0, normal_deg_views=4.0)
+    (main,) = tables(fake_grid([pristine_scene], ["shellgs"], tmp_path, seeds=(0, 1, 2)))
+    assert main.rows["shellgs"] == {"psnr": [20.0, 21.0], "normal_deg": [10.0, 10.0]}
+
+
+def test_the_papers_rows_are_beside_scenes_of_the_same_role(pristine_scene, tmp_path):
+    other = tmp_path / "copy"
+    other.mkdir()
+    for file in pristine_scene.iterdir():
+        (other / file.name).symlink_to(file)
+    runs = fake_grid([pristine_scene, other], ["photo-gs", "shellgs", "shellgs-depth"], tmp_path)
+    for run in runs:
+        fabricate(run, psnr=20.0, normal_deg=10.0, depth_mae_m=0.1, chamfer_m=0.1)
+    found = {table.name: table for table in tables(runs)}
+    assert found["main"].paper["shellgs (paper)"]["psnr"] == 23.06
+    assert found["surface"].paper["2dgs (paper)"]["f_score_20cm"] == 0.938
+    assert found["ablation"].paper["shellgs-depth (paper)"]["depth_mae_m"] == 0.113
+    assert found["copy-main"].paper["shellgs (paper)"]["normal_deg"] == 23.44
+    assert not found["copy-ablation"].paper
+    assert list(found["main"].rows) == ["photo-gs", "shellgs"]
+    assert list(found["ablation"].rows) == ["photo-gs", "shellgs", "shellgs-depth"]
+
+
+def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
+    """Its errors are small: it lacks only some detail of the truth."""
+    shell = measure_shell(SceneLayout(data=pristine_scene))
+    assert 0 < shell["truth_normal_deg"] < 15
+    assert 0 < shell["truth_chamfer_m"] < 0.1
+    runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path)
+    fabricate(runs[0], truth_normal_deg=40.0)
+    (truth,) = (table for table in tables(runs, {runs[0].scene: shell}) if table.name == "truth")
+    assert list(truth.rows) == ["photo-gs", "the shell itself"]
+
+
+def test_the_shell_itself_is_measured_over_the_pixels_of_every_method(pristine_scene, monkeypatch):
+    """Also where photographs contradict it, since no method is excused from the truth there."""
+    shell = measure_shell(SceneLayout(data=pristine_scene))
+    monkeypatch.setattr(regions, "contradicted", lambda batch, device: torch.ones_like(batch["shell_mask"]))
+    assert measure_shell(SceneLayout(data=pristine_scene)) == pytest.approx(shell, nan_ok=True)
+
+
+def test_the_paths_of_a_scene_reach_every_run(pristine_scene, tmp_path):
+    """The hashes in a run's settings use them too."""
+    paths = ScenePaths(images_path=Path("photos"), colmap_path=Path("model"))
+    ours, splatfacto = grid([pristine_scene], ["shellgs", "splatfacto"], [0], 20, tmp_path, paths=paths)
+    for run in (ours, splatfacto):
+        assert " ".join(run.commands()[0]).endswith(" facade-data --images-path photos --colmap-path model")
+    with pytest.raises(FileNotFoundError, match="nor a COLMAP model in model"):
+        ours.settle()
+
+
+def test_a_holdout_is_compared_with_all_methods_in_the_same_half(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["photo-gs", "shellgs", "shellgs-without-b"], tmp_path)
+    photo_gs, shellgs, without_b = runs
+    assert shellgs.halves == photo_gs.halves == ("B",)
+    assert without_b.halves == ()
+    fabricate(shellgs, normal_deg=1.0)
+    fabricate(shellgs, "B", normal_deg=2.0)
+    fabricate(without_b, normal_deg=3.0)
+    found = {table.name: table.rows for table in tables(runs)}
+    assert found["holdout-b"] == {"shellgs": {"normal_deg": [2.0]}, "shellgs-without-b": {"normal_deg": [3.0]}}
+
+
+def test_a_variant_is_a_method_an_ablation_or_the_users_own():
+    assert Variant.parse("splatfacto") == Variant("splatfacto", "splatfacto")
+    assert not Variant.parse("splatfacto").ours
+    assert Variant.parse("shellgs-plane").flags == ("--pipeline.model.depth", "plane")
+    assert Variant.parse("wide=shellgs --pipeline.model.geometry.ncc-window 11").method == "shellgs"
+
+
+def test_an_unknown_method_is_refused_with_the_names_of_the_known_ones(pristine_scene, tmp_path):
+    with pytest.raises(SceneError, match=r"no method 'shelgs': use photo-gs, .*shellgs-depth"):
+        fake_grid([pristine_scene], ["shelgs"], tmp_path)
+
+
+def test_a_name_that_leaves_its_folder_is_refused(pristine_scene, tmp_path):
+    with pytest.raises(SceneError, match="cannot name a folder"):
+        fake_grid([pristine_scene], ["../mine=shellgs"], tmp_path)
+
+
+@pytest.mark.usefixtures("offline_wandb")
+def test_wandb_gets_each_table_with_mean_and_deviation_and_each_figure(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["photo-gs", "shellgs"], tmp_path / "comparison", seeds=(0, 1))
+    for run in runs:
+        fabricate(run, psnr=20.0 + 2 * run.seed, chamfer_m=0.1)
+    image = tmp_path / "strip.png"
+    Image.new("RGB", (4, 3)).save(image)
+    log_comparison("facades", Comparison(list(tables(runs)), {"a caption": image}, {}), runs)
+    (files,) = (tmp_path / "comparison" / "wandb").glob("offline-run-*/files/media")
+    (main,) = files.glob("table/tables/main_*.json")
+    table = json.loads(main.read_text())
+    rows = [dict(zip(table["columns"], row, strict=True)) for row in table["data"]]
+    assert [row["method"] for row in rows] == ["photo-gs", "shellgs"]
+    assert (rows[0]["psnr"], rows[0]["psnr_std"], rows[0]["seeds"]) == (21.0, pytest.approx(2**0.5), 2)
+    assert rows[0]["ssim"] is None
+    assert len(list(files.glob("table/tables/surface_*.json"))) == 1
+    assert len(list(files.glob("images/figures/strip_*.png"))) == 1
+
+
+# finished, killed and failed runs
+
+FAKE_TRAIN = """
+import os, pathlib, signal, sys, time
+words = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+folder = pathlib.Path(words["--output-dir"], words["--experiment-name"], sys.argv[1], words["--timestamp"])
+last = int(words["--max-num-iterations"]) - 1
+(folder / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
+(folder / "config.yml").write_text(
+    "!!python/object:types.SimpleNamespace {pipeline: !!python/object:types.SimpleNamespace "
+    "{datamanager: !!python/object:types.SimpleNamespace {data: somewhere}}}"
+)
+if folder.parent.name == "mono-gs":
+    print("mono-gs needs maps")
+    sys.exit(1)
+killed = folder.parent.name == "photo-gs" and "--load-dir" not in words
+checkpoint = folder / "nerfstudio_models" / f"step-{2 if killed else last:09d}.ckpt"
+checkpoint.write_text(" ".join(sys.argv[1:]))
+print("10 (50.00%)", flush=True)
+time.sleep(float(os.environ.get("FAKE_SECONDS", 0)))
+if killed:
+    os.kill(os.getppid() if "KILL_PARENT" in os.environ else os.getpid(), signal.SIGKILL)
+"""
+FAKE_EVALUATE = """
+import json, pathlib, sys
+assert sys.argv[1] == "evaluate"
+words = dict(zip(sys.argv[3::2], sys.argv[4::2]))
+pathlib.Path(words["--output-path"]).write_text(json.dumps({"results": {"psnr": 20.0}}))
+"""
+
+
+def write_fake_commands(folder: Path) -> None:
+    for name, text in {"ns-train": FAKE_TRAIN, "shellgs": FAKE_EVALUATE}.items():
+        (folder / name).write_text(f"#!{sys.executable} -SI{text}")
+        (folder / name).chmod(stat.S_IRWXU)
+
+
+@pytest.fixture
+def fake_commands(tmp_path, monkeypatch) -> None:
+    """Instant training and evaluation: photo-gs is killed at its first start, mono-gs always fails."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    write_fake_commands(folder)
+    monkeypatch.setattr(local, "BIN", folder)
+
+
+def finish_all(runs: list[Run], jobs: int = 1):
+    console = Console(quiet=True)
+    return compare(runs, partial(launch_locally, jobs=jobs, console=console), runs[0].output, console).failures
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_one_failure_stops_no_other_run(pristine_scene, tmp_path, jobs):
+    runs = fake_grid([pristine_scene], ["mono-gs", "shellgs", "2dgs"], tmp_path / "out")
+    failures = finish_all(runs, jobs)
+    assert [run.variant.name for run in failures] == ["mono-gs"]
+    assert "mono-gs needs maps" in failures[runs[0]]
+    assert "mono-gs needs maps" in (tmp_path / "out" / "report.html").read_text()
+    assert [run.finished for run in runs] == [False, True, True]
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("terminal", [False, True])
+def test_the_console_shows_that_results_are_written(pristine_scene, tmp_path, terminal):
+    output = io.StringIO()
+    console = Console(file=output, force_terminal=terminal)
+    runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
+    compare(runs, partial(launch_locally, jobs=1, console=console), tmp_path / "out", console)
+    assert WRITING in output.getvalue()
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_log_shows_the_progress_of_a_run(pristine_scene, tmp_path, monkeypatch, terminal):
+    monkeypatch.setattr(local, "PROGRESS_SECONDS", 0.05)
+    monkeypatch.setenv("FAKE_SECONDS", "0.5")
+    output = io.StringIO()
+    launch_locally(
+        fake_grid([pristine_scene], ["shellgs", "mono-gs"], tmp_path), 1, Console(file=output, force_terminal=terminal)
+    )
+    status = "scene/shellgs/seed-0: 10 of 20 iterations" in output.getvalue()
+    assert status == (not terminal)
+    assert "scene/shellgs/seed-0 finished, 1 of 2." in output.getvalue()
+    assert "scene/mono-gs/seed-0 failed, 2 of 2." in output.getvalue()
+
+
+def test_the_time_left_is_estimated_from_the_time_so_far():
+    now = 0.0
+    progress = Progress(get_time=lambda: now)
+    task = progress.add_task("scene/shellgs/seed-0", total=1500)
+    for now, iterations in ((60.0, 100), (60.1, 200), (60.2, 300), (90.0, 400), (90.1, 500)):  # noqa: B007  # the clock reads it
+        progress.update(task, completed=iterations)
+    now = 120.0
+    (status,) = map(local._status, progress.tasks)
+    assert status == "scene/shellgs/seed-0: 500 of 1500 iterations, 2.0 min, at most about 4.0 min left"
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_finished_run_is_not_changed_again(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
+    finish_all(runs)
+    before = {path: path.stat().st_mtime_ns for path in runs[0].folder.rglob("*")}
+    finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+    assert {path: path.stat().st_mtime_ns for path in runs[0].folder.rglob("*")} == before
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_killed_run_resumes_from_its_checkpoint(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path / "out")
+    assert list(finish_all(runs)) == runs
+    assert not finish_all(runs)
+    resumed = (runs[0].checkpoints / "step-000000019.ckpt").read_text()
+    assert f"--load-dir {runs[0].checkpoints}" in resumed
+
+
+def write_script(path: Path, text: str = "") -> Path:
+    path.write_text(f"#!{sys.executable}\n{text}")
+    path.chmod(stat.S_IRWXU)
+    return path
+
+
+def test_commands_start_without_python_in_a_fork(tmp_path, monkeypatch):
+    """Clean-up of other threads' objects in a fork may wait for threads that it has not: libswscale's did, for ever."""
+
+    class Held:
+        def __del__(self, process: int = os.getpid(), marker: Path = tmp_path / "cleaned in a fork") -> None:
+            if os.getpid() != process:
+                marker.touch()
+
+    def hold() -> None:
+        kept.held = Held()
+        done.wait()
+
+    monkeypatch.setattr(local, "BIN", write_script(tmp_path / "nothing").parent)
+    kept, done = threading.local(), threading.Event()
+    thread = threading.Thread(target=hold)
+    thread.start()
+    follow([["nothing"]])
+    done.set()
+    thread.join()
+    assert not (tmp_path / "cleaned in a fork").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
+def test_killing_a_comparison_ends_its_commands(tmp_path):
+    sleep = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    write_script(tmp_path / "sleep", sleep)
+    following = (
+        "import pathlib; from shellgs_method.compare import launch; "
+        f"local.BIN = pathlib.Path({str(tmp_path)!r}); local.follow([['sleep']])"
+    )
+    comparison = subprocess.Popen([sys.executable, "-c", following])
+    while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+        time.sleep(0.05)
+    command = psutil.Process(int((tmp_path / "pid").read_text()))
+    comparison.kill()
+    comparison.wait()
+    command.wait(timeout=10)
+
+
+def test_commands_share_a_process_up_to_the_first_that_fails(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "BIN", tmp_path)
+    write_script(
+        tmp_path / "count", "import sys; sys.count = getattr(sys, 'count', 0) + int(sys.argv[1]); print(sys.count)"
+    )
+    write_script(tmp_path / "fail", "import sys; sys.exit('out of counts')")
+    commands, started, log = [["count", "1"], ["count", "2"], ["fail"], ["count", "4"]], [], tmp_path / "log.txt"
+    with pytest.raises(CommandError, match=r"fail failed:(.|\n)*out of counts"):
+        follow(commands, started.append, log=log)
+    assert started == commands[:3]
+    assert log.read_text() == "$ count 1\n1\n$ count 2\n3\n$ fail\nout of counts\n"
+
+
+def test_a_log_is_written_while_the_command_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "BIN", tmp_path)
+    log = tmp_path / "log.txt"
+    write_script(
+        tmp_path / "wait",
+        "import time\nprint('begun')\n"
+        f"while 'begun' not in open({str(log)!r}).read():\n    time.sleep(0.01)\nprint('read')",
+    )
+    follow([["wait"]], log=log)
+    assert log.read_text() == "$ wait\nbegun\nread\n"
+
+
+@pytest.mark.parametrize(("visible", "expected"), [(None, ["0", "1", "0"]), ("2,GPU-5", ["2", "GPU-5", "2"])])
+def test_concurrent_runs_are_on_different_gpus(pristine_scene, tmp_path, monkeypatch, visible, expected):
+    """With more runs than GPUs, each GPU has as many as are necessary."""
+    monkeypatch.setattr(local.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(local.torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible or "")
+    if visible is None:
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    together = threading.Barrier(3)
+    given = []
+
+    def record(run, announce, step, device):
+        together.wait(timeout=10)
+        given.append(device)
+
+    monkeypatch.setattr(local, "finish", record)
+    runs = fake_grid([pristine_scene], ["shellgs", "2dgs", "photo-gs"], tmp_path)
+    launch_locally(runs, 3, Console(quiet=True))
+    assert sorted(given) == sorted(expected)
+
+
+def test_a_command_sees_the_gpu_that_it_is_given(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "BIN", tmp_path)
+    write_script(tmp_path / "see", "import os; print(os.environ['CUDA_VISIBLE_DEVICES'])")
+    follow([["see"]], log=tmp_path / "log.txt", device="GPU-5")
+    assert (tmp_path / "log.txt").read_text() == "$ see\nGPU-5\n"
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_changed_setting_is_refused_before_anything_starts(pristine_scene, tmp_path):
+    finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+    longer = fake_grid([pristine_scene], ["2dgs", "shellgs"], tmp_path / "out", iterations=30)
+    with pytest.raises(SceneError, match=r"seed-0 is a run with other settings \(iterations: 20, now 30\)"):
+        finish_all(longer)
+    assert not longer[0].trained
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_run_that_failed_before_its_first_checkpoint_may_change(pristine_scene, tmp_path):
+    finish_all(fake_grid([pristine_scene], ["mono-gs"], tmp_path / "out"))
+    (longer,) = fake_grid([pristine_scene], ["mono-gs"], tmp_path / "out", iterations=30)
+    longer.settle()
+    assert json.loads((longer.folder / "settings.json").read_text())["iterations"] == 30
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("kind", ["shell", "checked"])
+def test_a_run_with_changed_maps_is_refused(scene, tmp_path, kind):
+    CueMaps.create(scene, "checked", command="shellgs cast {scene}")
+    finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+    manifest = scene / "cues" / kind / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"max_image_size": null', '"max_image_size": 32'))
+    with pytest.raises(SceneError, match=f"{kind} maps"):
+        finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+
+
+def test_a_run_that_compare_did_not_make_is_refused_and_undisturbed(pristine_scene, tmp_path):
+    (run,) = fake_grid([pristine_scene], ["shellgs"], tmp_path)
+    run.folder.mkdir(parents=True)
+    run.config.write_text("mine")
+    with pytest.raises(SceneError, match="did not make"):
+        run.settle()
+    assert [path.name for path in run.folder.iterdir()] == ["config.yml"]
+
+
+def test_a_method_that_does_not_undistort_is_refused_for_resized_photographs(scene, tmp_path):
+    manifest = scene / "cues" / "shell" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"max_image_size": null', '"max_image_size": 32'))
+    with pytest.raises(SceneError, match="splatfacto does not undistort or resize photographs"):
+        fake_grid([scene], ["splatfacto"], tmp_path)[0].settle()
+
+
+@pytest.fixture
+def fake_environment(tmp_path) -> Path:
+    """The bin folder of a copy of this virtual environment with the fake commands, which Ray's workers run too."""
+    home = tmp_path / "environment"
+    (home / "bin").mkdir(parents=True)
+    (home / "bin" / "python").symlink_to(Path(sys.executable).resolve())
+    (home / "lib").symlink_to(Path(sys.prefix) / "lib")
+    shutil.copy(Path(sys.prefix) / "pyvenv.cfg", home)
+    write_fake_commands(home / "bin")
+    return home / "bin"
+
+
+@pytest.mark.slow
+def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pristine_scene, tmp_path, fake_environment):
+    """photo-gs kills its worker at its first start, mono-gs always fails, and all results are returned."""
+    pytest.importorskip("ray")
+    words = ["compare", pristine_scene, "--methods", "photo-gs", "mono-gs", "shellgs", "--iterations", "20"]
+    command = [fake_environment / "python", "-c", "from shellgs_method.cli import main; main()", *words]
+    environment = os.environ | {"KILL_PARENT": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
+    environment |= {"TMPDIR": str(tmp_path), "RAY_TMPDIR": tempfile.gettempdir()}  # a socket's path must be short
+    done = subprocess.run(
+        [str(word) for word in (*command, "--launcher", "ray", "--output", tmp_path / "out")],
+        env=environment,
+        cwd=tmp_path,
+        text=True,
+        capture_output=True,
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "1 of 3 runs failed: scene/mono-gs/seed-0" in done.stderr
+    assert "mono-gs needs maps" in done.stdout
+    photo_gs, mono_gs, shellgs = fake_grid([pristine_scene], ["photo-gs", "mono-gs", "shellgs"], tmp_path / "out")
+    assert photo_gs.finished
+    assert "--load-dir" in (photo_gs.checkpoints / "step-000000019.ckpt").read_text()
+    assert shellgs.finished
+    assert not list((tmp_path / f"shellgs-{os.getuid()}").iterdir())  # the node keeps no copies
+    assert "mono-gs needs maps" in (mono_gs.folder / "log.txt").read_text()
+
+
+# what is refused
+
+
+def refusal(monkeypatch, *words: object) -> str:
+    """The sentence that `shellgs` ends with."""
+    monkeypatch.setattr("sys.argv", ["shellgs", *map(str, words)])
+    with pytest.raises(SystemExit, match=r"^shellgs: [^\n]*$") as end:
+        cli.main()
+    return str(end.value)
+
+
+REFUSED = {
+    "no method": (["--methods"], "give methods"),
+    "no seed": (["--seeds"], "give seeds"),
+    "a seed below 0": (["--seeds", "-1"], "--seeds and --curve-points at least 0"),
+    "no iteration": (["--iterations", "-5"], "--iterations must be at least 1"),
+    "no points": (["--curve-points", "-1"], "--curve-points at least 0"),
+    "no job": (["--jobs", "0"], "--jobs must be at least 1, not 0"),
+    "a flag that is none": (["--methods", "a=shellgs --window 3"], "ns-train shellgs --window 3 is refused"),
+    "a setting beyond its limits": (["--methods", "a=shellgs --pipeline.model.sh-degree=7"], "sh_degree cannot be 7"),
+    "an open quote": (["--methods", "a=shellgs '"], "is not a method with its flags"),
+    "another length": (["--methods", "a=shellgs --max-num-iterations 3"], "a sets max_num_iterations"),
+    "another folder": (["--methods", "a=shellgs --output-dir=elsewhere"], "a sets output_dir"),
+    "two of one name": (
+        ["--methods", "a=shellgs", "a=shellgs --pipeline.model.geometry.ncc-window=7"],
+        "two methods are named a",
+    ),
+    "the name of a method": (["--methods", "shellgs=photo-gs"], "shellgs is the name of a method"),
+    "the name of an ablation": (["--methods", "shellgs-flat=photo-gs"], "shellgs-flat is the name of a method"),
+    "a cluster that is not there": (["--launcher", "ray", "--address", "127.0.0.1:1"], "no Ray cluster at 127.0.0.1:1"),
+    "a cluster at no address": (["--launcher", "ray", "--address", "nowhere"], "no Ray cluster at nowhere"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_an_impossible_comparison_is_refused_with_one_sentence(pristine_scene, tmp_path, monkeypatch, what):
+    words, why = REFUSED[what]
+    output = tmp_path / "out"
+    said = refusal(monkeypatch, "compare", pristine_scene, "--methods", "photo-gs", *words, "--output", output)
+    assert why in said
+    if "cluster" not in what:
+        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_cluster_that_never_answers_is_refused(pristine_scene, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setattr(cluster, "TIMEOUT", 1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        words = ["--methods", "photo-gs", "--launcher", "ray", "--address", address, "--output", tmp_path]
+        assert f"no Ray cluster at {address}" in refusal(monkeypatch, "compare", pristine_scene, *words)
+
+
+def test_flags_are_read_as_ns_train_reads_them(pristine_scene, tmp_path):
+    for flag in (["--pipeline.datamanager.holdout", "B"], ["--pipeline.datamanager.holdout=B"]):
+        assert Variant.parse(f"half=shellgs {' '.join(flag)}").held_out == "B"
+    twice = fake_grid(
+        [pristine_scene],
+        ["a=shellgs --optimizers.quats.optimizer.lr 0.5", "a=shellgs --optimizers.quats.optimizer.lr=.5"],
+        tmp_path,
+    )
+    assert len(twice) == 1
+    (mono,) = fake_grid([pristine_scene], ["a=shellgs --pipeline.model.cues=mono"], tmp_path)
+    (shell,) = fake_grid([pristine_scene], ["a=shellgs"], tmp_path)
+    assert {key for key in shell.settings if mono.settings[key] != shell.settings[key]} == {"pipeline.model.cues"}
+
+
+def repaint(path: Path) -> None:
+    Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
+
+
+def move_points(path: Path) -> None:
+    cloud = trimesh.load(path)
+    cloud.apply_translation([0.1, 0, 0])
+    cloud.export(path)
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize(
+    ("file", "change", "what"),
+    [("images/frame_00003.png", repaint, "photographs"), ("sparse_pc.ply", move_points, "cameras")],
+)
+def test_a_run_whose_photographs_or_points_changed_is_refused(scene, tmp_path, file, change, what):
+    finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+    change(scene / file)
+    with pytest.raises(SceneError, match=rf"other settings \({what}: "):
+        finish_all(fake_grid([scene], ["photo-gs"], tmp_path / "out"))
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_setting_that_an_earlier_version_lacked_counts_as_its_default(pristine_scene, tmp_path):
+    (run,) = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
+    finish_all([run])
+    path = run.folder / "settings.json"
+    before = json.loads(path.read_text())
+    del before["pipeline.model.seeds"]
+    path.write_text(json.dumps(before))
+    assert not finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+    del before["pipeline.model.densify_grad_thresh"]
+    path.write_text(json.dumps(before | {"pipeline.model.extra.flattening": 100.0}))
+    with pytest.raises(SceneError, match=r"extra.flattening: 100.0, now 0.0"):
+        finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_two_comparisons_cannot_run_in_one_folder(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["shellgs"], tmp_path)
+    with held(tmp_path), pytest.raises(SceneError, match="another comparison is running in"):
+        finish_all(runs)
+    assert not finish_all(runs)
+
+
+DAMAGED = {
+    "cut metrics": ("eval.json", b'{"results": {"psnr": 2'),
+    "metrics of another kind": ("eval.json", b'{"results": {"psnr": "good"}}'),
+    "no metrics": ("eval.json", b"[]"),
+    "a cut view": ("views/0000-frame_00001.npz", b"PK\x03\x04"),
+    "an empty view": ("views/0000-frame_00001.npz", b""),
+    "cut settings": ("settings.json", b'{"method"'),
+    "settings of another kind": ("settings.json", b"[1]"),
+}
+
+
+@pytest.mark.usefixtures("fake_commands")
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_a_damaged_file_of_one_run_stops_no_other_and_is_made_again(pristine_scene, tmp_path, damage):
+    name, content = DAMAGED[damage]
+    names = ["shellgs", "2dgs"]
+    damaged, other = fake_grid([pristine_scene], names, tmp_path / "out")
+    finish_all([damaged, other])
+    before = other.metrics().stat().st_mtime_ns
+    (damaged.folder / name).parent.mkdir(exist_ok=True)
+    (damaged.folder / name).write_bytes(content)
+    failures = finish_all(fake_grid([pristine_scene], names, tmp_path / "out"))
+    if name == "settings.json":  # the settings of the run are unknown
+        assert [run.variant.name for run in failures] == ["shellgs"]
+        assert (damaged.folder / name).read_bytes() == content
+    else:
+        assert not failures
+        assert json.loads(damaged.metrics().read_text()) == {"results": {"psnr": 20.0}}
+    assert "2dgs" in (tmp_path / "out" / "results.md").read_text()
+    assert other.metrics().stat().st_mtime_ns == before
+
+
+def test_a_folder_is_replaced_whole_and_recovered_after_a_kill(tmp_path):
+    folder, fresh = tmp_path / "run", tmp_path / "run.new"
+    for each in (folder, fresh):
+        each.mkdir()
+        (each / "name").write_text(each.name)
+    replace_folder(folder, fresh)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert (folder / "name").read_text() == "run.new"
+    folder.rename(tmp_path / "run.old")  # as after a kill between the two renames
+    recover_folder(folder)
+    assert (folder / "name").read_text() == "run.new"
+
+
+def test_a_folder_is_unchanged_by_packing_in_pieces_and_unpacking(tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "PIECE", 4096)
+    folder = tmp_path / "folder"
+    (folder / "deep").mkdir(parents=True)
+    for name, size in {"a": 0, "b": 5000, "deep/c": 30_000}.items():
+        (folder / name).write_bytes(np.random.default_rng(size).bytes(size))
+    pieces = cluster._packed(folder, lambda piece: piece)
+    assert len(pieces) > 3
+    cluster._unpack(pieces, tmp_path / "there")
+    names = [str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()]
+    assert filecmp.cmpfiles(folder, tmp_path / "there", names, shallow=False) == (names, [], [])
+
+
+def test_a_temporary_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert stat.S_IMODE(cluster._own_folder().stat().st_mode) == stat.S_IRWXU
+    cluster._own_folder().chmod(0o777)
+    with pytest.raises(SceneError, match="is not a folder only you can write to"):
+        cluster._own_folder()
+
+
+# metrics and images
+
+
+@pytest.fixture(scope="module")
+def measured(pristine_scene, tmp_path_factory) -> list[Run]:
+    """Two methods trained in this process for four iterations and measured, in the launcher's folders."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SHELLGS_COMPILE", "0")
+        runs = grid([pristine_scene], ["photo-gs", "shellgs"], [0], 4, tmp_path_factory.mktemp("compare"))
+        methods: tuple[Method, Method] = ("photo_gs", "shellgs")
+        for run, method in zip(runs, methods, strict=True):
+            run.settle()
+
+            def set_folder(config, run=run):
+                config.output_dir, config.experiment_name = run.folder.parents[2], run.variant.name
+                config.timestamp, config.steps_per_eval_all_images = "seed-0", 2
+
+            trainer = trainer_of(pristine_scene, run.output, method, 4, change=set_folder)
+            trainer.config.save_config()
+            trainer.train()
+            write_metrics(run.config, run.metrics(), renders=run.renders)
+    return runs
+
+
+@pytest.mark.usefixtures("eager")
+def test_our_metrics_are_those_of_ns_eval(measured):
+    _, pipeline, _, _ = eval_setup(measured[1].config)
+    assert isinstance(pipeline, FacadePipeline)
+    theirs = pipeline.get_average_eval_image_metrics(get_std=True)
+    ours = json.loads(measured[1].metrics().read_text())["results"]
+    timing = {"fps", "fps_std", "num_rays_per_sec", "num_rays_per_sec_std"}
+    assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})
+
+
+@pytest.mark.usefixtures("eager")
+@pytest.mark.parametrize("background", ["black", "white", "random"])
+def test_our_metrics_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_path, background):
+    for path in (scene / "images").iterdir():
+        image = Image.open(path).convert("RGBA")
+        image.putalpha(Image.linear_gradient("L").resize(image.size))
+        image.save(path)
+
+    def set_background(config):
+        config.pipeline.model.background_color = background
+
+    trainer = trainer_of(scene, tmp_path, "photo_gs", iterations=2, change=set_background)
+    trainer.config.save_config()
+    trainer.train()
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    assert isinstance(pipeline, FacadePipeline)
+    theirs = pipeline.get_average_eval_image_metrics()
+    ours = measure(trainer.base_dir / "config.yml")["results"]
+    assert ours["psnr"] == pytest.approx(theirs["psnr"], rel=1e-5)
+    assert ours["ssim"] == pytest.approx(theirs["ssim"], rel=1e-5)
+
+
+@pytest.mark.usefixtures("eager")
+def test_a_half_can_be_measured_of_a_run_without_holdout(measured):
+    whole = json.loads(measured[0].metrics().read_text())["results"]
+    halves = [measure(measured[0].config, half)["results"]["supported"] for half in ("A", "B")]
+    assert sum(halves) == pytest.approx(whole["supported"], rel=1e-5)
+    assert min(halves) > 0.1 * whole["supported"]
+
+
+def test_snapshots_hold_renders_of_the_views(measured):
+    shot = Snapshot.load(sorted(measured[0].renders.glob("*.npz"))[0])
+    assert shot.rgb.shape == shot.photograph.shape == (32, 48, 3)
+    assert shot.mask.any()
+    assert shot.error[shot.mask].max() <= 90
+
+
+def test_a_subsampled_image_has_the_rays_of_the_pixels_it_keeps(measured, tmp_path, monkeypatch):
+    """Every third pixel: pixel (i, j) of the image is pixel (3 i, 3 j) of the view."""
+    monkeypatch.setattr("shellgs_method.compare.measure.IMAGE_SIZE", 16)
+    measure(measured[0].config, renders=tmp_path)
+    thin, full = (Snapshot.load(sorted(folder.glob("*.npz"))[0]) for folder in (tmp_path, measured[0].renders))
+    cameras = [
+        Camera(torch.from_numpy(shot.viewmat), torch.from_numpy(shot.K), *shot.mask.shape[1::-1])
+        for shot in (thin, full)
+    ]
+    assert torch.allclose(cameras[0].rays(), cameras[1].rays()[::3, ::3])
+    assert (thin.shell_depth == full.shell_depth[::3, ::3]).all()
+
+
+def test_the_report_is_self_contained_and_shows_every_view(measured, tmp_path):
+    write_results(measured, tmp_path, {})
+    report = (tmp_path / "report.html").read_text()
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", report)
+    assert "http" not in report
+    (data,) = re.findall(r'<script type="application/json">(.*?)</script>', report, re.DOTALL)
+    views = json.loads(data)
+    assert len(views) == 2
+    for methods in views.values():
+        assert list(methods) == ["photograph, shell", "photo-gs", "shellgs"]
+    for name in ("strip.png", "surfaces.png", "curves.png"):
+        with Image.open(tmp_path / name) as image:
+            assert np.asarray(image).std() > 5
+
+
+def test_the_nearer_of_two_points_is_in_front():
+    red, green = np.array([[255, 0, 0], [0, 255, 0]], np.uint8)
+    image = dotted(np.array([[0.0, 0, 2], [0, 0, 1], [1e9, 0, 3]]), np.stack([red, green, green]))
+    painted = (image != 255).any(axis=-1)
+    assert painted.sum() == DOT**2
+    assert (image[painted] == red).all()
+
+
+def test_ablations_without_their_method_have_a_report(measured, tmp_path):
+    (run,) = fake_grid([measured[0].scene], ["photo-gs-flat"], tmp_path)
+    shutil.copytree(measured[0].folder, run.folder)
+    comparison = write_results([run], tmp_path, {})
+    assert "ablation" in {table.name for table in comparison.tables}
+    assert '<option value="photo-gs-flat"' in (tmp_path / "report.html").read_text()
+
+
+def test_curves_hold_all_held_out_views(measured):
+    assert sorted(recorded_metrics(measured[1])["normal_deg"]) == [2]

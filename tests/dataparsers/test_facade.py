@@ -1,0 +1,549 @@
+"""What the dataparser gives nerfstudio."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import unicodedata
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from scenes import parse, write_colmap
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.datamanager import FacadeDataset
+from shellgs_method.errors import SceneError
+from shellgs_method.files.photographs import load_photograph
+from shellgs_method.files.sparse_points import read_sparse_points
+from shellgs_method.geometry.camera import Camera, upwards
+
+
+def names(outputs: DataparserOutputs) -> list[str]:
+    return [path.name for path in outputs.image_filenames]
+
+
+def test_every_eighth_image_by_sorted_name_is_held_out_starting_with_the_first(pristine_scene):
+    assert names(parse(pristine_scene, "test")) == ["frame_00001.png", "frame_00009.png"]
+    assert len(names(parse(pristine_scene, "train"))) == 8
+
+
+def test_the_split_of_a_colmap_scene_follows_names_and_not_colmap_ids(scene):
+    views = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, views, ids=list(range(len(views), 0, -1)))
+    assert names(parse(scene, "test")) == ["frame_00001.png", "frame_00009.png"]
+
+
+def test_colmap_and_transforms_json_give_the_same_cameras(scene):
+    before = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, before, ids=list(range(1, len(before) + 1)))
+    after = read_views(FacadeDataParserConfig(data=scene))
+    for one, other in zip(before, after, strict=True):
+        torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat, atol=1e-5, rtol=0)
+        torch.testing.assert_close(one.camera.K, other.camera.K)
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "ns-process-data", "COLMAP"])
+@pytest.mark.parametrize("method", [{}, {"orientation_method": "pca", "center_method": "focus"}])
+def test_the_rescaled_world_is_that_of_nerfstudios_own_parsers(scene, kind, method):
+    """So that earlier runs, and other methods, have the same cameras and points."""
+    common = {"data": scene, "downscale_factor": 1, "load_3D_points": True, **method}
+    if kind == "COLMAP":
+        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        config = ColmapDataParserConfig(colmap_path=Path("sparse/0"), eval_mode="all", **common)
+    else:
+        transforms = json.loads((scene / "transforms.json").read_text())
+        if kind == "ns-process-data":
+            transforms["applied_transform"] = [[0.0, 1, 0, 0.5], [1, 0, 0, -2], [0, 0, -1, 3]]
+        (scene / "transforms.json").write_text(json.dumps(transforms))
+        config = NerfstudioDataParserConfig(eval_mode="all", **common)
+    theirs = config.setup().get_dataparser_outputs("train")
+    order = {path: k for k, path in enumerate(theirs.image_filenames)}
+    ours = parse(scene, **method)
+    poses = theirs.cameras.camera_to_worlds[[order[path] for path in ours.image_filenames]]
+    torch.testing.assert_close(ours.cameras.camera_to_worlds, poses, atol=2e-6, rtol=0)
+    assert ours.dataparser_scale == pytest.approx(theirs.dataparser_scale, rel=1e-6)
+    torch.testing.assert_close(ours.dataparser_transform.float(), theirs.dataparser_transform, atol=1e-5, rtol=0)
+    for name, atol in (("points3D_xyz", 1e-5), ("points3D_rgb", 0)):
+        torch.testing.assert_close(ours.metadata[name], theirs.metadata[name], atol=atol, rtol=0)
+
+
+def test_points_without_colours_are_grey(scene):
+    header = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {axis}" for axis in "xyz")]
+    lines = [*header, "end_header", "0 0 0", "1 0 0", "0 1 0", "0 0 1"]
+    (scene / "sparse_pc.ply").write_text("\n".join(lines) + "\n")
+    assert (parse(scene).metadata["points3D_rgb"] == torch.full((4, 3), 128)).all()
+
+
+def test_scene_cameras_undo_nerfstudios_rescaling(pristine_scene):
+    frames = {f["file_path"]: f for f in json.loads((pristine_scene / "transforms.json").read_text())["frames"]}
+    for view in read_views(FacadeDataParserConfig(data=pristine_scene)):
+        pose = torch.tensor(frames[view.name]["transform_matrix"], dtype=torch.float64)
+        opencv = pose @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+        torch.testing.assert_close(view.camera.viewmat @ opencv, torch.eye(4, dtype=torch.float64), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("orientation", ["up", "none"])
+def test_maps_fit_their_cameras_however_nerfstudio_orients_the_world(pristine_scene, orientation):
+    outputs = parse(pristine_scene, "train", orientation_method=orientation)
+    batch = FacadeDataset(outputs)[0]
+    assert {"shell_depth", "shell_normal", "shell_mask", "truth_depth"} <= batch.keys()
+
+
+def test_shell_depth_is_in_units_of_the_rescaled_world(pristine_scene):
+    """A point of one view, projected by nerfstudio's poses, has the depth in its neighbour's map."""
+    outputs = parse(pristine_scene, "train")
+    dataset = FacadeDataset(outputs)
+    (here, there), (pose, other) = (dataset[3], dataset[4]), outputs.cameras.camera_to_worlds[3:5]
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    rays = Camera(torch.eye(4), here["K"], 48, 32).rays()
+    points = (here["shell_depth"] * rays)[here["shell_mask"][..., 0]] @ (pose[:, :3] @ flip).T + pose[:, 3]
+    seen = (points - other[:, 3]) @ (other[:, :3] @ flip)
+    column, row, _ = (seen @ there["K"].T / seen[:, 2:]).floor().long().unbind(-1)
+    inside = (column >= 0) & (column < 48) & (row >= 0) & (row < 32) & (seen[:, 2] > 0)
+    expected = there["shell_depth"][row[inside], column[inside], 0]
+    assert inside.sum() > 100
+    assert ((seen[inside, 2] / expected - 1).abs() < 0.02).float().mean() > 0.7
+
+
+def test_views_without_a_map_have_no_map_in_their_batch(scene):
+    (scene / "cues" / "shell" / "images" / "frame_00002.png.npz").unlink()
+    dataset = FacadeDataset(parse(scene, "train"))
+    assert "shell_depth" not in dataset[0]
+    assert "shell_depth" in dataset[1]
+
+
+def test_images_and_cameras_shrink_together(pristine_scene):
+    views = [v for v in parse(pristine_scene, max_image_size=24).metadata["views"]]
+    assert load_photograph(views[0]).shape == (16, 24, 3)
+    assert (views[0].camera.width, views[0].camera.height) == (24, 16)
+
+
+@pytest.mark.parametrize(("factor", "width", "height"), [(0.5, 24, 16), (0.4, 19, 13)])
+def test_a_scaled_dataset_has_photographs_maps_and_cameras_of_one_size(pristine_scene, factor, width, height):
+    dataset, whole = FacadeDataset(parse(pristine_scene), factor), FacadeDataset(parse(pristine_scene))
+    for index in range(len(dataset)):
+        camera, data = dataset.camera(index), dataset.get_data(index)
+        assert (camera.width, camera.height) == (width, height)
+        assert {tuple(data[name].shape[:2]) for name in ("image", "shell_depth", "shell_mask")} == {(height, width)}
+        stretch = torch.tensor([width / 48, height / 32, 1.0])[:, None]
+        torch.testing.assert_close(data["K"], stretch * whole.get_data(index)["K"])
+        torch.testing.assert_close(camera.K, data["K"])
+        assert dataset.views[index].camera.width == width
+
+
+@pytest.mark.parametrize(("size", "factor"), [(None, 0.1), (8, 1.0)])
+def test_photographs_smaller_than_the_window_of_ssim_are_refused(pristine_scene, size, factor):
+    with pytest.raises(SceneError, match=r"frame_00002.png is used at \d+x\d+ pixels, and SSIM needs 11: raise"):
+        FacadeDataset(parse(pristine_scene, max_image_size=size), factor)
+
+
+def test_maps_of_another_size_are_refused_with_the_command_that_makes_them_again(pristine_scene):
+    dataset = FacadeDataset(parse(pristine_scene, max_image_size=24))
+    with pytest.raises(SceneError, match=r"frame_00002.*48x32.*24x16.*shellgs cast"):
+        dataset[0]
+
+
+def test_the_size_the_maps_were_cast_at_is_the_size_of_training(scene):
+    manifest = scene / "cues" / "shell" / "manifest.json"
+    fields = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps(fields | {"max_image_size": 24}))
+    assert parse(scene).cameras.width[0] == 24
+
+
+def test_metres_per_unit_are_those_of_the_rescaled_world(pristine_scene):
+    outputs = parse(pristine_scene)
+    in_scene = outputs.metadata["cues"]["shell"].manifest.metres_per_unit
+    assert outputs.metadata["metres_per_unit"] == pytest.approx(in_scene / outputs.dataparser_scale)
+
+
+def test_a_distorted_camera_becomes_the_pinhole_camera_of_its_undistorted_image(scene):
+    """A straight line of the world, bent by the lens, is straight again in the undistorted photograph."""
+    views = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, views, list(range(1, 11)), model="OPENCV", extra="-0.2 0.05 0 0")
+    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    K = view.camera.K.numpy()
+    assert view.lens is not None
+    calibrated = view.lens.K.numpy()
+    height, width = view.lens.height, view.lens.width
+    # Paint x = 0.15 of the normalised plane in the distorted image.
+    y, x = np.mgrid[:height, :width] + 0.5
+    zero_centred = calibrated - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    pixels = np.stack([x - 0.5, y - 0.5], axis=-1).reshape(-1, 1, 2)
+    ideal = cv2.undistortPoints(pixels, zero_centred, np.array([-0.2, 0.05, 0, 0])).reshape(height, width, 2)
+    picture = (255 / (1 + np.exp(-(ideal[..., 0] - 0.15) * 40))).astype(np.uint8)
+    Image.fromarray(np.repeat(picture[..., None], 3, axis=2)).save(view.image)
+    straight = load_photograph(view)[..., 0].astype(float)
+    edge = [np.interp(127.5, row, np.arange(len(row)) + 0.5) for row in straight[2:-2]]
+    assert np.ptp(edge) < 0.5
+    assert np.mean(edge) == pytest.approx(K[0, 0] * 0.15 + K[0, 2], abs=0.6)
+
+
+@pytest.mark.parametrize("kind", ["grey", "rgba", "16 bit", "palette", "turned"])
+def test_any_photograph_becomes_8_bit_rgb_of_its_cameras_size(scene, kind):
+    view = parse(scene).metadata["views"][0]
+    picture = np.tile(np.linspace(0, 255, 48).astype(np.uint8), (32, 1))
+    grey = Image.fromarray(picture)
+    exif = Image.Exif()
+    variants = {
+        "grey": grey,
+        "rgba": Image.merge("RGBA", [grey, grey, grey, Image.new("L", grey.size, 255)]),
+        "16 bit": Image.fromarray(picture.astype(np.uint16) * 257),
+        "palette": grey.convert("P"),
+        "turned": grey.transpose(Image.Transpose.ROTATE_90),
+    }
+    if kind == "turned":
+        exif[0x0112] = 6  # stored turned to the left, to be shown turned to the right
+    variants[kind].save(view.image, exif=exif)
+    loaded = load_photograph(view)
+    assert loaded.dtype == np.uint8
+    np.testing.assert_allclose(loaded[..., :3], np.repeat(picture[..., None], 3, axis=2), atol=1)
+
+
+# EXIF orientations that do not change the shape of a photograph
+
+STORED = {2: np.fliplr, 3: lambda pixels: np.rot90(pixels, 2), 4: np.flipud, 6: np.rot90}
+"""How the upright photograph is stored, by orientation."""
+
+
+def store_turned(scene: Path, orientation: int, which: slice = slice(None)) -> dict[str, np.ndarray]:
+    """Store photographs turned, with their orientation in EXIF; returns the upright ones."""
+    upright = {}
+    for path in sorted((scene / "images").iterdir())[which]:
+        with Image.open(path) as image:
+            upright[path.stem] = np.asarray(image.convert("RGB"))
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        stored = Image.fromarray(np.ascontiguousarray(STORED[orientation](upright[path.stem])))
+        stored.save(path.with_suffix(".jpg"), exif=exif, quality=97, subsampling=0)
+        path.unlink()
+    respell(scene, lambda path: path.replace(".png", ".jpg") if Path(path).stem in upright else path)
+    return upright
+
+
+def turn_cameras(scene: Path) -> None:
+    """Make the cameras those of photographs that are stored turned by half a turn."""
+    transforms = json.loads((scene / "transforms.json").read_text())
+    transforms |= {"cx": transforms["w"] - transforms["cx"], "cy": transforms["h"] - transforms["cy"]}
+    for frame in transforms["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, -1, 1, 1])).tolist()
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+
+
+def with_heights_as_colours(scene: Path) -> None:
+    """Points darker at the top than below, and photographs the other way round."""
+    cloud: Any = trimesh.load(scene / "sparse_pc.ply")
+    heights = cloud.vertices @ upwards(view.camera for view in read_views(FacadeDataParserConfig(data=scene)))
+    grey = (255 * (heights.max() - heights) / np.ptp(heights)).astype(np.uint8)
+    trimesh.PointCloud(cloud.vertices, np.repeat(grey[:, None], 3, axis=1)).export(scene / "sparse_pc.ply")
+    for path in (scene / "images").iterdir():
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGB"))
+        Image.fromarray((pixels * np.linspace(1, 0.2, len(pixels))[:, None, None]).astype(np.uint8)).save(path)
+
+
+def without_colours(scene: Path) -> None:
+    lines = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {axis}" for axis in "xyz"), "end_header"]
+    (scene / "sparse_pc.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "0 0 1"]) + "\n")
+
+
+def differences(scene: Path, upright: dict[str, np.ndarray]) -> list[float]:
+    views = [view for view in read_views(FacadeDataParserConfig(data=scene)) if view.image.stem in upright]
+    return [np.abs(load_photograph(view).astype(float) - upright[view.image.stem]).mean() for view in views]
+
+
+@pytest.mark.parametrize("orientation", [2, 3, 4])
+def test_photographs_stored_turned_are_upright_for_upright_cameras(scene, caplog, orientation):
+    upright = store_turned(scene, orientation)
+    assert max(differences(scene, upright)) < 4
+    assert "10 photographs of" in caplog.text
+    assert "their cameras are of them upright, by the colours of the SfM points" in caplog.text
+
+
+def test_photographs_stored_turned_stay_so_for_cameras_of_what_is_stored(scene, caplog):
+    upright = store_turned(scene, 3)
+    turn_cameras(scene)
+    assert max(differences(scene, {stem: np.rot90(pixels, 2) for stem, pixels in upright.items()})) < 4
+    assert "their cameras are of them as stored, by the colours" in caplog.text
+
+
+@pytest.mark.parametrize("applied", [True, False])
+def test_without_coloured_points_photographs_stored_turned_are_judged_by_their_neighbours_cameras(
+    scene, caplog, applied
+):
+    upright = store_turned(scene, 3, slice(0, 10, 2))
+    without_colours(scene)
+    if not applied:
+        transforms = json.loads((scene / "transforms.json").read_text())
+        turn_cameras(scene)
+        turned = json.loads((scene / "transforms.json").read_text())
+        transforms["frames"][::2] = turned["frames"][::2]
+        (scene / "transforms.json").write_text(json.dumps(transforms))
+    expected = {stem: pixels if applied else np.rot90(pixels, 2) for stem, pixels in upright.items()}
+    assert max(differences(scene, expected)) < 4
+    assert f"are of them {'upright' if applied else 'as stored'}, by the cameras' up axes" in caplog.text
+
+
+@pytest.mark.parametrize("cloud", [with_heights_as_colours, without_colours])
+def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, caplog, cloud):
+    cloud(scene)
+    store_turned(scene, 3)
+    read_views(FacadeDataParserConfig(data=scene))
+    assert "nothing tells whether their cameras are of the upright ones" in caplog.text
+
+
+def test_a_square_photograph_is_turned_for_an_upright_camera(scene):
+    for path in (scene / "images").iterdir():
+        with Image.open(path) as image:
+            image.crop((8, 0, 40, 32)).save(path)
+    transforms = json.loads((scene / "transforms.json").read_text())
+    transforms |= {"w": 32, "cx": transforms["cx"] - 8}
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    assert max(differences(scene, store_turned(scene, 6))) < 4
+
+
+def test_photographs_of_a_phone_are_read(scene):
+    (scene / "images" / "frame_00002.png").unlink()
+    shutil.copy(Path(__file__).parents[1] / "phone.heic", scene / "images" / "frame_00002.HEIC")
+    respell(scene, lambda path: path.replace("00002.png", "00002.HEIC"))
+    assert (load_photograph(parse(scene).metadata["views"][0])[4, 4] > [200, -1, -1]).all()
+
+
+@pytest.mark.parametrize("suffix", ["NEF", "dng", "CR3"])
+def test_a_raw_photograph_is_refused_by_its_suffix(scene, suffix):
+    """Pillow reads the thumbnail of many, which has the same shape."""
+    (scene / "images" / "frame_00002.png").rename(scene / "images" / f"frame_00002.{suffix}")
+    respell(scene, lambda path: path.replace("00002.png", f"00002.{suffix}"))
+    with pytest.raises(SceneError, match=rf"frame_00002.{suffix} is raw, .*: export it as JPEG"):
+        load_photograph(parse(scene).metadata["views"][0])
+
+
+def test_a_photograph_of_another_shape_is_refused_by_name(scene):
+    view = parse(scene).metadata["views"][0]
+    Image.new("RGB", (30, 30)).save(view.image)
+    with pytest.raises(SceneError, match=r"frame_00002.png is 30x30 pixels, but its camera is 48x32"):
+        load_photograph(view)
+
+
+def test_a_truncated_photograph_is_refused_by_name(scene):
+    view = parse(scene).metadata["views"][0]
+    view.image.write_bytes(view.image.read_bytes()[:200])
+    with pytest.raises(SceneError, match=r"frame_00002.png cannot be read"):
+        load_photograph(view)
+
+
+def test_missing_images_are_refused_by_name(scene):
+    (scene / "images" / "frame_00003.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"1 of \d+ images .*frame_00003.png"):
+        parse(scene)
+
+
+def test_a_list_of_photographs_that_is_not_text_is_refused_by_name(scene):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    (scene / "test_list.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SceneError, match=r"test_list.txt is not a text file"):
+        read_views(FacadeDataParserConfig(data=scene))
+
+
+# Models: all photographs are read, and what is not is said
+
+
+def without_blank(lines: list[str]) -> list[str]:
+    return [line for line in lines if line]
+
+
+def with_keypoints(lines: list[str]) -> list[str]:
+    """Keypoints of every second image only, with comments between; blank lines are gone."""
+    images = without_blank(lines)
+    several = [[image, "1.5 2.5 -1 3 4 7", "# the next"] if k % 2 else [image] for k, image in enumerate(images)]
+    return [line for lines in several for line in lines]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without_blank,
+        with_keypoints,
+        lambda lines: [each for line in lines for each in (line, "")],
+        lambda lines: ["\ufeff# made elsewhere", *lines],
+        lambda lines: [line.replace("frame_00001.png", "fasade 1 2.png") for line in without_blank(lines)],
+        lambda lines: [line.replace("frame_00001.png", "1 2 3") for line in without_blank(lines)],
+    ],
+    ids=["no blank lines", "some keypoints", "doubled", "byte-order mark", "blanks in a name", "a name of numbers"],
+)
+def test_all_images_of_a_text_model_are_read_whatever_became_of_its_empty_lines(scene, change):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    path = scene / "sparse" / "0" / "images.txt"
+    path.write_text("\n".join(change(path.read_text().splitlines())) + "\n", "utf-8")
+    for name in ("fasade 1 2.png", "1 2 3"):
+        if name in path.read_text("utf-8"):
+            (scene / "images" / "frame_00001.png").rename(scene / "images" / name)
+    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+
+
+def split_model(scene: Path, place: str, counts: dict[str, int]) -> None:
+    """Models of the first photographs of a scene, in numbered folders."""
+    views = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, views, list(range(1, len(views) + 1)))
+    whole = (scene / "sparse" / "0").rename(scene / "whole")
+    lines = (whole / "images.txt").read_text().splitlines()
+    for number, count in counts.items():
+        folder = Path(shutil.copytree(whole, scene / place / number))
+        (folder / "images.txt").write_text("\n".join(lines[: 2 * count]) + "\n")
+    shutil.rmtree(whole)
+
+
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
+@pytest.mark.parametrize("counts", [{"0": 2, "1": 7}, {"1": 3, "2": 7, "10": 7}, {"3": 7}])
+def test_of_several_colmap_models_the_largest_is_read_and_named(scene, caplog, place, counts):
+    split_model(scene, place, counts)
+    largest = next(number for number, count in counts.items() if count == 7)
+    assert len(read_views(FacadeDataParserConfig(data=scene))) == 7
+    assert (f"{place}/{largest}, the largest, is used, with 7 photographs" in caplog.text) == (len(counts) > 1)
+    assert FacadeDataParserConfig(data=scene, colmap_path=Path(place)).colmap_folder() == Path(place, largest)
+
+
+def test_a_chosen_colmap_model_is_read_though_another_is_larger(scene):
+    split_model(scene, "sparse", {"0": 2, "1": 7})
+    assert len(read_views(FacadeDataParserConfig(data=scene, colmap_path=Path("sparse/0")))) == 2
+
+
+@pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
+def test_photographs_without_a_camera_are_counted(scene, caplog, kind):
+    views = read_views(FacadeDataParserConfig(data=scene))
+    assert "left out" not in caplog.text
+    if kind == "transforms.json":
+        transforms = json.loads((scene / "transforms.json").read_text())
+        transforms["frames"] = transforms["frames"][:7]
+        (scene / "transforms.json").write_text(json.dumps(transforms))
+    else:
+        write_colmap(scene, views[:7], list(range(1, 8)))
+    (scene / "images" / "more").mkdir()
+    shutil.copy(views[0].image, scene / "images" / "more" / "IMG_1.JPG")
+    (scene / "images" / "notes.txt").touch()
+    read_views(FacadeDataParserConfig(data=scene))
+    assert "4 of 11 photographs of" in caplog.text
+    assert "left out: images/frame_00008.png, images/frame_00009.png, images/frame_00010.png, …" in caplog.text
+
+
+def test_photographs_in_no_list_of_the_splits_are_counted(scene, caplog):
+    transforms = json.loads((scene / "transforms.json").read_text())
+    frames = [frame["file_path"] for frame in transforms["frames"]]
+    transforms |= {"train_filenames": frames[:6], "test_filenames": frames[6:8]}
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    assert len(names(parse(scene))) == 6
+    assert "2 of 10 photographs of" in caplog.text
+    assert "in no list of its splits" in caplog.text
+
+
+# Paths as other systems, programs and machines write them
+
+
+def respell(scene: Path, spell: Callable[[str], str]) -> None:
+    transforms = json.loads((scene / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        frame["file_path"] = spell(frame["file_path"])
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+
+
+SPELLINGS: dict[str, Callable[[str], str]] = {
+    "dot": lambda path: f"./{path}",
+    "backslash": lambda path: path.replace("/", "\\"),
+    "windows": lambda path: "D:\\shoot\\" + path.replace("/", "\\"),
+    "network": lambda path: "\\\\server\\share\\" + path.replace("/", "\\"),
+    "other machine": lambda path: f"/home/ann/shoot/{path}",
+    "other folder": lambda path: path.replace("images/", "input/"),
+    "no suffix": lambda path: path.removesuffix(".png"),
+    "only the name": lambda path: path.removeprefix("images/"),
+    "case": lambda path: path.replace("images", "Images").replace(".png", ".PNG"),
+    "all": lambda path: "c:\\" + path.upper().replace("/", "\\").removesuffix(".PNG"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_photographs_are_found_however_their_paths_are_written(scene, spelling):
+    before = read_views(FacadeDataParserConfig(data=scene))
+    respell(scene, SPELLINGS[spelling])
+    after = read_views(FacadeDataParserConfig(data=scene))
+    assert [(view.name, view.image) for view in after] == [(view.name, view.image) for view in before]
+
+
+def test_paths_of_which_letters_are_composed_otherwise_are_found(scene):
+    name = unicodedata.normalize("NFD", "façade.png")  # as macOS writes it
+    (scene / "images" / "frame_00001.png").rename(scene / "images" / name)
+    respell(scene, lambda path: path.replace("frame_00001", "façade"))
+    assert read_views(FacadeDataParserConfig(data=scene))[0].image.name == name
+
+
+def test_photographs_found_elsewhere_are_told(scene, caplog):
+    respell(scene, SPELLINGS["other machine"])
+    read_views(FacadeDataParserConfig(data=scene))
+    assert "10 of the files that" in caplog.text
+    assert "/home/ann/shoot/images/frame_00001.png is images/frame_00001.png" in caplog.text
+
+
+def test_a_path_that_fits_two_photographs_is_refused(scene):
+    respell(scene, SPELLINGS["no suffix"])
+    shutil.copy(scene / "images" / "frame_00004.png", scene / "images" / "frame_00004.jpg")
+    with pytest.raises(
+        SceneError, match=r"frame 4 names the file 'images/frame_00004', which may be .*4.jpg or .*4.png"
+    ):
+        read_views(FacadeDataParserConfig(data=scene))
+
+
+def test_a_deleted_photograph_is_not_taken_from_another_folder(scene):
+    (scene / "images" / "left").mkdir()
+    shutil.copy(scene / "images" / "frame_00001.png", scene / "images" / "left" / "a.png")
+    respell(scene, lambda path: path.replace("images/frame_00001", "images/left/frame_00002"))
+    with pytest.raises(FileNotFoundError, match=r"1 of 10 images .*\(images/left/frame_00002.png\)"):
+        read_views(FacadeDataParserConfig(data=scene))
+
+
+def test_masks_and_points_are_found_however_their_paths_are_written(scene):
+    Image.new("L", (48, 32), 255).save(scene / "mask.png")
+    transforms = json.loads((scene / "transforms.json").read_text())
+    transforms["ply_file_path"] = "D:\\shoot\\sparse_pc.ply"
+    for frame in transforms["frames"]:
+        frame["mask_path"] = ".\\MASK.PNG"
+    before = parse(scene).metadata["points3D_xyz"]
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    torch.testing.assert_close(parse(scene).metadata["points3D_xyz"], before)
+    assert read_views(FacadeDataParserConfig(data=scene))[0].mask == scene / "mask.png"
+
+
+def test_colmap_names_that_begin_with_the_folder_of_the_photographs_keep_their_points(scene):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    path = scene / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace(" frame_", " images/frame_"))
+    assert read_views(FacadeDataParserConfig(data=scene))[0].name == "images/frame_00001.png"
+    observed = read_sparse_points(FacadeDataParserConfig(data=scene)).observed
+    assert observed is not None
+    assert len(observed["images/frame_00001.png"]) == 39
+
+
+def test_a_folder_without_cameras_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"holds no cameras: neither transforms.json nor a COLMAP model"):
+        parse(tmp_path)
+
+
+def test_a_users_mask_is_attached_at_the_cameras_size(scene):
+    transforms = json.loads((scene / "transforms.json").read_text())
+    mask = np.zeros((64, 96), np.uint8)
+    mask[:, 48:] = 255
+    Image.fromarray(mask).save(scene / "mask.png")
+    for frame in transforms["frames"]:
+        frame["mask_path"] = "mask.png"
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    batch = FacadeDataset(parse(scene))[0]
+    assert batch["mask"].shape == (32, 48, 1)
+    assert not batch["mask"][:, :24].any()
+    assert batch["mask"][:, 24:].all()

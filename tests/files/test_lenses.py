@@ -1,0 +1,111 @@
+"""Maps of distorted cameras, cast for the pinhole camera of nerfstudio's undistorted image."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import write_colmap
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.errors import SceneError
+from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
+
+BROWN = {"k1": -0.2, "k2": 0.05, "k3": 0.02, "p1": 0.004, "p2": -0.003}
+FISHEYE = {"k1": 0.08, "k2": -0.03, "k3": 0.01, "k4": 0.004}
+WIDTH, HEIGHT = 480, 320
+
+
+def with_lens(scene: Path, model: str, coefficients: dict[str, float]) -> list[View]:
+    """Views of the scene, as if larger photographs had been taken with another lens."""
+    transforms = json.loads((scene / "transforms.json").read_text())
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 400.0, "fl_y": 396.0, "cx": 235.0, "cy": 163.0, "camera_model": model}
+    transforms |= lens | coefficients
+    for frame in transforms["frames"]:
+        for key in (*lens, "k1", "k2", "p1", "p2"):
+            frame.pop(key, None)
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    return read_views(FacadeDataParserConfig(data=scene))
+
+
+def rays_through(model: str, coefficients: dict[str, float]) -> np.ndarray:
+    """Ray direction of each pixel of the distorted photograph, with z = 1, by OpenCV."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)  # OpenCV's pixel centres are whole numbers
+    K = np.array([[400.0, 0, 234.5], [0, 396, 162.5], [0, 0, 1]])
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    if model == "OPENCV":
+        parameters = np.array([coefficients.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")])
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-10)
+        iterate: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # of OpenCV 4, of OpenCV 5
+        ideal = iterate(pixels, K, parameters, R=np.eye(3), P=np.eye(3), criteria=criteria)
+    else:
+        parameters = np.array([coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
+        ideal = cv2.fisheye.undistortPoints(pixels, K, parameters)
+    return np.concatenate([ideal.reshape(HEIGHT, WIDTH, 2), np.ones((HEIGHT, WIDTH, 1))], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [("OPENCV", BROWN), ("OPENCV", {}), ("OPENCV_FISHEYE", FISHEYE), ("OPENCV_FISHEYE", {})],
+)
+def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, model: str, coefficients: dict):
+    """The depth image cast through the lens itself, undistorted as a photograph, equals the cast depth."""
+    view = with_lens(scene, model, coefficients)[4]
+    alignment = Alignment.load(scene / ALIGNMENT)
+    caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
+    viewmat = view.camera.viewmat.numpy()
+    rays = np.empty((HEIGHT, WIDTH, 6), np.float32)
+    rays[..., :3] = -viewmat[:3, :3].T @ viewmat[:3, 3] - caster.origin
+    rays[..., 3:] = rays_through(model, coefficients) @ viewmat[:3, :3]
+    depth = caster.triangles.cast_rays(rays).t
+    shade = np.where(np.isfinite(depth), 40 + 200 * np.clip(depth / 25, 0, 1), 0).astype(np.uint8)
+    Image.fromarray(np.repeat(shade[..., None], 3, axis=2)).save(view.image)
+    photograph = load_photograph(view)[..., 0].astype(float)
+    cue = caster.cast(view.camera)
+    assert photograph.shape == cue.mask.shape
+    expected = np.where(cue.mask, 40 + 200 * np.clip(cue.depth / 25, 0, 1), 0)
+    difference = np.abs(photograph - expected)[3:-3, 3:-3]
+    assert 0.2 < cue.mask.mean() <= 1
+    assert np.median(difference) < 1.5
+    # Only depth edges, which undistortion blurs, may differ; a shift of one pixel makes three times as many differ.
+    assert (difference > 8).mean() < 0.02
+    shifted = np.abs(np.roll(photograph, 2, axis=1) - expected)[3:-3, 3:-3]
+    assert (difference > 8).mean() < 0.6 * (shifted > 8).mean()
+
+
+def test_a_colmap_fisheye_keeps_its_fourth_coefficient(scene: Path):
+    views = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, views, list(range(1, 11)), model="OPENCV_FISHEYE", extra="0.08 -0.03 0.01 0.004")
+    lens = read_views(FacadeDataParserConfig(data=scene))[0].lens
+    assert lens is not None
+    assert lens.fisheye
+    assert lens.distortion == (0.08, -0.03, 0.01, 0.004, 0, 0)
+
+
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "ORTHOPHOTO", "FISHEYE624"])
+def test_a_camera_that_cannot_be_undistorted_is_refused(scene: Path, model: str):
+    with pytest.raises(SceneError, match=rf"frame_\d+\.png is {model}.*undistort"):
+        with_lens(scene, model, {})
+
+
+def test_browns_fourth_radial_coefficient_is_refused(scene: Path):
+    with pytest.raises(SceneError, match=r"k4, which nerfstudio cannot undistort"):
+        with_lens(scene, "OPENCV", BROWN | {"k4": 0.01})
+
+
+@pytest.mark.parametrize(
+    ("model", "extra"),
+    [("FULL_OPENCV", "0.1 0 0 0 0 0 0.1 0"), ("FOV", "0.9"), ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 0 0")],
+)
+def test_a_colmap_model_unknown_to_nerfstudio_is_refused(scene: Path, model: str, extra: str):
+    views = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, views, list(range(1, 11)), model=model, extra=extra)
+    with pytest.raises(SceneError, match=rf"{re.escape(str(scene))} are of the model {model}, which.*undistort"):
+        read_views(FacadeDataParserConfig(data=scene))

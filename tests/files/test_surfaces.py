@@ -1,0 +1,800 @@
+"""Files of shells: each form of a format is read or refused by its name, and what is left out is counted."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.readers import scans
+from shellgs_method.files.readers.contents import Geometry
+from shellgs_method.files.surfaces import read_geometry
+from shellgs_method.geometry.triangles import area_vectors
+
+NATIONAL = np.array([410_000.0, 5_413_000.0, 250.0])
+BOX = trimesh.creation.box((2, 2, 2))
+CORNERS, FACES = np.asarray(BOX.vertices, np.float64), np.asarray(BOX.faces, np.int64)
+
+
+def assert_same_surface(read: Geometry, vertices: np.ndarray = CORNERS, faces: np.ndarray = FACES, atol: float = 1e-9):
+    """The same triangles in the same order, with the same winding."""
+    np.testing.assert_allclose(read.vertices[read.faces], vertices[faces], atol=atol)
+
+
+def volume(read: Geometry) -> float:
+    """Volume that the triangles enclose; negative if they wind inwards."""
+    return float(np.einsum("fc,fc->", read.vertices[read.faces[:, 0]], area_vectors(read.vertices, read.faces)) / 3)
+
+
+def area(read: Geometry) -> float:
+    return float(np.linalg.norm(area_vectors(read.vertices, read.faces), axis=1).sum())
+
+
+# glTF
+
+KINDS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
+
+
+class Gltf:
+    """A glTF that is put together array by array."""
+
+    def __init__(self, **fields: Any) -> None:
+        self.data = b""
+        self.json: dict[str, Any] = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], **fields}
+
+    def view(self, array: np.ndarray) -> int:
+        self.data += b"\0" * (-len(self.data) % 4)
+        self.json["bufferViews"].append({"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes})
+        self.data += array.tobytes()
+        return len(self.json["bufferViews"]) - 1
+
+    def accessor(self, array: np.ndarray, **fields: Any) -> int:
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.size // len(array)]
+        about = {"componentType": KINDS[array.dtype.name], "count": len(array), "type": kind}
+        self.json["accessors"].append({"bufferView": self.view(array), **about, **fields})
+        return len(self.json["accessors"]) - 1
+
+    def primitive(self, vertices: np.ndarray, indices: np.ndarray | None = None, **fields: Any) -> dict[str, Any]:
+        normalized = {} if vertices.dtype.kind == "f" else {"normalized": True}
+        made = {"attributes": {"POSITION": self.accessor(vertices, **normalized)}, **fields}
+        return made if indices is None else made | {"indices": self.accessor(indices.reshape(-1).astype(np.uint16))}
+
+    def box(self) -> dict[str, Any]:
+        return self.primitive(CORNERS.astype(np.float32), FACES)
+
+    def save(self, path: Path, *primitives: dict[str, Any]) -> Path:
+        whole = {"nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}], "meshes": [{"primitives": primitives}]}
+        whole |= self.json | {"buffers": [{"byteLength": len(self.data)}, *self.json.get("buffers", [])]}
+        text = json.dumps(whole).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = (
+            struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(self.data), b"BIN\0") + self.data
+        )
+        path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        return path
+
+
+@pytest.mark.parametrize(("kind", "most"), [("int8", 127), ("uint8", 255), ("int16", 32767), ("uint16", 65535)])
+def test_normalized_integers_of_a_glb_are_fractions(tmp_path: Path, kind: str, most: int):
+    low = -1.0 if kind.startswith("int") else 0.0
+    fractions = np.round((CORNERS > 0) * (1 - low) * most + low * most).astype(kind)
+    node = {"mesh": 0, "scale": [2 / (1 - low)] * 3, "translation": [-1 - low * 2 / (1 - low)] * 3}
+    gltf = Gltf(nodes=[node], extensionsRequired=["KHR_mesh_quantization"])
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", gltf.primitive(fractions, FACES))))
+
+
+def test_integers_of_a_glb_that_are_not_normalized_are_coordinates(tmp_path: Path):
+    gltf = Gltf(nodes=[{"mesh": 0, "translation": [-100, 0, 0]}])
+    positions = gltf.accessor((CORNERS + 100).astype(np.uint16))
+    indices = gltf.accessor(FACES.reshape(-1).astype(np.uint8))
+    primitive = {"attributes": {"POSITION": positions}, "indices": indices}
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", primitive)), CORNERS + np.array([0, 100, 100]))
+
+
+def test_every_instance_of_a_glbs_mesh_is_placed(tmp_path: Path):
+    gltf = Gltf(extensionsUsed=["EXT_mesh_gpu_instancing"])
+    box = gltf.box()
+    turns = Rotation.from_rotvec(np.radians([[0, 0, 0], [0, 0, 30], [0, 90, 0]]))
+    parts = {
+        "TRANSLATION": gltf.accessor(np.array([[0, 0, 0], [5, 0, 0], [0, 7, 0]], np.float32)),
+        "ROTATION": gltf.accessor(np.round(turns.as_quat() * 32767).astype(np.int16), normalized=True),
+        "SCALE": gltf.accessor(np.array([[1, 1, 1], [1, 1, 1], [2, 1, 1]], np.float32)),
+    }
+    gltf.json["nodes"] = [
+        {"translation": [0, 0, 9], "children": [1]},
+        {"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {"attributes": parts}}},
+    ]
+    placed = [
+        turn.apply(CORNERS * scale) + shift
+        for turn, scale, shift in zip(
+            turns, ([1, 1, 1], [1, 1, 1], [2, 1, 1]), ([0, 0, 9], [5, 0, 9], [0, 7, 9]), strict=True
+        )
+    ]
+    faces = np.concatenate([FACES + 8 * k for k in range(3)])
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", box)), np.concatenate(placed), faces, atol=1e-4)
+
+
+HEXAGON = np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3), np.zeros(6)], 1)
+ZIGZAG = np.array([0, 1, 5, 2, 4, 3])
+"""The hexagon as one strip."""
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+@pytest.mark.parametrize(("mode", "order"), [(5, ZIGZAG), (6, np.arange(6))])
+def test_strips_and_fans_of_a_glb_cover_their_polygon_facing_one_way(tmp_path: Path, mode, order, indexed):
+    gltf = Gltf()
+    points = HEXAGON.astype(np.float32)
+    part = gltf.primitive(points, order, mode=mode) if indexed else gltf.primitive(points[order], mode=mode)
+    read = read_geometry(gltf.save(tmp_path / "a.glb", part))
+    assert len(read.faces) == 4
+    vectors = area_vectors(read.vertices, read.faces)
+    np.testing.assert_allclose(vectors.sum(axis=0), [0, 0, 1.5 * np.sqrt(3)], atol=1e-6)
+    assert (vectors[:, 2] > 0).all()
+
+
+def test_sparse_positions_of_a_glb_replace_those_of_the_buffer(tmp_path: Path):
+    gltf = Gltf()
+    box = gltf.box()
+    at, values = np.array([2, 5], np.uint16), np.array([[9, 9, 9], [8, 8, 8]], np.float32)
+    stored = {
+        "indices": {"bufferView": gltf.view(at), "componentType": 5123},
+        "values": {"bufferView": gltf.view(values)},
+    }
+    gltf.json["accessors"][0]["sparse"] = {"count": 2, **stored}
+    moved = CORNERS.copy()
+    moved[at] = values
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", box)), moved)
+
+
+def test_morph_targets_of_a_glb_are_applied_at_their_default_weights(tmp_path: Path):
+    gltf = Gltf(nodes=[{"mesh": 0, "weights": [0.5, 0]}])
+    shift = np.tile(np.array([0, 0, 4], np.float32), (8, 1))
+    box = gltf.box() | {"targets": [{"POSITION": gltf.accessor(shift)}] * 2}
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", box)), CORNERS + np.array([0, 0, 2]))
+
+
+def test_a_mirrored_node_of_a_glb_still_winds_outwards(tmp_path: Path):
+    gltf = Gltf(nodes=[{"children": [1], "scale": [1, 1, -1]}, {"mesh": 0}])
+    assert volume(read_geometry(gltf.save(tmp_path / "a.glb", gltf.box()))) == pytest.approx(8)
+
+
+def test_points_and_lines_beside_the_triangles_of_a_glb_are_counted(tmp_path: Path, caplog):
+    gltf = Gltf()
+    parts = [
+        gltf.box(),
+        gltf.primitive(HEXAGON.astype(np.float32), mode=0),
+        gltf.primitive(HEXAGON.astype(np.float32), mode=3),
+    ]
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", *parts)))
+    assert "left out 2 of 3 primitives, which are points or lines" in caplog.text
+
+
+def test_a_glb_of_points_is_a_cloud(tmp_path: Path):
+    gltf = Gltf()
+    read = read_geometry(gltf.save(tmp_path / "a.glb", gltf.primitive(HEXAGON.astype(np.float32), mode=0)))
+    np.testing.assert_allclose(read.vertices, HEXAGON, atol=1e-6)
+    assert len(read.faces) == 0
+
+
+def test_meshes_outside_the_default_scene_of_a_glb_are_counted(tmp_path: Path, caplog):
+    gltf = Gltf(
+        nodes=[{"mesh": 0, "translation": [50, 0, 0]}, {"mesh": 0}], scenes=[{"nodes": [0]}, {"nodes": [1]}], scene=1
+    )
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", gltf.box())))
+    assert "left out 1 of 2 meshes, which are hidden or not in the file's default scene" in caplog.text
+
+
+@pytest.mark.parametrize("required", [{}, {"extensionsRequired": ["KHR_node_visibility"]}])
+def test_hidden_nodes_of_a_glb_are_left_out_with_those_below(tmp_path: Path, caplog, required: dict):
+    """As Blender writes objects that are hidden."""
+    hidden = {"mesh": 0, "children": [1], "extensions": {"KHR_node_visibility": {"visible": False}}}
+    shown = {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": True}}}
+    gltf = Gltf(nodes=[hidden, {"mesh": 0}, shown], scenes=[{"nodes": [0, 2]}], **required)
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", gltf.box())))
+    assert "left out 2 of 3 meshes, which are hidden" in caplog.text
+
+
+def without_values(gltf: Gltf, name: str) -> dict[str, Any]:
+    """A primitive whose values are only in the data of an extension."""
+    box = gltf.box() | {"extensions": {name: {"bufferView": 0, "attributes": {"POSITION": 0}}}}
+    for accessor in gltf.json["accessors"]:
+        del accessor["bufferView"]
+    return box
+
+
+def with_empty_fallback(gltf: Gltf, name: str) -> dict[str, Any]:
+    """A primitive whose values are only in compressed views of the first buffer."""
+    box = gltf.box()
+    gltf.json["buffers"] = [{"byteLength": len(gltf.data), "extensions": {name: {"fallback": True}}}]
+    for view in gltf.json["bufferViews"]:
+        view |= {"buffer": 1, "extensions": {name: {"buffer": 0, "byteLength": 8, "count": 8, "mode": "ATTRIBUTES"}}}
+    return box
+
+
+@pytest.mark.parametrize("required", [True, False])
+@pytest.mark.parametrize(
+    ("name", "compress"),
+    [
+        ("KHR_draco_mesh_compression", without_values),
+        ("EXT_meshopt_compression", with_empty_fallback),
+        ("KHR_meshopt_compression", with_empty_fallback),
+    ],
+)
+def test_a_compressed_glb_is_refused_by_the_name_of_its_compression(tmp_path: Path, name, compress, required):
+    gltf = Gltf(extensionsUsed=[name], extensionsRequired=[name] if required else [])
+    box = compress(gltf, name)
+    with pytest.raises(SceneError, match=rf"a\.glb is compressed with {name}.*export it without compression"):
+        read_geometry(gltf.save(tmp_path / "a.glb", box))
+
+
+def test_a_compressed_glb_with_a_fallback_is_read_from_it(tmp_path: Path):
+    name = "KHR_draco_mesh_compression"
+    gltf = Gltf(extensionsUsed=[name])
+    box = gltf.box() | {"extensions": {name: {"bufferView": 0, "attributes": {"POSITION": 0}}}}
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", box)))
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"extensionsRequired": ["ACME_curves"]}, "needs ACME_curves, which is not read"),
+        ({"extensionsUsed": ["CESIUM_RTC"]}, "is moved by CESIUM_RTC"),
+        ({"extensionsUsed": ["KHR_gaussian_splatting"]}, "holds Gaussian splats"),
+        ({"nodes": [{"mesh": 0, "skin": 0}]}, "is posed by a skeleton"),
+        ({"asset": {"version": "1.0"}}, r"is glTF 1\.0"),
+    ],
+)
+def test_what_would_move_the_surface_of_a_glb_is_refused_by_its_name(tmp_path: Path, fields, words):
+    gltf = Gltf(**fields)
+    with pytest.raises(SceneError, match=rf"a\.glb {words}"):
+        read_geometry(gltf.save(tmp_path / "a.glb", gltf.box()))
+
+
+def test_extensions_of_materials_do_not_matter(tmp_path: Path):
+    names = ["KHR_texture_transform", "KHR_materials_unlit", "KHR_texture_basisu"]
+    gltf = Gltf(extensionsUsed=names, extensionsRequired=names)
+    assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", gltf.box())))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda gltf: gltf["bufferViews"][0].update(byteLength=10**6), "shorter than the json claims"),
+        (lambda gltf: gltf["accessors"][0].update(count=10**9), "cannot be read"),
+        (lambda gltf: gltf["nodes"][0].update(children=[0]), "placed twice"),
+        (lambda gltf: gltf["accessors"][0].update(count=4), "outside its 4 vertices"),
+        (lambda gltf: gltf["accessors"][0].pop("bufferView"), "accessor 0 has no values"),
+        (lambda gltf: gltf.update(accessors=[]), "cannot be read"),
+    ],
+)
+def test_a_damaged_glb_is_refused(tmp_path: Path, change: Callable, words: str):
+    gltf = Gltf(nodes=[{"mesh": 0}])
+    box = gltf.box()
+    change(gltf.json)
+    with pytest.raises(SceneError, match=words):
+        read_geometry(gltf.save(tmp_path / "a.glb", box))
+
+
+def test_a_gltf_without_its_buffer_names_the_file(tmp_path: Path):
+    trimesh.Scene(BOX).export(tmp_path / "a.gltf")
+    assert_same_surface(read_geometry(tmp_path / "a.gltf"))
+    for buffer in tmp_path.glob("*.bin"):
+        buffer.unlink()
+    with pytest.raises(SceneError, match=r"a\.gltf has its geometry in .*\.bin, which does not exist"):
+        read_geometry(tmp_path / "a.gltf")
+
+
+# PLY
+
+XYZ = [f"property double {axis}" for axis in "xyz"]
+INDICES = "property list uchar int vertex_indices"
+
+
+def save_ply(path: Path, header: list[str], data: bytes | str, form: str = "binary_little_endian") -> Path:
+    body = data if isinstance(data, bytes) else data.encode()
+    path.write_bytes("\n".join(["ply", f"format {form} 1.0", *header, "end_header\n"]).encode() + body)
+    return path
+
+
+def rows(array: np.ndarray) -> str:
+    return "\n".join(" ".join(map(repr, row)) for row in array.tolist()) + "\n"
+
+
+def test_the_strips_of_a_ply_are_triangles(tmp_path: Path):
+    strips = np.concatenate([[*ZIGZAG, -1], [*ZIGZAG + 6]]).astype("<i4")
+    header = ["element vertex 12", *XYZ, "element tristrips 1", "property list int int vertex_indices"]
+    data = (
+        np.concatenate([HEXAGON, HEXAGON + np.array([0, 0, 1])]).tobytes()
+        + struct.pack("<i", len(strips))
+        + strips.tobytes()
+    )
+    read = read_geometry(save_ply(tmp_path / "a.ply", header, data))
+    assert len(read.faces) == 8
+    np.testing.assert_allclose(area_vectors(read.vertices, read.faces).sum(axis=0), [0, 0, 3 * np.sqrt(3)])
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_polygons_and_lists_of_a_ply_may_have_any_length(tmp_path: Path, form: str):
+    """A hexagon, a quadrangle and a triangle; vertices with lists, faces with a colour and a second list."""
+    order = ">" if "big" in form else "<"
+    header = ["element vertex 6", "property list uchar short seen_by", *XYZ, "element face 3", "property uchar red"]
+    header += [INDICES, "property list uchar float texcoord"]
+    polygons = [[0, 1, 2, 3, 4, 5], [0, 1, 2, 3], [3, 4, 5]]
+    if form == "ascii":
+        lists = [" ".join(map(str, [k % 3, *range(k % 3)])) for k in range(6)]
+        data = "".join(f"{a} {b}" for a, b in zip(lists, rows(HEXAGON).splitlines(keepends=True), strict=True))
+        data += "".join(f"9 {len(p)} {' '.join(map(str, p))} {len(p)} {'0.5 ' * len(p)}\n" for p in polygons)
+    else:
+        parts = [struct.pack(f"{order}B{k % 3}h3d", k % 3, *range(k % 3), *HEXAGON[k]) for k in range(6)]
+        parts += [
+            struct.pack(f"{order}BB{len(p)}iB{len(p)}f", 9, len(p), *p, len(p), *[0.5] * len(p)) for p in polygons
+        ]
+        data = b"".join(parts)
+    read = read_geometry(save_ply(tmp_path / "a.ply", header, data, form))
+    np.testing.assert_allclose(read.vertices, HEXAGON)
+    assert area(read) == pytest.approx(1.5 * np.sqrt(3) * (1 + 1 / 2 + 1 / 6))
+    assert len(read.faces) == 4 + 2 + 1
+
+
+def test_faces_of_two_corners_and_unknown_elements_of_a_ply_are_counted(tmp_path: Path, caplog):
+    header = ["element vertex 6", *XYZ, "element face 2", INDICES, "element blob 3", "property int size"]
+    data = rows(HEXAGON) + "3 0 1 2\n2 3 4\n7\n7\n7\n"
+    assert len(read_geometry(save_ply(tmp_path / "a.ply", header, data, "ascii")).faces) == 1
+    assert "left out 1 of 2 faces, which have fewer than 3 corners" in caplog.text
+    assert "left out 3 of 3 of the element 'blob'" in caplog.text
+
+
+@pytest.mark.parametrize("extra", ["0.5\n", "word\n"])
+def test_an_ascii_ply_with_other_numbers_than_its_header_claims_is_refused(tmp_path: Path, extra: str):
+    header = ["element vertex 6", *XYZ, "element face 1", INDICES]
+    with pytest.raises(SceneError, match="cannot be read"):
+        read_geometry(save_ply(tmp_path / "a.ply", header, rows(HEXAGON) + f"3 0 1 2 {extra}", "ascii"))
+
+
+FLOATS = [f"property float {name}" for name in ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0")]
+PACKED = [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [("a.ply", FLOATS), ("a.ply", PACKED), *((f"a.{s}", FLOATS) for s in ("splat", "ksplat", "spz", "sog", "SPLAT"))],
+)
+def test_splats_are_refused_as_a_shell(tmp_path: Path, name: str, header: list[str]):
+    save_ply(tmp_path / name, ["element vertex 1", *header], bytes(64))
+    with pytest.raises(SceneError, match=r"holds Gaussian splats, which are no surface.*shellgs mesh"):
+        read_geometry(tmp_path / name)
+
+
+# Polygons
+
+ARROW = (
+    np.array([[0, 0, 0], [4, 0, 0], [4, 3, 0], [2, 1, 0], [0, 3, 0]]) @ Rotation.from_rotvec([1, 2, 3]).as_matrix().T
+)
+COMB = np.array([[0, 0], [7, 0], [7, 3], [6, 3], [6, 1], [4, 1], [4, 3], [3, 3], [3, 1], [1, 1], [1, 3], [0, 3]])
+DART = np.array([[0, 0, 0], [2, 1, 0], [0, 4, 0], [1, 1, 0]])  # its corner 3 is concave
+
+
+@pytest.mark.parametrize(
+    ("polygon", "size"),
+    [(ARROW, 8), (ARROW[::-1], 8), (np.pad(COMB, ((0, 0), (0, 1))), 13), (DART, 2), (np.roll(DART, 1, axis=0), 2)],
+)
+def test_concave_polygons_are_covered_once(tmp_path: Path, polygon: np.ndarray, size: float):
+    text = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in polygon.astype(float).tolist())
+    (tmp_path / "a.obj").write_text(text + f"f {' '.join(str(k + 1) for k in range(len(polygon)))}\n")
+    read = read_geometry(tmp_path / "a.obj")
+    assert len(read.faces) == len(polygon) - 2
+    assert area(read) == pytest.approx(size)  # a fan of the first corner covers more
+    assert np.linalg.norm(area_vectors(read.vertices, read.faces).sum(axis=0)) == pytest.approx(size)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
+def test_a_drawing_of_lines_is_no_cloud_of_their_ends(tmp_path: Path, suffix: str):
+    """As CAD programs write plans: walls between the lines would be missing."""
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".obj":
+        path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nl 1 2 3 1\n")
+    elif suffix == ".ply":
+        edges = ["element edge 2", "property int vertex1", "property int vertex2"]
+        save_ply(path, ["element vertex 6", *XYZ, *edges], rows(HEXAGON) + "0 1\n1 2\n", "ascii")
+    else:
+        gltf = Gltf()
+        gltf.save(path, gltf.primitive(HEXAGON.astype(np.float32), mode=1))
+    with pytest.raises(SceneError, match="a drawing of lines"):
+        read_geometry(path)
+
+
+def test_a_ply_without_a_coordinate_names_it(tmp_path: Path):
+    header = ["element vertex 6", *(line.upper().replace("PROPERTY DOUBLE", "property double") for line in XYZ)]
+    with pytest.raises(SceneError, match="its vertices have X, Y, Z, but no x"):
+        read_geometry(save_ply(tmp_path / "a.ply", header, rows(HEXAGON), "ascii"))
+
+
+# OBJ, STL, OFF
+
+
+def test_negative_indices_of_an_obj_count_back_from_their_face(tmp_path: Path):
+    """As SketchUp and others write them, group by group."""
+    groups = "".join(
+        f"g {z}\nv 0 0 {z}\nv 1 0 {z}\nv 0 1 {z} 0.5 0.5 0.5\nvt 0 0\nf -3/-1 -2/-1 -1/-1\n" for z in range(3)
+    )
+    (tmp_path / "a.obj").write_text("mtllib gone.mtl\n" + groups + "\n \tf 1// 2// \\\n3// # a face\n \nl 1 2\np 1\n")
+    read = read_geometry(tmp_path / "a.obj")
+    np.testing.assert_array_equal(read.vertices[read.faces][:, :, 2], [[0] * 3, [1] * 3, [2] * 3, [0] * 3])
+
+
+@pytest.mark.parametrize("face", ["0 1 2", "-4 -2 -1", "1 2 9"])
+def test_an_obj_with_indices_of_no_vertex_is_refused(tmp_path: Path, face: str):
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf {face}\n")
+    from shellgs_method.shell import load_shell
+
+    with pytest.raises(SceneError, match=r"cannot be read|outside its 3 vertices"):
+        load_shell(tmp_path / "a.obj")
+
+
+def test_curved_surfaces_of_an_obj_are_counted(tmp_path: Path, caplog):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\ncstype bezier\nsurf 0 1 0 1 1 2 3\nend\n")
+    assert len(read_geometry(tmp_path / "a.obj").faces) == 1
+    assert "left out 1 of 2 elements, which are curves or curved surfaces" in caplog.text
+
+
+def solid(name: str, faces: np.ndarray) -> str:
+    facets = "".join(
+        "facet normal 0 0 0\n outer loop\n"
+        + "".join("  VERTEX {} {} {}\n".format(*c) for c in CORNERS[face])
+        + " endloop\nendfacet\n"
+        for face in faces
+    )
+    return f"solid {name}\n{facets}endsolid {name}\n"
+
+
+def test_all_solids_of_an_ascii_stl_are_read(tmp_path: Path):
+    (tmp_path / "a.stl").write_text(solid("a vertex", FACES[:5]) + solid("b", FACES[5:]))
+    assert_same_surface(read_geometry(tmp_path / "a.stl"))
+
+
+@pytest.mark.parametrize("lines", [-1, -2, -4, -30])
+def test_a_cut_ascii_stl_is_refused(tmp_path: Path, lines: int):
+    text = solid("a", FACES[:5]) + solid("b", FACES[5:])
+    (tmp_path / "a.stl").write_text("\n".join(text.splitlines()[:lines]))
+    with pytest.raises(SceneError, match=r"a\.stl cannot be read"):
+        read_geometry(tmp_path / "a.stl")
+
+
+def test_a_binary_stl_may_begin_like_one_of_text(tmp_path: Path):
+    BOX.export(tmp_path / "a.stl")
+    data = bytearray((tmp_path / "a.stl").read_bytes())
+    data[:11] = b"solid facet"
+    (tmp_path / "a.stl").write_bytes(data)
+    assert_same_surface(read_geometry(tmp_path / "a.stl"))
+    (tmp_path / "a.stl").write_bytes(data[:-1])
+    with pytest.raises(SceneError, match="claims 12 triangles"):
+        read_geometry(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize(("form", "more"), [("OFF", ""), ("COFF", " 9 9 9 255"), ("NOFF", " 0 0 1")])
+def test_an_off_may_have_colours_and_comments_and_no_end(tmp_path: Path, form: str, more: str):
+    lines = [form, "# a box", "8 12 0", *(" ".join(map(str, c)) + more for c in CORNERS)]
+    lines += [f"3 {a} {b} {c} 0.5 0.5 0.5" for a, b, c in FACES]
+    (tmp_path / "a.off").write_text("\n".join(lines))
+    assert_same_surface(read_geometry(tmp_path / "a.off"))
+    (tmp_path / "a.off").write_text("\n".join(lines[:-3]))
+    with pytest.raises(SceneError, match=r"it holds 8 of 8 vertices and 9 of 12 faces"):
+        read_geometry(tmp_path / "a.off")
+
+
+# PCD
+
+POINTS = np.random.default_rng(0).uniform(-9, 9, (300, 3)).astype(np.float32)
+
+
+def save_pcd(
+    path: Path, fields: list[tuple[str, str, int]], data: bytes | str, form: str = "binary", **more: str
+) -> Path:
+    """Fields: name, type and size as one word, count."""
+    named = {
+        "VERSION": ".7",
+        "FIELDS": " ".join(name for name, _, _ in fields),
+        "SIZE": " ".join(kind[1:] for _, kind, _ in fields),
+        "TYPE": " ".join(kind[0] for _, kind, _ in fields),
+        "COUNT": " ".join(str(count) for _, _, count in fields),
+        "WIDTH": "100",
+        "HEIGHT": "3",
+        "VIEWPOINT": "0 0 0 1 0 0 0",
+        "POINTS": "300",
+    } | more
+    head = "# .PCD v.7\n" + "".join(f"{key} {value}\n" for key, value in named.items()) + f"DATA {form}\n"
+    path.write_bytes(head.encode() + (data if isinstance(data, bytes) else data.encode()))
+    return path
+
+
+def save_open3d(path: Path, points: np.ndarray, **options: Any) -> None:
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor.from_numpy(points))
+    o3d.t.io.write_point_cloud(str(path), cloud, **options)  # pyright: ignore[reportArgumentType]
+
+
+F4 = [("x", "F4", 1), ("y", "F4", 1), ("z", "F4", 1)]
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        F4,
+        [("x", "f4", 1), ("y", "f4", 1), ("z", "f4", 1)],
+        [("z", "F8", 1), ("y", "F8", 1), ("x", "F8", 1)],
+        [*F4, ("_", "U1", 4), ("intensity", "F4", 1), ("_", "U1", 12)],
+        [("normal", "F4", 3), ("label", "I2", 1), *F4, ("fpfh", "F4", 33), ("time", "U8", 1)],
+    ],
+)
+def test_a_pcd_may_have_any_fields(tmp_path: Path, fields: list[tuple[str, str, int]], form: str):
+    kinds = [(f"{k}", f"<{kind.lower()}", (count,) * (count > 1)) for k, (_, kind, count) in enumerate(fields)]
+    table = np.zeros(300, kinds)
+    for k, (name, _, _) in enumerate(fields):
+        table[f"{k}"] = POINTS[:, "xyz".index(name)] if name in "xyz" else 7
+    text = "".join(" ".join(str(v) for cell in row for v in np.ravel(cell).tolist()) + "\n" for row in table.tolist())
+    read = read_geometry(save_pcd(tmp_path / "a.pcd", fields, text if form == "ascii" else table.tobytes(), form))
+    np.testing.assert_array_equal(read.vertices, POINTS.astype(np.float64))
+
+
+@pytest.mark.parametrize("compressible", [True, False])
+def test_a_compressed_pcd_gives_the_points_that_open3d_wrote(tmp_path: Path, compressible: bool):
+    points = (np.round(POINTS) if compressible else POINTS).astype(np.float64) + NATIONAL
+    save_open3d(tmp_path / "a.pcd", points, compressed=True)
+    assert b"binary_compressed" in (tmp_path / "a.pcd").read_bytes()[:400]
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.pcd").vertices, points)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"POINTS": "4000000"}, "it holds 300 of 4000000 points"),
+        ({"POINTS": "40000000000"}, "it holds 300 of 40000000000 points"),
+        ({"POINTS": "-1"}, "cannot be read"),
+        ({"COUNT": "1 1 0"}, "cannot be read"),
+        ({"SIZE": "4 4 5"}, "cannot be read"),
+        ({"FIELDS": "x y intensity"}, "it has no field z"),
+        ({"FIELDS": "x y z w"}, "it has 4 fields|4 fields, 3 types"),
+    ],
+)
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+def test_a_pcd_whose_header_does_not_fit_it_is_refused(tmp_path: Path, change: dict[str, str], words: str, form: str):
+    data = POINTS.tobytes() if form == "binary" else rows(POINTS)
+    with pytest.raises(SceneError, match=words):
+        read_geometry(save_pcd(tmp_path / "a.pcd", F4, data, form, **change))
+
+
+def test_hostile_pcds_are_refused(tmp_path: Path):
+    random = np.random.default_rng(0)
+    save_open3d(tmp_path / "a.pcd", POINTS, compressed=True)
+    data = (tmp_path / "a.pcd").read_bytes()
+    for _ in range(100):
+        damaged = bytearray(data)
+        for at in random.integers(len(data), size=5):
+            damaged[at] = random.integers(256)
+        (tmp_path / "a.pcd").write_bytes(damaged)
+        try:
+            read_geometry(tmp_path / "a.pcd")
+        except SceneError as error:
+            assert "cannot be read" in str(error)  # noqa: PT017
+
+
+def test_a_viewpoint_of_a_pcd_is_said_not_to_be_applied(tmp_path: Path, caplog):
+    read_geometry(save_pcd(tmp_path / "a.pcd", F4, POINTS.tobytes(), VIEWPOINT="1 2 3 1 0 0 0"))
+    assert "its VIEWPOINT is not applied" in caplog.text
+
+
+# Text
+
+SURVEYED = np.round(POINTS + NATIONAL, 3)
+LINES = [f"{x:.3f} {y:.3f} {z:.3f} {k % 256} 7 9" for k, (x, y, z) in enumerate(SURVEYED.tolist())]
+
+
+def columns(order: list[int], separator: str = " ") -> list[str]:
+    return [separator.join(line.split()[k] for k in order) for line in LINES]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        LINES,
+        ["X Y Z R G B", *LINES],
+        ["//X Y Z R G B", *LINES],
+        ["# made by hand", "", *LINES, ""],
+        ["300", *LINES],
+        ["//X Y Z", "300", *LINES],
+        ["100", *LINES[:100], "200", *LINES[100:]],
+        [line.replace(" ", ",") for line in LINES],
+        ['"X","Y","Z","R","G","B"', *(line.replace(" ", ",") for line in LINES)],
+        [line.replace(" ", ", ") for line in LINES],
+        [line.replace(" ", ";") for line in LINES],
+        [line.replace(" ", "\t") for line in LINES],
+        ["r;Z [m];Y(m);x", *columns([3, 2, 1, 0], ";")],
+        [f"P{k} {line}" for k, line in enumerate(LINES)],
+        [f"{k + 1000} {line}" for k, line in enumerate(LINES)],
+        ["id x y z", *(f"{k} {line}" for k, line in enumerate(LINES))],
+        ["name,x,y,z", *(f"wall {k},{line}" for k, line in enumerate(columns([0, 1, 2], ",")))],
+        ["name;note;x;y;z", *(f"a;;{line}" for line in columns([0, 1, 2], ";"))],
+        ["name,x,y,z", *(f'"a, b",{line}' for line in columns([0, 1, 2], ","))],
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_clouds_may_have_headers_counts_and_any_separator(tmp_path: Path, lines: list[str], encoding: str):
+    for suffix in ("xyz", "pts") if encoding == "utf-8" else ("csv",):
+        (tmp_path / f"a.{suffix}").write_text("\n".join(lines) + "\n", encoding)
+        np.testing.assert_array_equal(read_geometry(tmp_path / f"a.{suffix}").vertices, SURVEYED)
+
+
+@pytest.mark.parametrize(
+    ("comments", "form"),
+    [
+        (["# Z Y X"], "{2} {1} {0}"),
+        (["//id,Y,X,Z", "// exported"], "7,{1},{0},{2}"),
+        (["# X Y Z of the wall by Foo"], "{0} {1} {2}"),  # words, not the names of columns
+    ],
+)
+def test_a_comment_may_name_the_columns(tmp_path: Path, comments: list[str], form: str):
+    (tmp_path / "a.xyz").write_text("\n".join([*comments, *(form.format(*point) for point in SURVEYED)]))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.xyz").vertices, SURVEYED)
+
+
+def test_a_column_of_points_numbers_is_said(tmp_path: Path, caplog):
+    (tmp_path / "a.xyz").write_text("\n".join(f"{k + 1000} {line}" for k, line in enumerate(LINES)))
+    read_geometry(tmp_path / "a.xyz")
+    assert "its first column (1000) is taken for the points' numbers" in caplog.text
+
+
+def test_whole_numbers_in_all_columns_are_coordinates(tmp_path: Path, caplog):
+    (tmp_path / "a.xyz").write_text("1 2 3 4\n5 6 7 8\n9 1 2 3\n")
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.xyz").vertices, [[1, 2, 3], [5, 6, 7], [9, 1, 2]])
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([line.replace(".", ",") for line in LINES], "has decimal commas"),
+        ([line.replace(".", ",").replace(" ", ";") for line in LINES], "has decimal commas"),
+        ([line.replace(".", ",").replace(" ", "\t") for line in LINES], "has decimal commas"),
+        (["East North Up", *columns([0, 1, 2])], "'East North Up', which does not name one column each of X, Y and Z"),
+        (["x y 3", *columns([0, 1, 2])], "begins with 'x y 3' where X, Y and Z are expected"),
+        (columns([0, 1]), "where X, Y and Z are expected"),
+        (["name X Y Z", *(f"wall 3 {line}" for line in LINES)], "its header names 4 columns, and a line has 8"),
+        (["301", *LINES], "it holds 300 of 301 points"),
+        ([*LINES[:200], "end of file", *LINES[200:]], "cannot be read"),
+        ([*LINES[:200], "412345.1 5123", *LINES[200:]], "cannot be read"),
+    ],
+)
+def test_other_text_is_refused_with_what_it_looks_like(tmp_path: Path, lines: list[str], words: str):
+    (tmp_path / "a.xyz").write_text("\n".join(lines))
+    with pytest.raises(SceneError, match=words):
+        read_geometry(tmp_path / "a.xyz")
+
+
+# Misses
+
+
+@pytest.mark.parametrize("suffix", ["xyz", "pcd", "ply"])
+@pytest.mark.parametrize("origin", [np.zeros(3), NATIONAL])
+def test_misses_at_the_origin_are_left_out_and_counted(tmp_path: Path, caplog, suffix: str, origin: np.ndarray):
+    points = np.concatenate([POINTS + origin, np.zeros((50, 3))])
+    if suffix == "xyz":
+        np.savetxt(tmp_path / "a.xyz", points)
+    else:
+        save_open3d(tmp_path / f"a.{suffix}", points)
+    np.testing.assert_allclose(read_geometry(tmp_path / f"a.{suffix}").vertices, POINTS + origin)
+    assert "left out 50 of 350 points at exactly 0 0 0, which are misses of the scanner" in caplog.text
+
+
+@pytest.mark.parametrize(("origin", "kept"), [(np.zeros(3), 301), (NATIONAL, 300)])
+def test_one_point_at_the_origin_is_kept_among_others(tmp_path: Path, origin: np.ndarray, kept: int):
+    np.savetxt(tmp_path / "a.xyz", np.concatenate([POINTS + origin, np.zeros((1, 3))]))
+    assert len(read_geometry(tmp_path / "a.xyz").vertices) == kept
+
+
+# LAS and E57
+
+
+def save_e57(path: Path, *parts: dict[str, Any]) -> Path:
+    pye57 = pytest.importorskip("pye57")
+    with pye57.E57(str(path), mode="w") as file:
+        for part in parts:
+            points = part.pop("points")
+            more = {"cartesianInvalidState": part.pop("invalid")} if "invalid" in part else {}
+            data = {f"cartesian{axis}": np.ascontiguousarray(points[:, k]) for k, axis in enumerate("XYZ")}
+            file.write_scan_raw(data | more, **part)
+    return path
+
+
+TURNED = Rotation.from_euler("z", 90, degrees=True)
+
+
+def test_misses_of_an_e57_are_left_out_before_its_pose_moves_them(tmp_path: Path, caplog):
+    points = np.concatenate([POINTS, np.zeros((90, 3))])
+    pose = {"rotation": np.roll(TURNED.as_quat(), 1), "translation": NATIONAL}
+    read = read_geometry(save_e57(tmp_path / "a.e57", {"points": points, **pose}))
+    np.testing.assert_allclose(read.vertices, TURNED.apply(POINTS) + NATIONAL, atol=1e-5)
+    np.testing.assert_allclose(read.scanners, [NATIONAL])
+    assert "left out 90 of 390 points at 0 0 0, which are misses of the scanner" in caplog.text
+
+
+def test_points_that_an_e57_flags_as_invalid_are_counted(tmp_path: Path, caplog):
+    invalid = (np.arange(300) % 3).astype(np.int8)
+    pytest.importorskip("pye57")
+    try:
+        read = read_geometry(
+            save_e57(tmp_path / "a.e57", {"points": POINTS, "invalid": invalid, "translation": NATIONAL})
+        )
+    except TypeError as error:
+        pytest.skip(f"this pye57 does not write flags: {error}")
+    assert len(read.vertices) == 100
+    assert "left out 200 of 300 points, which are flagged as invalid" in caplog.text
+
+
+def test_a_scan_of_an_e57_without_a_pose_tells_no_scanner(tmp_path: Path):
+    unset = {"translation": np.zeros(3), "rotation": np.array([1.0, 0, 0, 0])}
+    placed = {"translation": np.array([0, 0, 2.0]), "rotation": np.array([1.0, 0, 0, 0])}
+    path = save_e57(tmp_path / "a.e57", {"points": POINTS, **unset}, {"points": POINTS, **placed})
+    read = read_geometry(path)
+    np.testing.assert_array_equal(read.scanners, [[0, 0, 2]])
+    assert len(read.vertices) == 600
+
+
+def test_spherical_coordinates_of_an_e57_become_cartesian_without_misses(tmp_path: Path):
+    libe57 = pytest.importorskip("pye57").libe57
+    ranges = np.linalg.norm(POINTS, axis=1).astype(np.float64)
+    elevations = np.arcsin(POINTS[:, 2] / ranges)
+    columns = {"Range": ranges, "Azimuth": np.arctan2(POINTS[:, 1], POINTS[:, 0]), "Elevation": elevations}
+    columns = {f"spherical{name}": np.append(column, np.zeros(20)) for name, column in columns.items()}
+    file = libe57.ImageFile(str(tmp_path / "a.e57"), "w")
+    scan, fields, scans = libe57.StructureNode(file), libe57.StructureNode(file), libe57.VectorNode(file, True)
+    file.root().set("data3D", scans)
+    scans.append(scan)
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, column in columns.items():
+        fields.set(name, libe57.FloatNode(file, 0.0, libe57.E57_DOUBLE, -1e7, 1e7))
+        buffers.append(libe57.SourceDestBuffer(file, name, column, len(column), True, True))
+    points = libe57.CompressedVectorNode(file, fields, libe57.VectorNode(file, True))
+    scan.set("points", points)
+    writer = points.writer(buffers)
+    writer.write(len(ranges) + 20)
+    writer.close()
+    file.close()
+    np.testing.assert_allclose(read_geometry(tmp_path / "a.e57").vertices, POINTS, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [3, 6])
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_withheld_points_and_noise_of_a_las_are_left_out_and_counted(tmp_path: Path, caplog, kind: int, suffix: str):
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    header = laspy.LasHeader(point_format=kind, version="1.4")
+    header.scales, header.offsets = [1e-4] * 3, NATIONAL
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (POINTS + NATIONAL).T
+    numbers = np.arange(300)
+    las.withheld = numbers < 10
+    las.classification = np.select([numbers < 30, numbers < 35], [7, 18], 2).astype(np.uint8)
+    las.write(str(tmp_path / f"a.{suffix}"))
+    read = read_geometry(tmp_path / f"a.{suffix}")
+    np.testing.assert_allclose(read.vertices, (POINTS + NATIONAL)[35:], atol=1e-4)
+    assert "left out 10 of 300 points, which are withheld" in caplog.text
+    assert "left out 25 of 300 points, which are classified as noise" in caplog.text
+
+
+@pytest.mark.parametrize(("end", "words"), [("os.abort()", "SIGABRT"), ("sys.exit('out of order')", "out of order")])
+def test_a_file_that_ends_its_reader_is_refused(tmp_path: Path, monkeypatch, end: str, words: str):
+    pytest.importorskip("pye57")
+    (tmp_path / "crash.py").write_text(f"import os, sys\n{end}\n")
+    (tmp_path / "a.e57").write_bytes(b"ASTM-E57")
+    monkeypatch.setattr(scans, "_SCRIPT", tmp_path / "crash.py")
+    with pytest.raises(SceneError, match=rf"a\.e57 cannot be read.*{words}"):
+        read_geometry(tmp_path / "a.e57")

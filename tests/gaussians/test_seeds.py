@@ -1,0 +1,211 @@
+"""Seeds on a wall of known position, colour and resolution, and on a skybox."""
+
+from __future__ import annotations
+
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.models.splatfacto import SH2RGB
+from scipy.spatial import KDTree
+from training_runs import data_of, model_of, trainer_of
+
+from shellgs_method.errors import SceneError
+from shellgs_method.gaussians.densification import SkyboxStrategy
+from shellgs_method.gaussians.seeds import SKYBOX_RADIUS, SeededView, SkyView, shell_seeds, skybox_seeds
+from shellgs_method.gaussians.surface_weights import WEIGHT_BEHIND, SurfaceWeights
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.reference import Reference
+from shellgs_method.model import FacadeModel
+from shellgs_method.render.maps import DISC_LOG_THICKNESS
+from shellgs_method.render.rasterizer import quats_to_rotations
+
+FOCAL, WIDTH, HEIGHT = 60.0, 80, 60
+NORMAL = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+"""Normal of the wall through (0, 0, 10), in the world."""
+
+
+def camera(position: tuple[float, float, float]) -> Camera:
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, 3] = -torch.tensor(position, dtype=torch.float64)
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+    return Camera(viewmat, K, WIDTH, HEIGHT)
+
+
+def view(position=(0.0, 0.0, 0.0), colour: float = 0.5, normal=NORMAL) -> SeededView:
+    """A view of the wall in one colour; pixels where it is behind the camera are masked."""
+    here = camera(position)
+    distance = (torch.tensor([0.0, 0.0, 10.0], dtype=torch.float64) - here.position) @ normal
+    depth = (distance / (here.rays() @ normal))[..., None]
+    mask = depth > 0
+    image = torch.full((HEIGHT, WIDTH, 3), colour)
+    return SeededView(here, image, Reference(depth.where(mask, 0.0), normal.expand(HEIGHT, WIDTH, 3), mask))
+
+
+def seeds_of(views: list[SeededView], spacing: float = 4.0, most: int = 100_000):
+    return shell_seeds(views, len(views) * WIDTH * HEIGHT, spacing, most)
+
+
+def test_seeds_lie_on_the_wall_and_have_its_normal():
+    seeds = seeds_of([view(), view((2.0, 0.0, 1.0))])
+    assert len(seeds.points) > 50
+    np.testing.assert_allclose((seeds.points - [0, 0, 10]) @ NORMAL.numpy(), 0, atol=1e-9)
+    np.testing.assert_allclose(seeds.normals, NORMAL.expand(len(seeds.points), 3))
+
+
+def test_seeds_are_a_few_pixels_apart_in_the_closest_view():
+    frontal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    seeds = seeds_of([view(normal=frontal), view((0.0, 0.0, 6.0), normal=frontal)], spacing=4.0)
+    near = (abs(seeds.points[:, :2]) < [2, 1.5]).all(axis=1)  # visible in the second view, from 4 instead of 10
+    neighbours = KDTree(seeds.points).query(seeds.points, k=2)[0][:, 1] * FOCAL
+    assert 2 < np.median(neighbours[near] / 4) < 6
+    assert 2 < np.median(neighbours[~near] / 10) < 6
+    assert np.median(seeds.spacing[near]) < np.median(seeds.spacing[~near])
+
+
+def test_a_seed_has_the_median_colour_of_the_views():
+    """A passer-by in one of three photographs does not change the wall's colour."""
+    seeds = seeds_of([view(colour=0.3), view((0.1, 0.0, 0.0), colour=0.3), view((-0.1, 0.0, 0.0), colour=1.0)])
+    central = np.linalg.norm(seeds.points - [0, 0, 10], axis=1) < 3
+    np.testing.assert_allclose(seeds.colours[central], 0.3, atol=1e-6)
+
+
+def test_gaussians_behind_the_wall_hardly_count_for_its_geometry():
+    seeds = seeds_of([view()])
+    weights = SurfaceWeights(seeds, metres_per_unit=0.5)
+    for metres, weight in ((-5.0, 1.0), (0.0, 1.0), (0.08, 1.0), (0.12, WEIGHT_BEHIND), (5.0, WEIGHT_BEHIND)):
+        means = torch.from_numpy(seeds.points - seeds.normals * metres / 0.5)
+        assert (weights(means) == weight).all()
+
+
+def test_masked_and_grazing_pixels_give_no_seeds():
+    masked = view()
+    masked.shell.mask[:, : WIDTH // 2] = False
+    assert (camera((0, 0, 0)).K.numpy() @ seeds_of([masked]).points.T)[0].min() > 0
+    assert len(seeds_of([masked]).points) < 0.7 * len(seeds_of([view()]).points)
+    grazing = torch.tensor([1.0, 0.0, -0.05], dtype=torch.float64)
+    edge_on = view(normal=grazing / grazing.norm())
+    edge_on = edge_on._replace(shell=edge_on.shell._replace(mask=edge_on.shell.depth > 5))
+    assert len(seeds_of([edge_on]).points) == 0
+
+
+def test_seeds_are_spread_more_widely_if_there_are_too_many():
+    few = seeds_of([view()], most=40)
+    assert 15 < len(few.points) <= 40
+    assert np.ptp(few.points, axis=0)[0] > 0.8 * np.ptp(seeds_of([view()]).points, axis=0)[0]
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(eager, pristine_scene, tmp_path, primitive):
+    def choose(config):
+        config.pipeline.model.primitive, config.pipeline.model.skybox_seeds = primitive, 0
+
+    trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
+    model, sfm = model_of(trainer), model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
+    n, seeds = sfm.num_points, data_of(trainer).shell_seeds(model.config.seed_spacing, model.config.max_seeds, True)
+    assert len(seeds.points) > 50
+    torch.testing.assert_close(model.means[:n], sfm.means)
+    torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
+    thin = quats_to_rotations(model.quats[n:])[..., 2]
+    cosines = (thin * torch.from_numpy(seeds.normals).float()).sum(dim=-1).abs()
+    torch.testing.assert_close(cosines, torch.ones_like(cosines))
+    scales = model.scales[n:].exp()
+    assert (scales[:, 2] < 0.11 * scales[:, :2].amin(dim=-1)).all()
+    assert primitive == "3d" or (model.scales[:, 2] == DISC_LOG_THICKNESS).all()
+    torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+
+
+@pytest.mark.parametrize(("count", "said"), [(3, "has 3 SfM points"), (0, "has no SfM points")])
+def test_too_few_sfm_points_are_counted(count, said):
+    model = SimpleNamespace(seed_points=(torch.zeros(count, 3), torch.zeros(count, 3)))
+    with pytest.raises(SceneError, match=f"{said} to start from, of at least 4"):
+        FacadeModel._seed_points(model)  # pyright: ignore[reportArgumentType]
+
+
+def test_without_shell_maps_in_any_training_view_there_are_no_seeds():
+    empty = view()
+    empty.shell.mask[:] = False
+    for views in ([empty], []):
+        assert [len(each) for each in seeds_of(views)] == [0, 0, 0, 0]
+
+
+def test_a_method_with_seeds_is_an_error_without_shell_maps(scene, tmp_path):
+    shutil.rmtree(scene / "cues" / "shell")
+    with pytest.raises(SystemExit, match="run `shellgs cast SCENE` first"):
+        trainer_of(scene, tmp_path, "shellgs_metric")
+
+
+def sky_view(mask: torch.Tensor | None = None) -> SkyView:
+    """A view along z, red above and blue below."""
+    image = torch.zeros(HEIGHT, WIDTH, 3)
+    image[: HEIGHT // 2, :, 0] = image[HEIGHT // 2 :, :, 2] = 1
+    return SkyView(
+        camera((1.0, 0.0, 0.0)), image, torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool) if mask is None else mask
+    )
+
+
+def skybox_of(views: list[SkyView], count: int = 500):
+    points = np.array([[1.0, 0.0, 3.0]] * 200 + [[1.0, 0.0, 100.0]])  # an outlier among points 3 away
+    return skybox_seeds(views, len(views) * WIDTH * HEIGHT, points, count)
+
+
+def test_a_skybox_is_spread_evenly_over_a_sphere_around_the_cameras():
+    count, centre, radius = 500, [1, 0, 0], SKYBOX_RADIUS * 3
+    seeds = skybox_of([sky_view()], count)
+    np.testing.assert_allclose(np.linalg.norm(seeds.points - centre, axis=1), radius)
+    np.testing.assert_allclose(seeds.points + radius * seeds.normals, np.tile(centre, (count, 1)), atol=1e-9)
+    cell = radius * np.sqrt(4 * np.pi / count)  # side of a square of each point's share of the sphere
+    neighbours = KDTree(seeds.points).query(seeds.points, k=2)[0][:, 1]
+    assert 0.75 * cell < neighbours.min() <= neighbours.max() < 1.2 * cell
+    # every direction, not only those near a point, is within two standard deviations of a Gaussian
+    directions = np.random.default_rng(0).normal(size=(10_000, 3))
+    on_sphere = centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    assert (KDTree(seeds.points).query(on_sphere)[0] < 2 * 0.5 * seeds.spacing[0]).all()
+
+
+def test_a_skybox_has_the_colours_of_the_directions_that_views_show():
+    seeds = skybox_of([sky_view()], 2000)
+    x, y, z = (seeds.points - [1, 0, 0]).T / (SKYBOX_RADIUS * 3)
+    visible = (z > 0.5) & (abs(x / z) < 0.5 * WIDTH / FOCAL) & (abs(y / z) < 0.5 * HEIGHT / FOCAL)
+    assert visible.sum() > 20
+    np.testing.assert_allclose(seeds.colours[visible & (y < -0.1)], [[1, 0, 0]] * (visible & (y < -0.1)).sum())
+    np.testing.assert_allclose(seeds.colours[visible & (y > 0.1)], [[0, 0, 1]] * (visible & (y > 0.1)).sum())
+
+
+def test_masked_pixels_do_not_colour_a_skybox():
+    mask = torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    assert [len(each) for each in skybox_of([sky_view(mask)])] == [0, 0, 0, 0]
+    mask[: HEIGHT // 2] = True
+    np.testing.assert_allclose(skybox_of([sky_view(mask)]).colours, [[1, 0, 0]] * 500)
+
+
+def test_a_run_starts_with_a_skybox_coloured_off_the_shell(eager, pristine_scene, tmp_path):
+    def choose(config):
+        config.pipeline.model.seeds, config.pipeline.model.skybox_seeds = "none", 300
+
+    trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
+    model, data = model_of(trainer), data_of(trainer)
+    n, seeds = model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs")).num_points, data.skybox_seeds(300)
+    assert model.num_points - n == 300
+    torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
+    torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+    for batch in data.cached_train:
+        batch["image"] = torch.where(batch["shell_mask"], torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
+    np.testing.assert_array_equal(data.skybox_seeds(300).colours, [[0, 0, 1]] * 300)
+
+
+def test_pruning_by_size_spares_the_skybox(eager, pristine_scene, tmp_path):
+    def choose(config):
+        config.pipeline.model.skybox_seeds = 1000
+
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=choose)
+    model, optimizers = model_of(trainer), trainer.optimizers.optimizers
+    n, strategy = model.num_points, model.strategy
+    assert isinstance(strategy, SkyboxStrategy)
+    strategy.prune_opa = 0.0
+    model.scales.data[:5], model.scales.data[5:300] = 0.0, -5.0  # as large as the region of the cameras, and small
+    strategy._prune_gs(model.gauss_params, optimizers, model.strategy_state, strategy.reset_every + 1)
+    assert model.num_points == n - 5
+    assert model.strategy_state["scene_scale"] == 1.0

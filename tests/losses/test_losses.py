@@ -1,0 +1,473 @@
+"""The losses against loops over pixels in float64, and their invariances."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from kornia.metrics import ssim as kornia_ssim
+from scipy.ndimage import gaussian_filter, sobel
+from torch.autograd import gradcheck
+
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.depth_normals import normals_along_rays
+from shellgs_method.losses import (
+    ExponentialDecay,
+    NccLoss,
+    NormalLoss,
+    PhotometricLoss,
+    PointToPlaneLoss,
+    SmoothnessLoss,
+    flattening_loss,
+    ncc_loss,
+    normal_consistency_loss,
+    normal_loss,
+    photometric_loss,
+    point_to_plane_loss,
+    smoothness_loss,
+    vid2sim_ncc_loss,
+)
+from shellgs_method.losses.ssim import SsimTarget, ssim
+from shellgs_method.machine import compilation
+from shellgs_method.machine.compilation import run_fused
+
+HEIGHT, WIDTH = 14, 17
+
+
+@pytest.fixture
+def random() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def some_mask(random: torch.Generator) -> torch.Tensor:
+    mask = torch.rand(HEIGHT, WIDTH, 1, generator=random) < 0.8
+    mask[:, :4] = False
+    return mask
+
+
+def some_normals(random: torch.Generator) -> torch.Tensor:
+    return torch.randn(HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+
+
+def wall(normal: tuple[float, float, float], distance: float = 8.0) -> torch.Tensor:
+    """z-depth of the plane n · x = -distance, seen at 96 x 64 pixels with a focal length of 100."""
+    K = torch.tensor([[100.0, 0, 48], [0, 100, 32], [0, 0, 1]], dtype=torch.float64)
+    n = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    rays = Camera(torch.eye(4, dtype=torch.float64), K, 96, 64).rays()
+    return (-distance / (rays @ n))[..., None]
+
+
+def yawed(degrees: float) -> torch.Tensor:
+    return wall((math.sin(math.radians(degrees)), 0.0, -math.cos(math.radians(degrees))))
+
+
+def ncc_by_patches(x, y, mask, window=9, min_valid=0.5, eps=1e-4) -> float:
+    """NCC loss patch by patch, with NumPy's correlation coefficient."""
+    x, y, mask = (t[..., 0].numpy() for t in (x, y, mask))
+    half, losses = window // 2, []
+    for row, column in np.argwhere(mask):
+        patch = np.s_[max(row - half, 0) : row + half + 1, max(column - half, 0) : column + half + 1]
+        inside = mask[patch]
+        a, b = x[patch][inside].astype(np.float64), y[patch][inside].astype(np.float64)
+        if inside.sum() >= min_valid * window**2 and b.std() > eps * b.mean():
+            losses.append(1 - np.corrcoef(a, b)[0, 1])
+    return float(np.mean(losses))
+
+
+# D
+
+
+@pytest.mark.parametrize("window", [3, 7, 9])
+def test_ncc_equals_numpys_correlation_of_each_patch(random, window):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) * 0.1 + 0.1
+    mask = some_mask(random)
+    torch.testing.assert_close(ncc_loss(x, y, mask, window).item(), ncc_by_patches(x, y, mask, window))
+
+
+def test_ncc_is_accurate_in_float32_for_patches_that_vary_by_a_thousandth(random):
+    # 1/8 with a deviation of 1/8000: E[x²] - E[x]² in float32 would be wrong by a tenth.
+    x, y = 0.125 + 0.000125 * torch.randn(2, HEIGHT, WIDTH, 1, generator=random)
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    expected = ncc_by_patches(x, y, mask, eps=1e-4)
+    assert ncc_loss(x, y, mask, eps=1e-4).item() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.1, 0.0), (1.0, 0.05), (3.0, -0.1)])
+def test_ncc_ignores_scale_and_offset_of_the_render(random, scale, offset):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) + 0.5
+    mask = some_mask(random)
+    torch.testing.assert_close(ncc_loss(scale * x + offset, y, mask), ncc_loss(x, y, mask))
+
+
+def test_ncc_depends_on_the_direction_of_a_planes_tilt_not_on_its_amount():
+    mask = torch.ones(64, 96, 1, dtype=torch.bool)
+    shell = 1 / yawed(30)
+    assert ncc_loss(1 / yawed(55), shell, mask).item() == pytest.approx(0.0, abs=1e-9)
+    # Tilted the other way, the two slopes are opposite: NCC -1. About the other axis they are orthogonal: NCC 0.
+    assert ncc_loss(1 / yawed(-30), shell, mask).item() == pytest.approx(2.0, abs=1e-9)
+    inner = torch.zeros_like(mask)
+    inner[8:-8, 8:-8] = True
+    pitched = 1 / wall((0.0, 0.5, -0.866))
+    assert ncc_loss(pitched, shell, inner, min_valid=1.0).item() == pytest.approx(1.0, abs=1e-9)
+
+
+def test_ncc_ignores_the_patches_of_a_frontal_wall():
+    rendered, shell = (1 / yawed(30)).requires_grad_(), 1 / yawed(0)
+    loss = ncc_loss(rendered, shell, torch.ones(64, 96, 1, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(loss, rendered)
+    assert loss.item() == 0.0
+    assert not gradient.any()
+
+
+def test_ncc_loss_of_a_flat_render_is_one_with_a_finite_gradient():
+    rendered = torch.full((64, 96, 1), 0.1, requires_grad=True)
+    loss = ncc_loss(rendered, (1 / yawed(30)).float(), torch.ones(64, 96, 1, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(loss, rendered)
+    assert loss.item() == pytest.approx(1.0, abs=1e-6)
+    assert gradient.isfinite().all()
+    assert gradient.any()
+
+
+def test_ncc_ignores_pixels_outside_the_mask(random):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random) + 0.5
+    mask = some_mask(random)
+    loss = ncc_loss(x, y, mask)
+    assert ncc_loss(x.where(mask, torch.inf), y.where(mask, torch.nan), mask) == loss
+
+
+def test_the_gradient_of_the_ncc_loss_matches_finite_differences(random):
+    x, y = torch.rand(2, 5, 6, 1, generator=random, dtype=torch.float64) + 0.5
+    mask = torch.rand(5, 6, 1, generator=random) < 0.8
+    assert gradcheck(lambda x: ncc_loss(x, y, mask, window=3), x.requires_grad_())
+
+
+def test_vid2sim_ncc_equals_its_formula_pixel_by_pixel(random):
+    x, y = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) * 0.01 + 0.1
+    mask = some_mask(random)
+    padded = [np.pad((t * mask)[..., 0].numpy(), 1) for t in (x, y)]
+    patches = [np.array([p[i : i + 3, j : j + 3].ravel() for i in range(HEIGHT) for j in range(WIDTH)]) for p in padded]
+    p, g = (patch - patch.mean() for patch in patches)
+    deviation = np.sqrt((p**2).mean(1)) * np.sqrt((g**2).mean(1))
+    expected = (1 - (p * g).sum(1) / (deviation + 1e-5) / 9).mean()
+    assert vid2sim_ncc_loss(x, y, mask).item() == pytest.approx(expected, abs=1e-12)
+
+
+# N
+
+
+def test_normal_loss_equals_a_loop_over_pixels(random):
+    normal, target, mask = 3 * some_normals(random), some_normals(random), some_mask(random)
+    terms = [
+        1 - a @ b / np.linalg.norm(a) / np.linalg.norm(b)
+        for a, b in zip(normal[mask[..., 0]].numpy(), target[mask[..., 0]].numpy(), strict=True)
+    ]
+    assert normal_loss(normal, target, mask).item() == pytest.approx(np.mean(terms), abs=1e-12)
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(0, 0.0), (60, 0.5), (90, 1.0), (180, 2.0)])
+def test_normal_loss_of_a_known_angle_is_signed(degrees, expected):
+    angle = math.radians(degrees)
+    target = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3, 3)
+    normal = torch.tensor([math.sin(angle), 0.0, -math.cos(angle)]).expand(2, 3, 3)
+    assert normal_loss(normal, target, torch.ones(2, 3, 1, dtype=torch.bool)).item() == pytest.approx(
+        expected, abs=1e-6
+    )
+
+
+def test_normal_loss_of_a_missing_normal_has_a_finite_gradient():
+    normal = torch.zeros(2, 3, 3, requires_grad=True)
+    target = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3, 3)
+    (gradient,) = torch.autograd.grad(normal_loss(normal, target, torch.ones(2, 3, 1, dtype=torch.bool)), normal)
+    assert gradient.isfinite().all()
+
+
+def test_the_gradient_of_the_normal_loss_matches_finite_differences(random):
+    normal, target, mask = some_normals(random), some_normals(random), some_mask(random)
+    assert gradcheck(lambda normal: normal_loss(normal, target, mask), normal.requires_grad_())
+
+
+# C
+
+
+def test_smoothness_equals_a_loop_over_pixels(random):
+    normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    mask[3, 5] = mask[9, 9:12] = False
+    depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    n = torch.nn.functional.normalize(normal, dim=-1).numpy()
+    z, m = depth[..., 0].numpy(), mask[..., 0].numpy()
+    steepness = np.hypot(sobel(z, 0), sobel(z, 1)) / 8 / z
+    pixels = [
+        (i, j) for i in range(1, HEIGHT - 1) for j in range(1, WIDTH - 1) if m[i - 1 : i + 2, j - 1 : j + 2].all()
+    ]
+    g = np.array([steepness[p] for p in pixels])
+    w = 1 - (g - g.min()) / (g.max() - g.min())
+    a = np.array([1 - 0.5 * (n[i, j] @ n[i, j - 1] + n[i, j] @ n[i - 1, j]) for i, j in pixels])
+    assert smoothness_loss(normal, depth, mask).item() == pytest.approx((w * a).sum() / w.sum(), abs=1e-12)
+
+
+def test_smoothness_ignores_pairs_across_the_edge_of_the_mask():
+    # Two walls at a right angle; the column between them is not in the mask.
+    normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
+    normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    depth = torch.full((HEIGHT, WIDTH, 1), 5.0)
+    assert smoothness_loss(normal, depth, mask) > 0
+    mask[:, WIDTH // 2] = False
+    assert smoothness_loss(normal, depth, mask) == 0
+
+
+def test_smoothness_sees_no_edge_at_missing_depth(random):
+    normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    mask[:, :5] = False
+    depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    missing = smoothness_loss(normal, depth.where(mask, 0.0), mask)
+    torch.testing.assert_close(missing, smoothness_loss(normal, depth, mask))
+
+
+def test_smoothness_is_free_at_the_strongest_depth_edge():
+    # The normals change at the only step of the depth, where w = 0.
+    normal = torch.tensor([0.0, 0.0, -1.0]).repeat(HEIGHT, WIDTH, 1)
+    normal[:, WIDTH // 2 :] = torch.tensor([-1.0, 0.0, 0.0])
+    depth = torch.full((HEIGHT, WIDTH, 1), 5.0)
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    flat = smoothness_loss(normal, depth, mask)
+    depth[:, WIDTH // 2 :] = 5.01
+    assert smoothness_loss(normal, depth, mask).item() < 0.01 * flat.item()
+
+
+def test_smoothness_does_not_depend_on_the_unit_of_length(random):
+    normal, mask = some_normals(random), some_mask(random)
+    mask[4:10, 6:12] = True
+    depth = 5 + torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    torch.testing.assert_close(smoothness_loss(normal, 100 * depth, mask), smoothness_loss(normal, depth, mask))
+
+
+def test_the_gradient_of_smoothness_matches_finite_differences(random):
+    normal, mask = torch.randn(5, 6, 3, generator=random, dtype=torch.float64), torch.ones(5, 6, 1, dtype=torch.bool)
+    depth = 5 + torch.rand(5, 6, 1, generator=random, dtype=torch.float64)
+    assert gradcheck(lambda normal: smoothness_loss(normal, depth, mask), normal.requires_grad_())
+
+
+# R
+
+
+def ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Wang et al. 2004, with SciPy's Gaussian of 11 taps and kornia's reflected border."""
+
+    def blur(image):
+        return gaussian_filter(image, sigma=(1.5, 1.5, 0), radius=5, mode="mirror")
+
+    mean_a, mean_b = blur(a), blur(b)
+    variance_a, variance_b = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2
+    covariance = blur(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
+    return luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
+
+
+def test_photometric_loss_is_l1_and_one_minus_ssim(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    l1, ssim = np.abs(a.numpy() - b.numpy()).mean(), ssim_map(a.numpy(), b.numpy()).mean()
+    assert photometric_loss(a, b).item() == pytest.approx(0.8 * l1 + 0.2 * (1 - ssim), abs=1e-9)
+
+
+def test_ssim_and_its_gradient_match_kornia(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    slope = torch.randn(HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    ours = ssim(a.requires_grad_(), SsimTarget.of(b))
+    theirs = kornia_ssim(a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None], window_size=11)[0].permute(1, 2, 0)
+    torch.testing.assert_close(ours, theirs)
+    gradients = [torch.autograd.grad((slope * each).sum(), a)[0] for each in (ours, theirs)]
+    torch.testing.assert_close(*gradients)
+
+
+def test_photometric_loss_averages_over_the_mask_only(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random, dtype=torch.float64)
+    mask = some_mask(random)
+    kept, shown = mask[..., 0].numpy(), a.where(mask, b).numpy()
+    l1, ssim = np.abs(a.numpy() - b.numpy())[kept].mean(), ssim_map(shown, b.numpy())[kept].mean()
+    assert photometric_loss(a, b, mask).item() == pytest.approx(0.8 * l1 + 0.2 * (1 - ssim), abs=1e-9)
+
+
+def test_photometric_loss_has_no_gradient_outside_the_mask(random):
+    a, b = torch.rand(2, HEIGHT, WIDTH, 3, generator=random)
+    mask = some_mask(random)
+    (gradient,) = torch.autograd.grad(photometric_loss(a.requires_grad_(), b, mask), a)
+    assert not gradient[~mask[..., 0]].any()
+    assert gradient[mask[..., 0]].any()
+
+
+# beyond the paper
+
+
+def slanted_wall(depth: float, yaw: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Depth, normals and rays of a wall at ``depth`` along the optical axis, turned by ``yaw``."""
+    K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+    rays = Camera(torch.eye(4, dtype=torch.float64), K, WIDTH, HEIGHT).rays()
+    normal = torch.tensor([math.sin(yaw), 0.0, -math.cos(yaw)], dtype=torch.float64)
+    z = depth * normal[2] / (rays @ normal)[..., None]
+    return z, normal.expand(HEIGHT, WIDTH, 3), rays
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.2])
+def test_point_to_plane_is_the_distance_of_two_parallel_walls(yaw):
+    """At any viewing angle: walls 0.3 units apart along the axis are 0.3 cos(yaw) apart."""
+    target, normal, rays = slanted_wall(8.0, yaw)
+    loss = point_to_plane_loss(
+        slanted_wall(8.3, yaw)[0],
+        target,
+        normal,
+        rays,
+        torch.ones_like(target).bool(),
+        metres_per_unit=2.0,
+        tolerance=0.05,
+    )
+    assert float(loss) == pytest.approx(math.log(1 + 0.6 * math.cos(yaw) - 0.05))
+
+
+def test_the_point_to_plane_gradient_is_zero_within_the_tolerance_and_falls_with_distance():
+    target, normal, rays = slanted_wall(8.0, 0.5)
+    distances = torch.tensor([0.04, 0.5, 5.0], dtype=torch.float64, requires_grad=True)
+    mask = torch.ones_like(target).bool()
+    losses = [
+        point_to_plane_loss(target - d / math.cos(0.5), target, normal, rays * 0 + rays[7, 8], mask, tolerance=0.05)
+        for d in distances
+    ]
+    near, middle, far = torch.autograd.grad(sum(losses), distances)[0].tolist()  # pyright: ignore
+    assert near == 0
+    assert middle > 3 * far > 0
+
+
+def test_the_loss_of_all_splats_is_positive_even_if_their_mean_depth_is_right():
+    """Half of the weight lies 0.3 in front of the wall and half 0.3 behind: the mean depth is the wall's."""
+    target, normal, rays = slanted_wall(8.0, 0.5)
+    loss = PointToPlaneLoss(target, normal, rays, torch.ones_like(target).bool(), metres_per_unit=2.0, tolerance=0.05)
+    offset, alpha = 0.3 / (rays * normal).sum(-1, keepdim=True).abs(), torch.ones_like(target)
+    assert float(loss(target)) == 0
+    assert float(loss.of_all(offset.square(), alpha)) == pytest.approx(0.2 * math.log(1 + (0.6 - 0.05) / 0.2))
+    # Half of the weight on the wall, the rest passing through: as if that were a metre behind.
+    assert float(loss.of_all(0 * target, alpha / 2)) == pytest.approx(0.2 * math.log(1 + (0.5**0.5 - 0.05) / 0.2))
+
+
+def test_the_gradient_of_the_loss_of_all_splats_is_right_and_finite_on_the_wall(random):
+    target, normal, rays = slanted_wall(8.0, 0.5)
+    loss = PointToPlaneLoss(target, normal, rays, some_mask(random), tolerance=0.05)
+    squares, alpha = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    assert torch.autograd.gradcheck(loss.of_all, (squares.requires_grad_(), alpha.requires_grad_()))
+    zero = torch.zeros_like(target, requires_grad=True)
+    assert torch.autograd.grad(loss.of_all(zero, torch.ones_like(target)), zero)[0].isfinite().all()
+
+
+def test_normal_consistency_equals_its_formula_pixel_by_pixel(random):
+    normal, depth_normal = some_normals(random), some_normals(random)
+    alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    expected = np.mean(
+        [1 - alpha[v, u, 0] * (normal[v, u] @ depth_normal[v, u]) for v in range(HEIGHT) for u in range(WIDTH)]
+    )
+    assert float(normal_consistency_loss(normal, depth_normal, alpha)) == pytest.approx(expected)
+
+
+def test_normal_consistency_has_no_gradient_to_alpha(random):
+    alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64).requires_grad_()
+    normal = some_normals(random).requires_grad_()
+    loss = normal_consistency_loss(normal, some_normals(random), alpha)
+    assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
+
+
+def test_flattening_shrinks_only_the_thinnest_axis_of_visible_gaussians():
+    scales = torch.tensor([[1.0, 2.0, 3.0], [6.0, 4.0, 5.0], [0.1, 0.1, 0.2]], requires_grad=True)
+    loss = flattening_loss(scales, torch.tensor([True, True, False]))
+    assert loss.item() == 2.5
+    (gradient,) = torch.autograd.grad(loss, scales)
+    assert gradient.tolist() == [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0]]
+
+
+def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[str, tuple]:
+    """Every compiled loss of a view of the given size, and a rendered map for it."""
+    mask = torch.rand(height, width, 1, generator=random) < 0.9
+    x, y = 0.125 + 0.001 * torch.randn(2, height, width, 1, generator=random)
+    a, b, normal, target = torch.rand(4, height, width, 3, generator=random) - 0.5
+    K = torch.tensor([[50.0, 0, width / 2], [0, 50, height / 2], [0, 0, 1]])
+    rays = Camera(torch.eye(4), K, width, height).rays()
+
+    def normals(depth):
+        return run_fused(normals_along_rays, depth, rays, varying=2)
+
+    return {
+        "photometric": (PhotometricLoss(b + 0.5), a + 0.5),
+        "photometric, masked": (PhotometricLoss(b + 0.5, mask), a + 0.5),
+        "ncc": (NccLoss(x, mask), y),
+        "normal": (NormalLoss(target, mask), normal),
+        "smoothness": (SmoothnessLoss(x, mask), normal),
+        "point to plane": (PointToPlaneLoss(x, target, rays, mask), y),
+        "empty space": (partial(PointToPlaneLoss(x, target, rays, mask).of_all, alpha=b[..., :1] + 0.5), y),
+        "normals of depth": (lambda depth: (target * normals(depth)).sum(), y),
+        "normal consistency": (lambda normal: normal_consistency_loss(normal, target, x, mask), normal),
+    }
+
+
+def test_compiled_losses_match_plain_torch_at_all_image_sizes(compiler):
+    compilation._compiled.cache_clear()
+    for size in [(30, 40), (37, 61), (52, 33)]:
+        losses = losses_of_a_view(*size, torch.Generator().manual_seed(1))
+        n_kernels = compilation._compiled.cache_info().currsize
+        for name, (loss, rendered) in losses.items():
+            rendered.requires_grad_()
+            value = loss(rendered)
+            (gradient,) = torch.autograd.grad(value, rendered)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv("SHELLGS_COMPILE", "0")
+                again = losses_of_a_view(*size, torch.Generator().manual_seed(1))[name][0]
+                plain = again(rendered)
+                torch.testing.assert_close(value, plain, rtol=1e-5, atol=1e-6, msg=name)
+                expected = torch.autograd.grad(plain, rendered)[0]
+                torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+        assert not compilation._failed
+        assert size == (30, 40) or compilation._compiled.cache_info().currsize == n_kernels
+    assert n_kernels == 10
+
+
+@pytest.mark.parametrize(
+    ("loss", "channels"),
+    [
+        (ncc_loss, 1),
+        (vid2sim_ncc_loss, 1),
+        (normal_loss, 3),
+        (lambda n, t, m: smoothness_loss(n, t[..., :1], m), 3),
+        (photometric_loss, 3),
+    ],
+    ids=["ncc", "vid2sim ncc", "normal", "smoothness", "photometric"],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_empty_mask_gives_a_differentiable_zero(random, loss, channels, dtype):
+    rendered, target = torch.rand(2, HEIGHT, WIDTH, channels, generator=random, dtype=dtype)
+    value = loss(rendered.requires_grad_(), target, torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool))
+    (gradient,) = torch.autograd.grad(value, rendered)
+    assert value.item() == 0.0
+    assert value.dtype == dtype
+    assert not gradient.any()
+
+
+def test_depth_weight_falls_from_a_half_to_a_tenth():
+    weight = ExponentialDecay(0.5, 0.1)
+    # 0.5 · 0.2^(1/2) = 0.2236
+    assert [weight(t) for t in (0, 0.5, 1, 2)] == pytest.approx([0.5, 0.2236068, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1])
+def test_equal_initial_and_final_weights_are_constant(value):
+    weight = ExponentialDecay(value, value)
+    assert [weight(t) for t in (0, 0.3, 1)] == pytest.approx([value] * 3)
+
+
+def test_a_weight_that_starts_at_0_stays_0():
+    assert [ExponentialDecay(0.0, 0.1)(t) for t in (0, 0.5, 1)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("ends", [(0.5, -0.1), (float("nan"), 0.1), (0.1, float("inf")), (0.5, 0.0)])
+def test_negative_or_infinite_weights_and_decay_to_0_are_errors(ends):
+    with pytest.raises(ValueError, match="a loss weight"):
+        ExponentialDecay(*ends)

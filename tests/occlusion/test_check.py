@@ -1,0 +1,474 @@
+"""Check of the shell against photographs: occluders are found, and a correct shell is confirmed."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+from PIL import Image
+from scipy.ndimage import binary_dilation
+from scipy.spatial import KDTree
+from training_runs import data_of, model_of, small_disk, trainer_of
+from viser import SceneApi
+
+from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
+from shellgs_method.evaluation import Rendering
+from shellgs_method.evaluation.regions import reference_errors, reference_maps, regions
+from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
+from shellgs_method.occlusion import check as checking
+from shellgs_method.occlusion.check import _told_apart
+from shellgs_method.occlusion.colours import ColourModel
+from shellgs_method.occlusion.contradiction import (
+    ALONE,
+    CONFIRMED,
+    CONTRADICTED,
+    MOVES,
+    OFFSETS,
+    OFFSETS_BEHIND,
+    REFLECTED,
+    Agreement,
+    ShellView,
+    Sweep,
+    _better_half,
+    agreement,
+    neighbours,
+    sides,
+    sweep,
+)
+from shellgs_method.viewer import ContradictedShell
+
+WIDTH, HEIGHT = 144, 64
+K = torch.tensor([[160.0, 0, WIDTH / 2], [0, 160, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
+WALL = 8.0
+
+
+def camera_at(x: float) -> Camera:
+    """A camera at z = 0 that looks along z."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 3] = -x
+    return Camera(viewmat, K, WIDTH, HEIGHT)
+
+
+def painted(points: np.ndarray, seed: int) -> np.ndarray:
+    """Colours of a plane's points: a sum of waves, the same from all directions."""
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(0, 6, (24, 2)), rng.uniform(0, 2 * np.pi, 24), rng.normal(0, 0.09, (24, 3))
+    return 0.5 + np.sin(points[..., :2] @ waves[0].T + waves[1]) @ waves[2]
+
+
+def street(
+    cameras: list[Camera], post: float | None = None, mirror: float | None = None
+) -> list[tuple[ShellView, np.ndarray]]:
+    """Views of a painted wall, optionally with a post in front of it or a mirror in it, and masks of the post."""
+    views = []
+    for camera in cameras:
+        rays, position = camera.rays().numpy(), camera.position.numpy()
+        image = painted(position + WALL * rays, 0)
+        if mirror is not None:
+            pane = np.abs((position + WALL * rays)[..., 0]) < 1.5
+            image[pane] = painted(position + mirror * WALL * rays, 1)[pane]
+        before = np.zeros(image.shape[:2], bool)
+        if post is not None:
+            place = position + post * rays
+            before = np.abs(place[..., 0] - 0.3) < 0.4
+            image[before] = painted(place, 2)[before]
+        pixels = torch.from_numpy((image.clip(0, 1) * 255).round().astype(np.uint8))
+        views.append((ShellView(camera, pixels, torch.full((HEIGHT, WIDTH), WALL)), before))
+    return views
+
+
+def image_with(view: ShellView, mask: np.ndarray, colour: list[int]) -> ShellView:
+    """The view with a mask in one colour."""
+    image = view.image.numpy().copy()
+    image[mask] = colour
+    return replace(view, image=torch.from_numpy(image))
+
+
+CAMERAS = [camera_at(x) for x in np.linspace(-2.5, 2.5, 9)]
+
+
+MIDDLE = len(CAMERAS) // 2
+
+
+def agreed(views: list[ShellView], judged: int = MIDDLE) -> tuple[Sweep, Agreement]:
+    """Sweep and agreement of one view."""
+    sweeps = [sweep(view, [other for other in views if other is not view]) for view in views]
+    beside = [index for index in range(len(views)) if index != judged]
+    found_there = [sweeps[k] for k in beside]
+    return sweeps[judged], agreement(views[judged], sweeps[judged], [views[k] for k in beside], found_there)
+
+
+def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Sweep score, agreed score and depth of the middle view."""
+    found, both = agreed(views)
+    return found.score.float(), both.score, WALL / (1 + found.offset)
+
+
+@pytest.mark.parametrize("depth", [7.0, 5.0, 3.5])
+def test_a_post_in_front_of_the_wall_is_found_at_its_depth(depth: float):
+    views = street(CAMERAS, post=depth)
+    _, score, found = scores([view for view, _ in views])
+    before, contradicted = views[len(views) // 2][1], score.numpy() > CONTRADICTED
+    both = (before & contradicted).sum()
+    assert both / before.sum() > 0.9
+    assert both / contradicted.sum() > 0.8
+    inverse = WALL / np.median(found.numpy()[before & contradicted]) - 1
+    assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # one step of the offsets
+
+
+def test_what_photographs_do_not_count_for_is_found_nowhere():
+    """A strip of the wall that is ignored in every photograph, and painted over, is neither contradicted nor beyond."""
+    ignored = np.zeros((HEIGHT, WIDTH), bool)
+    ignored[:, :20], ignored[20:40, 60:90] = True, True
+    counts = torch.from_numpy(~ignored)
+    whole = [view for view, _ in street(CAMERAS, post=5.0)]
+    views = [
+        replace(image_with(v, ignored, [255, 0, 255]), depth=v.depth.where(counts, 0.0), kept=counts) for v in whole
+    ]
+    found, both = agreed(views)
+    assert (found.score[ignored] == -1).all()
+    assert (both.score[ignored] == -1).all()
+    assert not both.beyond[ignored].any()
+    spread = np.asarray(binary_dilation(ignored, iterations=6), bool)  # the window of the filter that smooths scores
+    _, unspoilt = agreed(whole)
+    agree = (both.score > CONTRADICTED) == (unspoilt.score > CONTRADICTED)
+    assert agree.numpy()[np.logical_not(spread)].mean() > 0.97
+
+
+def test_what_a_mirror_shows_is_found_behind_the_wall():
+    views = [view for view, _ in street(CAMERAS, mirror=1 / 0.6)]
+    found = sweep(views[MIDDLE], views[:MIDDLE] + views[MIDDLE + 1 :], OFFSETS_BEHIND)
+    pane = np.abs(WALL * CAMERAS[MIDDLE].rays().numpy()[..., 0]) < 1.5
+    behind = found.score.numpy() > REFLECTED
+    assert behind[pane].mean() > 0.6
+    assert behind[~pane].mean() < 0.1
+    np.testing.assert_allclose(np.median(found.offset.numpy()[pane & behind]), -0.4, rtol=0.1)
+
+
+def test_a_wall_that_agrees_with_the_shell_is_confirmed():
+    swept, score, _ = scores([view for view, _ in street(CAMERAS)])
+    assert (score > CONTRADICTED).float().mean() < 0.002
+    assert (swept < CONFIRMED).float().mean() > 0.8
+
+
+def test_a_mirror_shows_farther_things_and_does_not_contradict_the_shell():
+    _, score, _ = scores([view for view, _ in street(CAMERAS, mirror=2.5)])
+    assert (score > CONTRADICTED).float().mean() < 0.01
+
+
+def test_colours_tell_a_dark_post_from_the_wall():
+    masks = [before for _, before in street(CAMERAS, post=5.0)]
+    views = [image_with(view, mask, [30, 20, 25]) for (view, _), mask in zip(street(CAMERAS), masks, strict=True)]
+    model = ColourModel(views, [sweep(view, [other for other in views if other is not view]) for view in views])
+    for view, mask in zip(views, masks, strict=True):
+        ratio = model.log_ratio(view.image)
+        assert (ratio[mask] > 2).all()
+        assert ratio[~mask].median() < 0
+
+
+def test_colours_say_nothing_where_nothing_is_in_front_of_the_shell():
+    views = [view for view, _ in street(CAMERAS)]
+    sweeps = [Sweep(torch.full((HEIGHT, WIDTH), -0.1), torch.zeros(HEIGHT, WIDTH)) for _ in views]
+    assert ColourModel(views, sweeps).log_ratio(views[0].image).abs().max() < 1e-5
+
+
+def test_the_ratio_of_colours_is_that_of_their_shares():
+    """Two colours far apart: the one fills 3/4 of the pixels in front of the shell and 1/4 of those on it."""
+    image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
+    score = torch.full((HEIGHT, WIDTH), -0.1)
+    score[:, WIDTH // 2 :] = CONTRADICTED + 0.1
+    image[: HEIGHT // 4, : WIDTH // 2] = 200
+    image[: 3 * HEIGHT // 4, WIDTH // 2 :] = 200
+    view = ShellView(camera_at(0.0), image, torch.full((HEIGHT, WIDTH), WALL))
+    ratio = ColourModel([view], [Sweep(score, score)]).log_ratio(image)
+    light = (0.75 + 0.01 * 0.25) / 1.01 / 0.25
+    dark = (0.25 + 0.01 * 0.75) / 1.01 / 0.75
+    expected = torch.where(image[..., 0] > 0, np.log(light), np.log(dark))
+    torch.testing.assert_close(ratio, expected.float(), atol=1e-3, rtol=0)
+
+
+def with_passer_by(views: list[ShellView]) -> tuple[list[ShellView], np.ndarray]:
+    """The views with something in front of the wall in the middle one alone, and its mask there."""
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[20:, 60:85] = True
+    return [image_with(view, mask, [60, 40, 160]) if k == MIDDLE else view for k, view in enumerate(views)], mask
+
+
+def test_a_passer_by_is_alone_in_its_photograph():
+    views, mask = with_passer_by([view for view, _ in street(CAMERAS)])
+    alone = agreed(views)[1].alone.numpy() > ALONE
+    assert (alone & mask).sum() / mask.sum() > 0.9
+    assert (alone & mask).sum() / alone.sum() > 0.9
+    for judged in (MIDDLE - 1, MIDDLE + 2):
+        assert (agreed(views, judged)[1].alone > ALONE).float().mean() < 0.002
+
+
+def test_another_exposure_is_not_something_that_moved():
+    views = [view for view, _ in street(CAMERAS)]
+    brighter = (1.4 * views[MIDDLE].image.float()).clamp(0, 255).to(torch.uint8)
+    views[MIDDLE] = replace(views[MIDDLE], image=brighter)
+    assert (agreed(views)[1].alone > ALONE).float().mean() < 0.002
+
+
+def test_where_other_photographs_differ_too_nothing_has_moved():
+    alone = agreed([view for view, _ in street(CAMERAS, mirror=2.5)])[1].alone
+    assert (alone > ALONE).float().mean() < 0.02
+
+
+def test_an_object_either_moved_or_stands():
+    """Two objects: of one, most pixels are alone; of the other, most are contradicted."""
+    static, alone = torch.zeros(2, 4, 12, dtype=torch.bool).numpy()
+    static[:, 0], alone[:, 1:4] = True, True
+    static[:, 7:10], alone[:, 10] = True, True
+    stands, moved = _told_apart(static, alone)
+    columns = np.arange(12)
+    assert (moved == (columns < 4)).all()
+    assert (stands == ((columns >= 7) & (columns < 10))).all()
+
+
+@pytest.mark.parametrize("offset", [OFFSETS[3], OFFSETS[8]])
+def test_chosen_neighbours_are_on_both_sides_and_have_the_wanted_parallax(offset: float):
+    view, others = camera_at(0.0), [camera_at(x) for x in np.linspace(-12, 12, 200)]
+    chosen = neighbours(view, sides(view, others), WALL, offset)
+    assert {side for _, side in chosen} == {0, 1}
+    for index, side in chosen:
+        x = float(others[index].position[0])
+        assert (x > 0) == (side == 1)
+        pixels = 160 * abs(x) * ((1 + offset) / WALL - 1 / WALL)
+        assert pixels == pytest.approx(MOVES, rel=0.25)
+
+
+def test_the_better_half_is_the_weighted_mean_of_the_lowest_costs():
+    costs = torch.tensor([0.9, 0.1, torch.nan, 0.3, 0.5]).view(5, 1, 1)
+    weights = torch.tensor([1.0, 1.0, 1.0, 0.5, 1.5]).view(5, 1, 1)
+    # Half of the weight that counts is 2: all of 0.1's, all of 0.3's, and half a unit of 0.5's.
+    expected = (1.0 * 0.1 + 0.5 * 0.3 + 0.5 * 0.5) / 2
+    assert _better_half(costs, weights).item() == pytest.approx(expected)
+
+
+def check(scene: Path):
+    config = FacadeDataParserConfig(data=scene)
+    return check_views(scene, read_views(config), held_out_names(config))
+
+
+def contents(scene: Path) -> dict[str, bytes]:
+    """Depth and mask of every map, as bytes."""
+    maps = {}
+    for path in sorted((scene / "cues/checked").rglob("*.npz")):
+        with np.load(path) as file:
+            maps[path.stem] = file["depth"].tobytes() + file["mask"].tobytes()
+    return maps
+
+
+def test_maps_are_made_once_and_again_only_if_missing(scene: Path):
+    first = check(scene)
+    assert (first.checked, first.skipped) == (10, 0)
+    before = contents(scene)
+    assert not [path for path in (scene / "cues/checked").iterdir() if path.name.startswith(".")]
+    again = check(scene)
+    assert (again.checked, again.skipped) == (0, 10)
+    next((scene / "cues/checked").rglob("*00004.png.npz")).unlink()
+    mended = check(scene)
+    assert (mended.checked, mended.skipped) == (1, 9)
+    assert contents(scene) == before
+
+
+def test_photographs_larger_than_the_maps_are_compared_at_their_own_size(shellgs, scene: Path, monkeypatch):
+    sizes, original = set(), checking.sweep
+
+    def noting(view, others, *offsets):
+        sizes.update(each.camera.width for each in (view, *others))
+        return original(view, others, *offsets)
+
+    monkeypatch.setattr(checking, "sweep", noting)
+    shellgs("cast", scene, "--max-image-size", 24)
+    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    assert sizes == {view.camera.width}
+    assert CueMaps.open(scene, "checked").require(view.name, view.camera.shrunk(24)).depth.shape[1] == 24
+
+
+def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
+    """A wall below a white sky, whose shell is 6 pixels too high and has a hole; in one view, a wall is behind it."""
+    sky, wall = np.s_[:20], np.full((HEIGHT, WIDTH), WALL, np.float32)
+    wall[:14] = wall[40:50, 60:70] = 0
+    shell, views = CueMaps.create(tmp_path, "shell", command="cast"), []
+    for index, (view, _) in enumerate(street(CAMERAS)):
+        image = view.image.numpy().copy()
+        image[sky] = 250
+        if index == MIDDLE:
+            image[:20, 60:80] = image[20:40, 60:80]
+        name = f"{index}.png"
+        Image.fromarray(image).save(tmp_path / name)
+        views.append(View(name, tmp_path / name, view.camera))
+        shell.write(name, CueMap(wall, np.zeros((HEIGHT, WIDTH, 3), np.float16), wall > 0), view.camera)
+    assert check_views(tmp_path, views, []).contradicted == pytest.approx(6 / 50, abs=0.03)
+    checked, inside = CueMaps.open(tmp_path, "checked"), wall > 0
+    inside[sky] = False
+    for view in views:
+        found = Findings.of(checked.require(view.name, view.camera), shell.require(view.name, view.camera))
+        assert (found.beyond == ((wall > 0) & ~inside)).mean() > 0.99
+        assert not (found.occluder | found.moved)[sky].any()
+        assert found.occluder.mean() < 0.01
+
+
+def test_a_checked_map_says_what_a_pixel_shows():
+    shell = np.full((1, 6), 8, np.float32)
+    depth, hidden = np.array([[5, 8, 16, 8, 16, 0]], np.float32), np.array([[True] * 3 + [False] * 3])
+    normal = np.zeros((1, 6, 3), np.float16)
+    found = Findings.of(CueMap(depth, normal, hidden), CueMap(shell, normal, shell > 0))
+    assert [mask[0].tolist() for mask in found] == np.eye(5, 6, dtype=bool).tolist()
+
+
+def test_a_full_disk_raises_an_error_that_says_so(scene: Path):
+    with small_disk(3_000), pytest.raises(OSError, match="File too large") as refusal:
+        check(scene)
+    assert refusal.value.errno == errno.EFBIG
+    assert check(scene).checked == 10
+
+
+def test_the_maps_of_training_views_do_not_depend_on_held_out_photographs(scene: Path):
+    check(scene)
+    before = contents(scene)
+    held_out = sorted(held_out_names(FacadeDataParserConfig(data=scene)))
+    for name in held_out:
+        with Image.open(scene / name) as image:
+            noise = np.random.default_rng(0).integers(0, 255, (*image.size[::-1], 3), dtype=np.uint8)
+        Image.fromarray(noise).save(scene / name)
+    assert check(scene).checked == 10  # the photographs have changed
+    stems = {f"{Path(name).name}" for name in held_out}
+    after = contents(scene)
+    assert {name for name in before if after[name] != before[name]} <= stems
+
+
+def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request():
+    mask = torch.tensor([True] * 7 + [False]).view(1, 8, 1)
+    nearer = torch.tensor([0.0, 1.5] + [0.0] * 6).view(1, 8, 1)
+    batch = {"shell_depth": torch.full((1, 8, 1), 2.0), "shell_normal": torch.zeros(1, 8, 3), "shell_mask": mask}
+    batch |= {"other_depth": nearer, "seen": torch.ones(1, 8, 1, dtype=torch.bool)}
+    beyond = {"beyond": torch.arange(8).view(1, 8, 1) == 6}
+    cpu = torch.device("cpu")
+    assert reference_maps(batch, "shell", cpu).mask.view(-1).tolist() == [False] * 4 + [True] * 3 + [False]
+    assert (reference_maps(batch, "shell", cpu, everywhere=True).mask == mask).all()
+    parts = {name: part.view(-1).tolist() for name, part in regions(batch, 1.0, cpu).items()}
+    assert parts["before_shell"] == [False, True] + [False] * 6
+    assert parts["on_shell"] == [True, False] + [True] * 5 + [False]
+    assert parts["off_shell"] == [False] * 7 + [True]
+    assert reference_maps(batch | beyond, "shell", cpu).mask.view(-1).tolist() == [False] * 8
+    assert (reference_maps(batch | beyond, "shell", cpu, everywhere=True).mask == mask).all()
+    parts = {name: part.view(-1).tolist() for name, part in regions(batch | beyond, 1.0, cpu).items()}
+    assert parts["on_shell"] == [True, False] + [True] * 4 + [False, False]
+    assert parts["off_shell"] == [False] * 6 + [True, True]
+
+
+def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(shellgs, scene: Path, tmp_path: Path):
+    """A square on one training photograph: `shellgs cast` names the photograph; training leaves out the square."""
+    name, square = "images/frame_00006.png", np.s_[10:20, 20:30]
+    with Image.open(scene / name) as photograph:
+        image = np.array(photograph)
+    image[square] = [200, 30, 160]
+    Image.fromarray(image).save(scene / name)
+    assert f"mostly in {name}" in " ".join(shellgs("cast", scene).split())
+    trainer = trainer_of(scene, tmp_path, "shellgs_metric")
+    model, data = model_of(trainer), data_of(trainer)
+    index = [view.name for view in data.train_dataset.views].index(name)
+    batch = next(batch for batch in data.cached_train if batch["image_idx"] == index)
+    losses = model._view_losses(batch, torch.zeros(3))
+    kept = losses.photometric.mask
+    assert kept is not None
+    assert losses.cue is not None
+    left_out = ~kept[..., 0].numpy()
+    assert left_out[square].mean() > 0.9
+    assert left_out.sum() < 2 * 14 * 14  # with a margin of 2 pixels
+    assert losses.cue.cue.mask[..., 0].numpy()[square].mean() > 0.9
+    model.config.ignore_transients = False
+    model._views.clear()
+    assert model._view_losses(batch, torch.zeros(3)).photometric.mask is None
+
+
+def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
+    """A wall at z = 8; 8 of 10 cameras show a box 1 m in front of its middle."""
+    views = [View(f"{k}.png", tmp_path / f"{k}.png", camera_at(0.1 * k)) for k in range(10)]
+    shell, checked = (CueMaps.create(tmp_path, kind, command="cast") for kind in ("shell", "checked"))
+    normal = np.zeros((HEIGHT, WIDTH, 3), np.float16)
+    for k, view in enumerate(views):
+        x = (view.camera.rays().numpy() * WALL)[..., 0] + 0.1 * k
+        box = (np.abs(x) < 0.4) & (k < 8)
+        wall = np.full((HEIGHT, WIDTH), WALL, np.float32)
+        shell.write(view.name, CueMap(wall, normal, wall > 0), view.camera)
+        checked.write(view.name, CueMap(np.where(box, 7, 0).astype(np.float32), normal, box), view.camera)
+    places = np.array([[0.0, 0, WALL], [1.0, 0, WALL], [0.0, 0, 7.0], [0.0, 100.0, WALL]])
+    verdicts = shell_verdicts(tmp_path, views, places)
+    assert verdicts.seen.tolist() == [10, 10, 0, 0]  # one is not on the shell, one is in no image
+    assert verdicts.contradicted.tolist() == [8, 0, 0, 0]
+    slant = np.hypot(1, 0.35 / WALL)  # of the median camera's ray
+    assert verdicts.distance[0] == pytest.approx(slant, rel=1e-3)
+    assert np.isnan(verdicts.distance[1:]).all()
+    assert verdicts.share == 0.5
+    assert verdicts.witness in [view.name for view in views[:8]]
+    assert verdicts.contradicted[0] >= MANY
+
+    spread = shell_verdicts(tmp_path, views)
+    contradicted = np.abs(spread.places[:, 0]) < 0.35
+    assert (spread.contradicted[contradicted] > 0).all()
+    spread.write(tmp_path / "places.ply")
+    cloud = trimesh.load(tmp_path / "places.ply")
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert np.asarray(cloud.colors)[contradicted, 1].max() < 100
+
+
+def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scene, tmp_path, monkeypatch):
+    """Places at the cameras' positions, which nerfstudio transforms to its own world."""
+    scene = tmp_path / "scene"
+    shutil.copytree(pristine_scene, scene)
+    views = read_views(FacadeDataParserConfig(data=scene))
+    (scene / CONTRADICTED_PLACES).parent.mkdir(parents=True)
+    places, red = positions(view.camera for view in views), np.full((len(views), 3), [255, 0, 0], np.uint8)
+    trimesh.PointCloud(places, red).export(scene / CONTRADICTED_PLACES)
+
+    def with_viewer(config):
+        config.vis = "viewer"
+        config.get_base_dir().mkdir(parents=True)
+
+    add, shown = SceneApi.add_point_cloud, {}
+
+    def noting(self, name, points, *args, **kwargs):
+        shown[name] = points, kwargs
+        return add(self, name, points, *args, **kwargs)
+
+    monkeypatch.setattr(SceneApi, "add_point_cloud", noting)
+    trainer = trainer_of(scene, tmp_path, "photo_gs", change=with_viewer)
+    points, settings = shown[ContradictedShell.LAYER]
+    data = trainer.pipeline.datamanager
+    poses = [dataset.cameras.camera_to_worlds for dataset in (data.train_dataset, data.eval_dataset)]
+    trainer.shutdown()
+    distance, _ = KDTree(points / VISER_NERFSTUDIO_SCALE_RATIO).query(torch.cat(poses)[..., 3].numpy())
+    assert len(points) == len(views)
+    assert distance.max() < 1e-3
+    assert not settings["visible"]
+
+
+def test_surfaces_are_measured_on_the_shell_and_in_front_of_it():
+    """A wall with something 1 m in front of its right half, which the rendering lacks."""
+    camera, size = camera_at(0.0), (HEIGHT, WIDTH, 1)
+    wall, everywhere = torch.full(size, WALL), torch.ones(size, dtype=torch.bool)
+    truth = torch.where(torch.arange(WIDTH)[None, :, None] < WIDTH // 2, wall, wall - 1)
+    normal = torch.tensor([0.0, 0, -1]).expand(HEIGHT, WIDTH, 3)
+    batch = {"seen": everywhere}
+    for kind, depth in (("shell", wall), ("truth", truth)):
+        batch |= {f"{kind}_depth": depth, f"{kind}_normal": normal, f"{kind}_mask": everywhere}
+    metrics = reference_errors(Rendering(wall, wall, torch.ones(size), normal), camera, batch, 1.0)
+    assert metrics["truth_f_score_5cm_on_shell"] == pytest.approx(1)
+    assert metrics["truth_f_score_5cm_before_shell"] == 0
+    assert list(metrics)[-2:] == ["truth_f_score_5cm_on_shell", "truth_f_score_5cm_before_shell"]  # in every process
+    assert 0.4 < metrics["truth_f_score_5cm"] < 0.6
+    assert not [name for name in metrics if name.startswith("f_score") and name.endswith("shell")]

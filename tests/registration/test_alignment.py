@@ -1,0 +1,1035 @@
+"""Alignments and their validation: closed forms, known truths, and mistakes that must be caught."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from scenes import write_colmap
+from scipy.spatial.transform import Rotation
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.errors import SceneError
+from shellgs_method.export.runs import TrainedRun
+from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.photographs import View, to_camera
+from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.files.undistortion import undistort
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.lens import Lens
+from shellgs_method.geometry.precision import mesh_step
+from shellgs_method.geometry.similarity import fit_similarity, transformed
+from shellgs_method.registration import proposal
+from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
+from shellgs_method.registration.picks import Pick, align_picks, read_picks, triangulate
+from shellgs_method.registration.positions import SurveyedPositions, align_positions, read_positions
+from shellgs_method.registration.proposal import Candidate
+from shellgs_method.registration.proposal import _main_wall as main_wall
+from shellgs_method.registration.refinement import refine
+from shellgs_method.registration.repetition import facade_axes, scan_shifts
+from shellgs_method.registration.report import shell_edges, write_report
+from shellgs_method.registration.validation import LIMITS, Limit, validate
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, cast_views, load_shell
+from shellgs_method.shell import alignment as alignment_module
+from shellgs_method.shell.raycast import ShellCaster
+from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera
+from shellgs_method.synthetic.path import walk
+
+OPAQUE = Path(__file__).parents[2] / "docs/picture.jpg"
+"""Any photograph: validation looks whether it is transparent."""
+TRUTH = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
+AXES = SHELL_FROM_BUILDING[:3, :3] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).T  # columns: right, up, out
+
+
+@pytest.fixture(scope="module")
+def mesh() -> ShellMesh:
+    """The shell of a facade of five bays and three storeys, in national coordinates."""
+    triangles = shell(Layout(5, 3))
+    return ShellMesh(transformed(triangles.vertices, SHELL_FROM_BUILDING), triangles.triangles)
+
+
+@pytest.fixture(scope="module")
+def surface(mesh: ShellMesh) -> ShellSurface:
+    return ShellSurface(mesh)
+
+
+@pytest.fixture(scope="module")
+def survey_from_scene(surface: ShellSurface) -> np.ndarray:
+    """The true similarity, which every start must converge to."""
+    return surface.survey_from_shell @ np.linalg.inv(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def points(mesh: ShellMesh, surface: ShellSurface, survey_from_scene: np.ndarray) -> SparsePoints:
+    """1500 points of the front with 1.5 cm of noise, and 150 of the street in front of it, in the scene's frame."""
+    random = np.random.default_rng(1)
+    samples, _ = surface.samples(20_000)
+    in_scene = transformed(samples, np.linalg.inv(survey_from_scene))
+    front = transformed(in_scene, np.linalg.inv(SCENE_FROM_BUILDING))
+    front = front[front[:, 1] < 0.26][:1500]
+    noisy = front + random.normal(0, 0.015, front.shape)
+    clutter = random.uniform([0, -9, -0.1], [15, -1, 3], (150, 3))
+    return SparsePoints(transformed(np.concatenate([noisy, clutter]), SCENE_FROM_BUILDING))
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    """Ten views of 96 x 64 pixels, without photographs."""
+    cameras = walk(15.0, 10, 96, 64, np.random.default_rng(0))
+    return [View(f"images/{k}.png", OPAQUE, scene_camera(camera)) for k, camera in enumerate(cameras)]
+
+
+def displaced(metres: float, degrees: float, growth: float, seed: int) -> np.ndarray:
+    """A similarity that shifts, turns and grows by these amounts, in random directions."""
+    random = np.random.default_rng(seed)
+    shift, turn = (v / np.linalg.norm(v) for v in random.normal(size=(2, 3)))
+    matrix = np.eye(4)
+    matrix[:3, :3] = (1 + growth) * Rotation.from_rotvec(np.radians(degrees) * turn).as_matrix()
+    matrix[:3, 3] = metres * shift
+    return matrix
+
+
+def error(surface: ShellSurface, found: np.ndarray, truth: np.ndarray) -> float:
+    """Mean displacement of the shell, in metres."""
+    moved = transformed(surface.vertices, found @ np.linalg.inv(truth))
+    return float(np.linalg.norm(moved - surface.vertices, axis=1).mean())
+
+
+def shifted(right: float = 0.0, up: float = 0.0, out: float = 0.0) -> Alignment:
+    """The true alignment, with the shell moved by metres."""
+    move = np.eye(4)
+    move[:3, 3] = AXES @ [right, up, out]
+    return Alignment(TRUTH @ move, "shell/facade.ply")
+
+
+def in_its_own_frame(mesh: ShellMesh, points: SparsePoints) -> tuple[Placement, np.ndarray]:
+    """A scene in the shell's national coordinates: the exact placement, and the SfM points."""
+    return Placement(Alignment(np.eye(4), "facade.ply")), transformed(points.positions, np.linalg.inv(TRUTH))
+
+
+# Similarities and refinement
+
+
+def test_refinement_does_not_follow_points_in_single_precision(mesh, views, points):
+    placement, exact = in_its_own_frame(mesh, points)
+    rounded = SparsePoints(exact.astype(np.float32).astype(np.float64))
+    with pytest.raises(
+        SceneError, match=r"--refine .* the SfM points are stored in steps of 0\.031 x 0\.5 x 1\.5e-05 m"
+    ):
+        refined(placement, mesh, views, rounded, 0.3)
+    assert "Refined" in refined(placement, mesh, views, SparsePoints(exact), 0.3).history[-1]
+
+
+def test_points_beyond_the_last_gate_by_rounding_count(surface, points, survey_from_scene):
+    exact = refine(surface, points.positions, survey_from_scene, 0.1).evidence.points
+    assert refine(surface, points.positions, survey_from_scene, 0.1, rounding=0.02).evidence.points > exact
+
+
+def test_decimetres_of_a_shell_are_never_good(mesh, views, points):
+    vertices = mesh.vertices.round(1)
+    rounded = replace(mesh, vertices=vertices, step=mesh_step(vertices, mesh.faces))
+    validation = validate(rounded, shifted(), views, points)
+    assert any("Steps of the coordinates of shell/facade.ply: 0.1 x 0.1" in reason for reason in validation.reasons)
+    assert (validation.metrics()["rounding_m"] or 0.0) >= 0.05
+
+
+def test_an_alignment_is_refused_if_its_cameras_were_rounded_to_metres(mesh, views, points):
+    placement, exact = in_its_own_frame(mesh, points)
+    moved = []
+    for view in views:
+        viewmat = view.camera.viewmat @ torch.from_numpy(TRUTH)
+        viewmat[:3] /= np.cbrt(np.linalg.det(TRUTH[:3, :3]))
+        viewmat[:3, 3] = viewmat[:3, 3].float().double()
+        moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+    validation = validate(mesh, placement.alignment, moved, SparsePoints(exact))
+    assert validation.verdict == "refused"
+    assert validation.reasons[0].startswith("Steps of the cameras: 0.")
+
+
+def test_a_similarity_is_found_from_exact_points():
+    random = np.random.default_rng(0)
+    points = random.normal(size=(4, 3))
+    truth = displaced(3.0, 70.0, 1.5, seed=3)
+    np.testing.assert_allclose(fit_similarity(points, transformed(points, truth)), truth, atol=1e-12)
+
+
+def test_mirrored_points_give_no_mirroring():
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    assert np.linalg.det(fit_similarity(points, points * [1, 1, -1])[:3, :3]) > 0
+
+
+@pytest.mark.parametrize("growth", [-0.01, 0.01])
+def test_refinement_returns_from_30_cm_1_degree_and_1_percent(surface, points, survey_from_scene, growth):
+    start = displaced(0.3, 1.0, growth, seed=5) @ survey_from_scene
+    assert error(surface, start, survey_from_scene) > 0.25
+    found = refine(surface, points.positions, start, reach=1.0)
+    assert error(surface, found.survey_from_scene, survey_from_scene) < 0.006  # 1.5 cm of noise in 1500 points
+    assert not found.evidence.weak.any()
+
+
+def test_a_bare_wall_determines_three_directions_and_leaves_the_other_four_unchanged():
+    corners = np.array([[-8.0, 0, -4], [8, 0, -4], [8, 0, 4], [-8, 0, 4]])
+    surface = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+    random = np.random.default_rng(0)
+    points = random.uniform([-6, 0, -3], [6, 0, 3], (500, 3)) + random.normal(0, 0.01, (500, 1)) * [0, 1, 0]
+    # 20 cm along the wall, which the points do not determine, and 10 cm out of it, which they do.
+    start = np.eye(4)
+    start[:3, 3] = [0.2, 0.1, 0.0]
+    found = refine(surface, points, start, reach=0.5)
+    assert found.evidence.weak.sum() == 4
+    np.testing.assert_allclose(found.survey_from_scene[:3, 3], [0.2, 0, 0], atol=0.005)
+    assert np.cbrt(np.linalg.det(found.survey_from_scene[:3, :3])) == pytest.approx(1, abs=1e-4)
+    words = " ".join(found.evidence.in_words(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])))
+    assert all(word in words for word in ("along the facade", "upwards", "roll", "scale"))
+    assert all(word not in words for word in ("out of the facade", "tilt", "turn"))
+
+
+def test_points_of_something_else_are_refused(surface, survey_from_scene):
+    with pytest.raises(SceneError, match="only 0 SfM points are within 1 m"):
+        refine(surface, np.full((50, 3), 1000.0), survey_from_scene, reach=1.0)
+
+
+# Coarse registration
+
+
+def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface, views, points, survey_from_scene):
+    placement = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0)
+    found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
+    assert placement.proposed
+    assert error(surface, found, survey_from_scene) < 0.02
+
+
+def test_a_proposal_is_right_for_a_shell_tilted_in_its_file(mesh, surface, views, points, survey_from_scene):
+    turned = displaced(0.0, 50.0, 0.0, seed=7)
+    askew = ShellMesh(transformed(mesh.vertices, turned), mesh.faces)
+    alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
+    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ turned)
+    assert error(surface, found, survey_from_scene) < 0.02
+
+
+def test_the_main_wall_is_the_same_in_each_run():
+    """Of a wall as rough as Open3D's segment_plane finds another plane in each of ten runs or so."""
+    random = np.random.default_rng(0)
+    wall = np.stack([random.uniform(0, 20, 3000), random.normal(0, 0.25, 3000), random.uniform(0, 8, 3000)], axis=1)
+    ground = np.stack([random.uniform(0, 20, 2500), random.uniform(-9, 0, 2500), random.normal(0, 0.02, 2500)], axis=1)
+    cameras, up = np.array([[5.0, -10, 2], [15, -10, 2]]), np.array([0.0, 0, 1])
+    found = [main_wall(np.concatenate([ground, wall]), cameras, up) for _ in range(20)]
+    assert len({cloud.axes.tobytes() for cloud in found}) == 1
+    assert np.degrees(np.arccos(-found[0].axes[2, 1])) < 1
+
+
+def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh, views, points, monkeypatch):
+    """As a shell in millimetres gives, if taken for one in metres."""
+    unsupported = [Candidate(np.eye(4), score=0.0)]
+    monkeypatch.setattr(proposal, "_upwards", lambda *_: [])
+    monkeypatch.setattr(proposal, "_refined", lambda *_: unsupported)
+    with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
+        place_by_guess(mesh, views, points, "shell/facade.glb", 1.0)
+
+
+def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
+    layout = Layout(5, 3)
+    openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]
+    random = np.random.default_rng(0)
+    # Window edges of bays 1 and 3 only, on both sides of the door, and the wall between them.
+    corners = [(x, -0.0, z) for x0, x1, z0, z1 in openings for x in (x0, x1) for z in (z0, z1) if 3 < x0 < 12]
+    wall = random.uniform([3.0, 0, 0.3], [12.0, 0, 9.5], (1500, 3))
+    inside = np.zeros(len(wall), bool)
+    for x0, x1, z0, z1 in openings:
+        inside |= (wall[:, 0] > x0) & (wall[:, 0] < x1) & (wall[:, 2] > z0) & (wall[:, 2] < z1)
+    building = np.concatenate([wall[~inside], np.repeat(np.array(corners), 10, axis=0)])
+    building += random.normal(0, 0.01, building.shape)
+    points = SparsePoints(transformed(building, SCENE_FROM_BUILDING))
+    history = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0).history
+    assert any(sentence.startswith("Ambiguous: an alignment") for sentence in history)
+
+
+# Picks
+
+
+def rig(count: int = 3) -> tuple[list[View], np.ndarray]:
+    """Views along a baseline that look along +z, 1000 pixels wide, and their 3x4 projections."""
+    views = []
+    K = torch.tensor([[800.0, 0, 500], [0, 800, 400], [0, 0, 1]], dtype=torch.float64)
+    for k in range(count):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 10.0 * k - 10, degrees=True).as_matrix())
+        viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([2.0 * k - 2, 0.1 * k, 0.0], dtype=torch.float64)
+        views.append(View(f"images/{k}.png", Path(f"{k}.png"), Camera(viewmat, K, 1000, 800)))
+    return views, np.stack([(v.camera.K @ v.camera.viewmat[:3]).numpy() for v in views])
+
+
+def project(projections: np.ndarray, point: np.ndarray) -> np.ndarray:
+    homogeneous = projections @ np.append(point, 1.0)
+    return homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def test_exact_pixels_triangulate_to_their_point():
+    views, projections = rig()
+    point = np.array([0.3, -0.7, 9.0])
+    viewmats, Ks = (np.stack([getattr(v.camera, name).numpy() for v in views]) for name in ("viewmat", "K"))
+    found, errors = triangulate(viewmats, Ks, project(projections, point))
+    np.testing.assert_allclose(found, point, atol=1e-10)
+    np.testing.assert_allclose(errors, 0, atol=1e-8)
+
+
+def test_two_parallel_cameras_triangulate_the_depth_of_the_textbook_formula():
+    # Baseline 2, focal length 800, disparity 160 pixels: depth = 800 * 2 / 160 = 10.
+    views, _ = rig(2)
+    viewmats, Ks = np.stack([np.eye(4)] * 2), np.stack([v.camera.K.numpy() for v in views])
+    viewmats[1, 0, 3] = -2.0
+    found, _ = triangulate(viewmats, Ks, np.array([[580.0, 400.0], [420.0, 400.0]]))
+    np.testing.assert_allclose(found, [1.0, 0.0, 10.0], atol=1e-10)
+
+
+def test_noisy_pixels_are_triangulated_to_the_least_squares_point():
+    from scipy.optimize import least_squares
+
+    views, projections = rig()
+    pixels = project(projections, np.array([0.3, -0.7, 9.0])) + np.array([[1.0, -2], [0, 1.5], [-1, 0.5]])
+    reference = least_squares(lambda x: (project(projections, x) - pixels).ravel(), [0.0, 0, 8], xtol=1e-15, gtol=1e-12)
+    viewmats, Ks = (np.stack([getattr(v.camera, name).numpy() for v in views]) for name in ("viewmat", "K"))
+    np.testing.assert_allclose(triangulate(viewmats, Ks, pixels)[0], reference.x, atol=1e-5)
+
+
+@pytest.fixture
+def rigged(tmp_path: Path) -> tuple[list[View], np.ndarray]:
+    """The rig with photographs on disk, in whose pixels picks are given."""
+    views, projections = rig()
+    Image.new("RGB", (1000, 800)).save(tmp_path / "0.png")
+    return [replace(view, image=tmp_path / "0.png") for view in views], projections
+
+
+def picked(projections: np.ndarray, count: int = 8, noise: float = 0.2) -> tuple[list[Pick], np.ndarray]:
+    """Picks on a shell in national coordinates, and its true alignment."""
+    random = np.random.default_rng(2)
+    scene = random.uniform([-3, -2, 8], [3, 2, 11], (count, 3))
+    truth = displaced(1.0, 50.0, -0.6, seed=1)
+    truth[:3, 3] -= truth[:3, :3] @ [410_000.0, 5_413_000.0, 250.0]
+    on_shell = transformed(scene, np.linalg.inv(truth)) + random.normal(0, 0.005, scene.shape)
+    picks = []
+    for k, (point, image) in enumerate(zip(on_shell, scene, strict=True)):
+        pixels = project(projections, image) + random.normal(0, noise, (3, 2))
+        picks.append(Pick(f"p{k}", point, {f"images/{v}.png": (x, y) for v, (x, y) in enumerate(pixels.tolist())}))
+    return picks, truth
+
+
+def far_off(matrix: np.ndarray, truth: np.ndarray, picks: list[Pick]) -> float:
+    """Largest distance between the picks under two alignments, in shell units."""
+    points = np.stack([pick.shell for pick in picks])
+    scale = np.cbrt(np.linalg.det(truth[:3, :3]))
+    return float(np.linalg.norm(transformed(points, matrix) - transformed(points, truth), axis=1).max() / scale)
+
+
+def test_noisy_picks_give_the_alignment(rigged):
+    views, projections = rigged
+    picks, truth = picked(projections)
+    matrix, points = align_picks(picks, views)
+    assert far_off(matrix, truth, picks) < 0.05
+    assert all(point.is_used for point in points)
+    assert all(point.left_out_residual > point.residual for point in points)  # a fit without it misses it by more
+
+
+def test_a_pick_that_is_2_m_off_is_left_out_and_comes_first(rigged):
+    views, projections = rigged
+    picks, truth = picked(projections)
+    picks[4] = replace(picks[4], shell=picks[4].shell + np.array([2.0, 0, 0]))
+    matrix, points = align_picks(picks, views)
+    assert far_off(matrix, truth, [p for p in picks if p.name != "p4"]) < 0.05
+    assert points[0].name == "p4"
+    assert points[0].residual == pytest.approx(2.0, abs=0.1)
+    assert [point.name for point in points if not point.is_used] == ["p4"]
+
+
+def test_a_pick_with_a_wrong_pixel_is_flagged_and_left_out(rigged):
+    views, projections = rigged
+    picks, truth = picked(projections)
+    x, y = picks[3].pixels["images/2.png"]
+    picks[3] = replace(picks[3], pixels={**picks[3].pixels, "images/2.png": (x, y + 60)})
+    matrix, points = align_picks(picks, views)
+    blurred = next(point for point in points if point.name == "p3")
+    assert not blurred.is_sharp
+    assert not blurred.is_used
+    assert blurred.reprojection > 10
+    assert far_off(matrix, truth, picks) < 0.05
+
+
+def test_check_points_are_measured_and_not_fitted(rigged):
+    views, projections = rigged
+    picks, _ = picked(projections)
+    picks[0] = replace(picks[0], name="check-corner", shell=picks[0].shell + np.array([0.12, 0, 0]))
+    _, points = align_picks(picks, views)
+    check = next(point for point in points if point.held_out)
+    assert not check.is_used
+    assert check.residual == pytest.approx(0.12, abs=0.05)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_too_few_picks_and_picks_on_a_line_are_refused(rigged, count):
+    views, projections = rigged
+    line = np.linspace([-2.0, 0, 9], [2, 0, 9], count)
+    picks = [
+        Pick(str(k), p, {f"images/{v}.png": tuple(xy) for v, xy in enumerate(project(projections, p).tolist())})
+        for k, p in enumerate(line)
+    ]
+    with pytest.raises(SceneError, match="at least 3 are needed" if count == 2 else "on one line"):
+        align_picks(picks, views)
+
+
+def test_a_picks_file_is_read_in_opendronemaps_format(rigged, tmp_path):
+    views, _ = rigged
+    views = [replace(view, image=Path(view.name).with_name(f"photo {k}.png")) for k, view in enumerate(views)]
+    file = tmp_path / "gcp_list.txt"
+    file.write_text(
+        "EPSG:25832\n"
+        '410000.5 5413000.25 251 10.5 20 "photo 0.png" door  # its left top corner\n'
+        "410000.5 5413000.25 251 30 40 images/1.png door\n\n"
+        "1 2 3 50 60 images/0.png\n1 2 3 70 80 images/1.png\n"
+    )
+    door, nameless = read_picks(file, views)
+    assert door.name == "door"
+    assert door.pixels == {"images/0.png": (10.5, 20), "images/1.png": (30, 40)}
+    np.testing.assert_array_equal(door.shell, [410000.5, 5413000.25, 251])
+    assert nameless.pixels["images/1.png"] == (70, 80)
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("1 2 3 4 5", "line 2: expected X Y Z"),
+        ("1 2 3 4 x images/0.png", "line 2: expected X Y Z"),
+        ("1 2 3 4 5 nowhere.png", "nowhere.png is not a photograph of the scene"),
+        ("1 2 9 4 5 images/1.png a", "line 2: the point a has other coordinates"),
+        ("1 2 3 4 5 images/0.png a", "line 2: the point a is picked twice"),
+        ("1 2 3 4 5 images/1.png 'a", "line 2"),
+    ],
+)
+def test_an_invalid_line_of_a_picks_file_is_refused_with_its_number(rigged, tmp_path, line, sentence):
+    (tmp_path / "picks.txt").write_text(f"1 2 3 4 5 images/0.png a\n{line}\n")
+    with pytest.raises(SceneError, match=re.escape(sentence)):
+        read_picks(tmp_path / "picks.txt", rigged[0])
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "1,5 2 3 4 5 images/0.png a",
+        "1.5; 2 3 4 5 images/0.png a",
+        "1,2,3,4,5,images/0.png,a",
+        "x1 2 3 4 5 images/0.png a",
+    ],
+)
+def test_a_slip_in_the_first_line_of_a_picks_file_is_no_header(rigged, tmp_path, first):
+    (tmp_path / "picks.txt").write_text(f"{first}\n1 2 3 4 5 images/1.png a\n")
+    with pytest.raises(SceneError, match="line 1: expected X Y Z of the shell"):
+        read_picks(tmp_path / "picks.txt", rigged[0])
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        "WGS84 UTM 32N",
+        "+proj=tmerc +lat_0=0 +towgs84=598.1,73.7,418.2 +units=m",
+        "X,Y,Z,x,y,image,name",
+        'PROJCS["ETRS89 / UTM 32N",GEOGCS["ETRS89"],PARAMETER["false_easting",500000]]',
+    ],
+)
+def test_a_header_of_a_picks_file_is_skipped(rigged, tmp_path, first):
+    (tmp_path / "picks.txt").write_text(f"{first}\n1 2 3 4 5 images/1.png a\n")
+    assert [pick.name for pick in read_picks(tmp_path / "picks.txt", rigged[0])] == ["a"]
+
+
+@pytest.mark.parametrize("header", ["EPSG:4326", "+proj=longlat +datum=WGS84", "lon,lat,z,x,y,image"])
+def test_a_header_of_degrees_is_refused(rigged, tmp_path, header):
+    (tmp_path / "picks.txt").write_text(f"{header}\n7.86 46.25 3 4 5 images/1.png a\n")
+    with pytest.raises(SceneError, match=r"picks.txt is in degrees \(.*\): convert it"):
+        read_picks(tmp_path / "picks.txt", rigged[0])
+
+
+@pytest.mark.parametrize("name", ["architect's-corner", "l'angle-d'en-haut", "5'-6\"", "p#1", "C:\\corner"])
+def test_signs_inside_a_name_are_part_of_it(rigged, tmp_path, name):
+    (tmp_path / "picks.txt").write_text(f"1 2 3 4 5 images/1.png {name}  # a comment, it's one\n")
+    assert [pick.name for pick in read_picks(tmp_path / "picks.txt", rigged[0])] == [name]
+
+
+def test_picks_are_pixels_of_the_photograph_on_disk(tmp_path):
+    # A pinhole ray through Brown's model with k1 = -0.1: x' = x (1 + k1 r²).
+    calibrated = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+    lens = Lens(calibrated, 640, 480, (-0.1, 0, 0, 0, 0, 0))
+    K, image = undistort(lens, np.zeros((480, 640, 3), np.uint8))
+    camera = Camera(torch.eye(4, dtype=torch.float64), torch.from_numpy(K).double(), image.shape[1], image.shape[0])
+    Image.new("RGB", (1280, 960)).save(tmp_path / "a.png")  # twice the calibrated size
+    view = View("a.png", tmp_path / "a.png", camera, lens)
+    x, y = 0.3, -0.2
+    factor = 1 - 0.1 * (x * x + y * y)
+    stored = 2 * np.array([[500 * factor * x + 320, 500 * factor * y + 240]])
+    expected = [camera.K[0, 0] * x + camera.K[0, 2], camera.K[1, 1] * y + camera.K[1, 2]]
+    np.testing.assert_allclose(to_camera(view, stored)[0], expected, atol=1e-3)
+
+
+# Camera positions
+
+
+ORIGIN = np.array([410_000.0, 5_413_000.0, 250.0])
+
+
+def surveyed(count: int = 20, noise: float = 0.02, bow: float = 2.0) -> tuple[SurveyedPositions, np.ndarray]:
+    """Cameras on a walk of 24 m that deviates from a line by ``bow`` metres, in national coordinates, and the truth."""
+    random = np.random.default_rng(4)
+    along = np.linspace(-1, 1, count)
+    walk = np.stack([12 * along, bow * along**2, 0.1 * bow * np.sin(7 * along)], axis=1)
+    truth = displaced(1.0, 50.0, -0.6, seed=1)
+    truth[:3, 3] -= truth[:3, :3] @ ORIGIN
+    views = []
+    for k, position in enumerate(transformed(walk + ORIGIN, truth)):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, 3] = torch.from_numpy(-position)
+        views.append(View(f"images/{k}.jpg", Path(f"{k}.jpg"), Camera(viewmat, torch.eye(3), 8, 8)))
+    shell = walk + ORIGIN + random.normal(0, noise, walk.shape)
+    return SurveyedPositions(views, shell, ()), truth
+
+
+def at_the_wall(found: np.ndarray, truth: np.ndarray) -> float:
+    """Largest displacement of a wall of 20 x 10 m, 12 m from the walk, in shell units."""
+    wall = np.array([[x, 12.0, z] for x in (-10.0, 10.0) for z in (0.0, 10.0)]) + ORIGIN
+    scale = np.cbrt(np.linalg.det(truth[:3, :3]))
+    return float(np.linalg.norm(transformed(wall, found) - transformed(wall, truth), axis=1).max() / scale)
+
+
+def test_exact_camera_positions_give_the_alignment_to_a_tenth_of_a_millimetre():
+    positions, truth = surveyed(noise=0.0)
+    found, cameras, play = align_positions(positions)
+    assert at_the_wall(found, truth) < 1e-4  # doubles in national coordinates are good to a nanometre
+    assert cameras[0].residual < 1e-6
+    assert play < 1e-5
+
+
+def test_rtk_camera_positions_give_the_alignment_within_their_play():
+    positions, truth = surveyed(noise=0.02)
+    found, cameras, play = align_positions(positions)
+    assert all(camera.is_used for camera in cameras)
+    # 2 cm over a breadth of 0.6 m (root mean square) and 20 cameras: 0.02 / (0.6 √20) = 0.4°.
+    assert play == pytest.approx(0.4, rel=0.3)
+    assert at_the_wall(found, truth) < 2.5 * np.radians(play) * np.hypot(12, 10)
+
+
+def test_the_play_is_the_standard_deviation_of_the_rotation_about_the_path():
+    turns, plays = [], []
+    for seed in range(40):
+        positions, truth = surveyed(count=10, noise=0.0)
+        noise = np.random.default_rng(seed).normal(0, 0.02, positions.shell.shape)
+        found, _, play = align_positions(replace(positions, shell=positions.shell + noise))
+        both = np.linalg.inv(found)[:3, :3] @ truth[:3, :3]
+        turns.append(Rotation.from_matrix(both / np.cbrt(np.linalg.det(both))).as_rotvec(degrees=True)[0])
+        plays.append(play)
+    assert np.std(turns) == pytest.approx(np.mean(plays), rel=0.35)  # of 40: 11 % standard error
+
+
+def test_a_camera_that_lost_its_fix_is_left_out_and_comes_first():
+    positions, truth = surveyed()
+    positions.shell[7] += [3.0, -1.0, 0.5]
+    found, cameras, play = align_positions(positions)
+    assert [camera.name for camera in cameras if not camera.is_used] == ["images/7.jpg"]
+    assert cameras[0].name == "images/7.jpg"
+    assert cameras[0].residual == pytest.approx(np.linalg.norm([3.0, -1.0, 0.5]), abs=0.1)
+    assert at_the_wall(found, truth) < 2.5 * np.radians(play) * np.hypot(12, 10)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"bow": 0.0}, "camera positions lie on one line, about which the shell can turn: add photographs"),
+        ({"bow": 0.0, "noise": 0.3}, "lie on one line"),  # by the cameras in the scene, which are exact
+        ({"count": 2}, "2 photographs of the scene have a position: at least 3 are needed"),
+        ({"noise": 2.0}, "of 20 camera positions agree with the photographs within 0.15 m: they must be accurate"),
+    ],
+    ids=["a straight walk", "a straight walk and a poor survey", "two", "a telephone"],
+)
+def test_camera_positions_that_do_not_determine_the_alignment_are_refused(settings, sentence):
+    with pytest.raises(SceneError, match=sentence):
+        align_positions(surveyed(**settings)[0])
+
+
+@pytest.mark.parametrize("first", ["EPSG:25832\n", "WGS84 UTM 32N\n", "+proj=utm +zone=32 +units=m +no_defs\n", ""])
+def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
+    views = [replace(view, image=Path(view.name).with_name(f"photo {k}.jpg")) for k, view in enumerate(rig()[0])]
+    (tmp_path / "geo.txt").write_text(
+        first + '"photo 0.jpg" 410000.125 5413000.25 251 0 0 0 0.02 0.03\n\n'
+        "images/2.png 410001 5413000 251  # the last one\nlost.jpg 1 2 3\n"
+    )
+    positions = read_positions(tmp_path / "geo.txt", views)
+    assert [view.name for view in positions.views] == ["images/0.png", "images/2.png"]
+    np.testing.assert_array_equal(positions.shell, [[410000.125, 5413000.25, 251], [410001, 5413000, 251]])
+    assert positions.unknown == ["lost.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("EPSG:4326", "is in degrees (EPSG:4326): convert it"),
+        ("#name,lat,lon,alt\nimages/0.png,1,2,3", "line 2: expected the image"),
+        ("images/0.png 1,5 2 3", "line 1: expected the image"),
+        ("EPSG:25832\nimages/0.png 1 2", "line 2: expected the image, then X Y Z"),
+        ("EPSG:25832\nimages/0.png 1 2 nan", "line 2: expected the image"),
+        ("images/0.png 1 2 3\nimages/0.png 1 2 3", "line 2: images/0.png has a position already"),
+        ("images/0.png 1 2 3\n'images/1.png 1 2 3", "line 2"),
+    ],
+)
+def test_an_invalid_line_of_a_positions_file_is_refused_with_its_number(rigged, tmp_path, line, sentence):
+    (tmp_path / "geo.txt").write_text(line)
+    with pytest.raises(SceneError, match=re.escape(sentence)):
+        read_positions(tmp_path / "geo.txt", rigged[0])
+
+
+# The bay test
+
+
+def test_the_sizes_of_bays_and_storeys_are_measured_on_the_shell(surface, points, survey_from_scene):
+    along, upwards = scan_shifts(surface, transformed(points.positions, survey_from_scene), AXES.T)
+    assert along.period in (pytest.approx(BAY, abs=0.1), pytest.approx(2 * BAY, abs=0.1))  # columns: every second bay
+    assert upwards.period == pytest.approx(STOREY, abs=0.1)
+
+
+def test_a_shell_shifted_by_a_bay_fits_better_a_bay_back(surface, points, survey_from_scene):
+    placed = transformed(points.positions, survey_from_scene)
+    along, _ = scan_shifts(surface, placed, AXES.T)
+    assert along.elsewhere[1] < 0.9
+    along, _ = scan_shifts(surface, placed + BAY * AXES[:, 0], AXES.T)
+    shift, fit = along.elsewhere
+    assert shift == pytest.approx(BAY, abs=0.15)
+    assert fit > 1.1
+
+
+def test_the_axes_of_a_facade_are_upright_even_if_the_cameras_look_up():
+    normals = np.array([[0.0, -1, 0]] * 8 + [[1.0, 0, 0]] * 3 + [[0, 0, 1.0]] * 20)
+    axes = facade_axes(normals, np.array([0.0, 0.3, 0.95]))
+    np.testing.assert_allclose(axes, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+
+
+# The verdict
+
+
+@pytest.mark.parametrize(
+    ("alignment", "verdict", "reason"),
+    [
+        (shifted(), "good", None),
+        (shifted(out=-0.05), "doubtful", "Bias along the normal"),
+        (shifted(right=0.05), "doubtful", "Motion that would fit the points better"),
+        (shifted(right=BAY), "refused", "along the facade"),
+        (shifted(right=-2 * BAY), "refused", "along the facade"),
+        (shifted(up=STOREY), "refused", "upwards"),
+        (replace(shifted(), metres_per_shell_unit=1000.0), "refused", "units"),
+        (replace(shifted(), metres_per_shell_unit=0.001), "refused", "units"),
+        (
+            Alignment(TRUTH @ np.diag([1000.0, 1000, 1000, 1]), "shell/facade.ply"),
+            "refused",
+            "Views that see the shell",
+        ),
+    ],
+    ids=["true", "5 cm in", "5 cm aside", "a bay", "two bays", "a storey", "kilometres", "millimetres", "1000 x"],
+)
+def test_the_verdict_names_what_is_wrong(mesh, views, points, alignment, verdict, reason):
+    validation = validate(mesh, alignment, views, points)
+    assert validation.verdict == verdict, validation.reasons
+    assert reason is None or any(reason in sentence for sentence in validation.reasons)
+
+
+def test_limits_work_from_both_sides_and_refuse_nan():
+    below, above = Limit(0.1, 0.5, ""), Limit(0.6, 0.3, "")
+    assert [below.verdict(v) for v in (0.1, 0.2, 0.6, np.nan)] == ["good", "doubtful", "refused", "refused"]
+    assert [above.verdict(v) for v in (0.6, 0.5, 0.2, np.nan)] == ["good", "doubtful", "refused", "refused"]
+    assert all(limit.why for limit in LIMITS.values())
+
+
+def test_the_bias_is_the_distance_of_the_wall(mesh, views, points):
+    # The shell is 5 cm deeper: wall points are 5 cm in front of it, points of reveals and undersides of slabs on it.
+    assert 0.03 < validate(mesh, shifted(out=-0.05), views, points).bias < 0.05
+    assert validate(mesh, shifted(), views, points).bias == pytest.approx(0.0, abs=0.003)
+
+
+# Report and command
+
+
+def test_edges_are_at_outlines_steps_and_bends_but_not_on_a_slanted_plane():
+    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", 40, degrees=True).as_matrix())
+    plane = ShellMesh(
+        np.array([[-99.0, -99, 9], [99, -99, 9], [99, 99, 9], [-99, 99, 9]]), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    assert not shell_edges(ShellCaster(plane, np.eye(4)).cast(Camera(viewmat, K, 64, 48)), 1.0).any()
+    # A plate 10 cm in front of the plane, from -1 to 1: with a focal length of 60 and a depth of 9 it ends at 32 ± 6.7.
+    corners = np.array([[-1.0, -1, 8.9], [1, -1, 8.9], [1, 1, 8.9], [-1, 1, 8.9]])
+    both = ShellMesh(np.concatenate([plane.vertices, corners]), np.concatenate([plane.faces, plane.faces + 4]))
+    edges = shell_edges(ShellCaster(both, np.eye(4)).cast(Camera(torch.eye(4, dtype=torch.float64), K, 64, 48)), 1.0)
+    assert set(np.flatnonzero(edges[24])) == {24, 25, 38, 39}
+
+
+def test_a_crease_is_an_edge_and_the_noise_of_triangles_beside_it_is_not():
+    # Two walls of 2 x 2 m that meet at a right angle in the middle of the image, in triangles of 4 cm, 3 pixels.
+    u, v = np.meshgrid(np.linspace(-2, 2, 101), np.linspace(-2, 2, 101))
+    noise = np.random.default_rng(0).normal(0, 0.01, u.shape)
+    vertices = np.stack([u / np.sqrt(2), v, 8 - np.abs(u) / np.sqrt(2) + noise], axis=-1).reshape(-1, 3)
+    corner = np.arange(101 * 100).reshape(100, 101)[:, :-1].ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 101], corner[:, None] + [1, 102, 101]])
+    K = torch.tensor([[600.0, 0, 80], [0, 600, 60], [0, 0, 1]], dtype=torch.float64)
+    cue = ShellCaster(ShellMesh(vertices, faces), np.eye(4)).cast(
+        Camera(torch.eye(4, dtype=torch.float64), K, 160, 120)
+    )
+    edges = shell_edges(cue, 1.0)
+    neighbours = np.einsum("hwc,hwc->hw", cue.normal[:, 1:].astype(float), cue.normal[:, :-1].astype(float))
+    beside = np.abs(np.arange(160) - 79.5) > 8
+    assert (neighbours < np.cos(np.radians(25)))[:, beside[1:]].mean() > 0.1  # edges of a threshold alone
+    assert edges[:, beside].mean() < 0.02
+    assert edges[1:-1, 76:84].any(axis=1).mean() > 0.7
+
+
+def test_a_matrix_is_validated_reported_and_written(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    shift = np.array([412_000.0, 5_123_000.0, 0.0])
+    unshifted = true.shell_to_scene.copy()
+    unshifted[:3, 3] += unshifted[:3, :3] @ shift  # for coordinates minus the shift, as CloudCompare has them
+    (scene / "matrix.txt").write_text("\n".join(" ".join(f"{value:.12f}" for value in row) for row in unshifted))
+    (scene / ALIGNMENT).unlink()
+    shell = scene / true.shell
+    output = shellgs("align", scene, shell, "--matrix", scene / "matrix.txt", "--global-shift", *(-shift))
+    assert "Verdict: good" in output or "Verdict: doubtful" in output
+    written = Alignment.load(scene / ALIGNMENT)
+    np.testing.assert_allclose(
+        written.apply(load_shell(shell).vertices), true.apply(load_shell(shell).vertices), atol=1e-4
+    )
+    assert written.verdict in output
+    assert (written.metrics["within_10cm"] or 0) > 0.5
+    page = (scene / REPORT / "index.html").read_text()
+    assert f"Verdict: <b>{written.verdict}</b>" in page
+    assert re.findall(r'(?:src|href)="(?!data:)', page) == []
+    assert "http" not in page
+    assert len(list((scene / REPORT).glob("view_*.png"))) >= 6
+    assert json.loads((scene / REPORT / "validation.json").read_text())["verdict"] == written.verdict
+
+
+def test_picks_and_refinement_give_the_alignment_and_residuals(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    corners = [(o.x0, 0.0, o.z0) for o in Layout(6, 3).openings] + [(o.x1, 0.0, o.z1) for o in Layout(6, 3).openings]
+    building = np.array(corners)
+    on_shell = transformed(building, SHELL_FROM_BUILDING)
+    lines = []
+    for view in read_views(FacadeDataParserConfig(data=scene)):
+        projection = (view.camera.K @ view.camera.viewmat[:3]).numpy()
+        for k, point in enumerate(transformed(building, SCENE_FROM_BUILDING)):
+            x, y, z = projection @ np.append(point, 1)
+            if z > 0 and 0 < x / z < view.camera.width and 0 < y / z < view.camera.height:
+                lines.append((k, f"{' '.join(map(str, on_shell[k]))} {x / z} {y / z} {view.name} p{k}"))
+    seen = [k for k, _ in lines]
+    picks = scene / "picks.txt"
+    picks.write_text("\n".join(line for k, line in lines if seen.count(k) >= 4))
+    (scene / ALIGNMENT).unlink()
+    output = shellgs("align", scene, scene / true.shell, "--picks", picks, "--refine", 0.3)
+    assert "picks are used" in output
+    assert "Refined against" in output
+    written = Alignment.load(scene / ALIGNMENT)
+    vertices = load_shell(scene / true.shell).vertices
+    moved = np.linalg.norm(written.apply(vertices) - true.apply(vertices), axis=1).mean() * true.metres_per_unit
+    assert moved < 0.05  # 300 SfM points, some of them on parts missing in the shell: flowers, railings, frames
+    assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
+
+
+def test_camera_positions_give_the_alignment_and_name_missing_photographs(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    lines = ["EPSG:25832", "IMG_0001.jpg 0 0 0"]
+    for k, view in enumerate(read_views(FacadeDataParserConfig(data=scene))):
+        position = transformed(view.camera.position.double().numpy(), np.linalg.inv(true.shell_to_scene))
+        position[0] += 2.0 if k == 3 else 0.0
+        lines.append(f"{Path(view.name).name} {' '.join(map(str, position))}")
+    (scene / "geo.txt").write_text("\n".join(lines))
+    (scene / ALIGNMENT).unlink()
+    output = shellgs("align", scene, scene / true.shell, "--positions", scene / "geo.txt")
+    assert "9 of 10 camera positions are used" in output
+    assert "In geo.txt but not in the scene: IMG_0001.jpg" in output
+    assert "left out" in output
+    written = Alignment.load(scene / ALIGNMENT)
+    np.testing.assert_allclose(written.shell_to_scene, true.shell_to_scene, rtol=1e-6)
+    assert written.source == "camera positions in geo.txt"
+    assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
+
+
+def test_a_refused_alignment_does_not_replace_the_saved_one(scene, shellgs):
+    before = (scene / ALIGNMENT).read_bytes()
+    true = Alignment.load(scene / ALIGNMENT)
+    (scene / "off.json").write_text(json.dumps((true.shell_to_scene @ np.diag([1e3, 1e3, 1e3, 1])).tolist()))
+    output = shellgs("align", scene, scene / true.shell, "--matrix", scene / "off.json")
+    assert "the alignment is refused" in output
+    assert (scene / ALIGNMENT).read_bytes() == before
+    assert "Verdict: <b>refused</b>" in (scene / REPORT / "index.html").read_text()
+
+
+def test_a_proposal_becomes_the_alignment_only_with_accept(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    (scene / ALIGNMENT).unlink()
+    assert "--accept" in shellgs("align", scene, scene / true.shell)
+    assert not (scene / ALIGNMENT).exists()
+    assert "Written" in shellgs("align", scene, "--accept")
+    assert Alignment.load(scene / ALIGNMENT).places_like(Alignment.load(scene / PROPOSAL))
+
+
+def test_validating_a_cast_alignment_writes_its_metrics_and_the_maps_error(scene, shellgs):
+    before = Alignment.load(scene / ALIGNMENT)
+    assert before.error is None
+    assert "Written" in shellgs("align", scene)
+    validated = Alignment.load(scene / ALIGNMENT)
+    assert validated.verdict in ("good", "doubtful")
+    assert validated.places_like(before)
+    maps = CueMaps.open(scene, "shell")
+    assert maps.manifest.error == validated.error is not None
+    for view in read_views(FacadeDataParserConfig(data=scene)):
+        assert maps.read(view.name, view.camera) is not None
+    assert "0 views cast, 10 already there" in shellgs("cast", scene)
+
+
+def test_another_alignment_makes_the_maps_stale(scene, shellgs):
+    moved = Alignment.load(scene / ALIGNMENT).shell_to_scene.copy()
+    moved[0, 3] += 0.01
+    np.save(scene / "matrix.npy", moved)
+    assert "Written" in shellgs("align", scene, scene / "shell" / "facade.ply", "--matrix", scene / "matrix.npy")
+    view = read_views(FacadeDataParserConfig(data=scene))[0]
+    with pytest.raises(SceneError, match=r"shell/alignment.json has changed since; run `shellgs cast"):
+        CueMaps.open(scene, "shell").read(view.name, view.camera)
+
+
+def move_cameras(scene: Path, motion: np.ndarray, digits: int = 17) -> None:
+    """Apply a similarity to the scene's frame, as another run of structure from motion does."""
+    transforms = json.loads((scene / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        pose = motion @ np.array(frame["transform_matrix"])
+        pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
+        frame["transform_matrix"] = [[float(f"{x:.{digits}g}") for x in row] for row in pose.tolist()]
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    cloud = trimesh.load(scene / "sparse_pc.ply")
+    cloud.apply_transform(motion).export(scene / "sparse_pc.ply")
+
+
+def scene_views(scene: Path) -> list[View]:
+    return read_views(FacadeDataParserConfig(data=scene))
+
+
+ANOTHER_FRAME = displaced(2.0, 30.0, 0.5, seed=3)
+
+
+def test_an_alignment_is_not_cast_for_other_cameras(scene, shellgs):
+    move_cameras(scene, ANOTHER_FRAME)
+    before = (scene / ALIGNMENT).read_bytes()
+    refusal = shellgs("cast", scene, "--no-check")
+    assert "was found for other cameras" in refusal
+    assert f"run `shellgs align {scene}`" in refusal
+    assert (scene / ALIGNMENT).read_bytes() == before
+
+
+def test_maps_of_an_alignment_to_other_cameras_are_refused_even_if_they_are_of_these(scene):
+    """As training reads them."""
+    bound = (scene / ALIGNMENT).read_bytes()
+    move_cameras(scene, displaced(0.1, 1.0, 0.0, seed=3))
+    views = scene_views(scene)
+    cast_views(scene, views, replace(Alignment.load(scene / ALIGNMENT), cameras=BoundCameras()))
+    (scene / ALIGNMENT).write_bytes(bound)
+    maps = CueMaps.open(scene, "shell")
+    with pytest.raises(SceneError, match=r"aligned to other cameras: .* run `shellgs align .* then `shellgs cast"):
+        maps.check(views[0].name, views[0].camera)
+
+
+def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
+    move_cameras(scene, ANOTHER_FRAME)
+    views = scene_views(scene)
+    halves = [SimpleNamespace(views=views[:5]), SimpleNamespace(views=views[5:])]
+    config = SimpleNamespace(dataparser=SimpleNamespace(data=scene))
+    data: Any = SimpleNamespace(config=config, train_dataset=halves[0], eval_dataset=halves[1])
+    model: Any = None
+    with pytest.raises(SceneError, match="was found for other cameras"):
+        _ = TrainedRun(model, data).shell
+
+
+def test_an_alignment_that_fits_other_cameras_too_is_validated_for_them(scene, shellgs):
+    move_cameras(scene, displaced(0.02, 0.0, 0.0, seed=3))
+    output = shellgs("align", scene)
+    assert "It was found for other cameras than these" in output
+    assert "Written" in output
+    assert Alignment.load(scene / ALIGNMENT).cameras.changed(scene_views(scene)) is None
+
+
+def test_a_proposal_for_other_cameras_is_not_accepted(scene, shellgs):
+    (scene / ALIGNMENT).rename(scene / PROPOSAL)
+    move_cameras(scene, ANOTHER_FRAME)
+    assert "was proposed for other cameras" in shellgs("align", scene, "--accept")
+
+
+def test_photographs_come_and_go_without_harm_to_the_alignment(scene):
+    found = Alignment.load(scene / ALIGNMENT)
+    views = scene_views(scene)
+    added = replace(views[0], name="images/new.png", camera=replace(views[0].camera, width=7))
+    assert found.cameras.changed([*views[3:], added]) is None
+    assert found.cameras.changed(views[4:5]) is None
+    assert "of their 10 photographs, 1 are in the scene" in (found.cameras.changed([views[0], added]) or "")
+
+
+def test_photographs_in_another_folder_are_the_same(views):
+    before = BoundCameras.of(views)
+    smaller = [
+        replace(view, name=view.name.replace("images/", "images_2/"), camera=view.camera.resized(32, 24))
+        for view in views
+    ]
+    assert before.changed(smaller) is None
+    smaller[3] = replace(smaller[3], camera=smaller[4].camera)
+    assert "stood" in (before.changed(smaller) or "")
+    by_drones = [replace(view, name=f"drone_{k % 2}/{k // 2}.jpg") for k, view in enumerate(views)]
+    assert "0 are in the scene" in (BoundCameras.of(by_drones).changed([replace(views[0], name="2/0.jpg")]) or "")
+
+
+@pytest.mark.parametrize("digits", [6, 8])
+def test_cameras_printed_again_are_the_same(scene, digits):
+    move_cameras(scene, np.eye(4), digits)
+    assert Alignment.load(scene / ALIGNMENT).cameras.changed(scene_views(scene)) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: replace(c, viewmat=c.viewmat + torch.tensor([0, 0, 0, 0.1])[:, None].T), "scene units away"),
+        (lambda c: replace(c, viewmat=torch.from_numpy(displaced(0, 1, 0, 3)) @ c.viewmat), "turned by 1°"),
+        (lambda c: replace(c, K=c.K * torch.tensor([1.01, 1.01, 1])[:, None]), "differ by"),
+    ],
+    ids=["position", "rotation", "intrinsics"],
+)
+def test_a_camera_that_changed_is_named(views, change, words):
+    before = BoundCameras.from_json(json.loads(json.dumps(BoundCameras.of(views).to_json())))
+    assert before.changed([replace(view, camera=view.camera.resized(48, 32)) for view in views]) is None
+    changed = [*views[:4], replace(views[4], camera=change(views[4].camera)), *views[5:]]
+    assert re.search(f"{views[4].name}.* {words}", before.changed(changed) or "")
+
+
+def test_an_alignment_of_an_older_version_is_cast_and_says_so(scene, shellgs):
+    fields = json.loads((scene / ALIGNMENT).read_text())
+    del fields["cameras"]
+    (scene / ALIGNMENT).write_text(json.dumps(fields))
+    assert "does not say which cameras it was found for" in shellgs("cast", scene, "--no-check")
+    assert "Written" in shellgs("align", scene)
+    assert "does not say" not in shellgs("cast", scene, "--no-check")
+
+
+@pytest.fixture
+def scanned(scene: Path) -> Path:
+    """The scene with a point cloud as its shell, sparse enough for fast meshing."""
+    alignment = Alignment.load(scene / ALIGNMENT)
+    samples, _ = ShellSurface(load_shell(scene / alignment.shell)).samples(4000)
+    survey = ShellSurface(load_shell(scene / alignment.shell)).survey_from_shell
+    np.savetxt(scene / "shell" / "scan.xyz", transformed(samples, np.linalg.inv(survey)), fmt="%.4f")
+    np.save(scene / "matrix.npy", alignment.shell_to_scene)
+    return scene
+
+
+def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):
+    """The validated mesh is cast and loaded; another mesher removes the verdict."""
+    used: list[str] = []
+    load = alignment_module.load_shell
+    monkeypatch.setattr(
+        alignment_module, "load_shell", lambda *args, **named: used.append(named["mesher"]) or load(*args, **named)
+    )
+    shell = scanned / "shell" / "scan.xyz"
+    shellgs("align", scanned, shell, "--matrix", scanned / "matrix.npy", "--mesher", "bpa")
+    validated = Alignment.load(scanned / ALIGNMENT)
+    assert (validated.mesher, bool(validated.verdict)) == ("bpa", True)
+    assert "10 views cast" in shellgs("cast", scanned)
+    validated.load_shell(scanned, read_views(FacadeDataParserConfig(data=scanned)))
+    assert set(used) == {"bpa"}
+    assert "validated with another mesher" in shellgs("cast", scanned, "--mesher", "planes")
+    assert Alignment.load(scanned / ALIGNMENT) == replace(validated, mesher="planes", verdict="", metrics={})
+
+
+def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
+    """A proposal's mesh, made without viewpoints, is not the one that is cast."""
+    shell, cache = scanned / "shell" / "scan.xyz", scanned / "shell"
+    views = read_views(FacadeDataParserConfig(data=scanned))
+    alignment = Alignment(np.load(scanned / "matrix.npy"), "shell/scan.xyz")
+    load_shell(shell, cache=cache)
+    guessed = (cache / "scan.xyz.planes.ply").read_bytes()
+    alignment.load_shell(scanned, views)
+    seen = (cache / "scan.xyz.planes.ply").read_bytes()
+    assert seen != guessed
+    nearby = replace(alignment, shell_to_scene=shifted(right=0.3).shell_to_scene)
+    nearby.load_shell(scanned, views)
+    assert (cache / "scan.xyz.planes.ply").read_bytes() == seen
+    behind = replace(alignment, shell_to_scene=shifted(out=40.0).shell_to_scene)
+    behind.load_shell(scanned, views)
+    assert (cache / "scan.xyz.planes.ply").read_bytes() != seen
+
+
+def test_chosen_folders_reach_every_command(scene, shellgs):
+    """Photographs and cameras in folders of other names, which the maps' manifest names too."""
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    cloud = trimesh.load(scene / "sparse_pc.ply")
+    lines = [
+        f"{k} {x} {y} {z} 9 9 9 0.1 {k % 10 + 1} 0"
+        for k, (x, y, z) in enumerate(cloud.vertices.tolist())  # pyright: ignore[reportAttributeAccessIssue]
+    ]
+    (scene / "sparse" / "0" / "points3D.txt").write_text("\n".join(lines))
+    (scene / "sparse" / "0").rename(scene / "model")
+    (scene / "sparse").rmdir()
+    (scene / "images").rename(scene / "photos")
+    paths = ("--images-path", "photos", "--colmap-path", "model")
+    assert "holds no cameras" in shellgs("align", scene)
+    assert "Written" in shellgs("align", scene, *paths)
+    assert "10 views cast" in shellgs("cast", scene, *paths)
+    command = CueMaps.open(scene, "shell").manifest.command
+    assert command == "shellgs cast {scene} --images-path photos --colmap-path model"
+    made = shellgs("mono", scene, *paths, "from", scene / "predictions")
+    assert "maps made" in made or "no view has a monocular map that can be trusted" in made
+
+
+@pytest.mark.parametrize(
+    "words", [["--matrix", "m.txt"], ["shell.ply", "--matrix", "m", "--picks", "p"], ["--positions", "g"]]
+)
+def test_starts_that_contradict_each_other_are_refused(scene, shellgs, words):
+    assert "give a shell, alone or with one of --matrix" in shellgs("align", scene, *words)
+
+
+@pytest.mark.parametrize("words", [["--global-shift", 1, 2, 3], ["--metres-per-shell-unit", 0.001]])
+@pytest.mark.parametrize("command", ["align", "cast"])
+def test_settings_of_a_matrix_are_refused_without_it(scene, shellgs, command, words):
+    before = (scene / ALIGNMENT).read_bytes()
+    assert re.match(f"refused: .*{words[0]}.* (give|go with)", shellgs(command, scene, *words))
+    assert (scene / ALIGNMENT).read_bytes() == before
+
+
+def test_a_global_shift_is_cast(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    shift = np.eye(4)
+    shift[:3, 3] = [-412_000.0, -5_123_000.0, 0.0]
+    np.save(scene / "matrix.npy", true.shell_to_scene @ np.linalg.inv(shift))
+    words = ("--shell", scene / true.shell, "--matrix", scene / "matrix.npy", "--global-shift", *shift[:3, 3])
+    shellgs("cast", scene, *words, "--no-check")
+    np.testing.assert_allclose(Alignment.load(scene / ALIGNMENT).shell_to_scene, true.shell_to_scene, atol=1e-6)
+
+
+def test_an_alignment_without_a_verdict_is_read(tmp_path):
+    fields = {"shell_to_scene": np.eye(4).tolist(), "shell": "a.ply", "metres_per_shell_unit": 1.0, "source": "matrix"}
+    (tmp_path / "alignment.json").write_text(json.dumps(fields))
+    assert Alignment.load(tmp_path / "alignment.json") == Alignment(np.eye(4), "a.ply")
+    validated = Alignment(np.eye(4), "a.ply", verdict="good", metrics={"bias_m": 0.01, "pull_m": None})
+    validated.save(tmp_path / "alignment.json")
+    assert Alignment.load(tmp_path / "alignment.json") == validated
+
+
+def test_a_report_is_written_even_if_no_camera_sees_the_shell(mesh, views, points, tmp_path):
+    validation = validate(mesh, Alignment(displaced(1e4, 0, 0, 1) @ TRUTH, "<shell>.ply"), views, points)
+    page = write_report(tmp_path / "report", mesh, validation).read_text()
+    assert "&lt;shell&gt;.ply: refused" in page

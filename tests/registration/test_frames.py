@@ -1,0 +1,247 @@
+"""Points that are not in the frame of what they belong to are refused, with the slip that explains it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.errors import SceneError
+from shellgs_method.files.photographs import View
+from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
+from shellgs_method.registration.frames import ShellPlace, apart
+from shellgs_method.registration.sfm_frame import _Sight, check_points, slips
+from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
+
+MILLIMETRES = "are in millimetres instead of metres"
+
+
+@pytest.fixture(scope="module")
+def views(pristine_scene: Path) -> list[View]:
+    return read_views(FacadeDataParserConfig(data=pristine_scene))
+
+
+@pytest.fixture(scope="module")
+def points(pristine_scene: Path) -> SparsePoints:
+    return find_sparse_points(FacadeDataParserConfig(data=pristine_scene))
+
+
+def other(points: SparsePoints, change: np.ndarray) -> SparsePoints:
+    return replace(points, positions=points.positions @ change.T)
+
+
+# Points and cameras
+
+
+def test_points_in_the_frame_of_the_cameras_are_accepted_in_silence(points, views, caplog):
+    check_points(points, views)
+    grey = replace(points, colours=np.full_like(points.colours, 128))
+    check_points(grey, views)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.diag([1, -1, -1]), "they have OpenGL's axes instead of OpenCV's"),
+        (np.diag([1, 1, -1]), "they have other axes: as x y -z they fit"),
+        (np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), "they have z up instead of y"),
+        (np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), "they have other axes: as y x -z they fit"),
+        (np.diag([1e3] * 3), f"they {MILLIMETRES}"),
+        (np.diag([0.3048] * 3), "they are in metres instead of feet"),
+        (np.diag([10] * 3), "they are ten times too large"),
+    ],
+    ids=["OpenGL", "mirrored", "COLMAP and nerfstudio", "an old applied_transform", "millimetres", "feet", "tenfold"],
+)
+def test_points_with_other_axes_or_in_another_unit_are_refused_with_the_slip(points, views, change, words):
+    with pytest.raises(SceneError, match=f"not in the frame of the cameras: {words}"):
+        check_points(other(points, change), views)
+
+
+def test_points_without_colours_are_refused_if_no_camera_sees_them(points, views):
+    grey = replace(other(points, np.diag([1, -1, -1])), colours=None)
+    with pytest.raises(SceneError, match="the cameras: perhaps they have OpenGL's axes"):
+        check_points(grey, views)
+
+
+@pytest.mark.parametrize("colours", [True, False])
+def test_points_in_national_coordinates_are_refused_with_their_distance(points, views, colours):
+    far = replace(
+        points, positions=np.add(points.positions, [4e5, 5e6, 0]), colours=points.colours if colours else None
+    )
+    with pytest.raises(SceneError, match=r"see 0% of them, and their centre is 6\..e\+05 times as far .* a shift"):
+        check_points(far, views)
+
+
+def test_points_beside_their_place_are_warned_of(points, views, caplog):
+    check_points(replace(points, positions=np.add(points.positions, [1.0, 1.0, 0])), views)
+    assert "may be in another frame than the cameras" in caplog.text
+    assert "they have other colours than the photographs there" in caplog.text
+
+
+@pytest.mark.parametrize("shown", ["heights", "heights in colours", "inverted intensities", "classes"])
+def test_colours_that_are_not_of_photographs_are_not_compared_with_them(points, views, shown, caplog):
+    heights = np.argsort(np.argsort(points.positions[:, 1])) / len(points.positions)
+    ramp = np.stack([np.clip(2 - abs(4 * heights - middle), 0, 1) for middle in (4, 2, 0)], axis=1)
+    grey = {"heights": 255 * heights, "inverted intensities": 255 - points.colours.mean(axis=1)}
+    coloured = {"heights in colours": 255 * ramp, "classes": np.where(ramp[:, :1] > 0, [255, 0, 0], [0, 255, 0])}
+    colours = coloured[shown] if shown in coloured else np.repeat(grey[shown][:, None], 3, axis=1)
+    check_points(replace(points, colours=colours.astype(np.uint8)), views)
+    assert not caplog.records
+
+
+def test_a_slip_explains_nothing_if_cameras_do_not_see_what_it_corrects(points, views):
+    """The little that is seen of a real photograph may be alike by chance: its sky and its ground."""
+    sight = _Sight.of(other(points, np.diag([1, -1, -1])), views)
+    assert sight.explanation(seen=0.0, away=1.0)
+    assert replace(sight, cameras=[]).explanation(seen=0.0, away=1.0) is None
+
+
+def test_points_of_a_long_street_are_accepted_though_each_camera_sees_few_of_them(views, caplog):
+    photographs = 1000
+    facing, shift = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.zeros((photographs, 3))
+    shift[:, 0] = -2 * np.arange(photographs)
+    viewmats = [np.vstack([np.column_stack([facing, each]), [0, 0, 0, 1]]) for each in shift]
+    street = [replace(views[0], camera=replace(views[0].camera, viewmat=torch.from_numpy(m))) for m in viewmats]
+    facades = np.random.default_rng(0).uniform([0, 5, -2], [2 * photographs, 6, 2], (2000, 3))
+    check_points(SparsePoints(facades), street)
+    assert not caplog.records
+
+
+def test_a_few_points_show_nothing(points, views):
+    check_points(SparsePoints(points.positions[:5] * [1, -1, -1]), views)
+
+
+def test_training_refuses_a_cloud_in_another_frame(scene):
+    """An applied_transform that was applied to the poses only."""
+    path = scene / "transforms.json"
+    applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    transforms = json.loads(path.read_text()) | {"applied_transform": applied[:3].tolist()}
+    for frame in transforms["frames"]:
+        frame["transform_matrix"] = (applied @ frame["transform_matrix"]).tolist()
+    path.write_text(json.dumps(transforms))
+    config = FacadeDataParserConfig(data=scene)
+    with pytest.raises(SceneError, match=r"transforms\.json names as ply_file_path are not in the frame"):
+        config.setup().get_dataparser_outputs("train")
+    cloud = trimesh.load(scene / "sparse_pc.ply")
+    cloud.apply_transform(applied).export(scene / "sparse_pc.ply")  # pyright: ignore[reportAttributeAccessIssue]
+    config.setup().get_dataparser_outputs("train")
+
+
+def test_every_slip_is_another_one():
+    corrections = [slip.correction for slip in slips()]
+    assert len(corrections) == 47 + 9
+    assert len(np.unique(np.round(corrections, 6), axis=0)) == len(corrections)
+    np.testing.assert_allclose([np.abs(np.linalg.det(c)) ** (1 / 3) for c in corrections[:4]], 1)
+
+
+# Picks and camera positions, and the shell
+
+
+@pytest.fixture(scope="module")
+def place(pristine_scene: Path) -> ShellPlace:
+    return ShellPlace(pristine_scene / "shell/facade.ply")
+
+
+@pytest.fixture(scope="module")
+def picks(pristine_scene: Path) -> np.ndarray:
+    return np.random.default_rng(0).permutation(load_shell(pristine_scene / "shell/facade.ply").vertices)[:8]
+
+
+@pytest.fixture(scope="module")
+def stood(pristine_scene: Path, views: list[View]) -> np.ndarray:
+    """Positions of the cameras in the shell's frame."""
+    to_shell = np.linalg.inv(Alignment.load(pristine_scene / ALIGNMENT).shell_to_scene)
+    return np.array([to_shell[:3, :3] @ view.camera.position.numpy() + to_shell[:3, 3] for view in views])
+
+
+def degrees(points: np.ndarray) -> np.ndarray:
+    """Longitude, latitude and height, of points in a zone of a national grid around 46° N, 7.9° E."""
+    east, north, height = (points - [412_352.0, 5_123_464.0, 0]).T
+    return np.stack([7.86 + east / 77_000, 46.25 + north / 110_574, height], axis=1)
+
+
+SLIPS = [
+    (degrees, "are in degrees: .* longitude and latitude"),
+    (lambda p: degrees(p)[:, [1, 0, 2]], "are in degrees"),
+    (lambda p: p * 1000, MILLIMETRES),
+    (lambda p: p / 0.3048, "are in feet instead of metres"),
+    (lambda p: p[:, [1, 0, 2]], r"have x and y \(easting and northing\) swapped"),
+    (lambda p: p - [412_000.0, 5_123_000.0, 0], r"are -4\d{5} -51\d{5} \S+ away from it, perhaps by a shift"),
+]
+NAMES = ["degrees", "latitude first", "millimetres", "feet", "northing first", "a shift"]
+
+
+@pytest.mark.parametrize(("slip", "words"), SLIPS, ids=NAMES)
+def test_picks_off_the_shell_are_refused_with_the_slip(place, picks, slip, words):
+    with pytest.raises(SceneError, match=f"the picks of a.txt .*{words}"):
+        place.check_picks(slip(picks), "the picks of a.txt")
+
+
+@pytest.mark.parametrize(("slip", "words"), SLIPS, ids=NAMES)
+def test_camera_positions_far_from_the_shell_are_refused_with_the_slip(place, stood, slip, words):
+    with pytest.raises(SceneError, match=f"the positions of a.txt .*{words}"):
+        place.check_positions(slip(stood), "the positions of a.txt")
+
+
+def test_a_shell_in_another_unit_than_picks_and_positions_is_named(pristine_scene, picks, stood, tmp_path):
+    mesh = load_shell(pristine_scene / "shell/facade.ply")
+    middle = picks.mean(axis=0)
+    trimesh.Trimesh(1000 * (mesh.vertices - middle), mesh.faces, process=False).export(tmp_path / "mm.ply")
+    with pytest.raises(SceneError, match=r"frame of the shell .*mm\.ply, .* they are in metres instead of millimetres"):
+        ShellPlace(tmp_path / "mm.ply").check_picks(picks - middle, "the picks")
+    with pytest.raises(SceneError, match=r"frame of the shell .*mm\.ply, .* they are in metres instead of millimetres"):
+        ShellPlace(tmp_path / "mm.ply").check_positions(stood - middle, "the positions")
+
+
+def test_picks_on_the_shell_and_cameras_around_it_are_accepted(place, picks, stood):
+    rng = np.random.default_rng(0)
+    place.check_picks(picks + rng.normal(0, 0.05, picks.shape), "the picks")
+    place.check_picks(np.concatenate([picks, picks[:3] + 50]), "the picks")  # a few are wrong, which the fit shows
+    place.check_positions(stood, "the positions")
+    place.check_positions(np.zeros((0, 3)), "no positions")
+
+
+def test_picks_up_one_edge_are_not_taken_for_degrees(tmp_path):
+    trimesh.creation.box(extents=[20, 10, 12]).export(tmp_path / "box.ply")
+    edge = np.array([[10.0, 5, -6], [10, 5, 0], [10, 5, 6]])
+    ShellPlace(tmp_path / "box.ply").check_picks(edge, "the picks")
+
+
+def test_a_cloud_of_points_has_a_place_too(place, picks, pristine_scene, tmp_path):
+    mesh = load_shell(pristine_scene / "shell/facade.ply")
+    cloud = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces), 3000, seed=0)[0]
+    np.savetxt(tmp_path / "scan.xyz", cloud, fmt="%.3f")
+    scanned = ShellPlace(tmp_path / "scan.xyz")
+    scanned.check_picks(picks, "the picks")
+    np.testing.assert_allclose(scanned.middle, place.middle, atol=0.02 * place.size)
+
+
+# Alignments
+
+
+def test_an_alignment_that_puts_the_shell_elsewhere_is_described():
+    rng = np.random.default_rng(0)
+    seen = rng.uniform([0, 0, 0], [20, 10, 8], (500, 3))
+    turned = Rotation.from_euler("z", 30, degrees=True).apply(seen)
+    assert apart(turned, seen) is None
+    assert "80.7 away from what the cameras see: a shift" in (apart(np.add(seen, [100.0, 0, 0]), seen) or "")
+    assert "look for another unit" in (apart(1000 * seen, seen) or "")
+    assert "look for another unit" in (apart(seen / 1000, seen) or "")
+
+
+def test_a_matrix_without_its_global_shift_is_refused_with_the_distance(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    shift = np.eye(4)
+    shift[:3, 3] = [412_000.0, 5_123_000.0, 0.0]
+    np.save(scene / "matrix.npy", true.shell_to_scene @ shift)
+    refusal = shellgs("align", scene, scene / true.shell, "--matrix", scene / "matrix.npy")
+    assert "is refused" in refusal
+    assert "away from what the cameras see: a shift (such as CloudCompare's --global-shift) is missing" in refusal

@@ -1,0 +1,202 @@
+"""Depth and normals of Gaussians and discs on a wall, against its closed form."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.render.maps import (
+    DISC_LOG_THICKNESS,
+    DepthKind,
+    Geometry,
+    Primitive,
+    depth_powers,
+    geometry_channels,
+    mode_of_depth,
+    rendered_geometry,
+    squared_depths,
+)
+from shellgs_method.render.rasterizer import rasterize
+
+CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]), width=40, height=30)
+
+
+def wall(yaw: float) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    """Flat Gaussians side by side on a wall at depth 5, turned by ``yaw``, and the wall's normal."""
+    x, y = torch.meshgrid(torch.linspace(-6, 6, 41), torch.linspace(-3, 3, 21), indexing="ij")
+    on_wall = torch.stack([x.flatten(), y.flatten(), torch.zeros(x.numel())], dim=-1)
+    rotation_y = Rotation.from_euler("y", yaw)
+    w, z = math.cos(yaw / 2), math.sin(yaw / 2)
+    rotation = torch.from_numpy(rotation_y.as_matrix()).float()
+    gaussians = {
+        "means": on_wall @ rotation.T + torch.tensor([0.0, 0.0, 5.0]),
+        "quats": torch.tensor([w, 0.0, z, 0.0]).repeat(len(on_wall), 1),
+        "scales": torch.tensor([0.3, 0.3, 1e-4]).log().repeat(len(on_wall), 1),
+    }
+    return gaussians, -rotation[:, 2]
+
+
+def render(
+    gaussians: dict[str, torch.Tensor], primitive: Primitive, depth: DepthKind, opacity: float = 0.9
+) -> Geometry:
+    channels = torch.cat(geometry_channels(gaussians, CAMERA, depth), dim=-1)
+    opacities = torch.full((len(channels),), opacity)
+    means, quats, scales = (gaussians[name] for name in ("means", "quats", "scales"))
+    composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, CAMERA, primitive)
+    return rendered_geometry(composited, alpha, info, CAMERA, depth)
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_moments_are_those_of_the_splats_own_depths(eager, primitive):
+    """The splats' weights are composited as one-hot features."""
+    random = torch.Generator().manual_seed(0)
+    gaussians = {
+        "means": torch.randn(6, 3, generator=random) * torch.tensor([1.0, 1.0, 2.0]) + torch.tensor([0.0, 0.0, 9.0]),
+        "quats": torch.randn(6, 4, generator=random),
+        "scales": torch.full((6, 3), 1.5).log(),
+    }
+    normals, depths = geometry_channels(gaussians, CAMERA, "expected")
+    squares, origin = squared_depths(depths)
+    features = torch.cat([normals, depths, squares, torch.eye(6)], dim=-1)
+    means, quats, scales = (gaussians[name] for name in ("means", "quats", "scales"))
+    composited, alpha, info = rasterize(means, quats, scales.exp(), torch.full((6,), 0.6), features, CAMERA, primitive)
+    geometry = rendered_geometry(composited[..., :5], alpha, info, CAMERA, "expected", origin)
+    assert geometry.moments is not None
+    target = 8 + torch.rand(30, 40, 1, generator=random)
+    expected = (composited[..., 5:] * (depths[:, 0] - target).square()).sum(dim=-1, keepdim=True)
+    torch.testing.assert_close(geometry.moments.about(target, alpha), expected, rtol=1e-4, atol=1e-4)
+
+
+def mode_of(depths: list[float], weights: list[float]) -> float:
+    """Mode of splats with these depths and compositing weights."""
+    z, w = torch.tensor(depths)[:, None], torch.tensor(weights)[:, None]
+    powers, median = depth_powers(z)
+    mean = ((z * w).sum() / w.sum())[None, None, None]
+    return float(mode_of_depth(mean, (powers * w).sum(dim=0)[None, None], median))
+
+
+def test_the_mode_is_the_depth_of_the_heavier_of_two_layers():
+    assert mode_of([5.0, 10.0], [0.56, 0.14]) == pytest.approx(5, rel=1e-3)
+    assert mode_of([5.0, 10.0], [0.3, 0.7]) == pytest.approx(10, rel=1e-3)
+    assert mode_of([5.0, 5.05, 4.95, 10.0], [0.2, 0.2, 0.2, 0.2]) == pytest.approx(5, rel=5e-3)
+    assert mode_of([3.0, 12.0], [0.01, 0.99]) == pytest.approx(12, rel=1e-3)  # haze
+    assert mode_of([5.0, 5000.0], [0.9, 0.1]) < 5.2  # the sky
+    assert mode_of([5.0], [0.5]) == pytest.approx(5, rel=1e-5)
+
+
+def test_the_mode_of_one_thin_layer_is_close_to_its_mean():
+    random = torch.Generator().manual_seed(0)
+    for spread, limit in ((0.001, 0.0001), (0.003, 0.001)):
+        for _ in range(20):
+            depths = 8 * (1 + spread * torch.randn(12, generator=random))
+            weights = torch.rand(12, generator=random)
+            mean = float((depths * weights).sum() / weights.sum())
+            assert mode_of(depths.tolist(), weights.tolist()) == pytest.approx(mean, rel=limit)
+
+
+def test_no_pixel_has_a_mode_between_a_wall_and_what_is_in_front_of_it(eager):
+    back, _ = wall(0.0)
+    front = {name: values[back["means"][:, 0] < 0.1] for name, values in back.items()}
+    back["means"] = back["means"] + torch.tensor([0.0, 0.0, 3.0])
+    both = {name: torch.cat([front[name], back[name]]) for name in front}
+    _, depths = geometry_channels(both, CAMERA, "expected")
+    powers, median = depth_powers(depths)
+    expected = render(both, "3d", "expected")
+    means, quats, scales = (both[name] for name in ("means", "quats", "scales"))
+    opacities = torch.full((len(means),), 0.9)
+    composited, _, _ = rasterize(means, quats, scales.exp(), opacities, powers, CAMERA, "3d")
+    mode = mode_of_depth(expected.depth, composited, median)
+    between = [((depth > 5.3) & (depth < 7.7)).sum() for depth in (expected.depth, mode)]
+    assert between[0] > 40
+    assert between[1] == 0
+
+
+def test_what_is_behind_the_surface_does_not_move_its_depth_and_normals(eager):
+    """Half a wall's opacity and a second wall behind it, of another direction, look like the first wall alone."""
+    (front, normal), (back, _) = wall(0.0), wall(0.3)
+    back["means"] = back["means"] + torch.tensor([0.0, 0.0, 5.0])
+    both = {name: torch.cat([front[name], back[name]]) for name in front}
+    weights = torch.cat([torch.ones(len(front["means"]), 1), torch.full((len(back["means"]), 1), 1e-6)])
+    normals, depths = geometry_channels(both, CAMERA, "expected")
+    squares, origin = squared_depths(depths)
+    channels = torch.cat([normals * weights, depths * weights, squares * weights, weights], dim=-1)
+    means, quats, scales = (both[name] for name in ("means", "quats", "scales"))
+    opacities = torch.full((len(means),), 0.1)
+    composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, CAMERA)
+    geometry = rendered_geometry(composited, alpha, info, CAMERA, "expected", origin, composited[..., -1:])
+    alone = render(front, "3d", "expected", 0.1)
+    assert geometry.surface is not None
+    assert geometry.moments is not None
+    torch.testing.assert_close(geometry.surface, alone.alpha, rtol=1e-3, atol=1e-4)
+    assert (geometry.alpha - geometry.surface).mean() > 0.1
+    seen = alone.alpha[..., 0] > 0.1
+    torch.testing.assert_close(geometry.depth[seen], alone.depth[seen], rtol=1e-4, atol=1e-4)
+    facing = torch.nn.functional.normalize(geometry.normal[seen], dim=-1)
+    torch.testing.assert_close(facing, normal.expand_as(facing), rtol=1e-4, atol=1e-4)
+    spread = geometry.moments.about(geometry.depth, geometry.solid)[seen]
+    assert spread.abs().max() < 1e-2
+
+
+def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:
+    """Relative error of the wall's depth where it is opaque."""
+    exact = 5 * normal[2] / (geometry.camera.rays() @ normal)[..., None]
+    return ((geometry.depth - exact) / exact).abs()[geometry.alpha > 0.9]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.9])
+@pytest.mark.parametrize(
+    ("primitive", "depth"), [("2d", "expected"), ("2d", "median"), ("2d", "plane"), ("3d", "plane")]
+)
+def test_depths_of_ray_intersections_are_those_of_the_wall(eager, primitive, depth, yaw):
+    gaussians, normal = wall(yaw)
+    assert error(render(gaussians, primitive, depth), normal).max() < 1e-4
+
+
+def test_the_depth_of_centres_is_wrong_on_a_receding_wall(eager):
+    gaussians, normal = wall(0.9)
+    assert error(render(gaussians, "3d", "expected"), normal).max() > 0.01
+
+
+@pytest.mark.parametrize("primitive", ["2d", "3d"])
+def test_normals_and_depth_normals_of_a_wall_are_right(eager, primitive):
+    gaussians, normal = wall(0.9)
+    geometry = render(gaussians, primitive, "plane")
+    opaque = (geometry.alpha > 0.9)[..., 0]
+    torch.testing.assert_close(geometry.normal[opaque] / geometry.alpha[opaque], normal.expand(int(opaque.sum()), 3))
+    inner = torch.zeros_like(opaque)
+    inner[1:-1, 1:-1] = opaque[1:-1, 1:-1] & opaque[1:-1, 2:] & opaque[1:-1, :-2]
+    known = geometry.depth_normal[inner & (geometry.depth_normal != 0).any(-1)]
+    assert len(known) > 300
+    assert ((known @ normal) > 0.999).float().mean() > 0.95  # except those with a neighbour off the wall
+
+
+@pytest.mark.parametrize(("depth", "moves"), [("plane", True), ("expected", False)])
+def test_only_plane_depth_depends_on_the_rotation_of_gaussians(depth, moves):
+    """Plane depth couples depth and normals; the depth of centres is independent of rotation."""
+    gaussians, _ = wall(0.5)
+    gaussians["quats"].requires_grad_()
+    assert geometry_channels(gaussians, CAMERA, depth)[1].requires_grad == moves
+
+
+def test_a_faint_disc_without_median_depth_has_its_expected_depth(eager):
+    gaussians, _ = wall(0.0)
+    one = {name: value[430:431] for name, value in gaussians.items()}  # the middle one
+    geometry = render(one, "2d", "median", opacity=0.3)
+    seen = geometry.alpha > 0
+    assert geometry.alpha.max() < 0.5
+    torch.testing.assert_close(geometry.depth[seen], torch.full_like(geometry.depth[seen], 5.0))
+
+
+def test_depth_is_positive_and_finite_for_planes_seen_edge_on(eager):
+    gaussians, _ = wall(math.pi / 2 - 1e-3)
+    geometry = render(gaussians, "3d", "plane")
+    assert geometry.depth.isfinite().all()
+    assert (geometry.depth > 0).all()
+
+
+def test_the_thickness_of_a_disc_is_finite_in_float32():
+    assert 0 < float(torch.tensor(DISC_LOG_THICKNESS).exp()) < 1e-8

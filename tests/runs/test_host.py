@@ -1,0 +1,159 @@
+"""Nerfstudio's other commands on a run: they work, or say in one sentence which command does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.scripts import exporter, render  # before a pipeline is built, as in their commands
+from nerfstudio.scripts.viewer import run_viewer
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from nerfstudio.viewer_legacy.server.gui_utils import parse_object as parse_for_legacy
+from PIL import Image
+from training_runs import data_of, held_out, model_of, trainer_of
+
+from shellgs_method.trainer import FacadeTrainer
+
+NOWHERE = {
+    "crop_bg_color": {"r": 255, "g": 0, "b": 0},
+    "crop_center": [99.0, 99.0, 99.0],
+    "crop_scale": [1.0, 1.0, 1.0],
+}
+CONFIG = Path("config.yml")
+
+
+@pytest.fixture(scope="module")
+def trainer(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> FacadeTrainer:
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "photo_gs")
+    trainer.pipeline.eval()
+    return trainer
+
+
+@pytest.fixture
+def loaded(trainer, monkeypatch) -> None:
+    """Nerfstudio's commands load that run, and a video encoder is there."""
+    for module in (render, exporter):
+        monkeypatch.setattr(module, "eval_setup", lambda *_, **__: (trainer.config, trainer.pipeline, None, 0))
+    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)
+
+
+def camera_path(folder: Path, **changes: Any) -> Path:
+    pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1]
+    path = {"camera_type": "perspective", "render_height": 16, "render_width": 32, "seconds": 1}
+    path |= {"camera_path": [{"camera_to_world": pose, "fov": 60, "aspect": 2}]}
+    (folder / "path.json").write_text(json.dumps(path | changes))
+    return folder / "path.json"
+
+
+def images_along(path: Path, folder: Path, **settings: Any) -> list[np.ndarray]:
+    command = render.RenderCameraPath(
+        CONFIG, folder / "out", "png", camera_path_filename=path, output_format="images", **settings
+    )
+    command.main()
+    return [np.asarray(Image.open(file)) for file in sorted((folder / "out").iterdir())]
+
+
+@pytest.mark.parametrize("kind", ["orthophoto", "omnidirectional", "VR180"])
+def test_a_path_of_cameras_that_cannot_be_rendered_is_refused_by_name(loaded, tmp_path, kind):
+    path = camera_path(tmp_path, camera_type=kind)
+    with pytest.raises(SystemExit, match=rf"^shellgs: .*cannot render a camera of type {kind.lower()}: .*fisheye"):
+        images_along(path, tmp_path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("kind", ["perspective", "fisheye", "equirectangular"])
+def test_a_path_of_other_cameras_is_rendered(loaded, tmp_path, kind):
+    (image,) = images_along(camera_path(tmp_path, camera_type=kind), tmp_path)
+    assert image.shape == (16, 32, 3)
+
+
+def test_a_crop_box_around_nothing_shows_the_background(loaded, tmp_path):
+    path = camera_path(tmp_path, crop=NOWHERE)
+    (image,) = images_along(path, tmp_path, rendered_output_names=["rgb", "normal", "background"])
+    assert image.shape == (16, 96, 3)
+    assert (image[:, :32] == [255, 0, 0]).all()  # the path's crop_bg_color
+    assert (image[:, 64:] == [255, 0, 0]).all()
+
+
+def test_a_crop_box_around_nothing_leaves_all_outputs(trainer):
+    model, camera = model_of(trainer), held_out(trainer)[0]
+    full = model.get_outputs_for_camera(camera)
+    nothing = model.get_outputs_for_camera(
+        camera, OrientedBox.from_params((99.0, 99.0, 99.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    )
+    model.set_crop(None)
+    assert {name: image.shape for name, image in nothing.items()} == {name: each.shape for name, each in full.items()}
+    assert nothing["accumulation"].max() == 0
+
+
+def test_a_spiral_is_rendered(loaded, tmp_path):
+    command = render.SpiralRender(CONFIG, tmp_path / "out", seconds=0.1, output_format="images")
+    command.main()
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+def test_the_poses_of_the_cameras_are_exported(loaded, trainer, tmp_path):
+    exporter.ExportCameraPoses(CONFIG, tmp_path).main()
+    assert len(json.loads((tmp_path / "transforms_train.json").read_text())) == len(data_of(trainer).train_dataset)
+
+
+COMMANDS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "rgba": (
+        lambda folder: render.RenderCameraPath(
+            CONFIG, folder, camera_path_filename=camera_path(folder), rendered_output_names=["rgba"]
+        ),
+        "name rgb and accumulation",
+    ),
+    "the nearest photograph": (
+        lambda folder: render.RenderCameraPath(
+            CONFIG, folder, camera_path_filename=camera_path(folder), render_nearest_camera=True
+        ),
+        "--render-nearest-camera",
+    ),
+    "pointcloud": (lambda folder: exporter.ExportPointCloud(CONFIG, folder), "shellgs mesh CONFIG"),
+    "pointcloud without normals": (
+        lambda folder: exporter.ExportPointCloud(CONFIG, folder, normal_method="open3d"),
+        "shellgs mesh CONFIG",
+    ),
+    "tsdf": (lambda folder: exporter.ExportTSDFMesh(CONFIG, folder), "shellgs mesh CONFIG"),
+    "poisson": (lambda folder: exporter.ExportPoissonMesh(CONFIG, folder), "shellgs mesh CONFIG"),
+    "marching cubes": (lambda folder: exporter.ExportMarchingCubesMesh(CONFIG, folder), "shellgs mesh CONFIG"),
+    "splats in a box around nothing": (
+        lambda folder: exporter.ExportGaussianSplat(
+            CONFIG, folder, obb_center=(99.0, 99.0, 99.0), obb_rotation=(0.0, 0.0, 0.0), obb_scale=(1.0, 1.0, 1.0)
+        ),
+        "no Gaussian is inside the box",
+    ),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_that_cannot_serve_ends_with_a_sentence(loaded, tmp_path, command):
+    made, sentence = COMMANDS[command]
+    with pytest.raises(SystemExit, match=f"^shellgs: .*{sentence}"):
+        made(tmp_path).main()
+
+
+def test_views_cannot_be_scaled_down_when_they_are_rendered(trainer):
+    with pytest.raises(SystemExit, match=r"^shellgs: --downscale-factor 2 cannot be followed.*--max-image-size"):
+        trainer.config.pipeline.datamanager.dataparser.downscale_factor = 2.0
+
+
+def test_a_port_that_there_is_not_ends_ns_viewer(trainer):
+    config = SimpleNamespace(viewer=ViewerConfig(websocket_port=99_999))
+    with pytest.raises(SystemExit, match=r"^shellgs: viewer.websocket_port cannot be 99999"):
+        run_viewer._start_viewer(config, trainer.pipeline, 0)  # pyright: ignore
+
+
+def test_what_is_refused_to_commands_does_not_stop_the_viewer(trainer):
+    """It reads every attribute of a pipeline in search of its elements."""
+    assert parse_object(trainer.pipeline, ViewerElement, "Custom") is not None
+    assert parse_for_legacy(trainer.pipeline, ViewerElement, "Custom") is not None

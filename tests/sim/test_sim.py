@@ -1,0 +1,479 @@
+"""Collision geometry, frames, textures and deviations, tested without a simulator."""
+
+from __future__ import annotations
+
+import tracemalloc
+import weakref
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import torch
+import trimesh
+from scipy.spatial import Delaunay
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.errors import SceneError
+from shellgs_method.export.frame import Frame
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.sim.building import moved_into
+from shellgs_method.sim.collision.collider import Collider, leaks, make_collider, standing_before, thickness
+from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
+from shellgs_method.sim.collision.distances import both_ways
+from shellgs_method.sim.collision.parts import Part
+from shellgs_method.sim.collision.planes import find_planes
+from shellgs_method.sim.deviations import find_deviations
+from shellgs_method.sim.frame import SimFrame, sim_frame
+from shellgs_method.sim.look.texture import Photo, bake
+from shellgs_method.sim.rays import Surface, outward
+from shellgs_method.synthetic.building import RECESS, Layout, building, shell
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
+from shellgs_method.synthetic.path import walk
+
+LAYOUT = Layout(bays=2, storeys=2)
+
+
+def surface_of(mesh: Any) -> Surface:
+    """Convert a mesh of trimesh, whose types are incomplete."""
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def box(low, high, subdivided: float | None = None) -> Surface:
+    mesh = trimesh.creation.box(bounds=[low, high])
+    return surface_of(mesh.subdivide_to_size(subdivided) if subdivided else mesh)
+
+
+def visible(surface: Surface, eyes: np.ndarray) -> np.ndarray:
+    points, _ = surface.samples(4000)
+    return points[np.any([surface.sees(np.broadcast_to(eye, points.shape), points, 5e-3) for eye in eyes], axis=0)]
+
+
+@pytest.fixture(scope="module")
+def eyes() -> np.ndarray:
+    cameras = walk(LAYOUT.length, 12, 64, 48, np.random.default_rng(0))
+    return np.stack([camera.position.numpy() for camera in cameras])
+
+
+@pytest.fixture(scope="module")
+def facade(eyes) -> Surface:
+    """The shell of a small building, wound towards the cameras in front of it."""
+    mesh = shell(LAYOUT)
+    return outward(Surface(mesh.vertices, mesh.triangles), eyes)[0]
+
+
+@pytest.fixture(scope="module")
+def nothing() -> Surface:
+    """A reconstruction without anything in front of the shell."""
+    return Surface(np.eye(3), np.array([[0, 1, 2]]))
+
+
+@pytest.fixture(scope="module")
+def collider(facade, nothing) -> Collider:
+    return make_collider(facade, nothing, np.array([False]))
+
+
+def test_planes_cover_exactly_a_building_without_noise(facade):
+    planes, rest = find_planes(facade.vertices, facade.faces)
+    assert len(rest) == 0
+    points, face = facade.samples(2000)
+    for plane in planes:
+        np.testing.assert_allclose(plane.axes @ plane.axes.T, np.eye(3), atol=1e-9)
+        of_plane = (points[np.isin(face, plane.faces)] - plane.origin) @ plane.axes.T
+        assert np.abs(of_plane[:, 2]).max(initial=0) < 1e-6
+        assert shapely.contains_xy(plane.outline.buffer(1e-6), of_plane[:, :2]).all()
+        assert plane.outline.area <= facade.areas[plane.faces].sum() + 1e-6
+
+
+def test_planes_are_found_in_noise():
+    """A corner of two walls with 5 mm of noise: two planes, at the right angle."""
+    rng = np.random.default_rng(0)
+    one = trimesh.creation.box(bounds=[[0, 0, 0], [4, 1e-9, 3]]).subdivide_to_size(0.3)
+    other = trimesh.creation.box(bounds=[[0, 0, 0], [1e-9, 4, 3]]).subdivide_to_size(0.3)
+    walls = surface_of(trimesh.util.concatenate([one, other]))
+    noisy = walls.vertices + rng.normal(0, 0.005, walls.vertices.shape)
+    planes, _ = find_planes(noisy, walls.faces)
+    assert abs(planes[0].normal @ planes[1].normal) < 0.02
+    assert all(plane.outline.area == pytest.approx(12, rel=0.05) for plane in planes[:2])
+
+
+def test_convex_pieces_are_convex_and_cover_the_outline_once():
+    holes = [shapely.box(x, y, x + 1, y + 1.5) for x in (1, 3, 5) for y in (1, 4)]
+    outline = shapely.Polygon([(0, 0), (7, 0), (7, 6), (3.5, 8), (0, 6)]).difference(shapely.union_all(holes))
+    assert isinstance(outline, shapely.Polygon)
+    pieces = convex_pieces(shapely.MultiPolygon([outline]))
+    assert shapely.union_all(pieces).symmetric_difference(outline).area < 1e-6
+    assert sum(piece.area for piece in pieces) == pytest.approx(outline.area, abs=1e-3)
+    assert all(piece.convex_hull.area - piece.area < 1e-3 for piece in pieces)
+    assert len(pieces) < len(shapely.get_coordinates(outline)) / 2  # triangles would be more than corners
+
+
+def test_the_cost_of_fewer_pieces_is_the_area_that_they_cover():
+    row = [[shapely.box(x, 0, x + 1, 1) for x in (0, 1.1, 4, 7)]]
+    pieces, cost = fewer_pieces(row, 3, lambda _, covered: float(shapely.area(covered)))
+    assert [len(plane) for plane in pieces] == [3]
+    assert cost == pytest.approx(0.1)
+    assert fewer_pieces(row, 4, lambda _, covered: float(shapely.area(covered)))[1] == 0
+
+
+def test_a_part_contains_the_points_inside_its_hull():
+    """Against the Delaunay triangulation of its corners."""
+    rng = np.random.default_rng(1)
+    corners, points = rng.normal(size=(30, 3)), rng.normal(size=(2000, 3))
+    part = Part.hull(corners, "surface")
+    assert part is not None
+    np.testing.assert_array_equal(part.contains(points, 0.0), Delaunay(corners).find_simplex(points) >= 0)
+    mesh = trimesh.Trimesh(part.vertices, part.faces)
+    assert mesh.is_watertight
+    assert mesh.volume > 0  # wound outwards
+
+
+def test_flat_points_have_no_hull():
+    assert Part.hull(np.eye(3), "surface") is None
+
+
+def test_the_collider_matches_the_visible_shell(collider, facade, eyes):
+    both = collider.surface.distance(visible(facade, eyes)), facade.distance(visible(collider.surface, eyes))
+    assert np.quantile(both[0], 0.95) < 1e-4
+    assert np.quantile(both[1], 0.95) < 1e-4
+    assert np.quantile(np.concatenate(both), 0.995) < 0.011  # parts that protrude by up to a centimetre are left out
+    assert leaks(collider.surface, facade, eyes) == 0
+    assert collider.filled == 0
+
+
+def test_windows_stay_recesses(collider):
+    opening = LAYOUT.openings[0]
+    place = np.array([[opening.centre, -5, (opening.z0 + opening.z1) / 2]])
+    assert collider.surface.cast(place, np.array([[0, 1.0, 0]]))[0] == pytest.approx(5 + RECESS, abs=1e-4)
+
+
+@pytest.mark.parametrize("most", [40, 12])
+def test_a_budget_of_parts_is_kept_and_leaves_no_hole(most, facade, nothing, eyes):
+    small = make_collider(facade, nothing, np.array([False]), most)
+    assert len(small.parts) <= most
+    assert leaks(small.surface, facade, eyes) == 0
+
+
+def test_parts_stay_inside_the_wall():
+    wall = box([0, 0, 0], [4, 0.1, 3])
+    made = make_collider(wall, wall, np.zeros(len(wall.faces), bool))
+    assert np.abs(made.surface.vertices - [2, 0.05, 1.5]).max(axis=0) == pytest.approx([2, 0.05, 1.5], abs=0.011)
+    plane = find_planes(wall.vertices, wall.faces)[0][0]
+    assert thickness(plane, wall) == pytest.approx(0.1, abs=0.011)
+
+
+def test_surfaces_in_front_of_the_shell_are_in_the_collider_but_not_those_beside_it(facade, eyes):
+    """A flower box on the wall, and a flap beyond the building's end."""
+    right = LAYOUT.ends[1]
+    planter: Any = trimesh.creation.box(bounds=[[2.6, -0.4, 1], [3.4, -0.001, 1.4]]).subdivide_to_size(0.1)
+    flap = trimesh.creation.box(bounds=[[right + 0.12, -0.02, 1], [right + 0.5, 0, 5]]).subdivide_to_size(0.1)
+    ground = trimesh.creation.box(bounds=[[0, -0.4, -0.02], [6, -0.05, 0.0]]).subdivide_to_size(0.1)
+    fused, _ = outward(surface_of(trimesh.util.concatenate([planter, flap, ground])), eyes)
+    standing = standing_before(facade, fused, eyes, 0.05)
+    of_planter = np.arange(len(fused.faces)) < len(planter.faces)
+    front = fused.normals[:, 1] < -0.9
+    assert standing[of_planter & front].all()
+    assert not standing[~of_planter & front].any()
+    made = make_collider(facade, fused, standing)
+    before = made.surface.cast(np.array([[3.0, -3, 1.2]]), np.array([[0, 1.0, 0]]))[0]
+    assert before == pytest.approx(2.6, abs=0.02)
+    beside = made.surface.cast(np.array([[right + 0.3, -3, 2]]), np.array([[0, 1.0, 0]]))[0]
+    assert np.isinf(beside)
+
+
+def test_surfaces_without_planes_become_parts_too(eyes):
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0).apply_translation([3, 2, 2])
+    fused, seen = outward(surface_of(ball), eyes)
+    made = make_collider(None, fused, seen, most=60)
+    assert 20 < len(made.parts) <= 60
+    assert np.quantile(made.surface.distance(visible(fused, eyes)), 0.95) < 0.03
+
+
+def test_an_empty_collider_is_refused(nothing):
+    with pytest.raises(SceneError, match="there is nothing to collide with"):
+        make_collider(None, nothing, np.array([False]))
+    with pytest.raises(SceneError, match="cannot have 0 parts"):
+        make_collider(None, nothing, np.array([True]), most=0)
+
+
+def cameras_of_scene() -> list[Camera]:
+    from shellgs_method.synthetic.frames import scene_camera
+
+    return [scene_camera(camera) for camera in walk(LAYOUT.length, 9, 64, 48, np.random.default_rng(0))]
+
+
+def metric_frame(up: str = "z") -> tuple[Frame, np.ndarray]:
+    """The frame of the shell of the synthetic facade, and the shell's points in it."""
+    offset = np.array([412300.0, 5123500, 200])
+    points = transformed(shell(LAYOUT).vertices, SHELL_FROM_BUILDING)
+    to_scene = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
+    if up == "y":
+        turned = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+        points, to_scene = transformed(points, turned), to_scene @ np.linalg.inv(turned)
+        offset = turned[:3, :3] @ offset
+    shift = np.eye(4)
+    shift[:3, 3] = offset
+    return Frame("shell", to_scene @ shift, offset, True, "y" if up == "y" else "z"), points - offset
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_the_origin_is_on_the_ground_in_front_of_the_facade(up):
+    frame, points = metric_frame(up)
+    made, motion = sim_frame(frame, points, cameras_of_scene())
+    from_building = np.linalg.inv(made.to_scene) @ SCENE_FROM_BUILDING
+    origin = transformed(np.zeros(3), np.linalg.inv(from_building))
+    assert -12 < origin[1] < -6
+    assert abs(origin[2]) < 1e-3
+    np.testing.assert_allclose(from_building[:3, :3] @ [0, 0, 1], [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(
+        transformed(points, motion), transformed(shell(LAYOUT).vertices, from_building), atol=1e-6
+    )
+
+
+def test_national_coordinates_are_recovered():
+    frame, points = metric_frame()
+    made, motion = sim_frame(frame, points, cameras_of_scene())
+    national = transformed(shell(LAYOUT).vertices, SHELL_FROM_BUILDING)
+    np.testing.assert_allclose(transformed(transformed(points, motion), made.to_national), national, atol=1e-6)
+    np.testing.assert_array_equal(made.to_national[:3, :3], np.eye(3))  # the offset alone is enough
+    assert not np.mod(made.offset[:2], 1).any()
+
+
+def test_a_scene_without_a_shell_is_turned_upright():
+    points = transformed(shell(LAYOUT).vertices, SCENE_FROM_BUILDING)
+    made, _ = sim_frame(Frame("scene", np.eye(4), np.zeros(3), False, "z"), points, cameras_of_scene())
+    up = np.linalg.inv(made.to_scene)[:3, :3] @ SCENE_FROM_BUILDING[:3, :3] @ [0, 0, 1]
+    assert up[2] / np.linalg.norm(up) > np.cos(np.radians(25))  # cameras look up or down a little
+    assert not made.metric
+
+
+def test_the_ground_height_can_be_set():
+    frame, points = metric_frame()
+    made, _ = sim_frame(frame, points, cameras_of_scene(), ground=215.0)
+    assert made.to_national[2, 3] == 215.0
+    assert isinstance(made, SimFrame)
+
+
+def test_a_second_building_is_moved_into_the_frame_of_the_first():
+    """By national coordinates; refused if they are far apart or unknown."""
+    frame, points = metric_frame()
+    home, to_home = sim_frame(frame, points, cameras_of_scene())
+    moved = np.eye(4)
+    moved[:3, 3] = [250, 40, 3]
+    other, motion = sim_frame(replace(frame, offset=frame.offset + moved[:3, 3]), points, cameras_of_scene())
+    placed, into = moved_into(other, motion, home, "b")
+    np.testing.assert_allclose(transformed(points, into), transformed(points, to_home) + moved[:3, 3], atol=1e-6)
+    there = np.linalg.inv(placed.to_scene) @ other.to_scene  # from its own frame to the world's
+    np.testing.assert_allclose(there @ motion, into, atol=1e-6)
+    far = sim_frame(replace(frame, offset=frame.offset + 9000), points, cameras_of_scene())
+    with pytest.raises(SceneError, match=r"b is \d+ km from the first building"):
+        moved_into(*far, home, "b")
+    with pytest.raises(SceneError, match="no common frame"):
+        moved_into(replace(other, metric=False), motion, home, "b")
+
+
+def frontal(x: float, distance: float = 4.0, size: int = 120) -> Camera:
+    """A camera in front of the plane y = 0, looking along y."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([x, -distance, 1.0], dtype=torch.float64)
+    K = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]], dtype=torch.float64)
+    return Camera(viewmat, K, size, size)
+
+
+def pattern(points: np.ndarray) -> np.ndarray:
+    """Colours of points of the plane: smooth, and different everywhere."""
+    x, z = points[..., 0], points[..., 2]
+    return 127 + 100 * np.stack([np.sin(1.3 * x), np.cos(1.7 * z), np.sin(x + z)], axis=-1)
+
+
+def photo_of(camera: Camera, light: float = 1.0) -> Photo:
+    """A photograph of the plane."""
+    pose = np.linalg.inv(camera.viewmat.numpy())
+    rays = camera.rays().numpy() @ pose[:3, :3].T
+    points = pose[:3, 3] - rays * (pose[1, 3] / rays[..., 1])[..., None]
+    return Photo((light * pattern(points)).clip(0, 255).astype(np.uint8), camera, None)
+
+
+def texture_at(textured, points: np.ndarray) -> np.ndarray:
+    """Colours of the texture at points of a mesh."""
+    mesh = trimesh.Trimesh(textured.vertices, textured.faces, process=False)
+    near, _, face = trimesh.proximity.closest_point(mesh, points)
+    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], near)
+    uv = np.einsum("nk,nkc->nc", weights, textured.uv[textured.faces[face]])
+    image = np.asarray(textured.image)
+    column, row = (uv * [image.shape[1], image.shape[0]]).astype(int).T
+    return image[image.shape[0] - 1 - row, column].astype(float)
+
+
+@pytest.fixture(scope="module")
+def wall() -> Surface:
+    mesh = trimesh.creation.box(bounds=[[-2, 0, 0], [2, 0.2, 2]]).subdivide_to_size(0.2)
+    return surface_of(mesh)
+
+
+def test_distances_are_measured_where_cameras_look(wall):
+    half = box([-2, 0, 0], [0.0, 0.2, 2], subdivided=0.2)  # what is reconstructed: the wall's left half
+    left = [frontal(-1.1, 1.5)]  # sees x from -1.85 to -0.35
+    assert both_ways(wall, half, None, left, 0.05)["from the collider"].p95 < 1e-6
+    both = both_ways(wall, half, None, [*left, frontal(1.0, 1.5)], 0.05)
+    assert both["from the collider"].p95 > 1.0
+    behind = replace(frontal(-1.1), viewmat=torch.diag(torch.tensor([1.0, 1, -1, 1]).double()) @ frontal(0.0).viewmat)
+    assert both_ways(wall, half, None, [behind], 0.05) == {}
+
+
+def test_distances_leave_out_what_cameras_look_along():
+    house, front = box([-1, 0, 0], [0, 6, 2], subdivided=0.5), box([-1, 0, 0], [0, 0.2, 2])
+    along = [frontal(0.2)]  # sees the side wall at a slant of 3° at most
+    assert both_ways(house, front, None, along, 0.05)["from the collider"].p95 < 1e-6
+
+
+def places(count: int = 400, width: float = 1.2) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return np.stack([rng.uniform(-width, width, count), np.zeros(count), rng.uniform(0.1, 1.9, count)], axis=1)
+
+
+def test_the_texture_has_the_photographed_colours(wall):
+    textured = bake(wall, np.zeros((len(wall.vertices), 3)), [photo_of(frontal(x)) for x in (-0.8, 0.0, 0.8)])
+    error = np.abs(texture_at(textured, places()) - pattern(places()))
+    assert np.median(error) < 3
+    assert np.quantile(error, 0.95) < 12
+
+
+class Loading(Sequence):
+    """Photographs that are loaded when asked for, and how many there were at most at the same time."""
+
+    def __init__(self, cameras: Sequence[Camera]):
+        self.cameras, self.most, self.alive = cameras, 0, 0
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __getitem__(self, index):
+        photo = photo_of(self.cameras[index])
+        weakref.finalize(photo.image, self._forget)
+        self.alive += 1
+        self.most = max(self.most, self.alive)
+        return photo
+
+    def _forget(self) -> None:
+        self.alive -= 1
+
+
+def test_a_texture_keeps_no_photographs_in_memory(wall):
+    photos = Loading([frontal(x) for x in np.linspace(-1, 1, 6)])
+    bake(wall, np.zeros((len(wall.vertices), 3)), photos)
+    assert photos.most <= 2  # one is loaded while the last one is still known
+
+
+def test_views_blend_into_each_other(wall):
+    """Two views of different exposure: no step between neighbouring points is as large as that between the views."""
+    photos = [photo_of(frontal(-1.2), 0.8), photo_of(frontal(1.2), 1.0)]
+    textured = bake(wall, np.zeros((len(wall.vertices), 3)), photos)
+    line = np.stack([np.linspace(-0.9, 0.9, 200), np.zeros(200), np.ones(200)], axis=1)
+    light = (texture_at(textured, line) / pattern(line)).mean(axis=1)
+    assert light[:20].mean() < 0.85
+    assert light[-20:].mean() > 0.95
+    assert np.abs(light[5:] - light[:-5]).max() < 0.1
+
+
+def test_an_object_that_hides_the_wall_is_not_in_its_texture(wall):
+    """A post 50 cm in front of the wall, black in the photograph, and grey where no photograph sees."""
+    camera = frontal(0.0)
+    post = trimesh.creation.box(bounds=[[-0.1, -0.6, -1], [0.1, -0.5, 3]])
+    together = Surface(
+        np.concatenate([wall.vertices, post.vertices]), np.concatenate([wall.faces, post.faces + len(wall.vertices)])
+    )
+    photo = photo_of(camera)
+    pose = np.linalg.inv(camera.viewmat.numpy())
+    rays = camera.rays().numpy() @ pose[:3, :3].T
+    hit = surface_of(post).cast(np.broadcast_to(pose[:3, 3], rays.shape), rays)[1] >= 0
+    black = photo._replace(image=np.where(hit[..., None], 0, photo.image).astype(np.uint8))
+    textured = bake(together, np.full((len(together.vertices), 3), 99.0), [black])
+    behind = np.stack([np.zeros(20), np.zeros(20), np.linspace(0.2, 1.8, 20)], axis=1)
+    assert np.abs(texture_at(textured, behind) - 99).max() < 3
+    masked = bake(wall, np.full((len(wall.vertices), 3), 99.0), [black._replace(mask=~hit)])
+    assert np.abs(texture_at(masked, behind) - 99).max() < 3
+
+
+def shell_and_bump() -> tuple[Surface, Surface]:
+    """A wall of 4 x 2 m, and a reconstruction 12 cm in front of it on 0.8 x 0.5 m."""
+    flat = surface_of(trimesh.creation.box(bounds=[[-2, 0, 0], [2, 3, 2]]))
+    built = [
+        trimesh.creation.box(bounds=[[-2, 0.01, 0], [2, 3, 2]]),
+        trimesh.creation.box(bounds=[[0.2, -0.12, 1], [1.0, 0.1, 1.5]]),
+    ]
+    return flat, surface_of(trimesh.util.concatenate(built))
+
+
+def test_a_deviation_has_the_right_position_and_size():
+    flat, built = shell_and_bump()
+    found = find_deviations(flat, built, [("a.jpg", frontal(-1.0)), ("b.jpg", frontal(0.6))], 0.05)
+    assert [region.what for region in found.regions] == ["before"]
+    (region,) = found.regions
+    assert region.area == pytest.approx(0.4, rel=0.35)
+    assert region.distance == pytest.approx(0.12, abs=1e-3)
+    assert np.linalg.norm(np.subtract(region.centre, [0.6, 0, 1.25])) < 0.12
+    assert region.photograph == "b.jpg"
+
+
+def test_the_memory_of_deviations_does_not_grow_with_the_photographs():
+    flat, built = shell_and_bump()
+    peaks = []
+    for count in (4, 40):
+        tracemalloc.start()
+        find_deviations(flat, built, [(f"{x}.jpg", frontal(x)) for x in np.linspace(-1, 1, count)], 0.05)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]
+
+
+def test_distances_are_unknown_where_no_photograph_sees_the_shell(tmp_path):
+    flat, built = shell_and_bump()
+    found = find_deviations(flat, built, [("a.jpg", frontal(0.0))], 0.05)
+    behind = found.surface.centres[:, 1] > 2.9
+    assert np.isnan(found.distance[behind]).all()
+    found.write(tmp_path / "deviations.ply")
+    visual = trimesh.load_mesh(tmp_path / "deviations.ply", process=False).visual
+    colours = visual.face_colors[:, :3]  # pyright: ignore
+    assert (colours[behind] == 150).all()
+    bump = found.flagged
+    assert (colours[bump, 0] > colours[bump, 1] + 50).all()  # red
+
+
+def test_photographs_take_precedence_over_the_reconstruction():
+    flat, built = shell_and_bump()
+
+    def contradicted(points: np.ndarray) -> np.ndarray:
+        return np.where(points[:, 0] < -1, -0.3, np.nan)
+
+    found = find_deviations(flat, built, [("a.jpg", frontal(0.0, 6))], 0.05, contradicted)
+    assert {region.what for region in found.regions} == {"before", "behind"}
+
+
+def test_a_turned_building_has_the_same_collider(facade, nothing, collider):
+    """Planes and parts do not depend on the axes."""
+    turn = Rotation.from_euler("z", 31, degrees=True).as_matrix()
+    turned = Surface(facade.vertices @ turn.T, facade.faces)
+    made = make_collider(turned, nothing, np.array([False]))
+    assert len(made.parts) == len(collider.parts)
+    points, _ = collider.surface.samples(500)
+    assert np.quantile(made.surface.distance(points @ turn.T), 0.99) < 1e-3
+
+
+def test_details_of_the_true_building_are_found_in_front_of_its_shell(facade, eyes):
+    """The synthetic building's own railings, as a perfect reconstruction would have them."""
+    mesh = building(LAYOUT)
+    true, _ = outward(
+        surface_of(trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False).subdivide_to_size(0.2)), eyes
+    )
+    standing = standing_before(facade, true, eyes, 0.05)
+    made = make_collider(facade, true, standing)
+    alone = make_collider(facade, true, np.zeros(len(standing), bool))
+    points = visible(true, eyes)
+    before = points[facade.signed_distance(points) > 0.05]
+    near, far = made.surface.distance(before), alone.surface.distance(before)
+    assert np.median(near) < 0.02 < np.median(far)
