@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -18,22 +18,19 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from dataparsers.cameras import pinhole_camera, pinhole_cameras
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.evaluation.holdout import Bands, facade_bands
-from shellgs_method.evaluation.pixels import kept_pixels, occluded, reference_maps, seen_through
 from shellgs_method.evaluation.regions import REFERENCES
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
 from shellgs_method.files.photographs import View, load_mask, load_photograph
-from shellgs_method.gaussians.seeds import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.geometry.reference import Reference
 from shellgs_method.machine.memory import available_memory
 from shellgs_method.runs.host import NoPixelSampler
 
+ViewT = TypeVar("ViewT")
 logger = logging.getLogger(__name__)
 
 MIN_SIDE = 11
@@ -283,8 +280,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             step = camera.thinning(MAX_SIZE)
             cameras.append(camera)
             depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())
-        points = self.train_dataparser_outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
-        return SeenBy(cameras, depths, points.float())
+        return SeenBy(cameras, depths, self.sfm_points.float())
 
     @cached_property
     def _held_out(self) -> Bands | None:
@@ -295,60 +291,26 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             raise SceneError("a holdout of bands needs the shell maps of the scene: run `shellgs cast SCENE` first")
         return facade_bands(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
 
-    def shell_seeds(self, spacing: float, most: int, everywhere: bool) -> Seeds:
-        """Seeds on the shell visible in the training views, in nerfstudio's rescaled world.
+    def seed_views(
+        self, view_of: Callable[[Camera, dict], ViewT], kind: str | None = None
+    ) -> tuple[Iterator[ViewT], int]:
+        """Training views to make seeds from, one at a time, and the number of pixels of all.
 
         Args:
-            spacing: distance between seeds, in pixels of the closest view.
-            most: largest number of seeds; the spacing is increased where it would give more.
-            everywhere: seed the shell even where photographs show something in front of it; else seed that instead.
+            view_of: makes one from the camera, in nerfstudio's rescaled world, and the batch with its maps.
+            kind: only views with a map of this kind; all if None.
         """
-        return self._seeds(lambda batch: self._seeded_view(batch, everywhere), spacing, most)
+        dataset = self.train_dataset
+        maps = dataset.cues[kind] if kind else None
+        chosen = [k for k, view in enumerate(dataset.views) if maps is None or maps.record(view.name)]
+        cameras, cached = [dataset.camera(k) for k in chosen], self.cached_train
+        views = (view_of(camera, self._with_maps(cached[k])) for k, camera in zip(chosen, cameras, strict=True))
+        return views, sum(camera.width * camera.height for camera in cameras)
 
-    def seeds_behind_shell(self, spacing: float, most: int) -> Seeds:
-        """Seeds for what windows reflect or let through, where photographs show it behind the shell."""
-        return self._seeds(self._view_behind, spacing, most)
-
-    def _seeds(self, view: Callable[[dict], SeededView], spacing: float, most: int) -> Seeds:
-        maps, views = self.train_dataset.cues["shell"], self.train_dataset.views
-        batches = [batch for batch in self.cached_train if maps.record(views[batch["image_idx"]].name)]
-        num_pixels = sum(batch["image"][..., 0].numel() for batch in batches)
-        return shell_seeds(map(view, batches), num_pixels, spacing, most)
-
-    def skybox_seeds(self, count: int) -> Seeds:
-        """Seeds all around the scene, in nerfstudio's rescaled world, coloured by what is not on the shell."""
-        points = self.train_dataparser_outputs.metadata["points3D_xyz"].double().numpy()
-        num_pixels = sum(batch["image"][..., 0].numel() for batch in self.cached_train)
-        return skybox_seeds(map(self._sky_view, self.cached_train), num_pixels, points, count)
-
-    def _sky_view(self, batch: dict) -> SkyView:
-        cpu, batch = torch.device("cpu"), self._with_maps(batch)
-        image = _colours(batch)
-        far = kept_pixels(batch, image)
-        if "shell_mask" in batch:
-            far = far & ~batch["shell_mask"].to(cpu)
-        return SkyView(self.train_dataset.camera(batch["image_idx"]), image, far)
-
-    def _seeded_view(self, batch: dict, everywhere: bool) -> SeededView:
-        index, cpu, batch = batch["image_idx"], torch.device("cpu"), self._with_maps(batch)
-        image = _colours(batch)
-        camera, shell = self.train_dataset.camera(index), reference_maps(batch, "shell", cpu, everywhere)
-        if not everywhere and "other_depth" in batch:
-            before = occluded(batch, cpu) & kept_pixels(batch, image)
-            shell = Reference(
-                torch.where(before, batch["other_depth"].to(cpu), shell.depth),
-                torch.where(before, _towards(camera), shell.normal),
-                shell.mask | before,
-            )
-        return SeededView(camera, image, shell)
-
-    def _view_behind(self, batch: dict) -> SeededView:
-        cpu, batch = torch.device("cpu"), self._with_maps(batch)
-        image, camera = _colours(batch), self.train_dataset.camera(batch["image_idx"])
-        shell = reference_maps(batch, "shell", cpu)
-        behind = shell.mask & seen_through(batch, cpu) & kept_pixels(batch, image)
-        depth = batch["other_depth"].to(cpu) if "other_depth" in batch else shell.depth
-        return SeededView(camera, image, Reference(depth, _towards(camera), behind))
+    @property
+    def sfm_points(self) -> Float[Tensor, "N 3"]:
+        """The SfM points in nerfstudio's rescaled world."""
+        return self.train_dataparser_outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """The next training view, with its maps."""
@@ -386,14 +348,3 @@ def _scaled(outputs: DataparserOutputs, factor: float) -> DataparserOutputs:
     views = [replace(view, camera=view.camera.scaled(factor)) for view in outputs.metadata["views"]]
     cameras = pinhole_cameras(outputs.cameras.camera_to_worlds, views)
     return replace(outputs, cameras=cameras, metadata=outputs.metadata | {"views": views})
-
-
-def _towards(camera: Camera) -> Float[Tensor, "H W 3"]:
-    """Normals that face the camera."""
-    return -normalize(camera.rays().float(), dim=-1)
-
-
-def _colours(batch: dict) -> Float[Tensor, "H W 3"]:
-    """The photograph in [0, 1], on the CPU."""
-    image = batch["image"][..., :3].cpu()
-    return image / (255 if image.dtype == torch.uint8 else 1)
