@@ -21,8 +21,8 @@ from torch import Tensor
 
 from dataparsers.cameras import pinhole_camera, pinhole_cameras
 from shellgs_method.errors import SceneError, refusals_end_the_program
-from shellgs_method.evaluation.covisibility import MAX_SIZE, SeenBy
-from shellgs_method.evaluation.holdout import Bands, facade_bands
+from shellgs_method.evaluation.covisibility import Covisibility
+from shellgs_method.evaluation.holdout import Holdout, facade_holdout
 from shellgs_method.evaluation.regions import REFERENCES
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
 from shellgs_method.files.photographs import View, load_mask, load_photograph
@@ -47,13 +47,13 @@ class FacadeDataset(InputDataset):
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
     kind lacks that kind's keys. ``other_depth`` is the depth of what photographs show in front of the shell, or behind
     it, in windows, else 0; ``transient`` is true where only this one shows something in front of it, ``beyond`` where
-    they show the background. With ``bands``, masks keep only pixels whose wall lies in them. With ``seen_by``,
-    ``seen`` is true where what a pixel shows is visible in a training view. ``kinds`` are the maps to read, all if not
-    set; with ``any_size`` they are resampled where their size differs, as they are if ``scale_factor`` is not 1.
+    they show the background. With ``part``, masks keep only pixels whose wall lies in it. With ``covisibility``,
+    ``seen`` is true where training views show what a pixel shows. ``kinds`` are the maps to read, all if not set; with
+    ``any_size`` they are resampled where their size differs, as they are if ``scale_factor`` is not 1.
     """
 
-    bands: Bands | None = None
-    seen_by: Callable[[], SeenBy] | None = None
+    part: Holdout | None = None
+    covisibility: Callable[[], Covisibility] | None = None
     kinds: Collection[str] | None = None
     any_size: bool = False
     held: bool = True
@@ -96,10 +96,10 @@ class FacadeDataset(InputDataset):
     def get_data(self, image_idx: int, image_type="float32") -> dict:
         """Photograph, intrinsics, mask and maps of a view, and what training views see of it."""
         data = self._read_data(image_idx, image_type)
-        if self.seen_by is not None:
+        if self.covisibility is not None:
             camera = self.camera(image_idx)
             no_depth = torch.zeros(camera.height, camera.width, 1)
-            data["seen"] = self.seen_by().mask(camera, data.get("shell_depth", no_depth))
+            data["seen"] = self.covisibility().mask(camera, data.get("shell_depth", no_depth))
         return data
 
     def _read_data(self, image_idx: int, image_type) -> dict:
@@ -120,9 +120,9 @@ class FacadeDataset(InputDataset):
         read = {kind: self._read(maps, view) for kind, maps in self.cues.items()}
         cues = {kind: cue for kind, cue in read.items() if cue is not None}
         inside = True
-        if self.bands is not None and cues:
+        if self.part is not None and cues:
             shell = cues.get("shell") or self._read(self._dataparser_outputs.metadata["cues"]["shell"], view)
-            inside = False if shell is None else self.bands.mask(shell, view.camera)
+            inside = False if shell is None else self.part.mask(shell, view.camera)
         maps = {}
         checked = self.sets.get("checked")
         if "shell" in cues and checked and (found := self._read(checked, view)):
@@ -152,7 +152,7 @@ class FacadeDataset(InputDataset):
             if has not in of_a_pixel:
                 data = self._read_data(index, image_type).values()
                 of_a_pixel[has] = sum(each.nbytes for each in data if isinstance(each, Tensor)) / pixels
-            total += pixels * (of_a_pixel[has] + (self.seen_by is not None))
+            total += pixels * (of_a_pixel[has] + (self.covisibility is not None))
         return round(total)
 
     def missing(self) -> dict[str, int]:
@@ -204,19 +204,18 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
 
     def create_train_dataset(self) -> FacadeDataset:
-        """Training views, whose maps leave out the held-out bands."""
+        """Training views, whose maps leave out the held-out half of the facade."""
         dataset = super().create_train_dataset()
-        held_out = self._held_out
-        dataset.bands = held_out and held_out.others
+        dataset.part = self._holdout and self._holdout.rest
         if self.test_mode != "val":
             dataset.kinds = ()
         return dataset
 
     def create_eval_dataset(self) -> FacadeDataset:
-        """Held-out views, whose maps are limited to the held-out bands."""
+        """Held-out views, whose maps are limited to the held-out half of the facade."""
         dataset = super().create_eval_dataset()
-        dataset.bands = self._held_out
-        dataset.seen_by = lambda: self._seen_by
+        dataset.part = self._holdout
+        dataset.covisibility = lambda: self._covisibility
         dataset.any_size, dataset.kinds = True, tuple(REFERENCES)
         return dataset
 
@@ -271,25 +270,19 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return similarity
 
     @cached_property
-    def _seen_by(self) -> SeenBy:
-        """What is visible in the training views."""
-        dataset, cameras, depths = self.train_dataset, [], []
-        hidden_by_shell = "shell" in self.eval_dataset.cues
-        for index in range(len(dataset)):
-            camera, depth = dataset.camera(index), dataset.shell_depth(index) if hidden_by_shell else None
-            step = camera.thinning(MAX_SIZE)
-            cameras.append(camera)
-            depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())
-        return SeenBy(cameras, depths, self.sfm_points.float())
+    def _covisibility(self) -> Covisibility:
+        dataset, hidden_by_shell = self.train_dataset, "shell" in self.eval_dataset.cues
+        views = ((dataset.camera(k), dataset.shell_depth(k) if hidden_by_shell else None) for k in range(len(dataset)))
+        return Covisibility.of(views, self.sfm_points.float())
 
     @cached_property
-    def _held_out(self) -> Bands | None:
+    def _holdout(self) -> Holdout | None:
         if self.config.holdout == "none":
             return None
         metadata = self.train_dataparser_outputs.metadata
         if "shell" not in metadata["cues"]:
-            raise SceneError("a holdout of bands needs the shell maps of the scene: run `shellgs cast SCENE` first")
-        return facade_bands(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
+            raise SceneError("a holdout needs the shell maps of the scene: run `shellgs cast SCENE` first")
+        return facade_holdout(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
 
     def seed_views(
         self, view_of: Callable[[Camera, dict], ViewT], kind: str | None = None
