@@ -25,7 +25,7 @@ from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
 from shellgs_method.evaluation.regions import REFERENCES
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
-from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.files.photographs import View, has_alpha, load_mask, load_photograph
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory
 from shellgs_method.runs.host import NoPixelSampler
@@ -143,12 +143,13 @@ class FacadeDataset(InputDataset):
         return cue and self._rescaled_depth(cue)
 
     def nbytes(self, image_type="float32") -> int:
-        """Memory that all photographs and maps take, by one view of those that have the same maps."""
+        """Memory in bytes that all photographs and maps take, by one view of those that have the same maps."""
         of_a_pixel: dict[tuple[bool, ...], float] = {}
         total = 0.0
         for index, view in enumerate(self.views):
             pixels = view.camera.width * view.camera.height
-            has = view.mask is not None, *(maps.record(view.name) is not None for maps in self.sets.values())
+            masked = view.mask is not None or has_alpha(view.image)
+            has = masked, *(maps.record(view.name) is not None for maps in self.sets.values())
             if has not in of_a_pixel:
                 data = self._read_data(index, image_type).values()
                 of_a_pixel[has] = sum(each.nbytes for each in data if isinstance(each, Tensor)) / pixels
