@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from shellgs_method.geometry.axes import main_direction
 from shellgs_method.sim.rays import Surface, spread
 
 
@@ -30,18 +31,19 @@ class Front:
     def of(cls, surface: Surface, eyes: Float64[np.ndarray, "E 3"]) -> Front:
         """The front of the vertical surfaces that are visible from the cameras."""
         points, triangle = surface.samples(4000)
-        normals, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
+        level, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
+        length = np.linalg.norm(level, axis=1)
+        normals = level / np.maximum(length, 1e-9)[:, None]
         for eye in spread(eyes, 12):
             away = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
             seen = surface.sees(np.broadcast_to(eye, points.shape), points, 0.01)
             facing += seen * np.einsum("nc,nc->n", away, normals).clip(0)
-        upright = (facing > 0) & (np.linalg.norm(normals, axis=1) > 0.9)
+        upright = (facing > 0) & (length > 0.9)
         if not upright.any():
             upright, facing = np.ones(len(points), bool), np.ones(len(points))
-        wall, normals = points[upright], normals[upright]
-        alike = normals @ normals.T > np.cos(np.radians(10))
-        outwards = normals[alike[(alike @ facing[upright]).argmax()]].mean(axis=0)
-        outwards = outwards / np.linalg.norm(outwards) if np.linalg.norm(outwards) > 0 else np.array([0.0, -1, 0])
+        wall, outwards = points[upright], np.array([0.0, -1, 0])
+        if length[upright].max() > 0.5:
+            outwards = main_direction(normals[upright], facing[upright])
         middle = np.median(wall, axis=0)
         if (np.median(eyes, axis=0) - middle) @ outwards < 0:
             outwards = -outwards

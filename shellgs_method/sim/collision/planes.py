@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float64, Int64
 
+from shellgs_method.geometry.axes import wall_axes
 from shellgs_method.geometry.planes import fitted_plane, largest_plane
 from shellgs_method.geometry.triangles import area_vectors
 
@@ -121,22 +122,14 @@ def _outlined(
     origin, normal = fitted_plane(corners, areas)
     if areas @ (normals @ normal) < 0:  # to the side that most of them face
         normal = -normal
-    axes = upright_axes(normal)
+    up = [0.0, 0, 1] if np.hypot(*normal[:2]) > 1e-3 else [0.0, normal[2], 0]  # u is along x on level planes
+    axes = wall_axes(normal, np.array(up))
     flat = (corners - origin) @ axes[:2].T
     triangles = shapely.buffer(shapely.polygons(flat), gap / 2, join_style="mitre", mitre_limit=2)
     union = shapely.union_all(triangles).buffer(-gap / 2 - even, join_style="mitre", mitre_limit=2)
     smooth = union.buffer(even, join_style="mitre", mitre_limit=2).simplify(max(tolerance, even))
     outline = _pieces(smooth, crumb)
     return None if outline.area < LEAST_AREA else Plane(origin, axes, outline, faces)
-
-
-def upright_axes(normal: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Axes u, v and the normal, right-handed, with u horizontal and v upwards, or u along x for a level plane."""
-    u = np.array([-normal[1], normal[0], 0.0])
-    u = u / np.linalg.norm(u) if np.linalg.norm(u) > 1e-3 else np.array([1.0, 0, 0])
-    u = u - (u @ normal) * normal
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(normal, u), normal])
 
 
 def _pieces(shape: shapely.Geometry, least: float) -> shapely.MultiPolygon:
