@@ -181,7 +181,8 @@ def refined(
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
     result = refine(surface, points.positions, start, reach, rounding_of(steps))
-    axes = facade_axes(surface.samples(5000)[1], start[:3, :3] @ upwards(view.camera for view in views))
+    _, triangle = surface.samples(5000)
+    axes = facade_axes(surface.normals[triangle], start[:3, :3] @ upwards(view.camera for view in views))
     sentence = f"Refined against {result.evidence.points} SfM points, which moved by {result.moved:.3f} m."
     if words := result.evidence.in_words(axes):
         sentence += f" Left unchanged, as the points do not determine it: {'; '.join(words)}."

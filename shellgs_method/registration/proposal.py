@@ -87,7 +87,8 @@ def propose(
     """
     cloud = _main_wall(points, cameras, scene_up)
     few = cloud.thinned()
-    samples, normals = surface.samples(20_000)
+    samples, triangle = surface.samples(20_000)
+    normals = surface.normals[triangle]
     spread = _some(samples, 5000)
     starts: list[Candidate] = []
     for up in _upwards(normals, shell_up):
@@ -99,7 +100,7 @@ def propose(
     found = _refined(surface, spread, cloud, _close_to_best(_distinct(found, spread, _KEPT)), 2 * FINAL_GATE)
     found = [candidate for candidate in found if candidate.score > 0]
     if not found:
-        size = float(np.ptp(surface.bounds, axis=0).max())
+        size = float(np.ptp(surface.vertices, axis=0).max())
         raise SceneError(
             f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
             "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"

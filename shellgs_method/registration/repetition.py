@@ -95,7 +95,7 @@ def _relief(surface: ShellSurface, axes: np.ndarray) -> tuple[Float64[np.ndarray
     cell = max(0.05, float((high - low)[:2].max()) / 1000)
     u, v = (np.arange(low[k] + cell / 2, high[k], cell) for k in range(2))
     origins = np.stack([*np.meshgrid(u, v), np.full((len(v), len(u)), high[2] + 1.0)], axis=-1) @ axes
-    depth = surface.first_hit(origins, -axes[2]).astype(np.float64)
+    depth = surface.cast(origins, -axes[2]).t.astype(np.float64)
     return np.where(np.isfinite(depth), high[2] + 1.0 - depth, np.nan), cell
 
 
