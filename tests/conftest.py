@@ -46,7 +46,7 @@ def scene(pristine_scene: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run(capsys, monkeypatch) -> Callable[..., str]:
+def in_process(capsys, monkeypatch) -> Callable[..., str]:
     """Run a command in this process; returns its output on one line, or ``refused: `` and its message."""
 
     def command(name: str, *words: object) -> str:
@@ -63,9 +63,9 @@ def run(capsys, monkeypatch) -> Callable[..., str]:
 
 
 @pytest.fixture
-def shellgs(run) -> Callable[..., str]:
+def shellgs(in_process) -> Callable[..., str]:
     """Run `shellgs` in this process."""
-    return partial(run, "shellgs")
+    return partial(in_process, "shellgs")
 
 
 @pytest.fixture
@@ -77,11 +77,6 @@ def compiler(monkeypatch) -> None:
         pytest.skip(f"no C++ compiler: {error}")
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
     monkeypatch.setattr(compilation, "_failed", set())
-
-
-@pytest.fixture
-def eager() -> None:
-    pass
 
 
 @pytest.fixture

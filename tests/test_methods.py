@@ -32,8 +32,6 @@ from shellgs_method.render.maps import DISC_LOG_THICKNESS, depth_powers, geometr
 from shellgs_method.render.rasterizer import quats_to_rotations, rasterize
 from shellgs_method.runs.ablations import ABLATIONS
 
-pytestmark = pytest.mark.usefixtures("eager")
-
 METHODS = {
     "shellgs": "shellgs",
     "shellgs-metric": "shellgs_metric",

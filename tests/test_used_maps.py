@@ -24,8 +24,6 @@ from shellgs_method.files.map_files import resampled
 from shellgs_method.runs.limits import check_settings
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
 
-pytestmark = pytest.mark.usefixtures("eager")
-
 
 def spoil(scene: Path, kind: str) -> None:
     """Write maps that belong to other cameras."""

@@ -19,7 +19,7 @@ from shellgs_method.machine import doctor
 DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20)
 
 
-def start(*words: object, cwd: Path, status: int = 0) -> str:
+def run(*words: object, cwd: Path, status: int = 0) -> str:
     """Output of `shellgs` in a process of its own, without the terminal's line breaks."""
     environment = os.environ | {"OMP_WAIT_POLICY": "passive", "COLUMNS": "200"}
     command = [str(Path(sys.executable).with_name("shellgs")), *map(str, words)]
@@ -33,7 +33,7 @@ def start(*words: object, cwd: Path, status: int = 0) -> str:
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a small `shellgs demo`; its output is in log.txt beside it."""
     folder = tmp_path_factory.mktemp("demo")
-    (folder / "log.txt").write_text(start(*DEMO, cwd=folder))
+    (folder / "log.txt").write_text(run(*DEMO, cwd=folder))
     return folder / "demo"
 
 
@@ -99,17 +99,17 @@ def test_ns_eval_writes_all_metrics(demo):
     } <= metrics.keys()
 
 
-def test_ns_export_writes_the_gaussians(demo, run, tmp_path):
-    run("ns-export", "gaussian-splat", "--load-config", config(demo), "--output-dir", tmp_path)
+def test_ns_export_writes_the_gaussians(demo, in_process, tmp_path):
+    in_process("ns-export", "gaussian-splat", "--load-config", config(demo), "--output-dir", tmp_path)
     cloud = trimesh.load(tmp_path / "splat.ply")
     assert isinstance(cloud, trimesh.PointCloud)
     assert len(cloud.vertices) > 100
 
 
-def test_ns_render_writes_images_of_every_output(demo, run, tmp_path):
+def test_ns_render_writes_images_of_every_output(demo, in_process, tmp_path):
     outputs = ("rgb", "depth", "normal", "accumulation")
     command = ("ns-render", "dataset", "--load-config", config(demo), "--output-path", tmp_path, "--split", "test")
-    run(*command, "--rendered-output-names", *outputs)
+    in_process(*command, "--rendered-output-names", *outputs)
     for output in outputs:
         assert len(list((tmp_path / "test" / output).iterdir())) == 2
 
@@ -125,21 +125,21 @@ def test_a_reader_that_stops_early_gets_no_error(tmp_path):
         assert process.stderr.read() == b""
 
 
-def test_ns_train_lists_the_methods_and_describes_their_settings(run, monkeypatch):
+def test_ns_train_lists_the_methods_and_describes_their_settings(in_process, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    assert {"shellgs", "mono-gs", "photo-gs", "2dgs"} <= set(run("ns-train", "--help").split())
-    described = run("ns-train", "shellgs", "--help")
+    assert {"shellgs", "mono-gs", "photo-gs", "2dgs"} <= set(in_process("ns-train", "--help").split())
+    described = in_process("ns-train", "shellgs", "--help")
     assert {"--pipeline.model.geometry.depth.initial", "--pipeline.model.primitive"} <= set(described.split())
     assert "facade-data" in described
 
 
-def test_a_missing_shell_ends_ns_train_with_one_sentence(demo, run, tmp_path, monkeypatch):
+def test_a_missing_shell_ends_ns_train_with_one_sentence(demo, in_process, tmp_path, monkeypatch):
     scene = tmp_path / "scene"
     scene.mkdir()
     for name in ("images", "transforms.json", "sparse_pc.ply"):
         (scene / name).symlink_to(demo / "scene" / name)
     monkeypatch.chdir(tmp_path)
-    output = run("ns-train", "shellgs", "--data", scene, "--vis", "tensorboard")
+    output = in_process("ns-train", "shellgs", "--data", scene, "--vis", "tensorboard")
     assert output.startswith("refused: shellgs: shellgs needs the shell maps")
 
 
@@ -157,7 +157,7 @@ def test_shellgs_cast_takes_a_shell_and_its_matrix(demo, shellgs, tmp_path):
 
 
 def test_a_users_mistake_ends_the_command_with_one_sentence(tmp_path):
-    output = start("cast", "nowhere", cwd=tmp_path, status=1)
+    output = run("cast", "nowhere", cwd=tmp_path, status=1)
     assert output.startswith("shellgs: ")
     assert "nowhere" in output
     assert output.count("\n") == 1
@@ -170,7 +170,7 @@ def test_a_shell_without_its_matrix_is_refused(shellgs):
 
 
 def test_doctor_lists_the_parts_of_this_machine(tmp_path):
-    output = start("doctor", cwd=tmp_path)
+    output = run("doctor", cwd=tmp_path)
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
 
 

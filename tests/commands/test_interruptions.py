@@ -17,6 +17,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,7 +67,7 @@ def act(words: list[str], folder: Path, log: Path) -> None:
                 raise SystemExit(1) from None
 
 
-Start = Callable[[str, Path], "multiprocessing.process.BaseProcess"]
+Start = Callable[[str, Path], BaseProcess]
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +91,7 @@ def start(log: Path) -> Start:
         first.join()
         os.sched_setaffinity(0, cores)
 
-    def command(name: str, folder: Path) -> multiprocessing.process.BaseProcess:
+    def command(name: str, folder: Path) -> BaseProcess:
         words = COMMANDS[name][0].split()
         if name == "train" and any((folder / CHECKPOINTS).glob("step-*.ckpt")):
             words += ["--load-dir", CHECKPOINTS]
@@ -101,7 +102,7 @@ def start(log: Path) -> Start:
     return command
 
 
-def finish(process: multiprocessing.process.BaseProcess) -> int | None:
+def finish(process: BaseProcess) -> int | None:
     process.join()
     return process.exitcode
 

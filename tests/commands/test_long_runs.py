@@ -153,7 +153,7 @@ def test_a_shell_of_20_million_triangles_is_cast_in_less_than_8_gb(tmp_path: Pat
 
 def divide(path: Path, count: int) -> None:
     """Subdivide each triangle of a mesh into a lattice until there are at least ``count``."""
-    mesh = o3d.io.read_triangle_mesh(str(path))
+    mesh = o3d.io.read_triangle_mesh(str(path))  # pyright: ignore[reportArgumentType]
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
     n = int(np.ceil(np.sqrt(count / len(corners))))
     i, j = np.nonzero(np.add.outer(np.arange(n + 1), np.arange(n + 1)) <= n)
@@ -166,4 +166,4 @@ def divide(path: Path, count: int) -> None:
     each = np.concatenate(faces)
     triangles = (np.arange(len(corners), dtype=np.int32)[:, None, None] * len(i) + each.astype(np.int32)).reshape(-1, 3)
     fine = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(triangles))
-    o3d.io.write_triangle_mesh(str(path), fine)
+    o3d.io.write_triangle_mesh(str(path), fine)  # pyright: ignore[reportArgumentType]

@@ -13,8 +13,6 @@ from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, UNITS_PER_METRE
 
-pytestmark = pytest.mark.usefixtures("eager")
-
 WIDTH = 2 * UNITS_PER_METRE  # width of a band, in scene units
 
 

@@ -246,7 +246,6 @@ def test_a_photograph_that_is_transparent_everywhere_is_refused_by_name(scene):
             load(view)
 
 
-@pytest.mark.usefixtures("eager")
 def test_hidden_colours_reach_neither_seeds_nor_training(scene, tmp_path):
     make_transparent(scene)
     cli.cast(scene, check=False)
@@ -376,7 +375,6 @@ def test_normal_consistency_can_leave_out_pixels_with_a_cue():
     torch.testing.assert_close(term("without_cue", with_cue), expected)
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_masked_view_is_measured_where_it_is_kept(scene, tmp_path):
     paint_all(scene)
     cli.cast(scene)
@@ -390,7 +388,6 @@ def test_a_masked_view_is_measured_where_it_is_kept(scene, tmp_path):
     assert "mask" in data_of(trainer).cached_train[0]
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_fully_masked_photograph_is_refused_by_name(scene, tmp_path):
     paint(scene / "masks" / "frame_00002.png", left=48)
     with pytest.raises(SystemExit, match=r"shellgs: the mask .*masks/frame_00002.png is black everywhere"):

@@ -132,7 +132,7 @@ def test_mcmc_ends_with_a_sentence_where_all_gaussians_are_transparent(logit):
         step(strategy(), params, stepped(params), at=7)
 
 
-def test_dividing_hardly_changes_the_image(eager):
+def test_dividing_hardly_changes_the_image():
     """It is exact for a lone splat in 1D; the screen is 2D and splats overlap."""
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), 40, 40)
 

@@ -97,7 +97,7 @@ def test_seeds_are_spread_more_widely_if_there_are_too_many():
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(eager, pristine_scene, tmp_path, primitive):
+def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(pristine_scene, tmp_path, primitive):
     def choose(config):
         config.pipeline.model.primitive, config.pipeline.model.skybox_seeds = primitive, 0
 

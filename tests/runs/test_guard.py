@@ -19,9 +19,6 @@ from shellgs_method.runs.folders import held
 from shellgs_method.runs.guard import MAX_SKIPPED
 from shellgs_method.trainer import FacadeTrainer
 
-pytestmark = pytest.mark.usefixtures("eager")
-
-
 # NaN and infinity
 
 

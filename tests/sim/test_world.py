@@ -307,12 +307,10 @@ def test_two_buildings_are_one_world(collider, tmp_path):
 @pytest.fixture(scope="module")
 def config(pristine_scene: Path, tmp_path_factory) -> Path:
     """A short run on the tiny scene."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SHELLGS_COMPILE", "0")
-        trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "shellgs_metric", iterations=10)
-        trainer.train()
-        trainer.save_checkpoint(10)
-        trainer.config.save_config()
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "shellgs_metric", iterations=10)
+    trainer.train()
+    trainer.save_checkpoint(10)
+    trainer.config.save_config()
     return trainer.base_dir / "config.yml"
 
 
@@ -327,7 +325,7 @@ def quick(monkeypatch) -> None:
 SMALL = SimSettings(faces=4000)
 
 
-def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, capsys):
+def test_the_command_writes_the_whole_folder(config, tmp_path, quick, capsys):
     out = tmp_path / "facade sim"
     cli.sim((config, out), SMALL)
     said = capsys.readouterr().out
@@ -365,7 +363,7 @@ def joined_file(out: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def test_a_run_without_a_shell_reports_its_frame(config, eager, monkeypatch):
+def test_a_run_without_a_shell_reports_its_frame(config, monkeypatch):
     monkeypatch.setattr(TrainedRun, "shell", None)
     built = Reconstruction.of(TrainedRun.load(config), SMALL.faces, None, None, None)
     said: list[str] = []

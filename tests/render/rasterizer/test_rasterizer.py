@@ -17,8 +17,6 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine import compilation
 from shellgs_method.render.rasterizer import compositing, rasterize
 
-pytestmark = pytest.mark.usefixtures("eager")
-
 
 def differentiate(splats: list[Tensor], composited: Tensor, alpha: Tensor, counted: Tensor, means2d: Tensor) -> dict:
     """Gradients of a random linear function of the counted pixels."""
