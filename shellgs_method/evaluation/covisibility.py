@@ -72,8 +72,8 @@ class Covisibility:
 
     def _depth_of_points(self, camera: Camera, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
         """Depth of the SfM point nearest in the image; that of the sky, 1e6, if the image has none."""
-        pixels, z = _project(camera, self.points)
-        inside = _inside(camera, pixels, z)
+        pixels, z = camera.project(self.points)
+        inside = camera.contains(pixels, z)
         if not inside.any():
             return rays.new_full((*rays.shape[:2], 1), 1e6)
         wanted = (rays @ camera.K.T)[..., :2].reshape(-1, 2)
@@ -82,24 +82,10 @@ class Covisibility:
 
 
 def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "*shape 3"]) -> Bool[Tensor, "*shape"]:
-    pixels, z = _project(camera, world)
-    inside = _inside(camera, pixels, z)
+    pixels, z = camera.project(world)
+    inside = camera.contains(pixels, z)
     size = pixels.new_tensor([camera.width, camera.height])
     thinned = pixels.new_tensor([depth.shape[1], depth.shape[0]])
     columns, rows = (pixels.where(inside[..., None], 0.0) / size * thinned).long().unbind(dim=-1)
     surface = depth[rows, columns]
     return inside & ((surface <= 0) | (z < (1 + BEHIND) * surface))
-
-
-def _project(
-    camera: Camera, world: Float[Tensor, "*shape 3"]
-) -> tuple[Float[Tensor, "*shape 2"], Float[Tensor, "*shape"]]:
-    """Pixel coordinates and z-depths of points."""
-    points = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = points[..., 2]
-    return (points @ camera.K.T)[..., :2] / z.clamp_min(1e-9)[..., None], z
-
-
-def _inside(camera: Camera, pixels: Float[Tensor, "*shape 2"], z: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
-    size = pixels.new_tensor([camera.width, camera.height])
-    return (z > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)

@@ -20,12 +20,13 @@ from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
+from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, make_collider
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.formats.usd import compliance_errors, import_pxr, write_usd_layers, write_usd_world
+from shellgs_method.sim.formats.usd import compliance_errors, write_usd_layers, write_usd_world
 from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.look.renders import rendered
@@ -215,7 +216,7 @@ def test_the_sdf_is_a_static_world(world, collider):
 
 
 def test_usd_of_an_unknown_unit_states_the_metre_in_every_layer(collider, tmp_path):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     building = write_building(tmp_path, collider, metric=False)
     write_usd_world(tmp_path / "facade.usda", [building], metric=False, with_splats=True)
     layers = [tmp_path / "facade.usda", *(tmp_path / "usd").iterdir()]
@@ -229,7 +230,7 @@ def test_usd_of_an_unknown_unit_states_the_metre_in_every_layer(collider, tmp_pa
 
 @pytest.mark.parametrize("look", ["mesh", "splats"])
 def test_the_usd_is_compliant(world, look):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
     assert pxr.UsdGeom.GetStageUpAxis(stage) == "Z"
     assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 1
@@ -239,7 +240,7 @@ def test_the_usd_is_compliant(world, look):
 
 
 def test_the_compliance_checker_finds_faults(tmp_path):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     stage = pxr.Usd.Stage.CreateNew(str(tmp_path / "bad.usda"))
     stage.DefinePrim("/a", "Mesh")
     stage.GetRootLayer().Save()
@@ -247,7 +248,7 @@ def test_the_compliance_checker_finds_faults(tmp_path):
 
 
 def test_usd_colliders_are_the_parts(world, collider):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
     prims = [prim for prim in stage.Traverse() if prim.HasAPI(pxr.UsdPhysics.MeshCollisionAPI)]
     assert len(prims) == len(collider.parts)
@@ -257,7 +258,7 @@ def test_usd_colliders_are_the_parts(world, collider):
 
 
 def test_splats_in_usd_are_the_gaussians(world):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     splats = some_splats()
     stage = pxr.Usd.Stage.Open(str(world / "usd" / "splats.usdc"))
     prim = stage.GetDefaultPrim()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.geometry.camera import Camera, positions, project
+from shellgs_method.geometry.camera import Camera, in_view, positions
 from shellgs_method.geometry.triangles import Triangles
 
 COUNT = 40_000
@@ -74,8 +74,7 @@ def visible(surface: Triangles, cameras: Sequence[Camera]) -> Float64[np.ndarray
     points, normals = points[above], surface.normals[faces[above]]
     seen = np.zeros(len(points), bool)
     for camera, eye in zip(cameras, positions(cameras), strict=True):
-        pixels, depth = project(camera, points)
-        inside = (depth > 0) & (pixels > 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+        inside, _, _ = in_view(camera, points)
         towards = eye - points
         steep = np.abs((normals * towards).sum(1)) > SLANT * np.linalg.norm(towards, axis=1)
         asked = np.flatnonzero(inside & steep & ~seen)
