@@ -26,14 +26,8 @@ from tyro.conf import Suppress
 from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
-from shellgs_method.evaluation.regions import (
-    kept_pixels,
-    masked_image_errors,
-    photometric_pixels,
-    reference_errors,
-    reference_maps,
-    references,
-)
+from shellgs_method.evaluation.pixels import kept_pixels, photometric_pixels, reference_maps
+from shellgs_method.evaluation.regions import masked_image_errors, reference_errors, references
 from shellgs_method.gaussians.densification import GradientStrategy, MCMCConfig, MCMCStrategy, SkyboxStrategy
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.gaussians.surface_weights import SurfaceWeights

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +21,7 @@ BEHIND = 0.02
 
 
 @dataclass(frozen=True)
-class SeenBy:
+class Covisibility:
     """Cameras and shell depths of the training views.
 
     Attributes:
@@ -33,6 +33,23 @@ class SeenBy:
     cameras: Sequence[Camera]
     depths: Sequence[Float[Tensor, "h w"]]
     points: Float[Tensor, "N 3"]
+
+    @classmethod
+    def of(
+        cls, views: Iterable[tuple[Camera, Float[Tensor, "H W 1"] | None]], points: Float[Tensor, "N 3"]
+    ) -> Covisibility:
+        """Covisibility of training views, whose depths are thinned.
+
+        Args:
+            views: camera of each, and z-depth of the shell, None where nothing is known to hide what lies behind.
+            points: SfM points in the cameras' world.
+        """
+        cameras, depths = [], []
+        for camera, depth in views:
+            step = camera.thinning(MAX_SIZE)
+            cameras.append(camera)
+            depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())
+        return cls(cameras, depths, points)
 
     def mask(self, camera: Camera, depth: Float[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
         """Pixels of a view that lie in at least two training images, not hidden by the shell.

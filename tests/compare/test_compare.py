@@ -38,7 +38,7 @@ from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
 from shellgs_method.compare.wandb_report import log_comparison
 from shellgs_method.errors import SceneError
-from shellgs_method.evaluation import regions
+from shellgs_method.evaluation import pixels
 from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import SceneLayout, ScenePaths
@@ -146,7 +146,7 @@ def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
 def test_the_shell_itself_is_measured_over_the_pixels_of_every_method(pristine_scene, monkeypatch):
     """Also where photographs contradict it, since no method is excused from the truth there."""
     shell = measure_shell(SceneLayout(data=pristine_scene))
-    monkeypatch.setattr(regions, "contradicted", lambda batch, device: torch.ones_like(batch["shell_mask"]))
+    monkeypatch.setattr(pixels, "occluded", lambda batch, device: torch.ones_like(batch["shell_mask"]))
     assert measure_shell(SceneLayout(data=pristine_scene)) == pytest.approx(shell, nan_ok=True)
 
 

@@ -21,6 +21,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.masks import kept_pixels
 from shellgs_method.files.photographs import load_mask, load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
+from shellgs_method.gaussians.seeds import shell_seeds, view_of_shell
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses.objective import ExtraLossConfig, self_losses
 from shellgs_method.registration import validate
@@ -249,7 +250,7 @@ def test_hidden_colours_reach_neither_seeds_nor_training(scene, tmp_path):
     make_transparent(scene)
     cli.cast(scene, check=False)
     trainer = trainer_of(scene, tmp_path)
-    seeds = data_of(trainer).shell_seeds(1.0, 10_000, everywhere=True)
+    seeds = shell_seeds(*data_of(trainer).seed_views(view_of_shell, "shell"), 1.0, 10_000)
     red, green, blue = seeds.colours.T
     assert len(seeds.points) > 100
     assert not ((red > green + 0.3) & (blue > green + 0.3)).any()
