@@ -172,7 +172,7 @@ def plain(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [plain(each) for each in value]
     if isinstance(value, torch.Tensor):
-        return hashlib.sha256(value.contiguous().view(torch.uint8).numpy()).hexdigest() if value.ndim else value.item()
+        return hashlib.sha256(value.numpy().tobytes()).hexdigest() if value.ndim else value.item()
     return f"{value:.12g}" if isinstance(value, float) else value
 
 
