@@ -61,7 +61,7 @@ def test_masked_pixels_do_not_colour_a_skybox():
     np.testing.assert_allclose(skybox_of([sky_view(mask)]).colours, [[1, 0, 0]] * 500)
 
 
-def test_a_run_starts_with_a_skybox_coloured_off_the_shell(eager, pristine_scene, tmp_path):
+def test_a_run_starts_with_a_skybox_coloured_off_the_shell(pristine_scene, tmp_path):
     def choose(config):
         config.pipeline.model.seeds, config.pipeline.model.skybox_seeds = "none", 300
 
@@ -78,7 +78,7 @@ def test_a_run_starts_with_a_skybox_coloured_off_the_shell(eager, pristine_scene
     np.testing.assert_array_equal(seeds.colours, [[0, 0, 1]] * 300)
 
 
-def test_pruning_by_size_spares_the_skybox(eager, pristine_scene, tmp_path):
+def test_pruning_by_size_spares_the_skybox(pristine_scene, tmp_path):
     def choose(config):
         config.pipeline.model.skybox_seeds = 1000
 
