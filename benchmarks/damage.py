@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
@@ -89,7 +89,9 @@ def _damage(bench: Workbench, kind: str, cases: int, start: int, broken: Counter
 
 def _workbench(scene: Path) -> Workbench:
     write_scene(scene, FacadeConfig(width=48, height=32, views=10, points=300, supersampling=1))
-    cast_views(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment.load(scene / ALIGNMENT))
+    cast_views(
+        PlacedShell.load(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment.load(scene / ALIGNMENT))
+    )
     return Workbench(scene)
 
 

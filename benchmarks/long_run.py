@@ -35,7 +35,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.map_files import MapRecord
 from shellgs_method.files.photographs import View
-from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 PLACES = 12
@@ -222,7 +222,9 @@ def without_record(file: Path) -> bytes:
 
 def cast(scene: Path) -> None:
     """Cast the shell into all views."""
-    cast_views(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment.load(scene / ALIGNMENT))
+    cast_views(
+        PlacedShell.load(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment.load(scene / ALIGNMENT))
+    )
 
 
 def many_triangles(config: LongRun, folder: Path) -> bool:
