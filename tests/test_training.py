@@ -21,6 +21,7 @@ from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine import compilation
 from shellgs_method.render.maps import geometry_channels
 from shellgs_method.trainer import FacadeTrainer
 
@@ -215,6 +216,24 @@ def test_masked_out_pixels_supervise_nothing(trained):
     outputs, (_, batch) = render(trained), held_out(trained)
     losses = model.get_loss_dict(outputs, batch | {"mask": torch.zeros(32, 48, 1, dtype=torch.bool)})
     assert all(float(value) == 0 for value in losses.values())
+
+
+def test_a_compiled_step_is_that_of_plain_torch(compiler, pristine_scene, tmp_path, monkeypatch):
+    compilation._compiled.cache_clear()
+    losses, gradients = [], []
+    for compiled in ("1", "0"):
+        monkeypatch.setenv("SHELLGS_COMPILE", compiled)
+        trainer = trainer_of(pristine_scene, tmp_path, "shellgs_metric")
+        model_of(trainer).step_cb(trainer.optimizers, 0)
+        _, terms, _ = trainer.pipeline.get_train_loss_dict(step=0)
+        parameters = list(model_of(trainer).gauss_params.values())
+        losses.append(terms)
+        gradients.append(torch.autograd.grad(sum(terms.values()), parameters))
+    torch.testing.assert_close(*losses)
+    for actual, expected in zip(*gradients, strict=True):
+        assert (actual - expected).norm() <= 1e-3 * expected.norm()
+    assert compilation._compiled.cache_info().currsize > 10
+    assert not compilation._failed
 
 
 def test_photo_gs_renders_no_geometry_while_it_trains(pristine_scene, tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.html import data_uri, encoded
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, leaks
 from shellgs_method.sim.collision.distances import Distances
@@ -20,7 +21,6 @@ from shellgs_method.sim.deviations import Deviations
 from shellgs_method.sim.formats.world import Building
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.look.renders import overlaid, rendered, shown
-from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.trials.engine import beams, lidar, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
 
@@ -55,12 +55,12 @@ class Chapter:
     """
 
     made: Reconstruction
-    shell: Surface | None
+    shell: Triangles | None
     collider: Collider
     facts: dict
     deviations: Deviations | None
     distances: Mapping[str, Mapping[str, Distances]]
-    truth: Surface | None
+    truth: Triangles | None
     with_splats: bool
 
 
@@ -73,7 +73,7 @@ def write_report(
         SceneError: MuJoCo refuses the world.
     """
     world = out / "facade.xml"
-    everything = Surface(*joined([part for chapter in chapters for part in chapter.collider.parts]))
+    everything = Triangles(*joined([part for chapter in chapters for part in chapter.collider.parts]))
     eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
     with warnings_kept() as warnings:
         thrown = throw(world, everything, eyes)
@@ -128,11 +128,11 @@ def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
     return made, sentences
 
 
-def lidar_errors(world: Path, collider: Surface, front: Front, truth: Surface) -> dict[str, dict]:
+def lidar_errors(world: Path, collider: Triangles, front: Front, truth: Triangles) -> dict[str, dict]:
     """Errors of a lidar in MuJoCo at 20 places in front of a building, over the rays that hit the true building."""
     places, rays = places_before(collider, front), beams()
     origins = np.repeat(places, len(rays), axis=0)
-    true, _ = truth.cast(origins, np.tile(rays, (len(places), 1)))
+    true = truth.cast(origins, np.tile(rays, (len(places), 1))).t
     with np.errstate(divide="ignore"):
         ground = np.where(rays[:, 2] < 0, np.repeat(places[:, 2:], len(rays), axis=1) / -rays[:, 2], np.inf).ravel()
     meets = true < ground

@@ -45,7 +45,7 @@ def features(
     """Points at up to ``count`` pixels of one view, drawn in proportion to the image's gradient."""
     origin, directions = rays(camera)
     hits = world.cast(origin, directions)
-    glass = hits.material == Material.GLASS
+    glass = world.material[hits.triangle] == Material.GLASS
     gradient = gaussian_gradient_magnitude(image.mean(axis=-1), 1.0)
     weight = np.maximum(gradient - 1.0, 0.0) * np.where(glass, _FEATURES_ON_GLASS, np.isfinite(hits.t))
     # Exponential races draw without replacement in proportion to the weights.
@@ -88,5 +88,5 @@ def _is_visible(world: World, camera: Camera, points: Points) -> np.ndarray:
     in_image = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=-1) & (in_camera[:, 2] > 0)
     origin = camera.position.numpy()
     hits = world.cast(origin, (points.positions - origin).astype(np.float32))
-    unoccluded = np.where(points.is_mirrored, hits.material == Material.GLASS, hits.t > 0.995)
+    unoccluded = np.where(points.is_mirrored, world.material[hits.triangle] == Material.GLASS, hits.t > 0.995)
     return in_image & unoccluded

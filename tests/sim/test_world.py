@@ -21,6 +21,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, make_collider
 from shellgs_method.sim.collision.parts import Part
@@ -30,11 +31,11 @@ from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.look.renders import rendered
 from shellgs_method.sim.look.texture import TexturedMesh
 from shellgs_method.sim.look.visual import write_visual
-from shellgs_method.sim.rays import Surface, outward
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
 from shellgs_method.sim.trials.engine import beams, compiled, import_mujoco, lidar, load, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
+from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import Layout, shell
 from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk as stroll
@@ -50,11 +51,11 @@ def eyes() -> np.ndarray:
 @pytest.fixture(scope="module")
 def collider(eyes) -> Collider:
     mesh = shell(LAYOUT)
-    facade, _ = outward(Surface(mesh.vertices, mesh.triangles), eyes)
+    facade, _ = outward(Triangles(mesh.vertices, mesh.triangles), eyes)
     return make_collider(facade, facade, np.zeros(len(facade.faces), bool))
 
 
-def painted(surface: Surface) -> TexturedMesh:
+def painted(surface: Triangles) -> TexturedMesh:
     """The surface in four colours, by position."""
     uv = (surface.vertices[:, [0, 2]] - surface.vertices[:, [0, 2]].min(0)) / np.ptp(
         surface.vertices[:, [0, 2]], axis=0
@@ -137,7 +138,7 @@ def test_a_lidar_in_mujoco_agrees_with_ray_casting(world, collider, eyes):
     surface = collider.surface
     places, rays = places_before(surface, Front.of(surface, eyes), count=3), beams(6, 40)
     measured = lidar(world / "facade.xml", places, rays, group=3)
-    exact = surface.cast(np.repeat(places, len(rays), axis=0), np.tile(rays, (3, 1)))[0].reshape(3, -1)
+    exact = surface.cast(np.repeat(places, len(rays), axis=0), np.tile(rays, (3, 1))).t.reshape(3, -1)
     with np.errstate(divide="ignore"):
         ground = np.where(rays[:, 2] < 0, places[:, 2:] / -rays[:, 2], np.inf)
     np.testing.assert_allclose(measured, np.minimum(exact, ground), atol=2e-3)
@@ -173,7 +174,7 @@ def test_mujoco_renders_what_a_camera_sees(world, collider):
     rays = camera.rays().numpy() @ pose[:3, :3].T
     surface, look = collider.surface, painted(collider.surface)
     origins = np.broadcast_to(pose[:3, 3], rays.shape)
-    t, face = surface.cast(origins, rays)
+    t, face, _ = surface.cast(origins, rays)
     hit = origins + np.where(np.isfinite(t), t, 0)[..., None] * rays
     weights = trimesh.triangles.points_to_barycentric(
         surface.vertices[surface.faces[face.ravel()]], hit.reshape(-1, 3)
@@ -340,7 +341,7 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, cap
     frame = json.loads((out / "frame.json").read_text())
     assert frame["up"] == "z"
     assert frame["offset"] == [row[3] for row in frame["to_national"][:3]]
-    corner = Surface(*joined_file(out)).vertices
+    corner = Triangles(*joined_file(out)).vertices
     building = transformed(transformed(corner, np.array(frame["to_national"])), np.linalg.inv(SHELL_FROM_BUILDING))
     assert building[:, 0].min() > -1.5
     assert building[:, 0].max() < 19.5
@@ -372,7 +373,7 @@ def test_a_run_without_a_shell_reports_its_frame(config, eager, monkeypatch):
     assert "has no aligned shell: the frame is the scene's" in said[0]
     assert built.shell is None
     assert not built.frame.metric
-    fused, seen = outward(Surface(np.asarray(built.fused.vertices), np.asarray(built.fused.faces)), built.eyes)
+    fused, seen = outward(Triangles(np.asarray(built.fused.vertices), np.asarray(built.fused.faces)), built.eyes)
     assert len(make_collider(None, fused, seen, most=20).parts) <= 20
 
 
