@@ -65,11 +65,13 @@ def align(
         place_by_picks,
         place_by_positions,
         refined,
-        validate_placement,
     )
     from shellgs_method.registration.frames import ShellPlace
+    from shellgs_method.registration.report import write_report
     from shellgs_method.registration.sfm_frame import check_points
+    from shellgs_method.registration.validation import validate
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
+    from shellgs_method.shell.cast import renew_error
 
     starts = [start for start in (matrix, picks, positions) if start]
     if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
@@ -106,7 +108,11 @@ def align(
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
-    validation = validate_placement(scene, placement, mesh, views, points, target)
+    validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
+    write_report(scene / REPORT, mesh, validation, placement.history)
+    if validation.verdict != "refused":
+        validation.validated(views).save(target)
+        renew_error(scene)
     _show_alignment(scene, target, placement, validation)
     if validation.verdict == "refused":
         why = f"{misplacement}; " if misplacement else ""

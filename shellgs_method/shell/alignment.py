@@ -154,6 +154,13 @@ class Alignment:
             lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
             file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
 
+    def record(self, scene: Path, views: Sequence[View]) -> None:
+        """Write a scene's alignment, bound to the cameras of its views; a file that says the same keeps its verdict."""
+        path = scene / ALIGNMENT
+        known = Alignment.load(path) if path.is_file() else None
+        if known is None or not known.places_like(self) or known.cameras.changed(views):
+            replace(self, cameras=BoundCameras.of(views)).save(path)
+
     @classmethod
     def load(cls, path: Path) -> Alignment:
         """Read what :meth:`save` wrote.
