@@ -31,6 +31,7 @@ class ShellPlace:
         path: the shell's file.
 
     Attributes:
+        geometry: what the file holds.
         middle: centre of the shell.
         size: diagonal of its box.
 
@@ -40,7 +41,7 @@ class ShellPlace:
     """
 
     def __init__(self, path: Path) -> None:
-        geometry = read_geometry(path)
+        self.geometry = geometry = read_geometry(path)
         points = geometry.vertices
         if len(geometry.faces) and geometry.faces.max() < len(points):
             areas = np.linalg.norm(area_vectors(points, geometry.faces), axis=1)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.surfaces import read_geometry
 from shellgs_method.geometry.outliers import sound
 from shellgs_method.geometry.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
@@ -83,6 +84,7 @@ def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, 
 def load_shell(
     path: Path,
     *,
+    geometry: Geometry | None = None,
     cache: Path | None = None,
     viewpoints: Float64[np.ndarray, "V 3"] | None = None,
     mesher: Mesher = "planes",
@@ -98,6 +100,7 @@ def load_shell(
     Args:
         path: a mesh (ply, obj, glb, gltf, stl, off) or a cloud (ply, pcd, xyz, pts, txt, asc, csv, las, laz, e57; the
             last three need the extras ``las`` and ``e57``).
+        geometry: what the file holds, if it was read already.
         cache: folder for the mesh of a point cloud; None for no cache.
         viewpoints: positions that see the surface, in the shell's frame. They orient the normals of a cloud whose file
             has no scanner positions. A mesh cached for other viewpoints is made again.
@@ -114,7 +117,7 @@ def load_shell(
     if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, viewpoints)):
         refuse_coarse(mesh.step.scaled(metres_per_unit), f"the coordinates of {path}")
         return mesh
-    geometry = read_geometry(path)
+    geometry = geometry or read_geometry(path)
     try:
         if len(geometry.faces) or not len(geometry.vertices):
             used = _referenced(geometry.vertices, geometry.faces)
