@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from shellgs_method.errors import SceneError
 from shellgs_method.files.surfaces import read_geometry
 from shellgs_method.geometry.nearest import point_tree
-from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.triangles import area_vectors, sampled
 from shellgs_method.registration.sfm_frame import first_slip, in_degrees
 
@@ -47,7 +47,7 @@ class ShellPlace:
             areas = np.linalg.norm(area_vectors(points, geometry.faces), axis=1)
             if np.isfinite(areas).all() and areas.any():
                 points = sampled(points, geometry.faces, areas, _SAMPLES)[0]
-        points = points[sound(points)]
+        points = points[inliers(points)]
         if len(points) == 0:
             raise SceneError(f"the shell {path} has no points")
         points = np.random.default_rng(0).permutation(points)[:_SAMPLES]

@@ -13,7 +13,7 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write, content_hash
 from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.surfaces import read_geometry
-from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
 from shellgs_method.geometry.triangles import area_vectors
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
@@ -121,7 +121,7 @@ def load_shell(
     try:
         if len(geometry.faces) or not len(geometry.vertices):
             used = _referenced(geometry.vertices, geometry.faces)
-            mesh = ShellMesh(*_referenced(*_without_strays(*used, path)))
+            mesh = ShellMesh(*_referenced(*_without_outliers(*used, path)))
             step = mesh_step(mesh.vertices, mesh.faces)
             refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
             return replace(_with_area(mesh, path), step=step)
@@ -179,9 +179,9 @@ def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> S
         return None
 
 
-def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Drop vertices that are not finite or absurdly far away, and their triangles."""
-    kept = sound(vertices, _FAR)
+    kept = inliers(vertices, _FAR)
     if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
         return vertices, faces
     usable = kept[faces].all(axis=1)
