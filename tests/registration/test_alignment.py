@@ -594,7 +594,7 @@ def test_an_invalid_line_of_a_positions_file_is_refused_with_its_number(rigged, 
         read_positions(tmp_path / "geo.txt", rigged[0])
 
 
-# The bay test
+# The repetition test
 
 
 def test_the_sizes_of_bays_and_storeys_are_measured_on_the_shell(surface, points, survey_from_scene):
