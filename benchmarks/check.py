@@ -73,11 +73,11 @@ def print_still(scene: Path, photographs: list[View], facade: Facade) -> None:
     assert unit is not None
     there, found, right = Counter[str](), 0, Counter[str]()
     for view, camera in zip(photographs, facade.cameras, strict=True):
-        on, real, said = (maps.require(view.name, view.camera) for maps in (shell, truth, checked))
+        on, real, check = (maps.require(view.name, view.camera) for maps in (shell, truth, checked))
         before = (on.depth > 0) & (real.depth > 0) & ((on.depth - real.depth) * unit > NEARER)
         material = facade.daylight.world.material[facade.daylight.world.cast(*rays(camera)).triangle]
-        said = Findings.of(said, on)
-        in_front = said.occluder | said.moved
+        findings = Findings.of(check, on)
+        in_front = findings.occluder | findings.moved
         found += int(in_front.sum())
         for kind in np.unique(material[before]):
             name = Material(kind).name.lower()
@@ -94,8 +94,8 @@ def print_moving(scene: Path, photographs: list[View], moving: dict[str, Bool[np
     shell, checked = CueMaps.open(scene, "shell"), CueMaps.open(scene, "checked")
     there = found = right = 0
     for view in photographs:
-        on, said = shell.require(view.name, view.camera), checked.require(view.name, view.camera)
-        moved = Findings.of(said, on).moved
+        on, check = shell.require(view.name, view.camera), checked.require(view.name, view.camera)
+        moved = Findings.of(check, on).moved
         there += int((moving[view.name] & (on.depth > 0)).sum())
         found += int(moved.sum())
         right += int((moved & moving[view.name]).sum())

@@ -86,9 +86,9 @@ def _lists(runs: list[dict]) -> dict[str, list[float]]:
 def origins(results: Path = RESULTS) -> str:
     """How many runs were made at which commit on which machine, and how many are missing."""
     cells: list[Cell] = [cell for setting in GRID for cell in setting.cells if cell.method != SHELL]
-    made = Counter((record["commit"], record["machine"]) for _, record in records(cells, results))
-    groups = [f"{count} at commit {commit} ({machine})" for (commit, machine), count in made.items()]
-    return f"Of {len(cells)} runs: {', '.join([*groups, f'{len(cells) - made.total()} not run yet'])}.\n"
+    counts = Counter((record["commit"], record["machine"]) for _, record in records(cells, results))
+    groups = [f"{count} at commit {commit} ({machine})" for (commit, machine), count in counts.items()]
+    return f"Of {len(cells)} runs: {', '.join([*groups, f'{len(cells) - counts.total()} not run yet'])}.\n"
 
 
 if __name__ == "__main__":

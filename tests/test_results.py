@@ -98,10 +98,10 @@ class Trainings:
 
 @pytest.fixture
 def trainings(monkeypatch, pristine_scene) -> Trainings:
-    made = Trainings()
-    monkeypatch.setattr(fill, "launch_locally", made)
+    trainings = Trainings()
+    monkeypatch.setattr(fill, "launch_locally", trainings)
     monkeypatch.setattr(fill, "prepared", lambda *_: pristine_scene)
-    return made
+    return trainings
 
 
 def measured(cells: tuple[Cell, ...], folder: Path, here: dict[str, str] = HERE) -> list[Cell]:

@@ -136,14 +136,14 @@ def test_a_resampled_map_equals_one_cast_at_that_size(scene, size):
     caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
     camera = read_views(FacadeDataParserConfig(data=scene))[4].camera
     wanted = camera.resized(*size)
-    made, expected = resampled(caster.cast(camera), wanted), caster.cast(wanted)
-    both = made.mask & expected.mask
-    relative = np.abs(made.depth / np.where(both, expected.depth, 1) - 1)[both]
-    assert (made.mask == expected.mask).mean() > 0.93
+    resized, expected = resampled(caster.cast(camera), wanted), caster.cast(wanted)
+    both = resized.mask & expected.mask
+    relative = np.abs(resized.depth / np.where(both, expected.depth, 1) - 1)[both]
+    assert (resized.mask == expected.mask).mean() > 0.93
     assert np.median(relative) < 1e-5
     assert (relative < 0.01).mean() > 0.75
-    assert made.depth.dtype == np.float32
-    assert made.depth[made.mask].all()
+    assert resized.depth.dtype == np.float32
+    assert resized.depth[resized.mask].all()
 
 
 @pytest.mark.parametrize("empty", [False, True])
@@ -174,9 +174,9 @@ def test_memory_is_reported_and_maps_that_do_not_fit_are_read_in_every_step(scen
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1e5})())
     data_of(read).train_dataset.held = True
     data_of(read).__dict__.pop("cached_train", None)
-    said = data_of(read).cached_train and " ".join(capsys.readouterr().out.split())
-    assert "10 photographs and their shell maps take 0.0 GB of memory" in said
-    assert "read from disk in every step" in said
+    printed = data_of(read).cached_train and " ".join(capsys.readouterr().out.split())
+    assert "10 photographs and their shell maps take 0.0 GB of memory" in printed
+    assert "read from disk in every step" in printed
     assert "shell_depth" not in data_of(read).cached_train[0]
     (_, one), (_, other) = data_of(held).next_train(0), data_of(read).next_train(0)
     assert one["image_idx"] == other["image_idx"]

@@ -87,9 +87,9 @@ def _make(scene: Path, config: FacadeConfig) -> None:
     from shellgs_method.synthetic import settings_of, write_scene
 
     if scene.exists():
-        made, asked = settings_of(scene), asdict(config)
-        if other := [name for name in asked if made.get(name, asked[name]) != asked[name]]:
-            what = ", ".join(f"--{name} {made[name]}, not {asked[name]}" for name in other)
+        existing, asked = settings_of(scene), asdict(config)
+        if other := [name for name in asked if existing.get(name, asked[name]) != asked[name]]:
+            what = ", ".join(f"--{name} {existing[name]}, not {asked[name]}" for name in other)
             raise SceneError(
                 f"{scene} was made with {what}: give another folder for this demo, or remove {scene.parent}"
             )

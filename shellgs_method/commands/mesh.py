@@ -42,12 +42,14 @@ def mesh(
     if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
         raise SceneError("--faces must be at least 4, --voxel above 0 and --margin at least 0")
     run = TrainedRun.load(config, up)
-    made = decimate(run.surface(margin, voxel), faces)
-    metrics = mesh_errors(run, made)
-    write_mesh(output, made, run.frame, metrics)
+    surface = decimate(run.surface(margin, voxel), faces)
+    metrics = mesh_errors(run, surface)
+    write_mesh(output, surface, run.frame, metrics)
     truth = {name.removeprefix("truth_"): value for name, value in metrics.items() if name.startswith("truth_")}
     rows = {name: row for name, row in (("shell", metrics), ("truth", truth)) if "rendered" in row}
-    console.print(f"{output}: {len(made.faces)} triangles, voxels of {made.metadata['voxel']:.3g}. {place(run.frame)}")
+    console.print(
+        f"{output}: {len(surface.faces)} triangles, voxels of {surface.metadata['voxel']:.3g}. {place(run.frame)}"
+    )
     if not run.frame.metric and output.suffix.lower() in METRE_FORMATS:
         console.print(f"A {output.suffix} file is in metres, so programs take this unit for the metre: scale it there.")
     if rows:

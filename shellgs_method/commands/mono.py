@@ -58,7 +58,7 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
     command = f"shellgs mono {{scene}}{size}{paths.flags} {source.command}"
     summary = make_maps(scene, views, points, predictor, command=command, max_image_size=max_image_size)
     console.print(
-        f"{summary.made} maps made, {summary.skipped} views already processed, in {summary.seconds:.1f} s; "
+        f"{summary.written} maps made, {summary.skipped} views already processed, in {summary.seconds:.1f} s; "
         f"{len(views) - len(summary.problems)} of {len(views)} views have a map, with a median depth error of "
         f"{summary.residual:.1%} at the SfM points."
     )

@@ -104,11 +104,11 @@ def _remove_damaged(run: Run, console: Console) -> None:
 def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]) -> Comparison:
     """Write results.md, tables/, the images and report.html from all metrics so far."""
     layouts = {run.scene: run.paths.of(run.scene) for run in runs}
-    made = list(tables(runs, {scene: measure_shell(layout) for scene, layout in layouts.items()}))
-    for table in made:
+    all_tables = list(tables(runs, {scene: measure_shell(layout) for scene, layout in layouts.items()}))
+    for table in all_tables:
         table.save(output / "tables")
     with atomic_write(output / "results.md") as file:
-        file.write("\n".join(table.markdown for table in made).encode())
+        file.write("\n".join(table.markdown for table in all_tables).encode())
     figures: dict[str, Path] = {}
     shown: dict[str, list[Run]] = {}
     for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):
@@ -116,8 +116,8 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
         of_scene = [run for run in runs if run.scene == scene]
         shown[scene.name] = _shown(of_scene)
         figures |= _figures(scene, [run for run in of_scene if not run.variant.is_ablation], output, suffix)
-    write_report(output / "report.html", made, figures, shown, {run.label: why for run, why in failures.items()})
-    return Comparison(made, figures, failures)
+    write_report(output / "report.html", all_tables, figures, shown, {run.label: why for run, why in failures.items()})
+    return Comparison(all_tables, figures, failures)
 
 
 def _shown(runs: Sequence[Run]) -> list[Run]:

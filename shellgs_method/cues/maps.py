@@ -30,14 +30,14 @@ class MonoSummary:
     """Summary of :func:`make_maps`.
 
     Attributes:
-        made: number of maps made.
+        written: number of maps made.
         skipped: number of views already processed, with or without a map.
         problems: reason why a view has no map, by the view's name.
         residual: median residual of the fits of all views with a map.
         seconds: wall time.
     """
 
-    made: int
+    written: int
     skipped: int
     problems: dict[str, str]
     residual: float
@@ -82,7 +82,7 @@ def make_maps(
         licence=predictor.licence,
     )
     fits = Fits.open(maps)
-    made = skipped = 0
+    written = skipped = 0
     for view in track(views, description="monocular cues"):
         if fits.problem(view.name) or (view.name in fits.views and maps.current(view.name, view.camera)):
             skipped += 1
@@ -92,11 +92,11 @@ def make_maps(
             maps.remove(view.name)
         else:
             maps.write(view.name, cue, view.camera)
-            made += 1
+            written += 1
         fits.add(view.name, fit)
     problems = {view.name: problem for view in views if (problem := fits.problem(view.name))}
     residuals = [fit["residual"] for name, fit in fits.views.items() if fit and name not in problems]
-    return MonoSummary(made, skipped, problems, float(np.median(residuals)), time.monotonic() - start)
+    return MonoSummary(written, skipped, problems, float(np.median(residuals)), time.monotonic() - start)
 
 
 def align_view(view: View, points: SparsePoints, predictor: Predictor) -> tuple[DisparityFit | None, CueMap | None]:

@@ -104,8 +104,8 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
             return training.compare(view, shell.require(view.name, cameras[view.name]))
 
         with workers() as pool:
-            made = track(pool.map(compare, missing), "comparing the photographs", len(missing))
-            for view, cue in zip(missing, made, strict=True):
+            compared = track(pool.map(compare, missing), "comparing the photographs", len(missing))
+            for view, cue in zip(missing, compared, strict=True):
                 maps.write(view.name, cue, cameras[view.name])
     for unfinished in maps.folder.glob(".*/"):
         shutil.rmtree(unfinished)
@@ -140,8 +140,8 @@ class _TrainingViews:
 
         unfinished.mkdir(exist_ok=True)
         with workers() as pool:
-            made = track(pool.map(look, missing), "looking before the shell", len(missing), disable=not missing)
-            for name, found in zip(missing, made, strict=True):
+            looks = track(pool.map(look, missing), "looking before the shell", len(missing), disable=not missing)
+            for name, found in zip(missing, looks, strict=True):
                 content = io.BytesIO()  # on a full disk, numpy's own writing raises an error that does not say so
                 np.save(content, torch.stack(found).numpy(), allow_pickle=False)
                 with atomic_write(files[name]) as stream:

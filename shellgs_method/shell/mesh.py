@@ -150,9 +150,9 @@ def _seen_alike(before: list[float] | str | None, now: list[float] | None, mesh:
 def _write_cached(mesh: ShellMesh, cached: Path, source: Path, seen_from: list[float] | str | None) -> None:
     """Write the mesh as a PLY of doubles, with a comment that identifies its source."""
     assert mesh.meshing is not None
-    made = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
+    source_record = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
     step = {"lengths": mesh.step.lengths.tolist(), "rounded": mesh.step.rounded}
-    record = json.dumps(made | {"seen_from": seen_from, "step": step})
+    record = json.dumps(source_record | {"seen_from": seen_from, "step": step})
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
     faces["count"], faces["indices"] = 3, mesh.faces
     header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]

@@ -110,13 +110,13 @@ def write_scene(scene: Path, config: FacadeConfig) -> None:
     scene = Path(scene)
     if scene.exists() and not (scene.is_dir() and not any(scene.iterdir())):
         raise ValueError(f"{scene} exists and is not an empty folder: give another one, or remove it first")
-    made = unfinished(scene)
-    made.mkdir(parents=True)
+    partial = unfinished(scene)
+    partial.mkdir(parents=True)
     try:
-        _write(made, config)
-        os.replace(made, scene)
+        _write(partial, config)
+        os.replace(partial, scene)
     except BaseException:
-        shutil.rmtree(made)
+        shutil.rmtree(partial)
         raise
 
 
@@ -150,8 +150,8 @@ def _write(scene: Path, config: FacadeConfig) -> None:
     sensor, sfm, network = _generators(config.seed + 1, 3)
     with workers() as pool:
         exposures = pool.map(partial(exposed, facade.daylight, supersampling=config.supersampling), facade.cameras)
-        made = track(exposures, "synthetic facade", config.views, transient=True)
-        for name, camera, exposure in zip(names, facade.cameras, made, strict=True):
+        taken = track(exposures, "synthetic facade", config.views, transient=True)
+        for name, camera, exposure in zip(names, facade.cameras, taken, strict=True):
             image = developed(exposure, sensor)
             Image.fromarray(image).save(scene / name)
             found.append(features(facade.daylight.world, camera, image, per_view, sfm))

@@ -107,16 +107,16 @@ def test_frames_of_a_rotated_video_are_upright(tmp_path):
 def add_streams(path: Path, *streams: tuple[tuple[int, int], int, dict[str, object]]) -> None:
     """A file of several video streams: size, number of frames and properties of each; blue but for the last, red."""
     with av.open(str(path), "w") as container:
-        made = []
+        added = []
         for size, count, properties in streams:
             is_cover = "disposition" in properties
             stream = container.add_stream("mjpeg" if is_cover else "mpeg4", rate=5)
             stream.width, stream.height, stream.pix_fmt = *size, "yuvj420p" if is_cover else "yuv420p"
             for name, value in properties.items():
                 setattr(stream if name == "disposition" else stream.codec_context, name, value)
-            made.append((stream, size, count))
-        for stream, size, count in made:
-            colour = "red" if stream is made[-1][0] else "blue"
+            added.append((stream, size, count))
+        for stream, size, count in added:
+            colour = "red" if stream is added[-1][0] else "blue"
             for _ in range(count):
                 container.mux(stream.encode(av.VideoFrame.from_image(Image.new("RGB", size, colour))))
             container.mux(stream.encode())

@@ -216,9 +216,9 @@ def test_a_full_disk_ends_a_command_with_one_sentence_and_loses_nothing(undistur
     with (disk / "ballast").open("wb") as ballast:
         os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(disk).free - room)
     if finish(start(command, work)):  # a run that writes less than the first had room
-        said = log.read_text()
-        assert "Traceback" not in said
-        last = said.strip().splitlines()[-1]
+        logged = log.read_text()
+        assert "Traceback" not in logged
+        last = logged.strip().splitlines()[-1]
         assert last.startswith("shellgs: ")
         assert "disk" in last
     found = contents(work)

@@ -543,8 +543,8 @@ REFUSED = {
 def test_an_impossible_comparison_is_refused_with_one_sentence(pristine_scene, tmp_path, monkeypatch, what):
     words, why = REFUSED[what]
     output = tmp_path / "out"
-    said = refusal(monkeypatch, "compare", pristine_scene, "--methods", "photo-gs", *words, "--output", output)
-    assert why in said
+    sentence = refusal(monkeypatch, "compare", pristine_scene, "--methods", "photo-gs", *words, "--output", output)
+    assert why in sentence
     if "cluster" not in what:
         assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 

@@ -65,8 +65,12 @@ class Gltf:
 
     def primitive(self, vertices: np.ndarray, indices: np.ndarray | None = None, **fields: Any) -> dict[str, Any]:
         normalized = {} if vertices.dtype.kind == "f" else {"normalized": True}
-        made = {"attributes": {"POSITION": self.accessor(vertices, **normalized)}, **fields}
-        return made if indices is None else made | {"indices": self.accessor(indices.reshape(-1).astype(np.uint16))}
+        primitive = {"attributes": {"POSITION": self.accessor(vertices, **normalized)}, **fields}
+        return (
+            primitive
+            if indices is None
+            else primitive | {"indices": self.accessor(indices.reshape(-1).astype(np.uint16))}
+        )
 
     def box(self) -> dict[str, Any]:
         return self.primitive(CORNERS.astype(np.float32), FACES)

@@ -54,13 +54,13 @@ def walked(count: int = 12) -> np.ndarray:
 
 def cameras(positions: np.ndarray, stored: Callable[[np.ndarray], np.ndarray] = lambda t: t) -> list[Camera]:
     """Cameras at positions whose translations, in the cameras' axes, were stored."""
-    made = []
+    placed = []
     for k, position in enumerate(positions):
         viewmat = np.eye(4)
         viewmat[:3, :3] = Rotation.from_euler("zyx", [10 * k, -80, k], degrees=True).as_matrix()
         viewmat[:3, 3] = stored(-viewmat[:3, :3] @ position)
-        made.append(Camera(torch.from_numpy(viewmat), torch.eye(3, dtype=torch.float64), 4, 3))
-    return made
+        placed.append(Camera(torch.from_numpy(viewmat), torch.eye(3, dtype=torch.float64), 4, 3))
+    return placed
 
 
 @pytest.mark.parametrize(

@@ -992,8 +992,8 @@ def test_chosen_folders_reach_every_command(scene, shellgs):
     assert "10 views cast" in shellgs("cast", scene, *paths)
     command = CueMaps.open(scene, "shell").manifest.command
     assert command == "shellgs cast {scene} --images-path photos --colmap-path model"
-    made = shellgs("mono", scene, *paths, "from", scene / "predictions")
-    assert "maps made" in made or "no view has a monocular map that can be trusted" in made
+    printed = shellgs("mono", scene, *paths, "from", scene / "predictions")
+    assert "maps made" in printed or "no view has a monocular map that can be trusted" in printed
 
 
 @pytest.mark.parametrize(

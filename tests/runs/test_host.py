@@ -137,9 +137,9 @@ COMMANDS: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_that_cannot_serve_ends_with_a_sentence(loaded, tmp_path, command):
-    made, sentence = COMMANDS[command]
+    command_of, sentence = COMMANDS[command]
     with pytest.raises(SystemExit, match=f"^shellgs: .*{sentence}"):
-        made(tmp_path).main()
+        command_of(tmp_path).main()
 
 
 def test_views_cannot_be_scaled_down_when_they_are_rendered(trainer):

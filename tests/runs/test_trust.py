@@ -172,9 +172,9 @@ def test_a_damaged_config_is_refused_with_a_sentence(run, monkeypatch, damage):
     text = (run / "config.yml").read_text()
     (run / "config.yml").write_text(change(text), errors="surrogateescape")
     before = files(run)
-    said = refusal(monkeypatch, "evaluate", run / "config.yml", "--output-path", run / "eval.json")
-    assert str(run / "config.yml") in said
-    assert why in said
+    sentence = refusal(monkeypatch, "evaluate", run / "config.yml", "--output-path", run / "eval.json")
+    assert str(run / "config.yml") in sentence
+    assert why in sentence
     assert files(run) == before
 
 
@@ -331,8 +331,8 @@ def test_a_full_disk_is_reported_with_the_file_and_changes_no_existing_file(run,
     monkeypatch.setattr("shellgs_method.export.runs.mesh_errors", lambda *_: {})
     flag = "--output-path" if command == "evaluate" else "--output"
     with small_disk(2000):
-        said = refusal(
+        sentence = refusal(
             monkeypatch, command, run / "config.yml", flag, target, *(["--margin", "1e9"] * (command == "mesh"))
         )
-    assert f"{target} cannot be written, the disk" in said
+    assert f"{target} cannot be written, the disk" in sentence
     assert files(run) == before
