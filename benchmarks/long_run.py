@@ -137,7 +137,7 @@ def many_steps(config: LongRun, folder: Path) -> bool:
     words = training(
         "shellgs-metric", folder / "scene", config.steps, "--vis", "tensorboard", "--steps-per-save", "500"
     )
-    few = ["--pipeline.model.max-seeds", "2000", "--pipeline.model.densify-grad-thresh", str(THRESHOLD)]
+    few = ["--pipeline.model.densify-grad-thresh", str(THRESHOLD)]
     watched([*words, *few], folder / "log.txt", look)
     table = Table("steps", "MB", "files", "threads", title=f"{config.steps} steps at 64x36, medians")
     rows = []

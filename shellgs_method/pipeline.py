@@ -18,6 +18,7 @@ from torch import Tensor
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
+from shellgs_method.gaussians.initial import MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
@@ -67,15 +68,14 @@ class FacadePipeline(VanillaPipeline):
     def _add_seeds(self) -> None:
         model, data = self.model, self.datamanager
         config = model.config
-        if config.seeds == "shell":
-            everywhere = config.shell_counts == "everywhere"
-            model.add_seeds(data.shell_seeds(config.seed_spacing, model.room_for(config.max_seeds), everywhere))
-        if config.geometry_of == "surface" and config.primitive == "3d":
-            shell = data.shell_seeds(config.seed_spacing, config.max_seeds, everywhere=True)
+        if config.init == "shell":
+            model.add_seeds(data.shell_seeds(SEED_SPACING, MAX_SEEDS, everywhere=config.trust == "shell"))
+        if config.trust == "photographs" and config.primitive == "3d":
+            shell = data.shell_seeds(SEED_SPACING, MAX_SEEDS, everywhere=True)
             model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
-            model.add_seeds(data.seeds_behind_shell(config.seed_spacing, model.room_for(config.max_seeds)))
-        if config.skybox_seeds > 0:
-            model.add_seeds(data.skybox_seeds(model.room_for(config.skybox_seeds)))
+            model.add_seeds(data.seeds_behind_shell(SEED_SPACING, MAX_SEEDS))
+        if config.init == "shell":
+            model.add_seeds(data.skybox_seeds(SKYBOX_SEEDS))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's Gaussians.

@@ -41,13 +41,6 @@ PRIVATE = [
             "_prune_gs": "self params optimizers state step",
         }.items()
     ),
-    ("shellgs_method/gaussians/densification.py", "gsplat.strategy.ops", "_multinomial_sample", "weights n"),
-    (
-        "shellgs_method/gaussians/densification.py",
-        "gsplat.strategy.ops",
-        "_update_param_with_optimizer",
-        "param_fn optimizer_fn params optimizers names",
-    ),
     ("shellgs_method/machine/compilation.py", "torch._dynamo", "mark_dynamic", "t index"),
     ("shellgs_method/machine/compilation.py", "torch._dynamo", "maybe_mark_dynamic", "t index"),
     ("shellgs_method/machine/compilation.py", "torch._inductor.cpp_builder", "get_cpp_compiler", ""),

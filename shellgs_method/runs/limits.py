@@ -38,8 +38,6 @@ class Limits(NamedTuple):
 
 
 TINY = 1e-30
-MIN_POINTS = 4
-"""Fewest points to start from: a point and its three neighbours, whose distance is its scale."""
 COUNT, FROM_ONE = Limits(0, 1e9, int), Limits(1, 1e9, int)
 WEIGHT, SHARE, LENGTH, RATE = Limits(0, 1e6), Limits(0, 1), Limits(TINY, 1e6), Limits(TINY, 1e3)
 PORT = Limits(1, 65535, int)
@@ -69,30 +67,15 @@ LIMITS = {
     "camera_res_scale_factor": Limits(TINY, 1),
     "warmup_length": COUNT,
     "stop_split_at": COUNT,
-    "stop_screen_size_at": COUNT,
     "refine_every": FROM_ONE,
-    "reset_alpha_every": FROM_ONE,
     "densify_grad_thresh": WEIGHT,
-    "densify_size_thresh": WEIGHT,
-    "wide_gradient": WEIGHT,
-    "split_screen_size": WEIGHT,
     "cull_scale_thresh": WEIGHT,
-    "cull_screen_size": WEIGHT,
     "cull_alpha_thresh": SHARE,
-    "ssim_lambda": SHARE,
     "sh_degree": Limits(0, 3, int),
-    "sh_degree_interval": FROM_ONE,
-    "seed_spacing": LENGTH,
-    "max_seeds": FROM_ONE,
-    "skybox_seeds": Limits(0, 1e6, int),
-    "init_opacity": Limits(0.01, 0.99),
-    "cap_max": Limits(MIN_POINTS, 1e9, int),
-    "noise": Limits(0, 1e12),
     "ncc_window": Limits(3, 101, int, odd=True),
-    "ncc_eps": Limits(TINY, 1),
 }
 """Ranges by the name of a setting; other numbers of the losses are weights and lengths from 0, ``…_from`` are steps."""
-_LOSSES = ("pipeline.model.geometry.", "pipeline.model.extra.", "pipeline.model.mcmc.")
+_LOSSES = ("pipeline.model.geometry.", "pipeline.model.extra.")
 
 _ONE_DEVICE = "a run is trained on one device, and `shellgs compare --jobs` trains several runs at a time"
 _VIEWS = "in training, held-out views are drawn one at a time, and `ns-eval` measures all of them"

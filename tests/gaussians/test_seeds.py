@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +13,11 @@ from training_runs import data_of, model_of, trainer_of
 
 from shellgs_method.errors import SceneError
 from shellgs_method.gaussians.densification import SkyboxStrategy
-from shellgs_method.gaussians.seeds import SKYBOX_RADIUS, SeededView, SkyView, shell_seeds, skybox_seeds
+from shellgs_method.gaussians.initial import MAX_SEEDS, OPACITY, SEED_SPACING, SKYBOX_SEEDS, sfm_points
+from shellgs_method.gaussians.seeds import SKYBOX_RADIUS, SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
 from shellgs_method.gaussians.surface_weights import WEIGHT_BEHIND, SurfaceWeights
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.reference import Reference
-from shellgs_method.model import FacadeModel
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 from shellgs_method.render.rasterizer import quats_to_rotations
 
@@ -98,14 +97,18 @@ def test_seeds_are_spread_more_widely_if_there_are_too_many():
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(eager, pristine_scene, tmp_path, primitive):
+def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_shell_and_skybox(
+    eager, pristine_scene, tmp_path, primitive
+):
     def choose(config):
-        config.pipeline.model.primitive, config.pipeline.model.skybox_seeds = primitive, 0
+        config.pipeline.model.primitive = primitive
 
     trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
-    model, sfm = model_of(trainer), model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
-    n, seeds = sfm.num_points, data_of(trainer).shell_seeds(model.config.seed_spacing, model.config.max_seeds, True)
-    assert len(seeds.points) > 50
+    model, data = model_of(trainer), data_of(trainer)
+    sfm = model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
+    n, on_shell = sfm.num_points, data.shell_seeds(SEED_SPACING, MAX_SEEDS, everywhere=False)
+    seeds = Seeds(*map(np.concatenate, zip(on_shell, data.skybox_seeds(SKYBOX_SEEDS), strict=True)))
+    assert len(on_shell.points) > 50
     torch.testing.assert_close(model.means[:n], sfm.means)
     torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
     thin = quats_to_rotations(model.quats[n:])[..., 2]
@@ -115,13 +118,13 @@ def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(eager,
     assert (scales[:, 2] < 0.11 * scales[:, :2].amin(dim=-1)).all()
     assert primitive == "3d" or (model.scales[:, 2] == DISC_LOG_THICKNESS).all()
     torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+    torch.testing.assert_close(model.opacities.sigmoid(), torch.full((model.num_points, 1), OPACITY["shell"]))
 
 
 @pytest.mark.parametrize(("count", "said"), [(3, "has 3 SfM points"), (0, "has no SfM points")])
 def test_too_few_sfm_points_are_counted(count, said):
-    model = SimpleNamespace(seed_points=(torch.zeros(count, 3), torch.zeros(count, 3)))
     with pytest.raises(SceneError, match=f"{said} to start from, of at least 4"):
-        FacadeModel._seed_points(model)  # pyright: ignore[reportArgumentType]
+        sfm_points((torch.zeros(count, 3), torch.zeros(count, 3)))
 
 
 def test_without_shell_maps_in_any_training_view_there_are_no_seeds():
@@ -181,16 +184,8 @@ def test_masked_pixels_do_not_colour_a_skybox():
     np.testing.assert_allclose(skybox_of([sky_view(mask)]).colours, [[1, 0, 0]] * 500)
 
 
-def test_a_run_starts_with_a_skybox_coloured_off_the_shell(eager, pristine_scene, tmp_path):
-    def choose(config):
-        config.pipeline.model.seeds, config.pipeline.model.skybox_seeds = "none", 300
-
-    trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
-    model, data = model_of(trainer), data_of(trainer)
-    n, seeds = model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs")).num_points, data.skybox_seeds(300)
-    assert model.num_points - n == 300
-    torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
-    torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+def test_a_skybox_is_coloured_by_what_is_off_the_shell(eager, pristine_scene, tmp_path):
+    data = data_of(trainer_of(pristine_scene, tmp_path, "shellgs"))
     for batch in data.cached_train:
         batch["image"] = torch.where(batch["shell_mask"], torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
     np.testing.assert_array_equal(data.skybox_seeds(300).colours, [[0, 0, 1]] * 300)
@@ -198,7 +193,7 @@ def test_a_run_starts_with_a_skybox_coloured_off_the_shell(eager, pristine_scene
 
 def test_pruning_by_size_spares_the_skybox(eager, pristine_scene, tmp_path):
     def choose(config):
-        config.pipeline.model.skybox_seeds = 1000
+        config.pipeline.model.init = "shell"
 
     trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=choose)
     model, optimizers = model_of(trainer), trainer.optimizers.optimizers

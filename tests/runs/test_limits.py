@@ -33,10 +33,8 @@ USED = """
     pipeline.datamanager.cache_images_type pipeline.datamanager.train_cameras_sampling_strategy
     pipeline.datamanager.train_cameras_sampling_seed pipeline.datamanager.fps_reset_every
     pipeline.model.warmup_length pipeline.model.refine_every pipeline.model.background_color
-    pipeline.model.cull_alpha_thresh pipeline.model.cull_scale_thresh pipeline.model.reset_alpha_every
-    pipeline.model.densify_grad_thresh pipeline.model.densify_size_thresh pipeline.model.sh_degree_interval
-    pipeline.model.cull_screen_size pipeline.model.split_screen_size pipeline.model.stop_screen_size_at
-    pipeline.model.ssim_lambda pipeline.model.stop_split_at pipeline.model.sh_degree
+    pipeline.model.cull_alpha_thresh pipeline.model.cull_scale_thresh pipeline.model.densify_grad_thresh
+    pipeline.model.stop_split_at pipeline.model.sh_degree
     optimizer.lr optimizer.eps optimizer.weight_decay optimizer.max_norm
 """
 """Inherited settings that change what a run does, by the end of their path."""
