@@ -8,10 +8,11 @@ demo: .venv/checked  ## install; make the synthetic facade, train photo-gs and s
 
 # OpenMP's threads spin while they wait; training adapts to what else runs (threads.py), but these tests are short.
 test: export OMP_WAIT_POLICY ?= passive
-test: .venv/dev .venv/checked  ## install; format, lint, types, tests
+test: .venv/dev .venv/checked  ## install; format, lint, types, imports, tests
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports --no-cache
 	$(BIN)/pytest -n 2 --dist loadfile
 
 docs: .venv/docs  ## the pages, in build/docs; broken links are errors

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
@@ -20,10 +19,11 @@ from dataparsers.cameras import pinhole_cameras
 from dataparsers.orientation import oriented
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.files.cue_maps import CueMaps, find_cues
-from shellgs_method.files.frames import Recording, Shot
-from shellgs_method.files.photographs import View, undistort
+from shellgs_method.files.frames import Frame, Recording
+from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
+from shellgs_method.files.undistortion import undistort
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.precision import camera_step, warn_of_coarse
 from shellgs_method.registration.sfm_frame import check_points
@@ -77,7 +77,7 @@ class FacadeDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         config = self.config
         recording = config.read()
-        views = _views(recording.shots, config)
+        views = _views(recording.frames, config)
         poses, transform, scale = _rescaled(recording, config)
         cues = {kind: CueMaps.open(config.data, kind) for kind in find_cues(config.data)}
         shell = cues["shell"].manifest if "shell" in cues else None
@@ -111,57 +111,40 @@ class FacadeDataParser(DataParser):
 
 def read_views(layout: SceneLayout) -> list[View]:
     """All views of a scene at full size, training and held-out, sorted by name."""
-    return _views(layout.read().shots, layout)
+    return _views(layout.read().frames, layout)
 
 
 def held_out_names(config: FacadeDataParserConfig) -> set[str]:
     """Names of the views that are held out for evaluation; none in a scene of one photograph."""
     recording = config.read()
-    held_out = _of_split(recording, "test", config) if len(recording.shots) > 1 else []
-    return {recording.shots[k].name for k in held_out}
+    held_out = _of_split(recording, "test", config) if len(recording.frames) > 1 else []
+    return {recording.frames[k].name for k in held_out}
 
 
-def _views(shots: Sequence[Shot], layout: SceneLayout) -> list[View]:
-    _refuse_missing_images(shots, layout.data)
-    cameras = [shot.camera for shot in shots]
+def _views(frames: Sequence[Frame], layout: SceneLayout) -> list[View]:
+    _refuse_missing_images(frames, layout.data)
+    cameras = [frame.camera for frame in frames]
     warn_of_coarse(camera_step(cameras), positions(cameras), f"the cameras of {layout.data}")
-    masks = layout.masks(shots)
+    masks = layout.masks(frames)
     views = []
     pinholes: dict[tuple, Camera] = {}  # photographs of one lens share their undistorted camera
-    for shot in shots:
-        camera, lens = shot.camera, None
-        if not shot.is_pinhole:
-            lens = _lens(shot)
-            key = (camera.K.numpy().tobytes(), shot.distortion, shot.kind, camera.width, camera.height)
+    for frame in frames:
+        camera, lens = frame.camera, frame.lens
+        if lens is not None:
+            key = (lens.K.numpy().tobytes(), lens.distortion, lens.fisheye, lens.width, lens.height)
             if key not in pinholes:
-                K, image = undistort(lens, np.zeros((camera.height, camera.width, 3), np.uint8))
-                pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K).double(), image.shape[1], image.shape[0])
+                K, image = undistort(lens, np.zeros((lens.height, lens.width, 3), np.uint8))
+                pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K), image.shape[1], image.shape[0])
             camera = replace(pinholes[key], viewmat=camera.viewmat)
-        views.append(View(shot.name, shot.image, camera, lens, masks.get(shot.name)))
+        views.append(View(frame.name, frame.image, camera, lens, masks.get(frame.name)))
     return oriented(views, layout)
-
-
-def _lens(shot: Shot) -> Cameras:
-    """The calibrated camera, for nerfstudio's undistortion."""
-    K = shot.camera.K.float()
-    return Cameras(
-        camera_to_worlds=torch.eye(4)[None, :3],
-        fx=K[0, 0],
-        fy=K[1, 1],
-        cx=K[0, 2],
-        cy=K[1, 2],
-        width=shot.camera.width,
-        height=shot.camera.height,
-        distortion_params=torch.tensor(shot.distortion)[None],
-        camera_type=shot.kind,
-    )[0]
 
 
 def _rescaled(
     recording: Recording, config: FacadeDataParserConfig
 ) -> tuple[torch.Tensor, Float64[np.ndarray, "4 4"], float]:
     """Poses in nerfstudio's world (OpenGL, float32), and the rigid motion and then scale from the scene to it."""
-    poses = np.stack([np.linalg.inv(shot.camera.viewmat.numpy()) for shot in recording.shots])
+    poses = np.stack([np.linalg.inv(frame.camera.viewmat.numpy()) for frame in recording.frames])
     poses = recording.applied @ poses @ np.diag([1.0, -1.0, -1.0, 1.0])
     to_origin = np.eye(4)
     positions = poses[:, :3, 3]
@@ -187,7 +170,7 @@ def _image_size(config: FacadeDataParserConfig, of_maps: int | None) -> int | No
 
 def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) -> list[int]:
     """Indices of the photographs of a split."""
-    names = [shot.name for shot in recording.shots]
+    names = [frame.name for frame in recording.frames]
     if recording.listed:
         listed = recording.listed.get(split, recording.listed.get("test" if split == "val" else "val", set()))
         unknown = sorted(listed - set(names))
@@ -203,12 +186,12 @@ def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) 
     return [k for k in range(len(names)) if (k % interval == 0) != (split == "train")]
 
 
-def _refuse_missing_images(shots: Sequence[Shot], scene: Path) -> None:
-    missing = [shot.name for shot in shots if not shot.image.is_file()]
+def _refuse_missing_images(frames: Sequence[Frame], scene: Path) -> None:
+    missing = [frame.name for frame in frames if not frame.image.is_file()]
     if missing:
         shown = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
         raise FileNotFoundError(
-            f"{len(missing)} of {len(shots)} images of the cameras in {scene} are not on disk ({shown}); "
+            f"{len(missing)} of {len(frames)} images of the cameras in {scene} are not on disk ({shown}); "
             "put them back or take them out of the model."
         )
 

@@ -170,14 +170,14 @@ def _in_view(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) 
     """Undistort a map of the photograph and resize it to the view's camera; NaN where less than half is valid."""
     import torch
 
-    from shellgs_method.files.photographs import undistort
+    from shellgs_method.files.undistortion import undistort
 
     height, width = valid.shape
-    calibrated = view.camera if view.lens is None else view.lens
-    if abs(width / height / (int(calibrated.width) / int(calibrated.height)) - 1) > ASPECT_TOLERANCE:
+    calibrated = view.lens or view.camera
+    if abs(width / height / (calibrated.width / calibrated.height) - 1) > ASPECT_TOLERANCE:
         raise SceneError(
             f"the map of view {view.name!r} is {width}x{height} pixels, not the aspect ratio of its photograph "
-            f"({int(calibrated.width)}x{int(calibrated.height)}): make it from the whole, upright photograph"
+            f"({calibrated.width}x{calibrated.height}): make it from the whole, upright photograph"
         )
     # Invalid pixels have weight 0; weighted values and weights are interpolated, then divided.
     weighted = np.concatenate([np.where(valid[..., None], values, 0), valid[..., None]], axis=-1).astype(np.float32)
@@ -190,7 +190,7 @@ def _in_view(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) 
         return planes[0].permute(1, 2, 0).numpy()
 
     if view.lens is not None:
-        weighted = undistort(view.lens, resized(weighted, (int(view.lens.height), int(view.lens.width))))[1]
+        weighted = undistort(view.lens, resized(weighted, (view.lens.height, view.lens.width)))[1]
     weighted = resized(weighted, (view.camera.height, view.camera.width))
     weight = weighted[..., -1:]
     return np.where(weight > 0.5, weighted[..., :-1] / np.maximum(weight, 0.5), np.nan).astype(np.float32)

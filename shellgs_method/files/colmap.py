@@ -6,51 +6,47 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
-from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.frames import UNDISTORT, Recording, Shot, in_order, shot
+from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order
 from shellgs_method.files.paths import NamedFiles
 
 PLACES = (Path("colmap/sparse"), Path("sparse"))
 """Folders of numbered models, or of one."""
 # From COLMAP's axes (-y is up) to nerfstudio's.
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-_MODELS = (  # name and number of parameters, by COLMAP's model id
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-    # From here on, nerfstudio has none of them; known in order to be named.
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    ("SIMPLE_DIVISION", 4),
-    ("DIVISION", 5),
-    ("SIMPLE_FISHEYE", 3),
-    ("FISHEYE", 4),
-    ("EUCM", 6),
-    ("EQUIRECTANGULAR", 2),
-)
-_PARAMETERS = dict(_MODELS)
+_MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, or their number if it is only named
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
+}
+_PARAMETERS = {name: known if isinstance(known, int) else len(known.split()) for name, known in _MODELS.items()}
 _PANORAMAS = {"EQUIRECTANGULAR", "SPHERICAL"}  # the same by the name of other programs
 
 T = TypeVar("T")
 
 
 class _Camera(NamedTuple):
-    """Camera as expected by nerfstudio's ``parse_colmap_camera_params``."""
-
     model: str
     width: int
     height: int
@@ -116,10 +112,10 @@ def read_recording(scene: Path, folder: Path, images_path: Path) -> Recording:
     cameras = _read(scene / folder, "cameras", _binary_cameras, _text_cameras)
     files = _files(scene, folder, images_path)
     images = _images(scene / folder)
-    shots = [_shot(scene, _path(image.name, files), image, cameras, folder) for image in images.values()]
+    frames = [_frame(scene, _path(image.name, files), image, cameras, folder) for image in images.values()]
     listed = _listed(files)
     files.tell_what_is_elsewhere()
-    return Recording(in_order(shots, str(scene / folder)), APPLIED, listed)
+    return Recording(in_order(frames, str(scene / folder)), APPLIED, listed)
 
 
 def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, Mapping[int, str]]:
@@ -158,16 +154,11 @@ def _path(name: str, files: NamedFiles) -> str:
     return path.relative_to(files.scene).as_posix()
 
 
-def _shot(scene: Path, path: str, image: _Image, cameras: Mapping[int, _Camera], folder: Path) -> Shot:
+def _frame(scene: Path, path: str, image: _Image, cameras: Mapping[int, _Camera], folder: Path) -> Frame:
     where = str(scene / folder)
     camera = cameras.get(image.camera)
     if camera is None:
         raise SceneError(f"{where}: the camera {image.camera} of {image.name} is not among its cameras")
-    try:
-        lens = parse_colmap_camera_params(camera)
-    except NotImplementedError as error:  # which names the model
-        reason = str(error).rstrip("!")
-        raise SceneError(f"nerfstudio cannot read the cameras of {scene}: {reason}; {_remedy(camera.model)}") from error
     quaternion = np.array(image.quaternion)
     if not np.isfinite(quaternion).all() or not 0.9 < np.linalg.norm(quaternion) < 1.1:
         raise SceneError(f"{where}: the pose of {image.name} has no rotation: its quaternion is {image.quaternion}")
@@ -176,11 +167,22 @@ def _shot(scene: Path, path: str, image: _Image, cameras: Mapping[int, _Camera],
     viewmat[:3, 3] = image.translation
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = viewmat[:3, :3].T, -viewmat[:3, :3].T @ viewmat[:3, 3]
-    return shot(scene, path, pose, lens, where)
+    return frame(scene, path, pose, _lens(camera, scene), where)
 
 
-def _remedy(model: str) -> str:
-    return "render perspective photographs from these panoramas first" if model in _PANORAMAS else UNDISTORT
+def _lens(camera: _Camera, scene: Path) -> dict[str, Any]:
+    """Intrinsics and distortion by the names of transforms.json."""
+    parameters = _MODELS.get(camera.model)
+    if not isinstance(parameters, str):
+        panorama = camera.model in _PANORAMAS
+        remedy = "render perspective photographs from these panoramas first" if panorama else UNDISTORT
+        raise SceneError(
+            f"the cameras of {scene} are of the model {camera.model}, which cannot be undistorted; {remedy}"
+        )
+    values = dict(zip(parameters.split(), camera.params, strict=True))
+    fx = values.pop("f", values.pop("fx", None))
+    lens = {"fl_x": fx, "fl_y": values.pop("fy", fx), "w": camera.width, "h": camera.height}
+    return lens | values | {"camera_model": FISHEYE if "FISHEYE" in camera.model else "OPENCV"}
 
 
 def _listed(files: NamedFiles) -> dict[str, set[str]]:
@@ -257,7 +259,8 @@ def _binary_cameras(file: _Bytes) -> dict[int, _Camera]:
                 f"its camera {number} has a model of the number {model}, which is unknown here: if it is not damaged "
                 f"but of a newer COLMAP or another program, {UNDISTORT}"
             )
-        name, count = _MODELS[model]
+        name = list(_MODELS)[model]
+        count = _PARAMETERS[name]
         cameras[number] = _Camera(name, width, height, file.take(f"<{count}d"))
     return cameras
 

@@ -1,4 +1,4 @@
-"""Photographs and cameras listed in a scene's files, validated and in double precision."""
+"""Frames: photographs and cameras listed in a scene's files, validated and in double precision."""
 
 from __future__ import annotations
 
@@ -12,43 +12,38 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float64
-from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.paths import inside
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.lens import COEFFICIENTS, Lens
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
 MAX_PIXELS = 178_956_970
 """Most pixels of a photograph: Pillow's limit for decompression bombs. Larger ones are never allocated."""
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE = "OPENCV_FISHEYE"
+"""Camera models that nerfstudio undistorts."""
 _ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
 
 
 @dataclass(frozen=True)
-class Shot:
+class Frame:
     """A photograph and its camera, as given in the scene's files.
 
     Attributes:
         name: the image's path relative to the scene, with forward slashes.
         image: the image file.
         camera: calibrated camera without its distortion, in the scene's own frame and units.
-        distortion: k1, k2, k3, k4, p1, p2, as nerfstudio orders them.
-        kind: perspective or fisheye.
+        lens: the camera with its distortion; None if it has none.
         mask: the user's mask file, if the scene's files name one.
     """
 
     name: str
     image: Path
     camera: Camera
-    distortion: tuple[float, ...] = (0.0,) * len(DISTORTION)
-    kind: CameraType = CameraType.PERSPECTIVE
+    lens: Lens | None = None
     mask: Path | None = None
-
-    @property
-    def is_pinhole(self) -> bool:
-        """Whether the camera is perspective and without distortion."""
-        return self.kind is CameraType.PERSPECTIVE and not any(self.distortion)
 
 
 @dataclass(frozen=True)
@@ -56,19 +51,19 @@ class Recording:
     """All photographs of a scene.
 
     Attributes:
-        shots: sorted by name.
+        frames: sorted by name.
         applied: rigid motion from the scene's frame to the one that nerfstudio would read.
         listed: names of photographs by split, where the files list them; else the interval decides.
         orientation: orientation method for the viewer, if the files set one.
     """
 
-    shots: Sequence[Shot]
+    frames: Sequence[Frame]
     applied: Float64[np.ndarray, "4 4"]
     listed: Mapping[str, set[str]] = field(default_factory=dict)
     orientation: str | None = None
 
 
-def shot(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping[str, Any], where: str) -> Shot:
+def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping[str, Any], where: str) -> Frame:
     """Validate a photograph and its camera.
 
     Args:
@@ -93,40 +88,36 @@ def shot(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mapping
     fx, fy, cx, cy = (_number(lens, key, where) for key in ("fl_x", "fl_y", "cx", "cy"))
     if fx <= 0 or fy <= 0:
         raise SceneError(f"{where} has the focal lengths {fx:g} and {fy:g}, which must be positive: calibrate it again")
-    kind = _kind(lens, where)
-    distortion = tuple(_number(lens, key, where) if key in lens else 0.0 for key in DISTORTION)
-    if kind is CameraType.PERSPECTIVE and distortion[3] != 0:
+    fisheye = _is_fisheye(lens, where)
+    distortion = tuple(_number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
+    if not fisheye and distortion[3] != 0:
         raise SceneError(f"{where} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     camera = Camera(torch.from_numpy(np.linalg.inv(_rigid(pose, where))), K, int(width), int(height))
-    return Shot(name, image, camera, distortion, kind)
+    distorts = fisheye or any(distortion)
+    return Frame(name, image, camera, Lens(K, int(width), int(height), distortion, fisheye) if distorts else None)
 
 
-def in_order(shots: Sequence[Shot], where: str) -> list[Shot]:
-    """The shots sorted by name.
+def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
+    """The frames sorted by name.
 
     Raises:
         SceneError: there are none, or two of the same photograph.
     """
-    if not shots:
+    if not frames:
         raise SceneError(f"{where} holds no photographs: it is empty")
-    shots = sorted(shots, key=lambda shot: shot.name)
-    for one, other in pairwise(shots):
+    frames = sorted(frames, key=lambda frame: frame.name)
+    for one, other in pairwise(frames):
         if one.name == other.name:
             raise SceneError(f"{where} has two cameras for the photograph {one.name}: leave one of them out")
-    return shots
+    return frames
 
 
-def _kind(lens: Mapping[str, Any], where: str) -> CameraType:
+def _is_fisheye(lens: Mapping[str, Any], where: str) -> bool:
     model = lens.get("camera_model", "OPENCV")
-    model = getattr(model, "value", model)
-    kind = CAMERA_MODEL_TO_TYPE.get(model) if isinstance(model, str) else None
-    if kind not in (CameraType.PERSPECTIVE, CameraType.FISHEYE):
-        raise SceneError(
-            f"{where} is {model if kind is None else kind.name}, but only perspective and fisheye ones work; "
-            f"{UNDISTORT}"
-        )
-    return kind
+    if model not in (*PERSPECTIVE, FISHEYE):
+        raise SceneError(f"{where} is {model}, but only perspective and fisheye ones work; {UNDISTORT}")
+    return model == FISHEYE
 
 
 def _rigid(pose: np.ndarray, where: str) -> Float64[np.ndarray, "4 4"]:

@@ -6,20 +6,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 from PIL import Image, ImageOps
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
+from shellgs_method.files.undistortion import undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
-
-if TYPE_CHECKING:
-    from nerfstudio.cameras.cameras import Cameras
+from shellgs_method.geometry.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ class View:
     name: str
     image: Path
     camera: Camera
-    lens: Cameras | None = None
+    lens: Lens | None = None
     mask: Path | None = None
     turned: bool = False
 
@@ -71,17 +69,6 @@ def load_mask(view: View, also: Path | None = None) -> Bool[np.ndarray, "H W"] |
     return np.logical_and.reduce(masks) if masks else None
 
 
-def undistort(lens: Cameras, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float[np.ndarray, "3 3"], np.ndarray]:
-    """Undistort an image as nerfstudio does, to the intrinsics and image of a pinhole camera."""
-    # Not at the top: nerfstudio imports dataparsers while its datamanagers are half imported.
-    from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
-
-    parameters, K = lens.distortion_params, lens.get_intrinsics_matrices().numpy().copy()
-    assert parameters is not None
-    K, image, _ = _undistort_image(lens, parameters.numpy(), {}, image, K)
-    return K, image
-
-
 def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
     """Map pixels of the photograph's file to the view's undistorted camera.
 
@@ -91,26 +78,12 @@ def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndar
     Raises:
         SceneError: the image cannot be read, or its aspect ratio is not the camera's.
     """
-    import cv2
-    from nerfstudio.cameras.cameras import CameraType
-
     width, height = _calibrated_size(view)
     image = _upright(view, read_image(view.image), view.image)
     pixels = pixels * [width / image.width, height / image.height]
     if view.lens is None:
         return pixels
-    assert view.lens.distortion_params is not None
-    k1, k2, k3, k4, p1, p2 = view.lens.distortion_params.double().ravel().tolist()
-    K = view.lens.get_intrinsics_matrices().double().numpy().reshape(3, 3)
-    if int(view.lens.camera_type) == CameraType.FISHEYE.value:
-        rays = cv2.fisheye.undistortPoints(pixels[:, None], K, np.array([k1, k2, k3, k4]))
-    else:
-        precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-        iterate: Any = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # of OpenCV 4, of OpenCV 5
-        coefficients = np.array([k1, k2, p1, p2, k3])
-        rays = iterate(pixels[:, None], K, coefficients, R=np.eye(3), P=np.eye(3), criteria=precise)
-    undistorted = view.camera.K.cpu().double().numpy()
-    return rays[:, 0] @ undistorted[:2, :2].T + undistorted[:2, 2]
+    return undistort_pixels(view.lens, pixels, view.camera.K.cpu().double().numpy())
 
 
 def read_image(path: Path) -> Image.Image:
@@ -214,8 +187,8 @@ def _undistorted(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray
 
 
 def _calibrated_size(view: View) -> tuple[int, int]:
-    calibrated = view.camera if view.lens is None else view.lens
-    return int(calibrated.width), int(calibrated.height)
+    calibrated = view.lens or view.camera
+    return calibrated.width, calibrated.height
 
 
 def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:

@@ -12,7 +12,7 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.paths import mask_names, photographs_in, tell_of_masks
 
 if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line needs only the paths
-    from shellgs_method.files.frames import Recording, Shot
+    from shellgs_method.files.frames import Frame, Recording
 
 MASKS = Path("masks")
 """Default folder of masks, in the scene."""
@@ -74,10 +74,10 @@ class SceneLayout(ScenePaths):
 
     def _tell_what_is_left_out(self, recording: Recording, cameras: str) -> None:
         """Count the photographs that have a camera and are in a split against those in their folders."""
-        used, masks = {shot.image for shot in recording.shots}, {shot.mask for shot in recording.shots}
+        used, masks = {frame.image for frame in recording.frames}, {frame.mask for frame in recording.frames}
         whole = self.data / self.images_path
         inner = whole if whole != self.data else None  # a scene's folder holds other images too
-        parents = {shot.image.parent for shot in recording.shots}
+        parents = {frame.image.parent for frame in recording.frames}
         folders = {inner if inner and folder.is_relative_to(inner) else folder for folder in parents}
         there = [
             p for folder in sorted(folders) for p in photographs_in(folder, deep=folder == inner) if p not in masks
@@ -89,7 +89,7 @@ class SceneLayout(ScenePaths):
                 f"{len(without)} of {len(there)} photographs of {self.data} are not in {cameras}, and are left out: "
                 f"{shown}."
             )
-        names = {shot.name for shot in recording.shots}
+        names = {frame.name for frame in recording.frames}
         unlisted = names.difference(*recording.listed.values()) if recording.listed else set()
         if unlisted:
             notice(
@@ -118,7 +118,7 @@ class SceneLayout(ScenePaths):
             )
         return folder
 
-    def masks(self, shots: Sequence[Shot]) -> dict[str, Path]:
+    def masks(self, frames: Sequence[Frame]) -> dict[str, Path]:
         """Mask files by the names of their photographs: the one that the frame names, else the one in the folder.
 
         Raises:
@@ -130,9 +130,9 @@ class SceneLayout(ScenePaths):
             raise FileNotFoundError(f"{folder} is not a folder of masks.")
         if folder.is_dir():
             there = set(photographs_in(folder, deep=True))
-            candidates = {shot.name: list(self._candidates(folder, shot.name)) for shot in shots}
+            candidates = {frame.name: list(self._candidates(folder, frame.name)) for frame in frames}
             masks = {name: next((p for p in paths if p in there), None) for name, paths in candidates.items()}
-            named = {shot.mask for shot in shots}
+            named = {frame.mask for frame in frames}
             if any(folder.iterdir()) and not any(masks.values()) and not any(named):
                 first = next(iter(candidates.values()))[0]
                 inverse = any(path.name.startswith("dynamic_mask_") for path in there)  # of instant-ngp
@@ -144,7 +144,7 @@ class SceneLayout(ScenePaths):
             tell_of_masks(masks, there - named, folder)
         else:
             masks = {}
-        masks |= {shot.name: shot.mask for shot in shots if shot.mask}
+        masks |= {frame.name: frame.mask for frame in frames if frame.mask}
         missing = [str(path) for path in masks.values() if path and not path.is_file()]
         if missing:
             raise FileNotFoundError(f"{len(missing)} masks of {self.data} are not on disk ({missing[0]}, for example).")

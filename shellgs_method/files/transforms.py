@@ -12,9 +12,10 @@ from jaxtyping import Float64, UInt8
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import read_json
-from shellgs_method.files.frames import DISTORTION, Recording, Shot, in_order, shot
+from shellgs_method.files.frames import Frame, Recording, frame, in_order
 from shellgs_method.files.headers import read_ply_header
 from shellgs_method.files.paths import NamedFiles
+from shellgs_method.geometry.lens import COEFFICIENTS
 
 NAME = "transforms.json"
 GREY = 128
@@ -22,7 +23,7 @@ GREY = 128
 # Applied to COLMAP's frame by old versions of ns-process-data, without being recorded.
 _UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *DISTORTION)
+_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *COEFFICIENTS)
 
 
 def read_recording(scene: Path, images_path: Path) -> Recording:
@@ -37,17 +38,17 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
     """
     path = scene / NAME
     meta = read_json(path)
-    frames = meta.get("frames")
-    if not isinstance(frames, list):
+    listed_frames = meta.get("frames")
+    if not isinstance(listed_frames, list):
         raise SceneError(f"{path} has no list of frames: make it again")
     applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
-    shots = [_shot(files, frame, meta, applied, f"{path}, frame {k}") for k, frame in enumerate(frames, start=1)]
+    frames = [_frame(files, each, meta, applied, f"{path}, frame {k}") for k, each in enumerate(listed_frames, start=1)]
     listed = {s: _names(meta[f"{s}_filenames"], files, path) for s in _SPLITS if f"{s}_filenames" in meta}
     files.tell_what_is_elsewhere()
     orientation = meta.get("orientation_override")
     if orientation not in (None, "pca", "up", "vertical", "none"):
         raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
-    return Recording(in_order(shots, str(path)), applied, listed, orientation)
+    return Recording(in_order(frames, str(path)), applied, listed, orientation)
 
 
 _SPLITS = ("train", "val", "test")
@@ -90,42 +91,42 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
     return positions @ undo[:3, :3].T + undo[:3, 3], colours
 
 
-def _shot(files: NamedFiles, frame: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Shot:
-    if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Frame:
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise SceneError(f"{where}: there is no file_path that names its photograph")
     try:
-        pose = np.array(frame.get("transform_matrix"), dtype=np.float64)
+        pose = np.array(entry.get("transform_matrix"), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape != (4, 4):
-        raise SceneError(f"{where} ({frame['file_path']}): its transform_matrix is not a 4x4 matrix of numbers")
-    lens = {key: source[key] for key in _LENS for source in (frame, meta) if key in source}
-    for key in DISTORTION if _has_distortion(meta) else ():  # as in nerfstudio, the file's own take precedence
+        raise SceneError(f"{where} ({entry['file_path']}): its transform_matrix is not a 4x4 matrix of numbers")
+    lens = {key: source[key] for key in _LENS for source in (entry, meta) if key in source}
+    for key in COEFFICIENTS if _has_distortion(meta) else ():  # as in nerfstudio, the file's own take precedence
         lens.pop(key, None)
-    lens |= _distortion(meta if _has_distortion(meta) else frame, where)
-    fisheye = frame.get("is_fisheye", meta.get("is_fisheye"))
+    lens |= _distortion(meta if _has_distortion(meta) else entry, where)
+    fisheye = entry.get("is_fisheye", meta.get("is_fisheye"))
     if fisheye is True and lens.get("camera_model") != "OPENCV_FISHEYE":  # instant-ngp's
         raise SceneError(
             f"{where}: is_fisheye is set, which counts only with the camera_model OPENCV_FISHEYE: set it too"
         )
-    name = files.photograph(frame["file_path"], where).relative_to(files.scene).as_posix()
-    made = shot(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
-    if frame.get("mask_path") is None:
-        return made
-    return replace(made, mask=files.other(str(frame["mask_path"]), where))
+    name = files.photograph(entry["file_path"], where).relative_to(files.scene).as_posix()
+    found = frame(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
+    if entry.get("mask_path") is None:
+        return found
+    return replace(found, mask=files.other(str(entry["mask_path"]), where))
 
 
 def _has_distortion(meta: Mapping[str, Any]) -> bool:
-    return any(key in meta for key in (*DISTORTION, "distortion_params"))
+    return any(key in meta for key in (*COEFFICIENTS, "distortion_params"))
 
 
 def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
     listed = source.get("distortion_params")
     if listed is None:
-        return {key: source[key] for key in DISTORTION if key in source}
-    if not isinstance(listed, list) or len(listed) != len(DISTORTION):
-        raise SceneError(f"{where}: distortion_params are {', '.join(DISTORTION)}, not {str(listed)[:40]}")
-    return dict(zip(DISTORTION, listed, strict=True))
+        return {key: source[key] for key in COEFFICIENTS if key in source}
+    if not isinstance(listed, list) or len(listed) != len(COEFFICIENTS):
+        raise SceneError(f"{where}: distortion_params are {', '.join(COEFFICIENTS)}, not {str(listed)[:40]}")
+    return dict(zip(COEFFICIENTS, listed, strict=True))
 
 
 def _applied(meta: Mapping[str, Any], scene: Path) -> Float64[np.ndarray, "4 4"]:

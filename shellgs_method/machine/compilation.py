@@ -2,7 +2,7 @@
 
 The first use of a kernel compiles it, in about a minute. Inductor caches the result on disk, and the next process loads
 it in seconds. The folder is ``TORCHINDUCTOR_CACHE_DIR``, by default ``torchinductor_<user>`` in the temporary folder.
-The environment variable ``SHELLGS_COMPILE=0`` switches fusion off.
+The environment variable ``SHELLGS_COMPILE=0`` switches compiling off.
 """
 
 from __future__ import annotations

@@ -198,7 +198,7 @@ BAD_MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
         "cameras.txt is damaged",
     ),
     "a camera too few": (edit("cameras.txt", "1 PINHOLE", "7 PINHOLE"), "the camera 1 of frame_00001.png is not"),
-    "an unheard-of camera": (edit("cameras.txt", "PINHOLE", "CUBE"), "CUBE camera model is not supported"),
+    "an unheard-of camera": (edit("cameras.txt", "PINHOLE", "CUBE"), "CUBE, which cannot be undistorted"),
     "a missing parameter": (edit("cameras.txt", "PINHOLE", "OPENCV"), "OPENCV has 8 parameters, not 4"),
     "half an image": (edit("images.txt", " 1 frame_00001.png", ""), "images.txt is damaged"),
     "a pose of nan": (first_pose("nan nan nan nan 0 0 0"), "has no rotation"),
@@ -211,11 +211,11 @@ BAD_MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a camera of no model": (binary("cameras", struct.pack("<QiiQQ4d", 1, 1, 99, 48, 32, 1, 1, 1, 1)), "number 99"),
     "a camera of a newer model": (
         binary("cameras", struct.pack("<QiiQQ5d", 1, 1, 13, 48, 32, *[1] * 5)),
-        "DIVISION camera model is not supported yet; undistort the photographs first",
+        "DIVISION, which cannot be undistorted; undistort the photographs first",
     ),
     "panoramas": (
         binary("cameras", struct.pack("<QiiQQ2d", 1, 1, 17, 48, 32, 48, 32)),
-        "EQUIRECTANGULAR camera model is not supported yet; render perspective photographs",
+        "EQUIRECTANGULAR, which cannot be undistorted; render perspective photographs",
     ),
     "more than it says": (
         binary(

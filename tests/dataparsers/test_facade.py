@@ -173,8 +173,8 @@ def test_a_distorted_camera_becomes_the_pinhole_camera_of_its_undistorted_image(
     view = read_views(FacadeDataParserConfig(data=scene))[0]
     K = view.camera.K.numpy()
     assert view.lens is not None
-    calibrated = view.lens.get_intrinsics_matrices().numpy()
-    height, width = int(view.lens.height), int(view.lens.width)
+    calibrated = view.lens.K.numpy()
+    height, width = view.lens.height, view.lens.width
     # Paint x = 0.15 of the normalised plane in the distorted image.
     y, x = np.mgrid[:height, :width] + 0.5
     zero_centred = calibrated - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])

@@ -147,7 +147,7 @@ def test_a_kernel_that_does_not_compile_leaves_the_others_compiled(caplog):
     assert run(uncompilable) == (1, PLAIN)
     assert run() == (1, COMPILED)
     assert run(uncompilable) == (1, PLAIN)
-    assert compilation._failed == {"test_fusion.uncompilable"}
+    assert compilation._failed == {"test_compilation.uncompilable"}
     (warning,) = warnings_of(caplog)
     assert warning.startswith("Some kernels of rasterizer or losses run without torch.compile, slower: Unsupported")
 

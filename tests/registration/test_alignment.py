@@ -24,7 +24,9 @@ from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View, to_camera
 from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.files.undistortion import undistort
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.lens import Lens
 from shellgs_method.geometry.precision import mesh_step
 from shellgs_method.geometry.similarity import fit_similarity, transformed
 from shellgs_method.registration import proposal
@@ -463,15 +465,9 @@ def test_signs_inside_a_name_are_part_of_it(rigged, tmp_path, name):
 
 
 def test_picks_are_pixels_of_the_photograph_on_disk(tmp_path):
-    from nerfstudio.cameras.cameras import Cameras, CameraType
-
-    from shellgs_method.files.photographs import undistort
-
     # A pinhole ray through Brown's model with k1 = -0.1: x' = x (1 + k1 r²).
-    lens = Cameras(
-        torch.eye(4)[None, :3], 500.0, 500.0, 320.0, 240.0, 640, 480,
-        distortion_params=torch.tensor([-0.1, 0, 0, 0, 0, 0]), camera_type=CameraType.PERSPECTIVE,
-    )[0]  # fmt: skip
+    calibrated = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+    lens = Lens(calibrated, 640, 480, (-0.1, 0, 0, 0, 0, 0))
     K, image = undistort(lens, np.zeros((480, 640, 3), np.uint8))
     camera = Camera(torch.eye(4, dtype=torch.float64), torch.from_numpy(K).double(), image.shape[1], image.shape[0])
     Image.new("RGB", (1280, 960)).save(tmp_path / "a.png")  # twice the calibrated size
