@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dataparsers.cameras import pinhole_camera, pinhole_cameras
+from shellgs_method.bounds import Length
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import MAX_SIZE, SeenBy
 from shellgs_method.evaluation.holdout import Bands, facade_bands
@@ -196,7 +197,7 @@ class FacadeDataManagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: FacadeDataManager)
     holdout: Literal["none", "A", "B"] = "none"
     """Vertical bands of the facade that cues leave out and metrics are limited to: every other one, A or B."""
-    band_width: float = 2.0
+    band_width: Length = 2.0
     """Width of a band in metres, or in scene units where the shell maps have no scale."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NoReturn, Optional
+from typing import Annotated, Any, Literal, NoReturn, Optional
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from tyro.conf import Suppress
 
 from dataparsers.cameras import pinhole_camera
+from shellgs_method.bounds import Bounds, Count, FromOne, Share, Weight
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
 from shellgs_method.evaluation.regions import kept_pixels, masked_image_errors, reference_errors, references
@@ -74,9 +75,13 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """Terms beyond the paper."""
 
     background_color: Literal["random", "black", "white"] = "black"
-    cull_alpha_thresh: float = 0.005
-    cull_scale_thresh: float = 0.1
-    densify_grad_thresh: float = 0.0002
+    sh_degree: Annotated[int, Bounds(0, 3, int)] = 3
+    warmup_length: Count = 500
+    stop_split_at: Count = 15_000
+    refine_every: FromOne = 100
+    cull_alpha_thresh: Share = 0.005
+    cull_scale_thresh: Weight = 0.1
+    densify_grad_thresh: Weight = 0.0002
 
     # Settings of splatfacto and nerfstudio's base model that these methods do not use.
     use_absgrad: Suppress[bool] = False

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple, Optional
+from typing import Annotated, Literal, NamedTuple, Optional
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from shellgs_method.bounds import Bounds, Count, Weight
 from shellgs_method.evaluation.regions import kept_pixels, photometric_pixels, reference_maps
 from shellgs_method.geometry.reference import Reference
 from shellgs_method.losses import (
@@ -53,7 +54,7 @@ class GeometryLossConfig:
     """Weight γ(t) of normal smoothness."""
     ncc: Literal["local", "vid2sim"] = "local"
     """local: the paper's equation; vid2sim: as in the baseline's released code."""
-    ncc_window: int = 9
+    ncc_window: Annotated[int, Bounds(3, 101, int, odd=True)] = 9
     """Patch side of the local NCC in pixels."""
 
 
@@ -61,21 +62,21 @@ class GeometryLossConfig:
 class ExtraLossConfig:
     """Terms beyond the paper's objective, each off at 0. Lengths are in scene units if metres are unknown."""
 
-    normal_consistency: float = 0.0
+    normal_consistency: Weight = 0.0
     """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05).
     Only of pixels without a cue, so that walls continue beyond the shell, but not what photographs show before it."""
-    normal_consistency_from: int = 7000
+    normal_consistency_from: Count = 7000
     """First iteration of that term."""
-    distortion: float = 0.0
+    distortion: Weight = 0.0
     """Weight of the depth distortion of 2DGS; discs only."""
-    depth_normal: float = 0.0
+    depth_normal: Weight = 0.0
     """Weight of the normal loss on normals of the rendered depth, which moves Gaussians; N only rotates them."""
-    empty_space: float = 0.0
+    empty_space: Weight = 0.0
     """Weight of E, the logarithm of the distance in metres of all splats of a pixel from the cue."""
-    tolerance: Optional[float] = None
+    tolerance: Optional[Weight] = None
     """Distance without cost in E, in metres. If not set: the shell's error by the metrics of its alignment, clamped to
     5 to 15 cm; 5 cm if it was not validated."""
-    flattening: float = 0.0
+    flattening: Weight = 0.0
     """Weight of the mean smallest scale of visible Gaussians, in units of the rescaled world (Vid2Sim: 100)."""
 
     def tolerance_for(self, shell_error: float | None) -> float:
