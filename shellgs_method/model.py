@@ -27,14 +27,7 @@ from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses import PAPER_ITERATIONS
-from shellgs_method.losses.objective import (
-    Cues,
-    ExtraLossConfig,
-    GeometryLossConfig,
-    Objective,
-    Trust,
-    ViewLosses,
-)
+from shellgs_method.losses.objective import Cues, ExtraLossConfig, GeometryLossConfig, Objective, Trust, ViewLosses
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.machine.threads import ThreadsByLoad
 from shellgs_method.render.maps import DepthKind, Geometry, Primitive
@@ -157,26 +150,22 @@ class FacadeModel(SplatfactoModel):
     @property
     def training_cues(self) -> set[str]:
         """Kinds of maps that the training views need."""
-        return {self.config.cues, "shell" if self._needs_points_of_shell else "none"} - {"none"}
-
-    @property
-    def _needs_points_of_shell(self) -> bool:
-        return self.config.init == "shell" or self.config.trust == "photographs"
+        config = self.config
+        points_of_shell = config.init == "shell" or config.trust == "photographs"
+        return {config.cues, "shell" if points_of_shell else "none"} - {"none"}
 
     def _check_settings(self) -> None:
-        config, found = self.config, self.kwargs["metadata"]["cues"]
+        config = self.config
         if config.primitive == "3d" and (config.depth == "median" or config.extra.distortion > 0):
             raise SceneError("median depth and distortion need discs: set pipeline.model.primitive to 2d")
         if config.depth == "plane" and config.extra.empty_space > 0:
             raise SceneError(
                 "empty_space needs the depths of the centres: set pipeline.model.depth to expected or mode"
             )
-        if self._needs_points_of_shell and "shell" not in found:
-            raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
-        if config.cues != "none" and config.cues not in found:
-            method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
+        for kind in sorted(self.training_cues - set(self.kwargs["metadata"]["cues"])):
+            command = {"shell": "cast", "mono": "mono"}[kind]
             raise SceneError(
-                f"{method} needs the {config.cues} maps of the scene, and there are none: "
+                f"this method needs the {kind} maps of the scene, and there are none: "
                 f"run `shellgs {command} SCENE` first, or train photo-gs"
             )
 
@@ -227,15 +216,13 @@ class FacadeModel(SplatfactoModel):
 
     @property
     def _gaussians(self) -> dict[str, Tensor]:
+        """The Gaussians to render: all, or in the viewer those inside its crop box."""
         self.update_surface()
-        return dict(self.gauss_params) | ({} if self.surface is None else {"surface": self.surface})
-
-    def _inside_crop(self) -> dict[str, Tensor]:
-        """The Gaussians, or in the viewer those inside its crop box."""
+        gaussians = dict(self.gauss_params) | ({} if self.surface is None else {"surface": self.surface})
         if self.crop_box is None or self.training:
-            return self._gaussians
+            return gaussians
         inside = self.crop_box.within(self.means).squeeze(-1)
-        return {name: values[inside] for name, values in self._gaussians.items()}
+        return {name: values[inside] for name, values in gaussians.items()}
 
     def coverage(self, camera: Camera) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
         """:meth:`ViewRenderer.coverage` of a training view."""
@@ -274,7 +261,7 @@ class FacadeModel(SplatfactoModel):
         surface_every = max(1, round(SURFACE_EVERY * self.num_iterations / PAPER_ITERATIONS))
         if self.training and self.step % surface_every == 0:
             self.surface = None
-        gaussians = self._inside_crop()
+        gaussians = self._gaussians
         if len(gaussians["means"]) == 0:
             return _nothing(pinhole, background)
         degree = min(int(self.step / (DEGREE_EVERY * self.num_iterations / PAPER_ITERATIONS)), self.config.sh_degree)

@@ -243,7 +243,7 @@ def test_mono_gs_learns_from_mono_maps_without_a_shell(mono_scene, tmp_path):
 
 
 def test_mono_gs_without_its_maps_ends_with_one_sentence(scene, tmp_path):
-    with pytest.raises(SystemExit, match=r"mono-gs needs the mono maps .* run `shellgs mono SCENE`"):
+    with pytest.raises(SystemExit, match=r"this method needs the mono maps .* run `shellgs mono SCENE`"):
         trainer_of(scene, tmp_path, "mono_gs")
 
 

@@ -386,7 +386,7 @@ def test_a_held_out_view_without_a_map_has_image_metrics_only(scene, tmp_path):
 
 def test_a_shell_method_on_a_scene_without_shell_maps_ends_with_one_sentence(scene, tmp_path):
     shutil.rmtree(scene / "cues" / "shell")
-    with pytest.raises(SystemExit, match=r"shellgs needs the shell maps .* run `shellgs cast"):
+    with pytest.raises(SystemExit, match=r"this method needs the shell maps .* run `shellgs cast"):
         trainer_of(scene, tmp_path)
 
 

@@ -138,7 +138,7 @@ def test_a_missing_shell_ends_ns_train_with_one_sentence(demo, tmp_path):
     for name in ("images", "transforms.json", "sparse_pc.ply"):
         (scene / name).symlink_to(demo / "scene" / name)
     output = run("ns-train", "shellgs", "--data", scene, "--vis", "tensorboard", cwd=tmp_path, status=1)
-    assert "shellgs needs the shell maps" in output
+    assert "this method needs the shell maps" in output
     assert "Traceback" not in output
 
 
