@@ -75,7 +75,7 @@ def print_still(scene: Path, photographs: list[View], facade: Facade) -> None:
     for view, camera in zip(photographs, facade.cameras, strict=True):
         on, real, said = (maps.require(view.name, view.camera) for maps in (shell, truth, checked))
         before = (on.depth > 0) & (real.depth > 0) & ((on.depth - real.depth) * unit > NEARER)
-        material = facade.daylight.world.cast(*rays(camera)).material
+        material = facade.daylight.world.material[facade.daylight.world.cast(*rays(camera)).triangle]
         said = Findings.of(said, on)
         in_front = said.occluder | said.moved
         found += int(in_front.sum())

@@ -21,12 +21,12 @@ from rich.table import Table
 from scipy.spatial import KDTree
 
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import Collider, leaks, make_collider
 from shellgs_method.sim.collision.distances import both_ways
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.deviations import EDGE, along_normals
 from shellgs_method.sim.front import Front
-from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.report import Chapter, lidar_errors, text
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
@@ -63,11 +63,11 @@ def main(
     _deviations(console, chapter)
 
 
-def true_building(to_world: np.ndarray, materials: tuple[Material, ...] = ()) -> Surface:
+def true_building(to_world: np.ndarray, materials: tuple[Material, ...] = ()) -> Triangles:
     """The synthetic building, or only its parts of some materials, in the simulation frame."""
     mesh = building(_LAYOUT)
     chosen = np.isin(mesh.material, materials) if materials else np.ones(len(mesh.triangles), bool)
-    return Surface(transformed(mesh.vertices, to_world @ SCENE_FROM_BUILDING), mesh.triangles[chosen])
+    return Triangles(transformed(mesh.vertices, to_world @ SCENE_FROM_BUILDING), mesh.triangles[chosen])
 
 
 def _fans(console: Console, out: Path, chapter: Chapter) -> None:
@@ -99,11 +99,11 @@ def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
     console.print(table)
 
 
-def _of_planes(shell: Surface, most: int) -> Collider:
+def _of_planes(shell: Triangles, most: int) -> Collider:
     return make_collider(shell, shell, np.zeros(len(shell.faces), bool), most)
 
 
-def _of_coacd(shell: Surface, resolution: int) -> Collider:
+def _of_coacd(shell: Triangles, resolution: int) -> Collider:
     import coacd
 
     coacd.set_log_level("error")

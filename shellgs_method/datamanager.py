@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -18,28 +18,20 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from dataparsers.cameras import pinhole_camera, pinhole_cameras
 from shellgs_method.bounds import Length
 from shellgs_method.errors import SceneError, refusals_end_the_program
-from shellgs_method.evaluation.covisibility import MAX_SIZE, SeenBy
-from shellgs_method.evaluation.holdout import Bands, facade_bands
-from shellgs_method.evaluation.regions import (
-    REFERENCES,
-    contradicted,
-    kept_pixels,
-    reference_maps,
-    seen_through,
-)
+from shellgs_method.evaluation.covisibility import Covisibility
+from shellgs_method.evaluation.holdout import Holdout, facade_holdout
+from shellgs_method.evaluation.regions import REFERENCES
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
-from shellgs_method.files.photographs import View, load_mask, load_photograph
-from shellgs_method.gaussians.seeds import SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
+from shellgs_method.files.photographs import View, has_alpha, load_mask, load_photograph
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.geometry.reference import Reference
 from shellgs_method.machine.memory import available_memory
 from shellgs_method.runs.host import NoPixelSampler
 
+ViewT = TypeVar("ViewT")
 logger = logging.getLogger(__name__)
 
 MIN_SIDE = 11
@@ -56,13 +48,13 @@ class FacadeDataset(InputDataset):
     Depth is in units of nerfstudio's rescaled world, normals are in the OpenCV camera frame. A view without maps of a
     kind lacks that kind's keys. ``other_depth`` is the depth of what photographs show in front of the shell, or behind
     it, in windows, else 0; ``transient`` is true where only this one shows something in front of it, ``beyond`` where
-    they show the background. With ``bands``, masks keep only pixels whose wall lies in them. With ``seen_by``,
-    ``seen`` is true where what a pixel shows is visible in a training view. ``kinds`` are the maps to read, all if not
-    set; with ``any_size`` they are resampled where their size differs, as they are if ``scale_factor`` is not 1.
+    they show the background. With ``part``, masks keep only pixels whose wall lies in it. With ``covisibility``,
+    ``seen`` is true where training views show what a pixel shows. ``kinds`` are the maps to read, all if not set; with
+    ``any_size`` they are resampled where their size differs, as they are if ``scale_factor`` is not 1.
     """
 
-    bands: Bands | None = None
-    seen_by: Callable[[], SeenBy] | None = None
+    part: Holdout | None = None
+    covisibility: Callable[[], Covisibility] | None = None
     kinds: Collection[str] | None = None
     any_size: bool = False
     held: bool = True
@@ -105,10 +97,10 @@ class FacadeDataset(InputDataset):
     def get_data(self, image_idx: int, image_type="float32") -> dict:
         """Photograph, intrinsics, mask and maps of a view, and what training views see of it."""
         data = self._read_data(image_idx, image_type)
-        if self.seen_by is not None:
+        if self.covisibility is not None:
             camera = self.camera(image_idx)
             no_depth = torch.zeros(camera.height, camera.width, 1)
-            data["seen"] = self.seen_by().mask(camera, data.get("shell_depth", no_depth))
+            data["seen"] = self.covisibility().mask(camera, data.get("shell_depth", no_depth))
         return data
 
     def _read_data(self, image_idx: int, image_type) -> dict:
@@ -129,9 +121,9 @@ class FacadeDataset(InputDataset):
         read = {kind: self._read(maps, view) for kind, maps in self.cues.items()}
         cues = {kind: cue for kind, cue in read.items() if cue is not None}
         inside = True
-        if self.bands is not None and cues:
+        if self.part is not None and cues:
             shell = cues.get("shell") or self._read(self._dataparser_outputs.metadata["cues"]["shell"], view)
-            inside = False if shell is None else self.bands.mask(shell, view.camera)
+            inside = False if shell is None else self.part.mask(shell, view.camera)
         maps = {}
         checked = self.sets.get("checked")
         if "shell" in cues and checked and (found := self._read(checked, view)):
@@ -152,16 +144,17 @@ class FacadeDataset(InputDataset):
         return cue and self._rescaled_depth(cue)
 
     def nbytes(self, image_type="float32") -> int:
-        """Memory that all photographs and maps take, by one view of those that have the same maps."""
+        """Memory in bytes that all photographs and maps take, by one view of those that have the same maps."""
         of_a_pixel: dict[tuple[bool, ...], float] = {}
         total = 0.0
         for index, view in enumerate(self.views):
             pixels = view.camera.width * view.camera.height
-            has = view.mask is not None, *(maps.record(view.name) is not None for maps in self.sets.values())
+            masked = view.mask is not None or has_alpha(view.image)
+            has = masked, *(maps.record(view.name) is not None for maps in self.sets.values())
             if has not in of_a_pixel:
                 data = self._read_data(index, image_type).values()
                 of_a_pixel[has] = sum(each.nbytes for each in data if isinstance(each, Tensor)) / pixels
-            total += pixels * (of_a_pixel[has] + (self.seen_by is not None))
+            total += pixels * (of_a_pixel[has] + (self.covisibility is not None))
         return round(total)
 
     def missing(self) -> dict[str, int]:
@@ -213,19 +206,18 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
 
     def create_train_dataset(self) -> FacadeDataset:
-        """Training views, whose maps leave out the held-out bands."""
+        """Training views, whose maps leave out the held-out half of the facade."""
         dataset = super().create_train_dataset()
-        held_out = self._held_out
-        dataset.bands = held_out and held_out.others
+        dataset.part = self._holdout and self._holdout.rest
         if self.test_mode != "val":
             dataset.kinds = ()
         return dataset
 
     def create_eval_dataset(self) -> FacadeDataset:
-        """Held-out views, whose maps are limited to the held-out bands."""
+        """Held-out views, whose maps are limited to the held-out half of the facade."""
         dataset = super().create_eval_dataset()
-        dataset.bands = self._held_out
-        dataset.seen_by = lambda: self._seen_by
+        dataset.part = self._holdout
+        dataset.covisibility = lambda: self._covisibility
         dataset.any_size, dataset.kinds = True, tuple(REFERENCES)
         return dataset
 
@@ -280,81 +272,40 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return similarity
 
     @cached_property
-    def _seen_by(self) -> SeenBy:
-        """What is visible in the training views."""
-        dataset, cameras, depths = self.train_dataset, [], []
-        hidden_by_shell = "shell" in self.eval_dataset.cues
-        for index in range(len(dataset)):
-            camera, depth = dataset.camera(index), dataset.shell_depth(index) if hidden_by_shell else None
-            step = camera.thinning(MAX_SIZE)
-            cameras.append(camera)
-            depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())
-        points = self.train_dataparser_outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
-        return SeenBy(cameras, depths, points.float())
+    def _covisibility(self) -> Covisibility:
+        dataset, hidden_by_shell = self.train_dataset, "shell" in self.eval_dataset.cues
+        views = ((dataset.camera(k), dataset.shell_depth(k) if hidden_by_shell else None) for k in range(len(dataset)))
+        return Covisibility.of(views, self.sfm_points.float())
 
     @cached_property
-    def _held_out(self) -> Bands | None:
+    def _holdout(self) -> Holdout | None:
         if self.config.holdout == "none":
             return None
         metadata = self.train_dataparser_outputs.metadata
         if "shell" not in metadata["cues"]:
-            raise SceneError("a holdout of bands needs the shell maps of the scene: run `shellgs cast SCENE` first")
-        return facade_bands(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
+            raise SceneError("a holdout needs the shell maps of the scene: run `shellgs cast SCENE` first")
+        return facade_holdout(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
 
-    def shell_seeds(self, spacing: float, most: int, everywhere: bool) -> Seeds:
-        """Seeds on the shell visible in the training views, in nerfstudio's rescaled world.
+    def seed_views(
+        self, view_of: Callable[[Camera, dict], ViewT], kind: str | None = None
+    ) -> tuple[Iterator[ViewT], int]:
+        """Training views to make seeds from, one at a time, and the number of pixels of all.
 
         Args:
-            spacing: distance between seeds, in pixels of the closest view.
-            most: largest number of seeds; the spacing is increased where it would give more.
-            everywhere: seed the shell even where photographs show something in front of it; else seed that instead.
+            view_of: makes one from the camera, in nerfstudio's rescaled world, and the batch with its maps.
+            kind: only views with a map of this kind; all if None.
         """
-        return self._seeds(lambda batch: self._seeded_view(batch, everywhere), spacing, most)
+        dataset = self.train_dataset
+        maps = dataset.cues[kind] if kind else None
+        chosen = [k for k, view in enumerate(dataset.views) if maps is None or maps.record(view.name)]
+        cameras, cached = [dataset.camera(k) for k in chosen], self.cached_train
+        views = (view_of(camera, self._with_maps(cached[k])) for k, camera in zip(chosen, cameras, strict=True))
+        return views, sum(camera.width * camera.height for camera in cameras)
 
-    def seeds_behind_shell(self, spacing: float, most: int) -> Seeds:
-        """Seeds for what windows reflect or let through, where photographs show it behind the shell."""
-        return self._seeds(self._view_behind, spacing, most)
-
-    def _seeds(self, view: Callable[[dict], SeededView], spacing: float, most: int) -> Seeds:
-        maps, views = self.train_dataset.cues["shell"], self.train_dataset.views
-        batches = [batch for batch in self.cached_train if maps.record(views[batch["image_idx"]].name)]
-        num_pixels = sum(batch["image"][..., 0].numel() for batch in batches)
-        return shell_seeds(map(view, batches), num_pixels, spacing, most)
-
-    def skybox_seeds(self, count: int) -> Seeds:
-        """Seeds all around the scene, in nerfstudio's rescaled world, coloured by what is not on the shell."""
-        points = self.train_dataparser_outputs.metadata["points3D_xyz"].double().numpy()
-        num_pixels = sum(batch["image"][..., 0].numel() for batch in self.cached_train)
-        return skybox_seeds(map(self._sky_view, self.cached_train), num_pixels, points, count)
-
-    def _sky_view(self, batch: dict) -> SkyView:
-        cpu, batch = torch.device("cpu"), self._with_maps(batch)
-        image = _colours(batch)
-        far = kept_pixels(batch, image)
-        if "shell_mask" in batch:
-            far = far & ~batch["shell_mask"].to(cpu)
-        return SkyView(self.train_dataset.camera(batch["image_idx"]), image, far)
-
-    def _seeded_view(self, batch: dict, everywhere: bool) -> SeededView:
-        index, cpu, batch = batch["image_idx"], torch.device("cpu"), self._with_maps(batch)
-        image = _colours(batch)
-        camera, shell = self.train_dataset.camera(index), reference_maps(batch, "shell", cpu, everywhere)
-        if not everywhere and "other_depth" in batch:
-            before = contradicted(batch, cpu) & kept_pixels(batch, image)
-            shell = Reference(
-                torch.where(before, batch["other_depth"].to(cpu), shell.depth),
-                torch.where(before, _towards(camera), shell.normal),
-                shell.mask | before,
-            )
-        return SeededView(camera, image, shell)
-
-    def _view_behind(self, batch: dict) -> SeededView:
-        cpu, batch = torch.device("cpu"), self._with_maps(batch)
-        image, camera = _colours(batch), self.train_dataset.camera(batch["image_idx"])
-        shell = reference_maps(batch, "shell", cpu)
-        behind = shell.mask & seen_through(batch, cpu) & kept_pixels(batch, image)
-        depth = batch["other_depth"].to(cpu) if "other_depth" in batch else shell.depth
-        return SeededView(camera, image, Reference(depth, _towards(camera), behind))
+    @property
+    def sfm_points(self) -> Float[Tensor, "N 3"]:
+        """The SfM points in nerfstudio's rescaled world."""
+        return self.train_dataparser_outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """The next training view, with its maps."""
@@ -392,14 +343,3 @@ def _scaled(outputs: DataparserOutputs, factor: float) -> DataparserOutputs:
     views = [replace(view, camera=view.camera.scaled(factor)) for view in outputs.metadata["views"]]
     cameras = pinhole_cameras(outputs.cameras.camera_to_worlds, views)
     return replace(outputs, cameras=cameras, metadata=outputs.metadata | {"views": views})
-
-
-def _towards(camera: Camera) -> Float[Tensor, "H W 3"]:
-    """Normals that face the camera."""
-    return -normalize(camera.rays().float(), dim=-1)
-
-
-def _colours(batch: dict) -> Float[Tensor, "H W 3"]:
-    """The photograph in [0, 1], on the CPU."""
-    image = batch["image"][..., :3].cpu()
-    return image / (255 if image.dtype == torch.uint8 else 1)

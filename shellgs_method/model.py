@@ -20,7 +20,8 @@ from dataparsers.cameras import pinhole_camera
 from shellgs_method.bounds import Bounds, Count, FromOne, Share, Weight
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
-from shellgs_method.evaluation.regions import kept_pixels, masked_image_errors, reference_errors, references
+from shellgs_method.evaluation.pixels import kept_pixels
+from shellgs_method.evaluation.regions import masked_image_errors, reference_errors, references
 from shellgs_method.gaussians.densification import GradientStrategy, SkyboxStrategy
 from shellgs_method.gaussians.initial import OPACITY, Init, InitialGaussians, sfm_points
 from shellgs_method.gaussians.seeds import Seeds

@@ -19,6 +19,8 @@ from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.gaussians.initial import MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
+from shellgs_method.gaussians.seeds import shell_seeds, view_behind_shell, view_of_shell, view_of_surface
+from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
@@ -69,13 +71,16 @@ class FacadePipeline(VanillaPipeline):
         model, data = self.model, self.datamanager
         config = model.config
         if config.init == "shell":
-            model.add_seeds(data.shell_seeds(SEED_SPACING, MAX_SEEDS, everywhere=config.trust == "shell"))
+            view_of = view_of_shell if config.trust == "shell" else view_of_surface
+            model.add_seeds(shell_seeds(*data.seed_views(view_of, "shell"), SEED_SPACING, MAX_SEEDS))
         if config.trust == "photographs" and config.primitive == "3d":
-            shell = data.shell_seeds(SEED_SPACING, MAX_SEEDS, everywhere=True)
+            shell = shell_seeds(*data.seed_views(view_of_shell, "shell"), SEED_SPACING, MAX_SEEDS)
             model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
-            model.add_seeds(data.seeds_behind_shell(SEED_SPACING, MAX_SEEDS))
+            behind = data.seed_views(view_behind_shell, "shell")
+            model.add_seeds(shell_seeds(*behind, SEED_SPACING, MAX_SEEDS))
         if config.init == "shell":
-            model.add_seeds(data.skybox_seeds(SKYBOX_SEEDS))
+            points = data.sfm_points.double().numpy()
+            model.add_seeds(skybox_seeds(*data.seed_views(view_of_sky), points, SKYBOX_SEEDS))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's Gaussians.

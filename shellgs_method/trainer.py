@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,20 +12,24 @@ from typing import TYPE_CHECKING, Literal, Optional
 
 import torch
 from gsplat.strategy.ops import remove
+from jaxtyping import Bool
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from tyro.conf import Suppress
 
 from shellgs_method.bounds import Rate
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.gaussians.pruning import broken, unshaped
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.runs.folders import held
-from shellgs_method.runs.guard import MAX_FAULTS, GuardedOptimizers, forget_gradients, remove_broken
+from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers, forget_gradients
+from shellgs_method.runs.host import wandb_refusals
 from shellgs_method.runs.limits import check_settings, check_training
 from shellgs_method.runs.run_folder import check_method, guard_nerfstudio, written_config
 
@@ -37,10 +40,6 @@ PARTIAL = "checkpoint-"
 """Prefix of the folder in which a checkpoint is written."""
 CHECK_EVERY = 100
 """Steps between two checks that all Gaussians are finite."""
-ONE_VIEW = 1.5
-"""Effective number of views that show a Gaussian, below which it counts as shown by one."""
-BARELY = 0.001
-"""Share of an image below which a Gaussian of any size is barely visible in it."""
 PRUNED = (
     "densification pruned all: lower the learning rates or --pipeline.model.cull-alpha-thresh, "
     "or raise --pipeline.model.cull-scale-thresh"
@@ -48,25 +47,6 @@ PRUNED = (
 """Why a step may leave no Gaussian."""
 
 guard_nerfstudio()
-
-
-@contextmanager
-def wandb_refusals() -> Iterator[None]:
-    """Turn errors of wandb (no key, no network) into one sentence.
-
-    Raises:
-        SceneError: wandb cannot be used.
-    """
-    try:
-        from wandb.errors import Error  # slow to import
-    except ImportError as error:
-        raise SceneError(f"wandb cannot be imported ({error}): pip install wandb") from error
-    try:
-        yield
-    except Error as error:
-        raise SceneError(
-            f"wandb says: {error} To log without an account or a network, set WANDB_MODE=offline"
-        ) from error
 
 
 @dataclass
@@ -134,12 +114,11 @@ class FacadeTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up everything that training needs."""
         with refusals_end_the_program(), wandb_refusals() if self.config.is_wandb_enabled() else nullcontext():
-            check_training(self.config)
             _remove_leftovers(self.base_dir)
             super().setup(test_mode)
         after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(after_step, self._check_any_left, kwargs={"why": PRUNED}))
-        self._faults = 0
+        self._skipped = 0
         self._last_step = self.config.max_num_iterations - 1  # later versions of nerfstudio change the setting
 
     def setup_optimizers(self) -> GuardedOptimizers:
@@ -170,25 +149,23 @@ class FacadeTrainer(Trainer):
         """
         loss, losses, metrics = super().train_iteration(step)
         if self.optimizers.skipped:
-            self._report_fault(step, losses)
+            self._report_skipped(step, losses)
         if step % CHECK_EVERY == 0 or self.optimizers.skipped:
             self._remove_broken_gaussians(step)
         if step >= self._last_step:
             self.stop_training = True
         return loss, losses, metrics
 
-    def _report_fault(self, step: int, losses: dict[str, torch.Tensor]) -> None:
-        self._faults += 1
+    def _report_skipped(self, step: int, losses: dict[str, Tensor]) -> None:
+        self._skipped += 1
         forget_gradients(self.pipeline.model.info)
         terms = [name for name, value in losses.items() if not bool(value.isfinite())]
         what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
-        view = self.pipeline.last_trained
-        CONSOLE.print(
-            f"[yellow]Step {step} is skipped: {what} of {view} is not finite ({self._faults} of at most {MAX_FAULTS}).",
-        )
-        if self._faults > MAX_FAULTS:
+        view, count = self.pipeline.last_trained, f"{self._skipped} of at most {MAX_SKIPPED}"
+        CONSOLE.print(f"[yellow]Step {step} is skipped: {what} of {view} is not finite ({count}).")
+        if self._skipped > MAX_SKIPPED:
             raise SceneError(
-                f"training stopped at step {step} after more than {MAX_FAULTS} steps whose loss or gradient is not "
+                f"training stopped at step {step} after more than {MAX_SKIPPED} steps whose loss or gradient is not "
                 f"finite, the last one with {view}: look at its photograph and maps, or lower the learning rates; "
                 f"{self._last_good}"
             )
@@ -201,39 +178,28 @@ class FacadeTrainer(Trainer):
         return "no checkpoint was saved before"
 
     def _remove_broken_gaussians(self, step: int) -> None:
-        model = self.pipeline.model
-        count = remove_broken(model.gauss_params, self.optimizers.optimizers, model.strategy_state)
-        if count:
+        gone = broken(self.pipeline.model.gauss_params)
+        if count := self._remove(gone):
             CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were not finite, and are removed.")
         self._check_any_left(step, "none was finite: lower the learning rates")
+
+    def _remove_unshaped_gaussians(self) -> None:
+        model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
+        cameras = map(dataset.camera, range(len(dataset)))
+        if count := self._remove(unshaped(model.means.detach(), model.scales.detach().exp(), cameras, model.coverage)):
+            CONSOLE.print(f"{count} Gaussians that the training views have not shaped are removed.")
+        self._check_any_left(self.step, "training views show none of them: lower the learning rates")
+
+    def _remove(self, gone: Bool[Tensor, "N"]) -> int:
+        """Remove Gaussians with their optimizers' moments and the densification's sums; return their number."""
+        model = self.pipeline.model
+        if count := int(gone.sum()):
+            remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, gone)  # pyright: ignore[reportArgumentType]
+        return count
 
     def _check_any_left(self, step: int, why: str) -> None:
         if self.pipeline.model.num_points == 0:
             raise SceneError(f"training stopped at step {step} with no Gaussian left, because {why}; {self._last_good}")
-
-    def _remove_unshaped_gaussians(self) -> None:
-        """Remove Gaussians that training views have not shaped, and that may spoil others.
-
-        No view shows them; or views show little of them, though they reach a camera: the edge of something wide. A
-        single one in front of a held-out camera displaced the depth of that view by 15 cm.
-        """
-        model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
-        means = model.means.detach()
-        total = squares = largest = means.new_zeros(len(means))  # of the shares of images that they cover
-        shown, distance = total > 0, total + torch.inf
-        for camera in map(dataset.camera, range(len(dataset))):
-            camera = camera.to(means)
-            area, in_view = model.coverage(camera)
-            share = area / (camera.width * camera.height)
-            total, squares, largest = total + share, squares + share.square(), largest.maximum(share)
-            shown, distance = shown | in_view, distance.minimum((means - camera.position).norm(dim=-1))
-        n_views = total.square() / squares.clamp_min(1e-30)  # effective number of views
-        deviations = distance / model.scales.detach().exp().amax(dim=-1)  # from the nearest camera
-        unshaped = ~shown | (deviations < 2) & (n_views < ONE_VIEW) | (deviations < 5) & (largest < BARELY)
-        if count := int(unshaped.sum()):
-            remove(model.gauss_params, self.optimizers.optimizers, model.strategy_state, unshaped)  # pyright: ignore[reportArgumentType]
-            CONSOLE.print(f"{count} Gaussians that the training views have not shaped are removed.")
-        self._check_any_left(self.step, "training views show none of them: lower the learning rates")
 
     def _after_train(self) -> None:
         if self.step >= self._last_step:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -12,11 +15,12 @@ from torch._inductor.cpp_builder import get_cpp_compiler
 from torch._inductor.exc import InvalidCxxCompiler
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method import cli
 from shellgs_method.errors import notice
 from shellgs_method.machine import compilation
 from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
+
+os.environ.setdefault("SHELLGS_COMPILE", "0")  # kernels take longer to compile, or to load, than these tests to run
 
 
 @pytest.fixture(autouse=True)
@@ -42,18 +46,26 @@ def scene(pristine_scene: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def shellgs(capsys, monkeypatch) -> Callable[..., str]:
-    """Run `shellgs` in this process; returns its output on one line, or ``refused: `` and its message."""
+def in_process(capsys, monkeypatch) -> Callable[..., str]:
+    """Run a command in this process; returns its output on one line, or ``refused: `` and its message."""
 
-    def command(*words: object) -> str:
-        monkeypatch.setattr(sys, "argv", ["shellgs", *map(str, words)])
+    def command(name: str, *words: object) -> str:
+        (entry,) = {*entry_points(group="console_scripts", name=name)}
+        monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
         try:
-            cli.main()
+            entry.load()()
         except SystemExit as stop:
-            return f"refused: {stop}"
+            if stop.code:
+                return f"refused: {stop}"
         return capsys.readouterr().out.replace("\n", " ")
 
     return command
+
+
+@pytest.fixture
+def shellgs(in_process) -> Callable[..., str]:
+    """Run `shellgs` in this process."""
+    return partial(in_process, "shellgs")
 
 
 @pytest.fixture
@@ -65,12 +77,6 @@ def compiler(monkeypatch) -> None:
         pytest.skip(f"no C++ compiler: {error}")
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
     monkeypatch.setattr(compilation, "_failed", set())
-
-
-@pytest.fixture
-def eager(monkeypatch) -> None:
-    """Do not compile kernels, which takes long."""
-    monkeypatch.setenv("SHELLGS_COMPILE", "0")
 
 
 @pytest.fixture

@@ -41,9 +41,7 @@ def watched(scene: Path, folder: Path, vis: Literal["tensorboard", "wandb"]) -> 
 @pytest.fixture(scope="module")
 def tensorboard(pristine_scene, tmp_path_factory) -> tuple[FacadeTrainer, EventAccumulator]:
     """A run and its tensorboard events."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SHELLGS_COMPILE", "0")
-        trainer = watched(pristine_scene, tmp_path_factory.mktemp("run"), "tensorboard")
+    trainer = watched(pristine_scene, tmp_path_factory.mktemp("run"), "tensorboard")
     return trainer, EventAccumulator(str(trainer.base_dir)).Reload()
 
 
@@ -59,7 +57,6 @@ def test_tensorboard_gets_every_term_of_the_loss(tensorboard):
     assert sum(terms.values()) == pytest.approx(last(events, "Train Loss")[""], rel=1e-5)
 
 
-@pytest.mark.usefixtures("eager")
 def test_tensorboard_gets_all_held_out_metrics(tensorboard):
     trainer, events = tensorboard
     expected = trainer.pipeline.get_average_eval_image_metrics()
@@ -94,7 +91,7 @@ def test_the_error_image_agrees_with_the_metric(tensorboard):
         assert share > 0.03
 
 
-@pytest.mark.usefixtures("eager", "offline_wandb")
+@pytest.mark.usefixtures("offline_wandb")
 def test_wandb_offline_gets_all_that_tensorboard_gets(tensorboard, pristine_scene, tmp_path):
     trainer = watched(pristine_scene, tmp_path, "wandb")
     wandb.teardown()  # finish does not wait for the process that writes the file

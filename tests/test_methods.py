@@ -22,7 +22,6 @@ import method_configs
 from dataparsers.cameras import pinhole_camera
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.runs import PAPER
-from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.gaussians.initial import OPACITY
 from shellgs_method.gaussians.seeds import Seeds
@@ -33,8 +32,6 @@ from shellgs_method.losses.objective import CueLosses, ExtraLossConfig, Geometry
 from shellgs_method.render.maps import DISC_LOG_THICKNESS, depth_powers, geometry_channels, mode_of_depth
 from shellgs_method.render.rasterizer import quats_to_rotations, rasterize
 from shellgs_method.runs.ablations import ABLATIONS
-
-pytestmark = pytest.mark.usefixtures("eager")
 
 METHODS = {
     "shellgs": "shellgs",
@@ -401,7 +398,7 @@ def test_shellgs_metric_brings_the_surface_to_the_shell(pristine_scene, tmp_path
     monkeypatch.setitem(OPACITY, "shell", 0.1)
     if primitive == "2d":  # and to make discs of the wall, whose depths include the sky's, opaque.
         nothing = Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-        monkeypatch.setattr(FacadeDataManager, "skybox_seeds", lambda *_: nothing)
+        monkeypatch.setattr("shellgs_method.pipeline.skybox_seeds", lambda *_: nothing)
 
     def distance(method) -> float:
         trainer = trainer_of(pristine_scene, tmp_path / method, method, iterations=60, change=choose)

@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DATAMANAGER = "nerfstudio.data.datamanagers.full_images_datamanager"
 PRIVATE = [
-    ("shellgs_method/files/photographs.py", DATAMANAGER, "_undistort_image", "camera distortion_params data image K"),
+    ("shellgs_method/files/undistortion.py", DATAMANAGER, "_undistort_image", "camera distortion_params data image K"),
     (
         "dataparsers/facade.py",
         "nerfstudio.data.dataparsers.base_dataparser",

@@ -21,6 +21,7 @@ from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine import compilation
 from shellgs_method.render.maps import geometry_channels
 from shellgs_method.trainer import FacadeTrainer
 
@@ -208,6 +209,24 @@ def test_masked_out_pixels_supervise_nothing(trained):
     assert all(float(value) == 0 for value in losses.values())
 
 
+def test_a_compiled_step_is_that_of_plain_torch(compiler, pristine_scene, tmp_path, monkeypatch):
+    compilation._compiled.cache_clear()
+    losses, gradients = [], []
+    for compiled in ("1", "0"):
+        monkeypatch.setenv("SHELLGS_COMPILE", compiled)
+        trainer = trainer_of(pristine_scene, tmp_path, "shellgs_metric")
+        model_of(trainer).step_cb(trainer.optimizers, 0)
+        _, terms, _ = trainer.pipeline.get_train_loss_dict(step=0)
+        parameters = list(model_of(trainer).gauss_params.values())
+        losses.append(terms)
+        gradients.append(torch.autograd.grad(torch.stack([*terms.values()]).sum(), parameters))
+    torch.testing.assert_close(*losses)
+    for actual, expected in zip(*gradients, strict=True):
+        assert (actual - expected).norm() <= 1e-3 * expected.norm()
+    assert compilation._compiled.cache_info().currsize > 10
+    assert not compilation._failed
+
+
 def test_photo_gs_renders_no_geometry_while_it_trains(pristine_scene, tmp_path):
     trainer = trainer_of(pristine_scene, tmp_path, "photo_gs")
     trainer.train()
@@ -216,7 +235,7 @@ def test_photo_gs_renders_no_geometry_while_it_trains(pristine_scene, tmp_path):
     assert "normal" not in trainer.pipeline.model(camera)
 
 
-def test_the_same_seed_on_one_thread_gives_the_same_run_to_the_last_digit(eager, pristine_scene, tmp_path, monkeypatch):
+def test_the_same_seed_on_one_thread_gives_the_same_run_to_the_last_digit(pristine_scene, tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
     def gaussians(folder: str) -> dict[str, torch.Tensor]:
@@ -259,7 +278,7 @@ def test_a_resumed_run_trains_the_restored_parameters_to_the_planned_end(pristin
     assert (model.opacities.detach() - saved["opacities"]).abs().max() > 0.05
 
 
-def test_a_resumed_run_ends_as_one_that_was_never_stopped(eager, pristine_scene, tmp_path, monkeypatch):
+def test_a_resumed_run_ends_as_one_that_was_never_stopped(pristine_scene, tmp_path, monkeypatch):
     """To the last digit, on one thread: Gaussians, moments, sums of gradients, the order of views, random numbers."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 

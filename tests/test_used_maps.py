@@ -24,8 +24,6 @@ from shellgs_method.files.map_files import resampled
 from shellgs_method.runs.limits import check_settings
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, load_shell
 
-pytestmark = pytest.mark.usefixtures("eager")
-
 
 def spoil(scene: Path, kind: str) -> None:
     """Write maps that belong to other cameras."""
@@ -67,7 +65,12 @@ def test_what_photographs_say_against_another_shell_stops_no_method_without_a_sh
 
 
 def with_all_maps(scene: Path) -> None:
-    """Check the shell, mask two photographs, and take the maps of a third."""
+    """Check the shell, mask two photographs, and take the maps of a third; two others are transparent on the left."""
+    for name in ("frame_00007", "frame_00008"):
+        with Image.open(scene / "images" / f"{name}.png") as photograph:
+            pixels = np.array(photograph.convert("RGBA"))
+        pixels[:, :12, 3] = 0
+        Image.fromarray(pixels).save(scene / "images" / f"{name}.png")
     cli.cast(scene)
     assert CueMaps.open(scene, "checked").names
     for name in ("frame_00002", "frame_00005"):

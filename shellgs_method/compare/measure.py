@@ -18,16 +18,12 @@ from torch import Tensor
 
 from dataparsers.cameras import pinhole_camera
 from dataparsers.facade import FacadeDataParserConfig
-from shellgs_method.compare.runs import Half
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataManagerConfig, FacadeDataset
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.evaluation import Rendering, angular_error, colours_to_normals, geometry_errors, mean_over_views
-from shellgs_method.evaluation.regions import (
-    REFERENCES,
-    masked_image_errors,
-    reference_errors,
-    reference_maps,
-)
+from shellgs_method.evaluation.holdout import Half
+from shellgs_method.evaluation.pixels import reference_maps
+from shellgs_method.evaluation.regions import REFERENCES, masked_image_errors, reference_errors
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import find_cues
@@ -97,7 +93,7 @@ def measure(config_path: Path, half: Half | None = None, renders: Path | None = 
 
     Args:
         config_path: config.yml of the run.
-        half: bands of the facade to measure; None for those that the run held out, or for all.
+        half: half of the facade to measure; None for that which the run held out, or for all of it.
         renders: folder for a :class:`Snapshot` of each view in which the shell is visible.
 
     Raises:

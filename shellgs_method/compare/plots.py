@@ -20,6 +20,7 @@ from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
+from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import upwards
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.voxels import voxel_means
@@ -87,7 +88,7 @@ def surfaces(runs: Sequence[Run], path: Path) -> None:
     seen = next(iter(shots.values()))
     unit, voxel = _resolution(seen[0])
     reference = voxel_means(np.concatenate([_world(shot, shot.shell_depth) for shot in seen]), voxel)
-    tree, centre, frame = point_tree(reference), np.median(reference, axis=0), _facade_frame(seen)
+    tree, centre, frame = point_tree(reference), np.median(reference, axis=0), _facade_axes(seen)
     pixel = np.linalg.norm(np.percentile(reference, 99, axis=0) - np.percentile(reference, 1, axis=0)) / PANEL[1]
     figure = Figure(figsize=(3.4 * len(shots) + 0.8, 2.2 * len(AZIMUTHS)), layout="constrained")
     axes = figure.subplots(len(AZIMUTHS), len(shots), squeeze=False)
@@ -134,13 +135,10 @@ def _resolution(shot: Snapshot) -> tuple[str, float]:
     return "units of the rescaled world", VOXEL_SHARE * float(np.median(shot.shell_depth[shot.mask]))
 
 
-def _facade_frame(shots: Sequence[Snapshot]) -> Float[np.ndarray, "3 3"]:
-    """Right, up and front of the facade, as rows: front from the shell's mean normal, up from the cameras."""
-    up = upwards(shot.camera for shot in shots)
-    facing = [shot.shell_normal[shot.mask[..., 0]].astype(float).mean(axis=0) @ shot.viewmat[:3, :3] for shot in shots]
-    right = np.cross(up, np.mean(facing, axis=0))
-    right /= np.linalg.norm(right)
-    return np.stack([right, up, np.cross(right, up)])
+def _facade_axes(shots: Sequence[Snapshot]) -> Float[np.ndarray, "3 3"]:
+    """Right, up and out of the facade, as rows."""
+    normals = [shot.shell_normal[shot.mask[..., 0]][::20].astype(float) @ shot.viewmat[:3, :3] for shot in shots]
+    return facade_axes(np.concatenate(normals), upwards(shot.camera for shot in shots))
 
 
 def _world(shot: Snapshot, depth: Float[np.ndarray, "H W 1"]) -> Float[np.ndarray, "N 3"]:

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -18,6 +17,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from dataparsers.facade import read_views
 from shellgs_method.compare.settings import config_settings, default_settings, parsed, scene_settings
 from shellgs_method.errors import SceneError
+from shellgs_method.evaluation.holdout import Half
 from shellgs_method.files.atomic import atomic_write, fingerprint
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.scene import SceneLayout, ScenePaths
@@ -39,7 +39,6 @@ class DamagedRunError(SceneError):
     """The folder of one run cannot be used; the others continue."""
 
 
-Half = Literal["A", "B"]
 HALVES: tuple[Half, ...] = ("A", "B")
 
 

@@ -11,7 +11,8 @@ from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
 
-from shellgs_method.compare.runs import HALVES, Half, Run
+from shellgs_method.compare.runs import HALVES, Run
+from shellgs_method.evaluation.holdout import Half
 from shellgs_method.evaluation.tables import (
     MAIN_COLUMNS,
     REGION_COLUMNS,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from shellgs_method.compare.results import Comparison
 from shellgs_method.compare.runs import Run
 from shellgs_method.evaluation.tables import plain_table
-from shellgs_method.trainer import wandb_refusals
+from shellgs_method.runs.host import wandb_refusals
 
 
 def log_in() -> None:

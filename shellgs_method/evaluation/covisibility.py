@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +21,7 @@ BEHIND = 0.02
 
 
 @dataclass(frozen=True)
-class SeenBy:
+class Covisibility:
     """Cameras and shell depths of the training views.
 
     Attributes:
@@ -33,6 +33,23 @@ class SeenBy:
     cameras: Sequence[Camera]
     depths: Sequence[Float[Tensor, "h w"]]
     points: Float[Tensor, "N 3"]
+
+    @classmethod
+    def of(
+        cls, views: Iterable[tuple[Camera, Float[Tensor, "H W 1"] | None]], points: Float[Tensor, "N 3"]
+    ) -> Covisibility:
+        """Covisibility of training views, whose depths are thinned.
+
+        Args:
+            views: camera of each, and z-depth of the shell, None where nothing is known to hide what lies behind.
+            points: SfM points in the cameras' world.
+        """
+        cameras, depths = [], []
+        for camera, depth in views:
+            step = camera.thinning(MAX_SIZE)
+            cameras.append(camera)
+            depths.append(torch.zeros(1, 1) if depth is None else depth[::step, ::step, 0].contiguous())
+        return cls(cameras, depths, points)
 
     def mask(self, camera: Camera, depth: Float[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
         """Pixels of a view that lie in at least two training images, not hidden by the shell.
@@ -55,8 +72,8 @@ class SeenBy:
 
     def _depth_of_points(self, camera: Camera, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
         """Depth of the SfM point nearest in the image; that of the sky, 1e6, if the image has none."""
-        pixels, z = _project(camera, self.points)
-        inside = _inside(camera, pixels, z)
+        pixels, z = camera.project(self.points)
+        inside = camera.contains(pixels, z)
         if not inside.any():
             return rays.new_full((*rays.shape[:2], 1), 1e6)
         wanted = (rays @ camera.K.T)[..., :2].reshape(-1, 2)
@@ -65,24 +82,10 @@ class SeenBy:
 
 
 def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "*shape 3"]) -> Bool[Tensor, "*shape"]:
-    pixels, z = _project(camera, world)
-    inside = _inside(camera, pixels, z)
+    pixels, z = camera.project(world)
+    inside = camera.contains(pixels, z)
     size = pixels.new_tensor([camera.width, camera.height])
     thinned = pixels.new_tensor([depth.shape[1], depth.shape[0]])
     columns, rows = (pixels.where(inside[..., None], 0.0) / size * thinned).long().unbind(dim=-1)
     surface = depth[rows, columns]
     return inside & ((surface <= 0) | (z < (1 + BEHIND) * surface))
-
-
-def _project(
-    camera: Camera, world: Float[Tensor, "*shape 3"]
-) -> tuple[Float[Tensor, "*shape 2"], Float[Tensor, "*shape"]]:
-    """Pixel coordinates and z-depths of points."""
-    points = world @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = points[..., 2]
-    return (points @ camera.K.T)[..., :2] / z.clamp_min(1e-9)[..., None], z
-
-
-def _inside(camera: Camera, pixels: Float[Tensor, "*shape 2"], z: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
-    size = pixels.new_tensor([camera.width, camera.height])
-    return (z > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)

@@ -1,7 +1,7 @@
-"""Vertical bands of a facade, alternately A and B, that separate supervised from evaluated surface.
+"""Half of a facade held out: cues supervise one half, and geometry is measured in the other.
 
-Bands are cut by planes fixed in the scene, perpendicular to the facade, so that each is the same piece of wall in every
-view.
+The halves, A and B, are alternate vertical bands, cut by planes fixed in the scene, perpendicular to the facade, so
+that each is the same piece of wall in every view.
 """
 
 from __future__ import annotations
@@ -18,30 +18,35 @@ from torch import Tensor
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View
+from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import Camera, upwards
+
+Half = Literal["A", "B"]
 
 MAX_VIEWS = 32
 """Maximum number of views, evenly spaced, used to find the facade's direction."""
+MAX_NORMALS = 1000
+"""Maximum number of normals of each of them."""
 
 
 @dataclass(frozen=True)
-class Bands:
+class Holdout:
     """Every other vertical band of a facade: band k extends from k to k + 1 widths along the axis; even k are A.
 
     Attributes:
         axis: unit vector in the scene, horizontal along the facade.
         width: width of a band, in scene units.
-        name: which of the two halves.
+        half: which of the two halves.
     """
 
     axis: Float[Tensor, "3"]
     width: float
-    name: Literal["A", "B"]
+    half: Half
 
     @property
-    def others(self) -> Bands:
+    def rest(self) -> Holdout:
         """The other half."""
-        return replace(self, name="B" if self.name == "A" else "A")
+        return replace(self, half="B" if self.half == "A" else "A")
 
     def index(self, depth: Float[Tensor, "H W"], camera: Camera) -> Int[Tensor, "H W"]:
         """Index k of the band of each pixel's surface.
@@ -57,40 +62,35 @@ class Bands:
     def mask(self, shell: CueMap, camera: Camera) -> Bool[np.ndarray, "H W"]:
         """Pixels whose surface lies in this half; pixels without shell are in no band."""
         odd = self.index(torch.from_numpy(shell.depth), camera).numpy() % 2 == 1
-        return shell.mask & (odd == (self.name == "B"))
+        return shell.mask & (odd == (self.half == "B"))
 
 
-def facade_bands(maps: CueMaps, views: Sequence[View], width: float, name: Literal["A", "B"]) -> Bands:
-    """Find the bands of the facade in a shell's maps; deterministic for the same maps and views.
+def facade_holdout(maps: CueMaps, views: Sequence[View], width: float, half: Half) -> Holdout:
+    """Cut the facade in a shell's maps into bands; deterministic for the same maps and views.
 
-    The facade's normal is the dominant horizontal direction of the shell's normals; up is the mean of the cameras'. If
-    all cameras look up at the facade, up tilts within the plane of the two, which does not change the axis.
+    Up is the mean of the cameras'. If all cameras look up at the facade, up tilts within the plane of the two, which
+    does not change the axis.
 
     Args:
         maps: shell maps.
         views: training views, with cameras of the maps' size.
         width: width of a band in metres, or in scene units if the maps' metres are unknown.
-        name: which half.
+        half: which half is held out.
 
     Raises:
-        SceneError: If no view has a map, or the shell in the maps has no upright wall.
+        SceneError: no view has a map with a pixel on the shell.
     """
-    up = torch.from_numpy(upwards(view.camera for view in views))
-    upright = torch.eye(3).double() - torch.outer(up, up)
-    scatter, facing = torch.zeros(3, 3).double(), torch.zeros(3).double()
+    normals = []
     for view in views[:: -(-len(views) // MAX_VIEWS)]:
         cue = maps.read(view.name, view.camera)
         if cue is not None and cue.mask.any():
-            normals = torch.from_numpy(cue.normal[cue.mask]).double() @ view.camera.viewmat[:3, :3].double() @ upright
-            scatter += normals.mT @ normals / len(normals)
-            facing += normals.mean(dim=0)
-    strengths, directions = torch.linalg.eigh(scatter)
-    if strengths[-1] <= 0:
+            on_shell = cue.normal[cue.mask].astype(np.float64)
+            thinned = on_shell[:: -(-len(on_shell) // MAX_NORMALS)]
+            normals.append(thinned @ view.camera.viewmat[:3, :3].double().numpy())
+    if not normals:
         raise SceneError(
-            f"the shell maps of {maps.scene} show no upright wall to cut into bands: "
+            f"the shell maps of {maps.scene} show no wall to cut into bands: "
             "run `shellgs cast SCENE`, or train without a holdout"
         )
-    wall = directions[:, -1]
-    wall = wall if wall @ facing >= 0 else -wall  # towards the cameras: the sign of an eigenvector is arbitrary
-    axis = torch.linalg.cross(up, wall)
-    return Bands(axis / axis.norm(), width / (maps.manifest.metres_per_unit or 1.0), name)
+    axis = facade_axes(np.concatenate(normals), upwards(view.camera for view in views))[0]
+    return Holdout(torch.from_numpy(axis), width / (maps.manifest.metres_per_unit or 1.0), half)

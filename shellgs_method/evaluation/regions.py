@@ -1,29 +1,18 @@
-"""Convert batches of nerfstudio to the types of this project."""
+"""Regions of a held-out view, and its metrics over them; which pixels count at all is said in ``pixels``."""
 
 from __future__ import annotations
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from shellgs_method.evaluation import Rendering, geometry_errors, image_errors
+from shellgs_method.evaluation.pixels import beyond, kept_pixels, occluded, reference_maps
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.reference import Reference
 
 REFERENCES = {"shell": "", "truth": "truth_"}
 """Kinds of maps that geometry is measured against, and the prefixes of their metrics."""
-
-
-MARGIN = 2
-"""Pixels around what stands in front of the shell that its splats also cover."""
-
-
-def kept_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"]:
-    """Pixels of an image that the user's mask keeps; all where there is none."""
-    if "mask" in batch:
-        return batch["mask"].to(image.device)
-    return torch.ones_like(image[..., :1], dtype=torch.bool)
 
 
 def masked_image_errors(
@@ -66,12 +55,12 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
     if "shell_depth" not in batch:
         return {"seen": seen, "off_shell": seen}
     shell, on_shell = (batch[f"shell_{name}"].to(device) for name in ("depth", "mask"))
-    before = seen & contradicted(batch, device)
+    before = seen & occluded(batch, device)
     if "truth_depth" in batch:
         truth = batch["truth_depth"].to(device)
         gap = 0.05 / metres_per_unit if metres_per_unit else shell / 200
         before = seen & (truth > 0) & (truth < shell - gap)
-    on_shell, rest = on_shell & ~_beyond(batch, device), seen & ~before
+    on_shell, rest = on_shell & ~beyond(batch, device), seen & ~before
     return {"seen": seen, "on_shell": rest & on_shell, "off_shell": rest & ~on_shell, "before_shell": before}
 
 
@@ -80,49 +69,3 @@ def references(batch: dict, device: torch.device) -> dict[str, Reference]:
     return {
         prefix: reference_maps(batch, kind, device) for kind, prefix in REFERENCES.items() if f"{kind}_depth" in batch
     }
-
-
-def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: bool = False) -> Reference:
-    """Maps of one kind in a batch; pixels that the user masked out are not supported.
-
-    Neither is the shell where photographs show something else, with a margin, unless ``everywhere`` is set.
-    """
-    depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
-    if kind == "shell" and not everywhere:
-        mask = mask & ~_with_margin(contradicted(batch, device) | _beyond(batch, device))
-    if "mask" in batch:
-        mask = mask & batch["mask"].to(device)
-    return Reference(depth, normal.float(), mask)
-
-
-def photometric_pixels(
-    batch: dict, image: Float[Tensor, "H W 3"], ignore_transients: bool
-) -> Bool[Tensor, "H W 1"] | None:
-    """Pixels of a photograph to train on, None for all: :func:`kept_pixels`, without what is known to have moved."""
-    if ignore_transients and "transient" in batch and batch["transient"].any():
-        return kept_pixels(batch, image) & ~_with_margin(batch["transient"].to(image.device))
-    return kept_pixels(batch, image) if "mask" in batch else None
-
-
-def contradicted(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
-    """Pixels where photographs show something in front of the shell; none if they were not compared."""
-    other = _other_depth(batch)
-    return ((other > 0) & (other < batch["shell_depth"])).to(device)
-
-
-def seen_through(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
-    """Pixels where photographs show something behind the shell, in windows; none if they were not compared."""
-    return (_other_depth(batch) > batch["shell_depth"]).to(device)
-
-
-def _other_depth(batch: dict) -> Float[Tensor, "H W 1"]:
-    return batch.get("other_depth", torch.zeros_like(batch["shell_depth"]))
-
-
-def _beyond(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
-    """Pixels of the shell where photographs show the background; none if they were not compared."""
-    return batch.get("beyond", torch.zeros_like(batch["shell_mask"])).to(device)
-
-
-def _with_margin(mask: Bool[Tensor, "H W 1"]) -> Bool[Tensor, "H W 1"]:
-    return max_pool2d(mask.float().permute(2, 0, 1), 2 * MARGIN + 1, 1, MARGIN).bool().permute(1, 2, 0)

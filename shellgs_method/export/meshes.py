@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,18 +9,17 @@ import numpy as np
 
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.export.frame import Frame
-from shellgs_method.files.atomic import atomic_write, unfinished
-from shellgs_method.machine.extras import import_extra
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.usd import USD_FORMATS, add_mesh, import_pxr, make_collider, new_stage
 
 if TYPE_CHECKING:
     import trimesh
 
-USD_FORMATS = (".usd", ".usda", ".usdc")
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turns z-up coordinates into y-up ones."""
 MESH_FORMATS = (".ply", ".obj", ".glb", *USD_FORMATS)
 METRE_FORMATS = (".glb", *USD_FORMATS)
-"""Formats whose unit is the metre, even if it is unknown: glTF by its specification, USD by :func:`set_unit`."""
+"""Formats whose unit is the metre, even if it is unknown: glTF by its specification, USD as its readers need it."""
 
 
 def check_mesh_format(path: Path) -> None:
@@ -33,7 +31,7 @@ def check_mesh_format(path: Path) -> None:
     if path.suffix.lower() not in MESH_FORMATS:
         raise SceneError(f"{path}: a mesh can be written as {', '.join(MESH_FORMATS)}")
     if path.suffix.lower() in USD_FORMATS:
-        _usd_modules(path)
+        import_pxr("usd", f"{path}: USD")
     check_output(path)
 
 
@@ -58,49 +56,15 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
     frame.describe(path, about | mesh.metadata | (facts or {}))
 
 
-def set_unit(UsdGeom: Any, stage: Any, metric: bool) -> None:
-    """State the metre as the unit of a USD stage, and in its comment whether it is unknown.
-
-    Every reader takes a stage that states none for centimetres.
-    """
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    if not metric:
-        stage.GetRootLayer().comment = "The unit is unknown: metersPerUnit is 1 because a stage must state it."
-
-
-def _usd_modules(path: Path) -> tuple[Any, ...]:
-    names = "Usd", "UsdGeom", "UsdPhysics", "Vt"
-    return tuple(import_extra(f"pxr.{name}", "usd-core", "usd", f"{path}: USD") for name in names)
-
-
 def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
     """Write a stage whose default prim is a static collider made of the triangles themselves.
 
-    A convex hull, the default of physics engines, would close the windows and doors.
+    A convex hull would close the windows and doors.
     """
-    Usd, UsdGeom, UsdPhysics, Vt = _usd_modules(path)
-    temporary = unfinished(path, path.suffix)
-    try:
-        stage = Usd.Stage.CreateNew(str(temporary))
-        UsdGeom.SetStageUpAxis(stage, frame.up.upper())
-        set_unit(UsdGeom, stage, frame.metric)
-        prim = UsdGeom.Mesh.Define(stage, "/facade")
-        stage.SetDefaultPrim(prim.GetPrim())
-        points = np.ascontiguousarray(mesh.vertices, dtype=np.float32)
-        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
-        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
-        prim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(0), points.max(0)])))
-        prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    pxr = import_pxr("usd", f"{path}: USD")
+    with new_stage(pxr, path, frame.up, frame.metric) as stage:
+        prim = add_mesh(pxr, stage, "/facade", np.asarray(mesh.vertices), np.asarray(mesh.faces))
         prim.CreateDoubleSidedAttr(True)
         colours = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3] / 255, dtype=np.float32)  # pyright: ignore
-        prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(Vt.Vec3fArray.FromNumpy(colours))
-        UsdPhysics.CollisionAPI.Apply(prim.GetPrim())
-        collider = UsdPhysics.MeshCollisionAPI.Apply(prim.GetPrim())
-        collider.CreateApproximationAttr(UsdPhysics.Tokens.none)
-        stage.GetRootLayer().Save()
-        os.replace(temporary, path)
-    except RuntimeError as error:  # pxr's, whose message says little
-        raise SceneError(f"{path} cannot be written: is there room on the disk? ({str(error)[:200]})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
+        prim.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex).Set(pxr.Vt.Vec3fArray.FromNumpy(colours))
+        make_collider(pxr, prim, "none")

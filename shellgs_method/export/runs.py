@@ -16,6 +16,7 @@ from rich.progress import track
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, mean_over_views
+from shellgs_method.evaluation.regions import reference_errors
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.export.frame import Frame, UpAxis, scene_frame, shell_frame
 from shellgs_method.export.splats import Splats
@@ -25,7 +26,7 @@ from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.tsdf import DepthView, fuse
-from shellgs_method.model import FacadeModel, reference_errors
+from shellgs_method.model import FacadeModel
 from shellgs_method.runs.trained import load_run
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
 

@@ -1,4 +1,4 @@
-"""Initial points on the shell, as dense as the photographs resolve, and on a skybox."""
+"""Initial points on the shell, and before and behind it, as dense as the photographs resolve."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.evaluation.pixels import kept_pixels, occluded, reference_maps, seen_through
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.reference import Reference
 from shellgs_method.geometry.voxels import cell_means, voxel_cells
@@ -20,15 +22,7 @@ GRAZING = 0.2
 """Smallest cosine of the shell's normal and the ray of a sampled pixel: below it, colours and depth smear."""
 MAX_SAMPLES = 8_000_000
 """Maximum number of pixels of all views that seeds are made from."""
-SKYBOX_RADIUS = 1.5
-"""Radius of the skybox, in units of the 99th percentile of the SfM points' distances from the cameras' centre. A radius
-of ten medians cost 0.8 dB on Herz-Jesu, where most of what is off the shell is near."""
-SKYBOX_OVERLAP = 1.6
-"""Size of the skybox's Gaussians against that of other seeds of the same spacing; smaller ones leave gaps."""
-MAX_SKY_PIXELS = 1_000_000
-"""Maximum number of pixels of all views that colour the skybox."""
-PIXELS_PER_COLOUR = 32
-"""Number of pixels, nearest in direction, whose median colours a point of the skybox."""
+_CPU = torch.device("cpu")
 
 
 class SeededView(NamedTuple):
@@ -39,16 +33,6 @@ class SeededView(NamedTuple):
     """Colours in [0, 1]."""
     shell: Reference
     """Shell in units of the camera's world, or what photographs show in front of it; the mask is where seeds may be."""
-
-
-class SkyView(NamedTuple):
-    """A training view to colour the skybox from."""
-
-    camera: Camera
-    image: Float[Tensor, "H W 3"]
-    """Colours in [0, 1]."""
-    mask: Bool[Tensor, "H W 1"]
-    """Pixels that may show what is far away."""
 
 
 class Seeds(NamedTuple):
@@ -72,6 +56,52 @@ class _Samples(NamedTuple):
 
     def select(self, kept: Bool[ndarray, " S"]) -> _Samples:
         return _Samples(*(each[kept] for each in self))
+
+
+def view_of_shell(camera: Camera, batch: dict) -> SeededView:
+    """The shell in a training view, also where photographs show something in front of it.
+
+    Args:
+        camera: camera of the view, in the world of the maps.
+        batch: photograph and maps of the view.
+    """
+    return SeededView(camera, photograph_of(batch), reference_maps(batch, "shell", _CPU, everywhere=True))
+
+
+def view_of_surface(camera: Camera, batch: dict) -> SeededView:
+    """The shell in a training view, or what photographs show in front of it, facing the camera.
+
+    The arguments are those of :func:`view_of_shell`.
+    """
+    image, shell = photograph_of(batch), reference_maps(batch, "shell", _CPU)
+    if "other_depth" not in batch:
+        return SeededView(camera, image, shell)
+    before = occluded(batch, _CPU) & kept_pixels(batch, image)
+    depth = torch.where(before, batch["other_depth"].to(_CPU), shell.depth)
+    normal = torch.where(before, _towards(camera), shell.normal)
+    return SeededView(camera, image, Reference(depth, normal, shell.mask | before))
+
+
+def view_behind_shell(camera: Camera, batch: dict) -> SeededView:
+    """What windows reflect or let through in a training view, where photographs show it behind the shell.
+
+    The arguments are those of :func:`view_of_shell`.
+    """
+    image, shell = photograph_of(batch), reference_maps(batch, "shell", _CPU)
+    behind = shell.mask & seen_through(batch, _CPU) & kept_pixels(batch, image)
+    depth = batch.get("other_depth", shell.depth).to(_CPU)
+    return SeededView(camera, image, Reference(depth, _towards(camera), behind))
+
+
+def photograph_of(batch: dict) -> Float[Tensor, "H W 3"]:
+    """The photograph of a batch in [0, 1], on the CPU."""
+    image = batch["image"][..., :3].to(_CPU)
+    return image / (255 if image.dtype == torch.uint8 else 1)
+
+
+def _towards(camera: Camera) -> Float[Tensor, "H W 3"]:
+    """Normals that face the camera."""
+    return -normalize(camera.rays().float(), dim=-1)
 
 
 def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, most: int) -> Seeds:
@@ -107,54 +137,11 @@ def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, mo
     return Seeds(points[known], normals[known], colours[known], apart[known])
 
 
-def skybox_seeds(views: Iterable[SkyView], num_pixels: int, sfm_points: Float[ndarray, "P 3"], count: int) -> Seeds:
-    """Make seeds all around the scene, for the sky and what is too far for SfM points.
-
-    They are spread evenly over a sphere around the cameras' centre; those that no training view shows are removed after
-    training, as all such Gaussians are. The skybox is that of Hierarchical 3D Gaussians (Kerbl et al. 2024), with
-    colours from the photographs.
-
-    Args:
-        views: training views.
-        num_pixels: number of pixels of all views together.
-        sfm_points: points in the world, which the sphere encloses.
-        count: number of seeds.
-
-    Returns:
-        Seeds; none if no view has a pixel that may show what is far away.
-    """
-    stride = max(1, int(np.ceil((num_pixels / MAX_SKY_PIXELS) ** 0.5)))
-    cameras, directions, colours = [], [np.empty((0, 3))], [np.empty((0, 3))]
-    for view in views:
-        mask, image, rays = (each[::stride, ::stride] for each in (view.mask[..., 0], view.image, view.camera.rays()))
-        rays = torch.nn.functional.normalize(rays[mask], dim=-1) @ view.camera.viewmat[:3, :3]
-        cameras.append(view.camera)
-        directions.append(rays.double().cpu().numpy())
-        colours.append(image[mask].double().cpu().numpy())
-    directions, colours = np.concatenate(directions), np.concatenate(colours)
-    if not len(directions):
-        return Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    centre, towards = positions(cameras).mean(axis=0), _fibonacci_sphere(count)
-    radius = SKYBOX_RADIUS * np.percentile(np.linalg.norm(sfm_points - centre, axis=1), 99)
-    k = min(PIXELS_PER_COLOUR, len(directions))
-    _, nearest = point_tree(directions).query(towards, k, workers=-1)
-    spacing = np.full(count, SKYBOX_OVERLAP * radius * np.sqrt(4 * np.pi / count))
-    return Seeds(centre + radius * towards, -towards, np.median(colours[nearest.reshape(count, k)], axis=1), spacing)
-
-
-def _fibonacci_sphere(count: int) -> Float[ndarray, "N 3"]:
-    """Unit vectors spread evenly over the sphere (Swinbank and Purser 2006)."""
-    i = np.arange(count)
-    z, turn = 1 - (2 * i + 1) / count, np.pi * (3 - np.sqrt(5)) * i
-    across = np.sqrt(1 - z**2)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
-
-
 def _lift(view: SeededView, index: int, stride: int) -> _Samples:
     """Lift every ``stride``-th pixel of a view, in both directions, to the shell."""
     depth, normal, mask = (each[::stride, ::stride] for each in view.shell)
     rays, image = view.camera.rays()[::stride, ::stride], view.image[::stride, ::stride]
-    facing = -(normal * torch.nn.functional.normalize(rays, dim=-1)).sum(dim=-1)
+    facing = -(normal * normalize(rays, dim=-1)).sum(dim=-1)
     kept = mask[..., 0] & (facing > GRAZING)
     rotation = view.camera.viewmat[:3, :3]
     points = (depth * rays)[kept] @ rotation + view.camera.position

@@ -67,6 +67,17 @@ class Camera:
         pixels = torch.stack([*torch.meshgrid(u, v, indexing="xy"), torch.ones_like(u).expand(self.height, -1)], dim=-1)
         return pixels @ torch.linalg.inv(self.K).T
 
+    def project(self, points: Float[Tensor, "*N 3"]) -> tuple[Float[Tensor, "*N 2"], Float[Tensor, "*N"]]:
+        """Pixels and z-depths of points of the world; pixels of points behind the camera mean nothing."""
+        in_camera = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        depth = in_camera[..., 2]
+        return (in_camera @ self.K.T)[..., :2] / depth.where(depth.abs() > 1e-9, 1e-9)[..., None], depth
+
+    def contains(self, pixels: Float[Tensor, "*N 2"], depth: Float[Tensor, "*N"]) -> Bool[Tensor, "*N"]:
+        """Whether pixels of projected points are in the image, and the points in front of the camera."""
+        size = pixels.new_tensor([self.width, self.height])
+        return (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)
+
 
 def angle_between(one: Camera, other: Camera) -> float:
     """Angle in radians by which two cameras are turned from each other."""
@@ -83,11 +94,10 @@ def positions(cameras: Iterable[Camera]) -> Float64[np.ndarray, "V 3"]:
 def project(
     camera: Camera, points: Float64[np.ndarray, "N 3"]
 ) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, " N"]]:
-    """Project points of the world to pixels and z-depths."""
-    viewmat, K = (each.detach().cpu().double().numpy() for each in (camera.viewmat, camera.K))
-    in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depth = in_camera[:, 2]
-    return (in_camera / np.where(np.abs(depth) > 1e-9, depth, 1e-9)[:, None] @ K.T)[:, :2], depth
+    """:meth:`Camera.project` in double precision."""
+    with torch.no_grad():
+        pixels, depth = camera.to("cpu", torch.float64).project(torch.tensor(points, dtype=torch.float64))
+    return pixels.numpy(), depth.numpy()
 
 
 def in_view(
@@ -95,7 +105,7 @@ def in_view(
 ) -> tuple[Bool[np.ndarray, " N"], Float64[np.ndarray, "n 2"], Float64[np.ndarray, " n"]]:
     """Which points of the world project into the image, and the pixels and z-depths of these."""
     pixels, depth = project(camera, points)
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    inside = camera.contains(torch.from_numpy(pixels), torch.from_numpy(depth)).numpy()
     return inside, pixels[inside], depth[inside]
 
 

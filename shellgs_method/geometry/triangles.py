@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -46,11 +47,11 @@ class Triangles:
 
     Embree computes in float32: coordinates must be relative to an origin near the triangles.
 
-    Args:
-        vertices: in any unit.
-        faces: indices of three vertices each.
-
     Attributes:
+        vertices: positions in any unit.
+        faces: indices of three vertices each, counter-clockwise seen from outside where the caller needs sides.
+        areas: area of each triangle.
+        normals: unit normal of each triangle, by its winding.
         scene: Open3D's ray casting scene.
 
     Raises:
@@ -59,6 +60,11 @@ class Triangles:
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
         o3d = import_open3d()
+        self.vertices: Float64[np.ndarray, "V 3"] = np.asarray(vertices, np.float64)
+        self.faces: Int64[np.ndarray, "F 3"] = np.asarray(faces, np.int64)
+        self.normals: Float64[np.ndarray, "F 3"] = area_vectors(self.vertices, self.faces)
+        self.areas: Float64[np.ndarray, " F"] = np.linalg.norm(self.normals, axis=1)
+        self.normals /= np.maximum(self.areas, np.finfo(float).tiny)[:, None]
         self._tensor = o3d.core.Tensor.from_numpy
         self.scene = o3d.t.geometry.RaycastingScene()
         self.scene.add_triangles(
@@ -66,14 +72,33 @@ class Triangles:
             self._tensor(np.ascontiguousarray(faces, np.uint32)),
         )
 
+    @cached_property
+    def centres(self) -> Float64[np.ndarray, "F 3"]:
+        """Centre of each triangle."""
+        return self.vertices[self.faces].mean(axis=1)
+
+    def cast(self, origins: Float[np.ndarray, "*#N 3"], directions: Float[np.ndarray, "*#N 3"]) -> Hits:
+        """First hits of rays; origins and directions, of any length, are broadcast."""
+        return self.cast_rays(rays_from(origins, directions))
+
     def cast_rays(self, rays: Float32[np.ndarray, "*N 6"]) -> Hits:
         """First hits of rays, made by :func:`rays_from`."""
         answer = self.scene.cast_rays(self._tensor(rays))
         return Hits(answer["t_hit"].numpy(), _index(answer), answer["primitive_normals"].numpy())
 
-    def blocked(self, rays: Float32[np.ndarray, "*N 6"]) -> Bool[np.ndarray, " *N"]:
+    def blocked(
+        self, origins: Float[np.ndarray, "*#N 3"], directions: Float[np.ndarray, "*#N 3"]
+    ) -> Bool[np.ndarray, " *N"]:
         """Whether rays hit anything at all."""
-        return self.scene.test_occlusions(self._tensor(rays)).numpy()
+        return self.scene.test_occlusions(self._tensor(rays_from(origins, directions))).numpy()
+
+    def sees(
+        self, points: Float[np.ndarray, "*#N 3"], targets: Float[np.ndarray, "*#N 3"], slack: float
+    ) -> Bool[np.ndarray, " *N"]:
+        """Whether nothing is between points and targets, except in the last ``slack`` units before the target."""
+        away = targets - points
+        length = np.linalg.norm(away, axis=-1, keepdims=True)
+        return self.cast(points, away / np.maximum(length, 1e-9)).t >= length[..., 0] - slack
 
     def closest(self, points: Float[np.ndarray, "N 3"]) -> Closest:
         """The nearest point of the surface to each point."""
@@ -84,6 +109,17 @@ class Triangles:
     def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
         """Unsigned distance of each point from the surface."""
         return self.scene.compute_distance(self._tensor(np.ascontiguousarray(points, np.float32))).numpy()
+
+    def signed_distance(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+        """Distance of each point, positive on the side that the nearest triangle's normal points to."""
+        closest = self.closest(points)
+        away = points - closest.point
+        side = np.einsum("nc,nc->n", away, self.normals[closest.triangle])
+        return np.where(side < 0, -1.0, 1.0) * np.linalg.norm(away, axis=1)
+
+    def samples(self, count: int) -> tuple[Float64[np.ndarray, "N 3"], Int64[np.ndarray, " N"]]:
+        """Random points, uniform by area, and the triangle of each; the same in each call."""
+        return sampled(self.vertices, self.faces, self.areas, count)
 
 
 def _index(answer) -> Int32[np.ndarray, " *N"]:

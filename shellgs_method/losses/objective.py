@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from shellgs_method.bounds import Bounds, Count, Weight
-from shellgs_method.evaluation.regions import kept_pixels, photometric_pixels, reference_maps
+from shellgs_method.evaluation.pixels import kept_pixels, photometric_pixels, reference_maps
 from shellgs_method.geometry.reference import Reference
 from shellgs_method.losses import (
     PAPER_ITERATIONS,

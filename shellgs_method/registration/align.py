@@ -16,6 +16,7 @@ from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMaps, source_hash
 from shellgs_method.files.photographs import View
 from shellgs_method.files.surfaces import up_axis
+from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import positions, upwards
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
@@ -25,7 +26,6 @@ from shellgs_method.registration.picks import align_picks, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import propose
 from shellgs_method.registration.refinement import refine
-from shellgs_method.registration.repetition import facade_axes
 from shellgs_method.registration.report import write_report
 from shellgs_method.registration.validation import Validation, rounding_of, steps_in_metres, validate
 from shellgs_method.shell.alignment import Alignment
@@ -181,8 +181,8 @@ def refined(
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
     result = refine(surface, points.positions, start, reach, rounding_of(steps))
-    up = start[:3, :3] @ upwards(view.camera for view in views)
-    axes = facade_axes(surface.samples(5000)[1], up / np.linalg.norm(up))
+    _, triangle = surface.samples(5000)
+    axes = facade_axes(surface.normals[triangle], start[:3, :3] @ upwards(view.camera for view in views))
     sentence = f"Refined against {result.evidence.points} SfM points, which moved by {result.moved:.3f} m."
     if words := result.evidence.in_words(axes):
         sentence += f" Left unchanged, as the points do not determine it: {'; '.join(words)}."

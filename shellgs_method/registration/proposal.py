@@ -17,11 +17,11 @@ from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
 
 from shellgs_method.errors import SceneError
+from shellgs_method.geometry.axes import main_direction, wall_axes
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.planes import fitted_plane, largest_plane
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.refinement import FINAL_GATE, refine
-from shellgs_method.registration.repetition import wall_axes
 from shellgs_method.shell.surface import ShellSurface
 
 AMBIGUOUS = 0.90
@@ -87,7 +87,8 @@ def propose(
     """
     cloud = _main_wall(points, cameras, scene_up)
     few = cloud.thinned()
-    samples, normals = surface.samples(20_000)
+    samples, triangle = surface.samples(20_000)
+    normals = surface.normals[triangle]
     spread = _some(samples, 5000)
     starts: list[Candidate] = []
     for up in _upwards(normals, shell_up):
@@ -99,7 +100,7 @@ def propose(
     found = _refined(surface, spread, cloud, _close_to_best(_distinct(found, spread, _KEPT)), 2 * FINAL_GATE)
     found = [candidate for candidate in found if candidate.score > 0]
     if not found:
-        size = float(np.ptp(surface.bounds, axis=0).max())
+        size = float(np.ptp(surface.vertices, axis=0).max())
         raise SceneError(
             f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
             "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"
@@ -129,20 +130,17 @@ def _main_wall(points: np.ndarray, cameras: np.ndarray, up: np.ndarray) -> _Clou
 
 def _upwards(normals: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
     """Up directions of the shell to try: ``up``, or if its walls are not aligned with it, their axes in both signs."""
-    first = _commonest(normals)
+    first = _main_line(normals)
     across = normals[np.abs(normals @ first) < 0.2]
     if len(across) < 100:
         return [up]
-    axes = wall_axes(first, _commonest(across))
+    axes = wall_axes(first, _main_line(across))
     return [up] if np.abs(axes @ up).max() > 0.97 else [*axes, *-axes]
 
 
-def _commonest(normals: np.ndarray) -> np.ndarray:
-    """Direction, up to its sign, of the most normals within 20°."""
-    some = normals[:: max(1, len(normals) // 1000)]
-    alike = np.abs(some @ some.T) > 0.94
-    group = some[alike[alike.sum(axis=1).argmax()]]
-    return np.linalg.eigh(group.T @ group)[1][:, 2]
+def _main_line(normals: np.ndarray) -> np.ndarray:
+    """Direction of the most normals within 20°, which a shell may have in either sign."""
+    return main_direction(np.concatenate([normals, -normals]), within=20)
 
 
 def _shell_walls(samples: np.ndarray, normals: np.ndarray, up: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -152,7 +150,7 @@ def _shell_walls(samples: np.ndarray, normals: np.ndarray, up: np.ndarray) -> It
     for _ in range(4):
         if len(samples) < 1000:
             return
-        out = _commonest(normals)
+        out = _main_line(normals)
         out = out - (out @ up) * up
         out /= np.linalg.norm(out)
         alike = np.abs(normals @ out) > 0.94

@@ -67,24 +67,6 @@ class ShiftScan:
         return {k: float(self.fits[n].max() / max(self.in_place, 1e-9)) for k, n in near.items() if n.any()}
 
 
-def facade_axes(normals: Float64[np.ndarray, "N 3"], up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Right, up and out of the wall that most outward normals belong to, as rows; ``up`` may be approximate."""
-    upright = normals[np.abs(normals @ up) < 0.5]
-    if len(upright) == 0:
-        upright = normals
-    upright = upright[:: max(1, len(upright) // 2000)]
-    alike = upright @ upright.T > np.cos(np.radians(10))
-    out = upright[alike[alike.sum(axis=1).argmax()]].mean(axis=0)
-    return wall_axes(out / np.linalg.norm(out), up)
-
-
-def wall_axes(out: Float64[np.ndarray, " 3"], up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Right, up and out of a wall, as rows; ``up`` may be approximate."""
-    up = up - (up @ out) * out  # removes the tilt of cameras that look up at a building
-    up /= np.linalg.norm(up)
-    return np.stack([np.cross(up, out), up, out])
-
-
 def scan_shifts(
     surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes: Float64[np.ndarray, "3 3"]
 ) -> list[ShiftScan]:
@@ -113,7 +95,7 @@ def _relief(surface: ShellSurface, axes: np.ndarray) -> tuple[Float64[np.ndarray
     cell = max(0.05, float((high - low)[:2].max()) / 1000)
     u, v = (np.arange(low[k] + cell / 2, high[k], cell) for k in range(2))
     origins = np.stack([*np.meshgrid(u, v), np.full((len(v), len(u)), high[2] + 1.0)], axis=-1) @ axes
-    depth = surface.first_hit(origins, -axes[2]).astype(np.float64)
+    depth = surface.cast(origins, -axes[2]).t.astype(np.float64)
     return np.where(np.isfinite(depth), high[2] + 1.0 - depth, np.nan), cell
 
 

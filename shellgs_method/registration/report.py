@@ -16,13 +16,13 @@ from scipy.ndimage import gaussian_filter
 
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import CueMap
-from shellgs_method.files.html import data_uri, encoded
+from shellgs_method.files.html import captioned, encoded, img, table, write_page
 from shellgs_method.files.photographs import load_photograph
 from shellgs_method.registration.correspondences import Correspondence
 from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.registration.repetition import RIVALRY
 from shellgs_method.registration.support import representative
-from shellgs_method.registration.validation import Validation
+from shellgs_method.registration.validation import Validation, Verdict
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
 
@@ -30,21 +30,6 @@ COLOURS = {"good": "#1a7f37", "doubtful": "#9a6700", "refused": "#cf222e"}
 _EDGE = (255, 0, 140)
 _OVERLAY = 1280  # pixels of the longer side
 _BLUR = 2  # pixels
-_STYLE = """
-:root { color-scheme: light }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1f2328; max-width: 68rem; margin: 2rem auto; padding: 0 1rem }
-h1 { font-size: 1.6rem } h2 { font-size: 1.2rem; margin-top: 2.5rem }
-.good { color: #1a7f37 } .doubtful { color: #9a6700 } .refused { color: #cf222e }
-.verdict { font-size: 1.3rem; border-left: .4rem solid; padding: .2rem 1rem; margin: 1rem 0 }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; width: 100% }
-th, td { text-align: left; padding: .3rem .7rem .3rem 0; border-bottom: 1px solid #d1d9e0; vertical-align: top }
-th { font-weight: 600 } small, .why { color: #59636e }
-.views { display: grid; grid-template-columns: repeat(auto-fill, minmax(30rem, 1fr)); gap: 1rem }
-img { max-width: 100% } figure { margin: 0 }
-figure > div { position: relative } figure img { width: 100%; display: block }
-figure img + img { position: absolute; inset: 0 } figure div:hover img + img { opacity: 0 }
-@media (max-width: 34rem) { .views { grid-template-columns: 1fr } }
-"""
 
 
 def shell_edges(cue: CueMap, metres_per_unit: float) -> Bool[np.ndarray, "H W"]:
@@ -102,7 +87,9 @@ def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history:
         "metrics": validation.metrics(),
     }
     _write(folder / "validation.json", (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
-    _write(folder / "index.html", "".join(_page(validation, history, plots, overlays)).encode())
+    title = f"Alignment of {validation.alignment.shell}: {validation.verdict}"
+    body = _body(validation, history, plots, overlays)
+    write_page(folder / "index.html", title, body, ".layers:hover img + img { opacity: 0 }")
     return folder / "index.html"
 
 
@@ -119,45 +106,43 @@ def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator
         _write(folder / name, encoded(composite))
         lines = np.zeros((*edges.shape, 4), np.uint8)
         lines[edges] = (*_EDGE, 255)
-        layers = _img(encoded(photograph, "JPEG"), view.name) + _img(encoded(lines), "the shell's edges")
-        caption = f"{escape(view.name)} <small>{support.supported:.0%} on the shell</small>"
-        yield f"<figure><div>{layers}</div><figcaption>{caption}</figcaption></figure>"
+        layers = img(encoded(photograph, "JPEG"), view.name) + img(encoded(lines), "the shell's edges")
+        caption = f"{escape(view.name)}, {support.supported:.0%} on the shell"
+        yield captioned(f'<div class="layers">{layers}</div>', caption)
 
 
-def _page(
+def _body(
     validation: Validation, history: Sequence[str], plots: Mapping[str, bytes], overlays: Sequence[str]
 ) -> Iterator[str]:
     alignment, verdict = validation.alignment, validation.verdict
-    title = f"Alignment of {escape(alignment.shell)}: {verdict}"
-    yield f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
-    yield f'<h1>Alignment of {escape(alignment.shell)}</h1><p class="verdict {verdict}">Verdict: <b>{verdict}</b></p>'
+    yield f'<p class="verdict" style="color: {COLOURS[verdict]}">Verdict: <b>{verdict}</b></p>'
     yield "".join(f"<p>{escape(sentence)}</p>" for sentence in (f"From: {alignment.source}.", *history))
     yield f"<p>One scene unit is {alignment.metres_per_unit:.6g} m; {validation.near:.0%} of the SfM points are within "
     yield "1 m of the shell.</p>"
     yield "<h2>Checks behind the verdict</h2>"
     checks = (
-        (f'<span class="{c.verdict}">{c.verdict}</span>', escape(c.name), escape(c.value), escape(c.limits),
-         f'<span class="why">{escape(c.why)}</span>') for c in validation.checks
-    )  # fmt: skip
-    yield _table(("", "metric", "value", "limits", "because"), checks)
+        (_coloured(c.verdict), escape(c.name), escape(c.value), escape(c.limits), f"<small>{escape(c.why)}</small>")
+        for c in validation.checks
+    )
+    yield table(("", "metric", "value", "limits", "because"), checks)
     if overlays:
         yield "<h2>The shell's edges on the photographs</h2><p>They must lie on the photographed edges, also at both "
         yield "ends of the building. Hover over an image to hide them.</p>"
-        yield f'<div class="views">{"".join(overlays)}</div>'
+        yield f'<div class="row">{"".join(overlays)}</div>'
     if "distances" in plots:
         shares = ", ".join(f"{validation.share_within(d):.0%} within {100 * d:.0f} cm" for d in (0.05, 0.10, 0.20))
         yield f"<h2>Distance of the SfM points from the shell</h2><p>Of those within 1 m: {shares}; median "
         yield f"{100 * validation.bias:+.1f} cm along the normal, positive in front of the shell.</p>"
-        yield _img(plots["distances"], "histogram of the distances")
+        yield img(plots["distances"], "histogram of the distances")
     if "shifts" in plots:
         yield "<h2>Bay test</h2><p>Fit of the shell to the points when it is shifted along the facade and upwards. "
         yield f"Another peak of {RIVALRY:.0%} or more of the one at 0 makes the alignment ambiguous.</p>"
-        yield _img(plots["shifts"], "fit by shift")
+        yield img(plots["shifts"], "fit by shift")
         rows = (
             (scan.name, f"{k:+d} × {scan.period:.2f} m", f"{fit:.2f}")
             for scan in validation.scans if scan.period for k, fit in scan.at_periods().items()
         )  # fmt: skip
-        yield _table(("direction", "shift", "fit, relative"), rows)
+        yield table(("direction", "shift", "fit, relative"), rows)
     if validation.test is not None:
         evidence = validation.test.evidence
         yield f"<h2>What the points determine</h2><p>Condition number of the fit {evidence.condition:.3g} over "
@@ -165,19 +150,23 @@ def _page(
         yield ", ".join(f"{strength:.2g}" for strength in evidence.strengths) + ".</p>"
     if validation.correspondences:
         head, *rows = residual_table(validation.correspondences)
-        yield "<h2>Points known in both frames, worst first</h2>" + _table(head, map(_escaped, rows))
+        yield "<h2>Points known in both frames, worst first</h2>" + table(head, (map(escape, row) for row in rows))
     yield "<h2>All views</h2>"
     rows = (
         (escape(s.view.name), f"{s.supported:.0%}", len(s.errors), f"{100 * s.error:.1f} cm", f"{s.occluded:.0%}")
         for s in validation.views
     )
-    yield _table(("view", "on the shell", "SfM points there", "median depth error", "occluded"), rows)
+    yield table(("view", "on the shell", "SfM points there", "median depth error", "occluded"), rows)
+
+
+def _coloured(verdict: Verdict) -> str:
+    return f'<span style="color: {COLOURS[verdict]}">{verdict}</span>'
 
 
 def residual_table(points: Sequence[Correspondence]) -> list[tuple[str, ...]]:
     """Header and one row per point: its residuals, and for a pick its reprojection error."""
     picked = [point for point in points if isinstance(point, PickedPoint)]
-    table = [("point", "residual", "leave-one-out", *(("reprojection", "worst photograph") if picked else ()), "")]
+    lines = [("point", "residual", "leave-one-out", *(("reprojection", "worst photograph") if picked else ()), "")]
     for point in points:
         remark = "check point" if point.held_out else "" if point.is_used else "left out"
         without = "–" if np.isnan(point.left_out_residual) else f"{point.left_out_residual:.3f} m"
@@ -185,17 +174,8 @@ def residual_table(points: Sequence[Correspondence]) -> list[tuple[str, ...]]:
         if isinstance(point, PickedPoint):
             pixels = (f"{point.reprojection:.1f} px", point.worst_view)
             remark += "" if point.is_sharp else ": its pixels disagree"
-        table.append((point.name, f"{point.residual:.3f} m", without, *pixels, remark))
-    return table
-
-
-def _escaped(row: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(map(escape, row))
-
-
-def _table(head: Sequence[str], rows) -> str:
-    cells = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><tr>{''.join(f'<th>{word}</th>' for word in head)}</tr>{cells}</table>" if cells else ""
+        lines.append((point.name, f"{point.residual:.3f} m", without, *pixels, remark))
+    return lines
 
 
 def _histogram(validation: Validation) -> Figure | None:
@@ -228,10 +208,6 @@ def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
-
-
-def _img(data: bytes, text: str) -> str:
-    return f'<img alt="{escape(text)}" src="{data_uri(data)}">'
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -14,13 +14,14 @@ from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View
+from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import positions, upwards
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.precision import COARSEST, FINE, REMEDY, Step, camera_step
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.correspondences import Correspondence
 from shellgs_method.registration.refinement import Refinement, refine
-from shellgs_method.registration.repetition import BETTER, RIVALRY, ShiftScan, facade_axes, scan_shifts
+from shellgs_method.registration.repetition import BETTER, RIVALRY, ShiftScan, scan_shifts
 from shellgs_method.registration.support import NEAR, OCCLUDING, ViewSupport, look
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.mesh import ShellMesh
@@ -180,7 +181,8 @@ def validate(
     if size.verdict == "refused":
         return Validation(alignment, [sight, size], supports)
     cameras = transformed(positions(view.camera for view in views), survey_from_scene)
-    axes = _axes(seeing, survey_from_scene)
+    up = survey_from_scene[:3, :3] @ upwards(support.view.camera for support in seeing)
+    axes = facade_axes(np.concatenate([support.normals for support in seeing]), up)
     placed = transformed(points.positions, survey_from_scene)
     signed = _signed_distances(surface, placed, cameras)
     near = np.abs(signed) < NEAR
@@ -248,13 +250,6 @@ def _check(key: str, value: float, name: str, form: str) -> Check:
     good, refused = (f"{value:.0%}" if percent else f"{value:g}" for value in (limit.good, limit.refused))
     limits = f"good {sign} {good}, refused beyond {refused}"
     return Check(name, form.format(value), limits, limit.verdict(value), limit.why)
-
-
-def _axes(seeing: Sequence[ViewSupport], survey_from_scene: np.ndarray) -> np.ndarray:
-    """Right, up and out of the facade that is most visible in the views."""
-    up = survey_from_scene[:3, :3] @ upwards(support.view.camera for support in seeing)
-    normals = np.concatenate([support.normals for support in seeing])
-    return facade_axes(normals, up / np.linalg.norm(up))
 
 
 def _signed_distances(surface: ShellSurface, points: np.ndarray, cameras: np.ndarray) -> np.ndarray:

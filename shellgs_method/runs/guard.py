@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from gsplat.strategy.ops import remove
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor, nn
 
-MAX_FAULTS = 10
+MAX_SKIPPED = 10
 """Most steps of a run that may be skipped."""
 _NOT_SUMMED = "features_rest"
 """Not checked: four fifths of a Gaussian's numbers, with the gradients of ``features_dc`` times the harmonics."""
@@ -58,17 +57,3 @@ def forget_gradients(info: dict[str, Any]) -> None:
     for key in ("means2d", "gradient_2dgs"):
         if isinstance(rendered := info.get(key), Tensor) and rendered.grad is not None:
             rendered.grad.zero_()
-
-
-def remove_broken(
-    gaussians: nn.ParameterDict, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any]
-) -> int:
-    """Remove Gaussians with a parameter that is not finite; return their number."""
-    if all(bool(parameter.detach().sum().isfinite()) for parameter in gaussians.values()):
-        return 0
-    broken: Tensor = sum(  # pyright: ignore[reportAssignmentType]
-        (~parameter.detach().flatten(1).isfinite().all(dim=1)).long() for parameter in gaussians.values()
-    )
-    broken = broken > 0
-    remove(gaussians, optimizers, state, broken)  # pyright: ignore[reportArgumentType]
-    return int(broken.sum())

@@ -8,7 +8,8 @@ mended in the modules of the commands, in processes that run one of them.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import wraps
 from typing import Any, NoReturn
 
@@ -33,6 +34,25 @@ def refuse(sentence: str) -> NoReturn:
     with refusals_end_the_program():
         raise SceneError(sentence)
     raise AssertionError
+
+
+@contextmanager
+def wandb_refusals() -> Iterator[None]:
+    """Turn errors of wandb (no key, no network) into one sentence.
+
+    Raises:
+        SceneError: wandb cannot be used.
+    """
+    try:
+        from wandb.errors import Error  # slow to import
+    except ImportError as error:
+        raise SceneError(f"wandb cannot be imported ({error}): pip install wandb") from error
+    try:
+        yield
+    except Error as error:
+        raise SceneError(
+            f"wandb says: {error} To log without an account or a network, set WANDB_MODE=offline"
+        ) from error
 
 
 class NoPixelSampler:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from scipy.spatial import Delaunay, QhullError
 
 from shellgs_method.errors import SceneError
@@ -181,9 +181,10 @@ def _planes(cloud: _Cloud) -> Iterator[_Part]:
     rng, points = np.random.default_rng(0), cloud.points.copy()
     plane = np.full(len(points), NO_PLANE)
     least = max(3, min(LEAST_POINTS, len(cloud.points) // 20))
+    tolerance = float(np.clip(4 * cloud.roughness, 0.1 * cloud.spacing, cloud.spacing))
     left, failures = np.arange(len(cloud.points)), 0
     while len(left) >= least and failures < FAILURES:
-        members = left[_largest_plane(cloud, left, rng)]
+        members = left[largest_plane(cloud.points[left], tolerance, rng, cloud.normals[left])]
         part = _flat(cloud.points[members], LONGEST_EDGE * cloud.spacing) if len(members) >= least else None
         if part is None:
             failures += 1
@@ -192,11 +193,6 @@ def _planes(cloud: _Cloud) -> Iterator[_Part]:
         points[members], plane[members] = part.vertices, members[0]
         left = np.setdiff1d(left, members, assume_unique=True)
     yield _mesh_seams(replace(cloud, points=points), plane)
-
-
-def _largest_plane(cloud: _Cloud, left: Int64[np.ndarray, " L"], rng: np.random.Generator) -> Bool[np.ndarray, " L"]:
-    tolerance = float(np.clip(4 * cloud.roughness, 0.1 * cloud.spacing, cloud.spacing))
-    return largest_plane(cloud.points[left], tolerance, rng, cloud.normals[left])
 
 
 def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:

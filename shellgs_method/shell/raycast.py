@@ -8,7 +8,7 @@ from jaxtyping import Float16, Float32, Float64
 from shellgs_method.files.cue_maps import CueMap
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.geometry.triangles import Triangles, area_vectors
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.shell.mesh import ShellMesh
 
 
@@ -35,10 +35,7 @@ class ShellCaster:
         self.extent = float(np.ptp(placed, axis=0).max())
         placed -= self.origin
         self.triangles = Triangles(placed, mesh.faces)
-        normals = area_vectors(placed, mesh.faces)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-        offsets = np.einsum("fc,fc->f", normals, placed[mesh.faces[:, 0]])
-        self._planes = np.concatenate([normals, offsets[:, None]], axis=1)  # n · x = d
+        self._offsets = np.einsum("fc,fc->f", self.triangles.normals, placed[mesh.faces[:, 0]])  # n · x = d
         self._rays = np.empty((0, 0, 6), np.float32)
 
     def rays(self, camera: Camera) -> Float32[np.ndarray, "H W 6"]:
@@ -71,8 +68,8 @@ class ShellCaster:
         The winding of shells is not consistent; but a triangle shows a camera the same side in all pixels.
         """
         position, rotation = self._pose(camera)
-        normals, offsets = self._planes[:, :3], self._planes[:, 3]
-        facing = np.where((normals @ position < offsets)[:, None], -normals, normals) @ rotation.T
+        normals = self.triangles.normals
+        facing = np.where((normals @ position < self._offsets)[:, None], -normals, normals) @ rotation.T
         return np.concatenate([facing, np.zeros((1, 3))]).astype(np.float16)
 
     def _pose(self, camera: Camera) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"]]:

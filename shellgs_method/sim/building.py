@@ -18,12 +18,12 @@ from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.tsdf import DepthView, decimate
 from shellgs_method.occlusion import shell_verdicts
 from shellgs_method.shell import ShellCaster
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo
-from shellgs_method.sim.rays import Surface
 
 MARGIN = 0.5
 """Margin around the shell, in metres, within which the fused surface is kept."""
@@ -51,7 +51,7 @@ class Reconstruction:
     folder: Path
     frame: SimFrame
     fused: trimesh.Trimesh
-    shell: Surface | None
+    shell: Triangles | None
     splats: Splats
     views: list[View]
     hidden: list[Bool[np.ndarray, "h w"]]
@@ -81,7 +81,7 @@ class Reconstruction:
         folder = Path(run.datamanager.config.dataparser.data)
         if home is not None:
             frame, motion = moved_into(frame, motion, home, folder.name)
-        shell = Surface(transformed(known, motion), run.shell_in_frame.faces) if run.shell else None
+        shell = Triangles(transformed(known, motion), run.shell_in_frame.faces) if run.shell else None
         return cls(
             folder,
             frame,

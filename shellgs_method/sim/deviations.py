@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.camera import Camera, in_view
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import connected
-from shellgs_method.sim.rays import Surface
 
 EDGE = 0.15
 """Longest edge in metres of the triangles into which the shell is subdivided."""
@@ -58,7 +58,7 @@ class Deviations:
         regions: connected regions of these, the largest first.
     """
 
-    surface: Surface
+    surface: Triangles
     distance: Float64[np.ndarray, " F"]
     flagged: Bool[np.ndarray, " F"]
     regions: list[Region]
@@ -74,8 +74,8 @@ class Deviations:
 
 
 def find_deviations(
-    shell: Surface,
-    fused: Surface,
+    shell: Triangles,
+    fused: Triangles,
     views: Sequence[tuple[str, Camera]],
     threshold: float,
     contradicted: Contradicted | None = None,
@@ -91,7 +91,7 @@ def find_deviations(
         contradicted: distances from the photographs themselves, used instead of the reconstruction where not NaN.
         least: minimum area of a region in square metres.
     """
-    small = Surface(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
+    small = Triangles(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
     centres = small.centres
     best, score = np.full(len(centres), -1), np.zeros(len(centres))
     for number, (_, camera) in enumerate(views):
@@ -101,7 +101,7 @@ def find_deviations(
         away = eye - centres[inside]
         length = np.linalg.norm(away, axis=1)
         facing = np.einsum("nc,nc->n", away, small.normals[inside]) / length
-        visible = (facing > 0.05) & shell.sees(np.broadcast_to(eye, away.shape), centres[inside], 0.02)
+        visible = (facing > 0.05) & shell.sees(eye, centres[inside], 0.02)
         quality = np.where(visible, facing / length**2, 0.0)
         better = quality > score[inside]
         score[inside[better]], best[inside[better]] = quality[better], number
@@ -118,9 +118,9 @@ def find_deviations(
     return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
 
 
-def along_normals(small: Surface, places: Float64[np.ndarray, "F 3"], other: Surface) -> Float64[np.ndarray, " F"]:
+def along_normals(small: Triangles, places: Float64[np.ndarray, "F 3"], other: Triangles) -> Float64[np.ndarray, " F"]:
     """Signed distance of another surface along each triangle's normal, seen from outside; NaN if none is in reach."""
-    t, _ = other.cast(places + REACH * small.normals, -small.normals)
+    t = other.cast(places + REACH * small.normals, -small.normals).t
     return np.where(t < 2 * REACH, REACH - t, np.nan)
 
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.sim.rays import Surface, spread
+from shellgs_method.geometry.axes import main_direction
+from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.winding import spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,21 +29,22 @@ class Front:
     length: float
 
     @classmethod
-    def of(cls, surface: Surface, eyes: Float64[np.ndarray, "E 3"]) -> Front:
+    def of(cls, surface: Triangles, eyes: Float64[np.ndarray, "E 3"]) -> Front:
         """The front of the vertical surfaces that are visible from the cameras."""
         points, triangle = surface.samples(4000)
-        normals, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
+        level, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
+        length = np.linalg.norm(level, axis=1)
+        normals = level / np.maximum(length, 1e-9)[:, None]
         for eye in spread(eyes, 12):
             away = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
-            seen = surface.sees(np.broadcast_to(eye, points.shape), points, 0.01)
+            seen = surface.sees(eye, points, 0.01)
             facing += seen * np.einsum("nc,nc->n", away, normals).clip(0)
-        upright = (facing > 0) & (np.linalg.norm(normals, axis=1) > 0.9)
+        upright = (facing > 0) & (length > 0.9)
         if not upright.any():
             upright, facing = np.ones(len(points), bool), np.ones(len(points))
-        wall, normals = points[upright], normals[upright]
-        alike = normals @ normals.T > np.cos(np.radians(10))
-        outwards = normals[alike[(alike @ facing[upright]).argmax()]].mean(axis=0)
-        outwards = outwards / np.linalg.norm(outwards) if np.linalg.norm(outwards) > 0 else np.array([0.0, -1, 0])
+        wall, outwards = points[upright], np.array([0.0, -1, 0])
+        if length[upright].max() > 0.5:
+            outwards = main_direction(normals[upright], facing[upright])
         middle = np.median(wall, axis=0)
         if (np.median(eyes, axis=0) - middle) @ outwards < 0:
             outwards = -outwards
@@ -50,15 +53,15 @@ class Front:
         foot = middle + ((first + last) / 2 - middle @ along) * along
         return cls(along, outwards, foot * [1, 1, 0], float(last - first))
 
-    def before(self, surface: Surface, share: float, distance: float, height: float) -> Float64[np.ndarray, " 3"]:
+    def before(self, surface: Triangles, share: float, distance: float, height: float) -> Float64[np.ndarray, " 3"]:
         """The point at a share of the length, ``distance`` in front of the surface and ``height`` above the ground."""
         far = self.foot + (share - 0.5) * self.length * self.along + [0, 0, height] + 30 * self.outwards
         wide = far + np.linspace(-0.5, 0.5, 11)[:, None] * self.along
-        reached = float(surface.cast(wide, np.broadcast_to(-self.outwards, wide.shape))[0].min())
+        reached = float(surface.cast(wide, -self.outwards).t.min())
         return far - max(min(reached, 30.0) - distance, 0.0) * self.outwards
 
 
-def places_before(surface: Surface, front: Front, count: int = 20, height: float = 0.6) -> Float64[np.ndarray, "P 3"]:
+def places_before(surface: Triangles, front: Front, count: int = 20, height: float = 0.6) -> Float64[np.ndarray, "P 3"]:
     """Places where a robot could stand: along the facade, one to five metres in front of it."""
     shares = np.linspace(0.02, 0.98, count)
     return np.stack([front.before(surface, share, 1.0 + k % 5, height) for k, share in enumerate(shares)])

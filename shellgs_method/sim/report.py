@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write
-from shellgs_method.files.html import data_uri, encoded
+from shellgs_method.files.html import captioned, encoded, img, table, write_page
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, leaks
 from shellgs_method.sim.collision.distances import Distances
@@ -20,7 +20,6 @@ from shellgs_method.sim.deviations import Deviations
 from shellgs_method.sim.formats.world import Building
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.look.renders import overlaid, rendered, shown
-from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.trials.engine import beams, lidar, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
 
@@ -28,15 +27,6 @@ IMAGES = 3
 """Number of photographs shown of each building."""
 REGIONS = 20
 """Number of deviations listed."""
-_STYLE = """
-:root { color-scheme: light }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1f2328; max-width: 80rem; margin: 2rem auto; padding: 0 1rem }
-h1 { font-size: 1.6rem } h2 { font-size: 1.2rem; margin-top: 2.5rem }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums }
-th, td { text-align: left; padding: .3rem 1rem .3rem 0; border-bottom: 1px solid #d1d9e0 }
-.row { display: grid; grid-template-columns: repeat(3, 1fr); gap: .5rem; margin-bottom: .5rem }
-img { width: 100%; display: block } figure { margin: 0 } figcaption { color: #59636e; font-size: .85rem }
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +45,12 @@ class Chapter:
     """
 
     made: Reconstruction
-    shell: Surface | None
+    shell: Triangles | None
     collider: Collider
     facts: dict
     deviations: Deviations | None
     distances: Mapping[str, Mapping[str, Distances]]
-    truth: Surface | None
+    truth: Triangles | None
     with_splats: bool
 
 
@@ -73,25 +63,20 @@ def write_report(
         SceneError: MuJoCo refuses the world.
     """
     world = out / "facade.xml"
-    everything = Surface(*joined([part for chapter in chapters for part in chapter.collider.parts]))
+    everything = Triangles(*joined([part for chapter in chapters for part in chapter.collider.parts]))
     eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
     with warnings_kept() as warnings:
         thrown = throw(world, everything, eyes)
     summary = [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
     metrics = {"summary": summary, "throws": asdict(thrown), "warnings": warnings, "buildings": {}}
-    page = [
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Simulation</title><style>{_STYLE}</style>',
-        f"<h1>{escape(', '.join(chapter.made.scene for chapter in chapters))}</h1>",
-    ]
     sections: list[str] = []
     for building, chapter in zip(buildings, chapters, strict=True):
         made, sentences = _metrics(world, building, chapter)
         metrics["buildings"][building.name] = made
         summary += sentences
         sections += _section(world, building, chapter, made, log)
-    page += [f"<p>{escape(sentence)}</p>" for sentence in summary]
-    with atomic_write(out / "report.html") as file:
-        file.write("".join([*page, *sections]).encode())
+    title = f"Simulation of {', '.join(chapter.made.scene for chapter in chapters)}"
+    write_page(out / "report.html", title, [*(f"<p>{escape(sentence)}</p>" for sentence in summary), *sections])
     return metrics
 
 
@@ -128,11 +113,11 @@ def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
     return made, sentences
 
 
-def lidar_errors(world: Path, collider: Surface, front: Front, truth: Surface) -> dict[str, dict]:
+def lidar_errors(world: Path, collider: Triangles, front: Front, truth: Triangles) -> dict[str, dict]:
     """Errors of a lidar in MuJoCo at 20 places in front of a building, over the rays that hit the true building."""
     places, rays = places_before(collider, front), beams()
     origins = np.repeat(places, len(rays), axis=0)
-    true, _ = truth.cast(origins, np.tile(rays, (len(places), 1)))
+    true = truth.cast(origins, np.tile(rays, (len(places), 1))).t
     with np.errstate(divide="ignore"):
         ground = np.where(rays[:, 2] < 0, np.repeat(places[:, 2:], len(rays), axis=1) / -rays[:, 2], np.inf).ravel()
     meets = true < ground
@@ -175,7 +160,7 @@ def _section(
         for name, ways in chapter.distances.items()
         for way, d in ways.items()
     ]
-    yield _table(("surface", "points", "median (cm)", "95 % (cm)", "within 10 cm"), rows)
+    yield table(("surface", "points", "median (cm)", "95 % (cm)", "within 10 cm"), rows)
     if chapter.deviations is not None:
         regions = chapter.deviations.regions
         yield f"<h3>Where the building and its shell differ</h3><p>{len(regions)} regions"
@@ -186,11 +171,11 @@ def _section(
                 f"{region.area:.2f}",
                 f"{100 * region.distance:+.0f}",
                 " ".join(f"{value:.2f}" for value in region.centre),
-                region.photograph,
+                escape(region.photograph),
             )
             for region in regions[:REGIONS]
         ]
-        yield _table(("what", "area (m²)", "distance (cm)", "place (m)", "photograph"), rows)
+        yield table(("what", "area (m²)", "distance (cm)", "place (m)", "photograph"), rows)
 
 
 def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:
@@ -206,19 +191,10 @@ def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterat
     surface = chapter.collider.surface
     for k, photo, image in zip(chosen, photos, drawn, strict=True):
         yield '<div class="row">'
-        yield _figure(photo.image, chapter.made.views[k].name)
-        if image is not None:
-            yield _figure(image, "MuJoCo")
-        yield _figure(overlaid(photo, surface), "edges of the collision geometry")
-        yield "</div>"
+        yield _captioned(photo.image, chapter.made.views[k].name)
+        yield "" if image is None else _captioned(image, "MuJoCo")
+        yield _captioned(overlaid(photo, surface), "edges of the collision geometry") + "</div>"
 
 
-def _figure(image: np.ndarray, caption: str) -> str:
-    source = data_uri(encoded(np.ascontiguousarray(image), "JPEG"))
-    return f'<figure><img src="{source}" alt=""><figcaption>{escape(caption)}</figcaption></figure>'
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    cells = ["".join(f"<th>{escape(cell)}</th>" for cell in head)]
-    cells += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
-    return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+def _captioned(image: np.ndarray, caption: str) -> str:
+    return captioned(img(encoded(np.ascontiguousarray(image), "JPEG"), ""), escape(caption))

@@ -15,6 +15,7 @@ from shellgs_method.export.frame import UpAxis
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import GROUND, Collider, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
@@ -24,10 +25,10 @@ from shellgs_method.sim.formats.usd import write_usd_layers, write_usd_world
 from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
-from shellgs_method.sim.rays import Surface, outward
 from shellgs_method.sim.report import Chapter, write_report
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.trials.engine import import_mujoco
+from shellgs_method.sim.winding import outward
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
@@ -41,7 +42,7 @@ def simulate(
     settings: SimSettings,
     log: Callable[[str], None] = print,
     up: UpAxis | None = None,
-    truths: Sequence[Callable[[np.ndarray], Surface]] = (),
+    truths: Sequence[Callable[[np.ndarray], Triangles]] = (),
 ) -> tuple[dict, list[Chapter]]:
     """Export the buildings of trained runs to one folder that simulators load.
 
@@ -88,13 +89,13 @@ def simulate(
 
 
 def _building(
-    made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None], truth: Surface | None
+    made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None], truth: Triangles | None
 ) -> Chapter:
     """Write the files of one building."""
     folder.mkdir(parents=True, exist_ok=True)
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
-    fused, seen = outward(Surface(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
+    fused, seen = outward(Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
     shell, standing, beside = None, seen & (fused.centres[:, 2] > GROUND), np.zeros(len(seen), bool)
     if made.shell is not None:
         shell, _ = outward(made.shell, eyes)
@@ -105,7 +106,7 @@ def _building(
     mesh = made.fused
     mesh.update_faces(~beside)
     mesh.remove_unreferenced_vertices()
-    fused, _ = outward(Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
+    fused, _ = outward(Triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
     _report_gaps(collider, made.scene, log)
     write_parts(folder, collider.parts)
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore

@@ -50,7 +50,7 @@ class Daylight:
         missed = np.isinf(hits.t)
         colour[missed] = self._sky(directions[missed])
         hit = np.flatnonzero(~missed)
-        material, normal, towards = hits.material[hit], hits.normal[hit], directions[hit]
+        material, normal, towards = self.world.material[hits.triangle[hit]], hits.normal[hit], directions[hit]
         points = np.broadcast_to(origins, directions.shape)[hit] + hits.t[hit, None] * towards
         colour[hit] = self._albedo(material, points) * self._irradiance(points, normal)
 
@@ -69,7 +69,7 @@ class Daylight:
     def _irradiance(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
         sun = SUN / np.linalg.norm(SUN)
         cosine = np.maximum(normal @ sun, 0.0)
-        cosine[self.world.is_shadowed(points + 1e-3 * normal, sun)] = 0.0
+        cosine[self.world.blocked(points + 1e-3 * normal, sun)] = 0.0
         up = 0.5 + 0.5 * normal[:, 2:]
         ambient = up * _SKYLIGHT + (1 - up) * _GROUNDLIGHT
         # Recesses get less skylight.

@@ -94,10 +94,11 @@ class Facade:
     def truth(self, camera: Camera) -> CueMap:
         """True depth and normals in scene units, of everything but the sky; the mask is the building."""
         origin, directions = rays(camera)
-        hits = self.daylight.world.cast(origin, directions)
+        world = self.daylight.world
+        hits = world.cast(origin, directions)
         depth = np.where(np.isfinite(hits.t), UNITS_PER_METRE * hits.t, 0.0).astype(np.float32)
         normal = hits.normal @ camera.viewmat[:3, :3].numpy().T
-        return CueMap(depth, normal.astype(np.float16), hits.material <= Material.RAILING)
+        return CueMap(depth, normal.astype(np.float16), world.material[hits.triangle] <= Material.RAILING)
 
 
 def write_scene(scene: Path, config: FacadeConfig) -> None:

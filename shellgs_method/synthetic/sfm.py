@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from scipy.ndimage import gaussian_gradient_magnitude
 
-from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.camera import Camera, in_view
 from shellgs_method.synthetic.appearance import rays
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.world import World
@@ -45,7 +45,7 @@ def features(
     """Points at up to ``count`` pixels of one view, drawn in proportion to the image's gradient."""
     origin, directions = rays(camera)
     hits = world.cast(origin, directions)
-    glass = hits.material == Material.GLASS
+    glass = world.material[hits.triangle] == Material.GLASS
     gradient = gaussian_gradient_magnitude(image.mean(axis=-1), 1.0)
     weight = np.maximum(gradient - 1.0, 0.0) * np.where(glass, _FEATURES_ON_GLASS, np.isfinite(hits.t))
     # Exponential races draw without replacement in proportion to the weights.
@@ -81,12 +81,8 @@ def triangulate(
 
 def _is_visible(world: World, camera: Camera, points: Points) -> np.ndarray:
     """Whether points project into the image, unoccluded, or, for mirror images, into a pane."""
-    viewmat, K = camera.viewmat.numpy(), camera.K.numpy()
-    in_camera = points.positions @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depth = np.maximum(in_camera[:, 2:], 1e-6)
-    pixels = (in_camera / depth @ K.T)[:, :2]
-    in_image = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=-1) & (in_camera[:, 2] > 0)
+    in_image, _, _ = in_view(camera, points.positions)
     origin = camera.position.numpy()
     hits = world.cast(origin, (points.positions - origin).astype(np.float32))
-    unoccluded = np.where(points.is_mirrored, hits.material == Material.GLASS, hits.t > 0.995)
+    unoccluded = np.where(points.is_mirrored, world.material[hits.triangle] == Material.GLASS, hits.t > 0.995)
     return in_image & unoccluded

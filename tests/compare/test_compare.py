@@ -38,7 +38,7 @@ from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
 from shellgs_method.compare.wandb_report import log_comparison
 from shellgs_method.errors import SceneError
-from shellgs_method.evaluation import regions
+from shellgs_method.evaluation import pixels
 from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import SceneLayout, ScenePaths
@@ -146,7 +146,7 @@ def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
 def test_the_shell_itself_is_measured_over_the_pixels_of_every_method(pristine_scene, monkeypatch):
     """Also where photographs contradict it, since no method is excused from the truth there."""
     shell = measure_shell(SceneLayout(data=pristine_scene))
-    monkeypatch.setattr(regions, "contradicted", lambda batch, device: torch.ones_like(batch["shell_mask"]))
+    monkeypatch.setattr(pixels, "occluded", lambda batch, device: torch.ones_like(batch["shell_mask"]))
     assert measure_shell(SceneLayout(data=pristine_scene)) == pytest.approx(shell, nan_ok=True)
 
 
@@ -357,11 +357,12 @@ def test_killing_a_comparison_ends_its_commands(tmp_path):
     sleep = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     write_script(tmp_path / "sleep", sleep)
     following = (
-        "import pathlib; from shellgs_method.compare import launch; "
+        "import pathlib; from shellgs_method.launch import local; "
         f"local.BIN = pathlib.Path({str(tmp_path)!r}); local.follow([['sleep']])"
     )
     comparison = subprocess.Popen([sys.executable, "-c", following])
     while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+        assert comparison.poll() is None
         time.sleep(0.05)
     command = psutil.Process(int((tmp_path / "pid").read_text()))
     comparison.kill()
@@ -688,25 +689,22 @@ def test_a_temporary_folder_that_others_can_write_to_is_refused(tmp_path, monkey
 @pytest.fixture(scope="module")
 def measured(pristine_scene, tmp_path_factory) -> list[Run]:
     """Two methods trained in this process for four iterations and measured, in the launcher's folders."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SHELLGS_COMPILE", "0")
-        runs = grid([pristine_scene], ["photo-gs", "shellgs"], [0], 4, tmp_path_factory.mktemp("compare"))
-        methods: tuple[Method, Method] = ("photo_gs", "shellgs")
-        for run, method in zip(runs, methods, strict=True):
-            run.settle()
+    runs = grid([pristine_scene], ["photo-gs", "shellgs"], [0], 4, tmp_path_factory.mktemp("compare"))
+    methods: tuple[Method, Method] = ("photo_gs", "shellgs")
+    for run, method in zip(runs, methods, strict=True):
+        run.settle()
 
-            def set_folder(config, run=run):
-                config.output_dir, config.experiment_name = run.folder.parents[2], run.variant.name
-                config.timestamp, config.steps_per_eval_all_images = "seed-0", 2
+        def set_folder(config, run=run):
+            config.output_dir, config.experiment_name = run.folder.parents[2], run.variant.name
+            config.timestamp, config.steps_per_eval_all_images = "seed-0", 2
 
-            trainer = trainer_of(pristine_scene, run.output, method, 4, change=set_folder)
-            trainer.config.save_config()
-            trainer.train()
-            write_metrics(run.config, run.metrics(), renders=run.renders)
+        trainer = trainer_of(pristine_scene, run.output, method, 4, change=set_folder)
+        trainer.config.save_config()
+        trainer.train()
+        write_metrics(run.config, run.metrics(), renders=run.renders)
     return runs
 
 
-@pytest.mark.usefixtures("eager")
 def test_our_metrics_are_those_of_ns_eval(measured):
     _, pipeline, _, _ = eval_setup(measured[1].config)
     assert isinstance(pipeline, FacadePipeline)
@@ -716,7 +714,6 @@ def test_our_metrics_are_those_of_ns_eval(measured):
     assert ours == pytest.approx({key: value for key, value in theirs.items() if key not in timing})
 
 
-@pytest.mark.usefixtures("eager")
 @pytest.mark.parametrize("background", ["black", "white", "random"])
 def test_our_metrics_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_path, background):
     for path in (scene / "images").iterdir():
@@ -738,7 +735,6 @@ def test_our_metrics_of_transparent_photographs_are_those_of_ns_eval(scene, tmp_
     assert ours["ssim"] == pytest.approx(theirs["ssim"], rel=1e-5)
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_half_can_be_measured_of_a_run_without_holdout(measured):
     whole = json.loads(measured[0].metrics().read_text())["results"]
     halves = [measure(measured[0].config, half)["results"]["supported"] for half in ("A", "B")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from shellgs_method.evaluation.covisibility import SeenBy
+from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.geometry.camera import Camera
 
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
@@ -25,18 +25,18 @@ def wall(depth: float) -> torch.Tensor:
 
 def test_a_pixel_is_seen_if_two_training_images_contain_it():
     """At depth 10 a sideways step of 5 is 20 pixels."""
-    seen = SeenBy([camera(5), camera(-5)], [wall(10.0)] * 2, NO_POINTS).mask(camera(0), wall(10.0)[..., None])
+    seen = Covisibility([camera(5), camera(-5)], [wall(10.0)] * 2, NO_POINTS).mask(camera(0), wall(10.0)[..., None])
     expected = torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool)
     expected[:, 20:60] = True
     assert torch.equal(seen, expected)
-    one = SeenBy([camera(5)], [wall(10.0)], NO_POINTS)
+    one = Covisibility([camera(5)], [wall(10.0)], NO_POINTS)
     assert not one.mask(camera(0), wall(10.0)[..., None]).any()
 
 
 def test_pixels_hidden_by_the_shell_in_a_training_view_are_not_seen():
     hidden = wall(10.0)
     hidden[:30] = 4.0
-    seen = SeenBy([camera(0), camera(0)], [hidden, wall(10.0)], NO_POINTS).mask(camera(0), wall(10.0)[..., None])
+    seen = Covisibility([camera(0), camera(0)], [hidden, wall(10.0)], NO_POINTS).mask(camera(0), wall(10.0)[..., None])
     assert not seen[:30].any()
     assert seen[30:].all()
 
@@ -45,22 +45,23 @@ def test_a_pixel_off_the_shell_has_the_depth_of_the_nearest_sfm_point():
     """The left is at depth 5, where a sideways step of 5 is 40 pixels; the right at 100, where it is 2."""
     points = torch.tensor([[-2.5, 0.0, 5.0], [50.0, 0.0, 100.0]])
     nothing = torch.zeros(HEIGHT, WIDTH, 1)
-    seen = SeenBy([camera(5), camera(5)], [nothing[..., 0]] * 2, points).mask(camera(0), nothing)
+    seen = Covisibility([camera(5), camera(5)], [nothing[..., 0]] * 2, points).mask(camera(0), nothing)
     assert not seen[:, :35].any()
     assert seen[:, 45:].all()
 
 
 def test_sky_without_points_is_seen_by_all_views_that_look_there():
     nothing = torch.zeros(HEIGHT, WIDTH, 1)
-    assert SeenBy([camera(5), camera(-5)], [nothing[..., 0]] * 2, NO_POINTS).mask(camera(0), nothing).all()
+    assert Covisibility([camera(5), camera(-5)], [nothing[..., 0]] * 2, NO_POINTS).mask(camera(0), nothing).all()
 
 
 def test_visibility_of_large_images_is_computed_on_a_thinned_grid():
     large = Camera(torch.eye(4), torch.tensor([[500.0, 0, 500], [0, 500, 375], [0, 0, 1]]), 1001, 751)
     aside = Camera(camera(5).viewmat, large.K, 1001, 751)
     depth = torch.full((751, 1001, 1), 10.0)
-    thin = depth[::4, ::4, 0]
-    seen = SeenBy([aside, aside], [thin, thin], NO_POINTS).mask(large, depth)
+    covisibility = Covisibility.of([(aside, depth), (aside, None)], NO_POINTS)
+    assert [tuple(each.shape) for each in covisibility.depths] == [(188, 251), (1, 1)]
+    seen = covisibility.mask(large, depth)
     assert seen.shape == (751, 1001, 1)
     assert not seen[:, :246].any()
     assert seen[:, 254:].all()

@@ -8,12 +8,10 @@ import torch
 from training_runs import data_of, model_of, trainer_of
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
-from shellgs_method.evaluation.holdout import Bands, facade_bands
+from shellgs_method.evaluation.holdout import Holdout, facade_holdout
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, UNITS_PER_METRE
-
-pytestmark = pytest.mark.usefixtures("eager")
 
 WIDTH = 2 * UNITS_PER_METRE  # width of a band, in scene units
 
@@ -24,8 +22,8 @@ def views(pristine_scene) -> list[View]:
 
 
 @pytest.fixture(scope="module")
-def bands(pristine_scene, views) -> Bands:
-    return facade_bands(CueMaps.open(pristine_scene, "shell"), training(views), 2.0, "A")
+def half(pristine_scene, views) -> Holdout:
+    return facade_holdout(CueMaps.open(pristine_scene, "shell"), training(views), 2.0, "A")
 
 
 def training(views: list[View]) -> list[View]:
@@ -47,40 +45,40 @@ def world_points(view: View, depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return in_camera @ pose[:3, :3].T + pose[:3, 3]
 
 
-def test_bands_run_vertically_up_the_wall(bands):
+def test_bands_run_vertically_up_the_wall(half):
     """Their axis is the facade's horizontal, far from any axis of the world."""
     along_the_facade = SCENE_FROM_BUILDING[:3, 0] / UNITS_PER_METRE
-    assert abs(bands.axis.numpy() @ along_the_facade) == pytest.approx(1, abs=1e-3)
-    assert bands.width == pytest.approx(WIDTH)
+    assert abs(half.axis.numpy() @ along_the_facade) == pytest.approx(1, abs=1e-3)
+    assert half.width == pytest.approx(WIDTH)
 
 
-def test_bands_do_not_depend_on_the_order_of_the_calls_or_on_a_sign(pristine_scene, views, bands):
-    again = facade_bands(CueMaps.open(pristine_scene, "shell"), training(views), 2.0, "B").others
-    assert torch.equal(again.axis, bands.axis)
+def test_bands_do_not_depend_on_the_order_of_the_calls_or_on_a_sign(pristine_scene, views, half):
+    again = facade_holdout(CueMaps.open(pristine_scene, "shell"), training(views), 2.0, "B").rest
+    assert torch.equal(again.axis, half.axis)
     for view in views:
         shell = shell_of(pristine_scene, view)
-        assert (again.mask(shell, view.camera) == bands.mask(shell, view.camera)).all()
+        assert (again.mask(shell, view.camera) == half.mask(shell, view.camera)).all()
 
 
-def test_the_halves_are_disjoint_and_cover_the_shell(pristine_scene, views, bands):
+def test_the_halves_are_disjoint_and_cover_the_shell(pristine_scene, views, half):
     for view in views:
         shell = shell_of(pristine_scene, view)
-        a, b = bands.mask(shell, view.camera), bands.others.mask(shell, view.camera)
+        a, b = half.mask(shell, view.camera), half.rest.mask(shell, view.camera)
         assert not (a & b).any()
         assert ((a | b) == shell.mask).all()
 
 
-def test_a_band_is_the_same_wall_in_two_views(pristine_scene, views, bands):
+def test_a_band_is_the_same_wall_in_two_views(pristine_scene, views, half):
     """A pixel's surface point lies in the same half in another view."""
     first, second = views[4], views[5]
     shell, other = shell_of(pristine_scene, first), shell_of(pristine_scene, second)
     points = world_points(first, shell.depth, shell.mask)
-    labels = bands.mask(shell, first.camera)[shell.mask]
+    labels = half.mask(shell, first.camera)[shell.mask]
     in_camera = points @ second.camera.viewmat[:3, :3].numpy().T + second.camera.viewmat[:3, 3].numpy()
     u, v = np.floor((in_camera @ second.camera.K.numpy().T)[:, :2] / in_camera[:, 2:]).astype(int).T
     inside = (u > 0) & (u < 47) & (v > 0) & (v < 31)
     u, v, z, labels = u[inside], v[inside], in_camera[inside, 2], labels[inside]
-    there = bands.mask(other, second.camera)
+    there = half.mask(other, second.camera)
     # Pixels are about 30 cm wide here: those at a band's edge may show both halves.
     clear = np.stack([there[v, u] == there[v, u + step] for step in (-1, 1)]).all(0)
     same = clear & other.mask[v, u] & (np.abs(other.depth[v, u] / z - 1) < 0.02)
@@ -90,7 +88,7 @@ def test_a_band_is_the_same_wall_in_two_views(pristine_scene, views, bands):
 
 
 @pytest.mark.parametrize("holdout", ["A", "B"])
-def test_supervised_and_evaluated_wall_are_disjoint(pristine_scene, views, bands, tmp_path, holdout):
+def test_supervised_and_evaluated_wall_are_disjoint(pristine_scene, views, half, tmp_path, holdout):
     def hold_out(config):
         config.pipeline.datamanager.holdout = holdout
 
@@ -108,7 +106,7 @@ def test_supervised_and_evaluated_wall_are_disjoint(pristine_scene, views, bands
                 mask = batch[f"{kind}_mask"][..., 0].numpy()
                 depth = shell_of(pristine_scene, view).depth
                 assert (depth[mask] > 0).all()
-                coordinates.append(world_points(by_name[view.name], depth, mask) @ bands.axis.numpy())
+                coordinates.append(world_points(by_name[view.name], depth, mask) @ half.axis.numpy())
         halves.append(np.concatenate(coordinates) % (2 * WIDTH) // WIDTH)  # 0 in A, 1 in B
     supervised, evaluated = halves
     assert len(supervised) > 1000
@@ -142,5 +140,5 @@ def test_a_holdout_without_shell_maps_is_an_error(scene, tmp_path):
         config.pipeline.datamanager.holdout = "B"
 
     (scene / "cues" / "shell" / "manifest.json").unlink()
-    with pytest.raises(SystemExit, match=r"holdout .* needs the shell maps .* run `shellgs cast"):
+    with pytest.raises(SystemExit, match=r"holdout needs the shell maps .* run `shellgs cast"):
         trainer_of(scene, tmp_path, "photo_gs", change=hold_out)

@@ -20,6 +20,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.masks import kept_pixels
 from shellgs_method.files.photographs import load_mask, load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
+from shellgs_method.gaussians.seeds import shell_seeds, view_of_shell
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses.objective import ExtraLossConfig, self_losses
 from shellgs_method.registration import validate
@@ -244,12 +245,11 @@ def test_a_photograph_that_is_transparent_everywhere_is_refused_by_name(scene):
             load(view)
 
 
-@pytest.mark.usefixtures("eager")
 def test_hidden_colours_reach_neither_seeds_nor_training(scene, tmp_path):
     make_transparent(scene)
     cli.cast(scene, check=False)
     trainer = trainer_of(scene, tmp_path)
-    seeds = data_of(trainer).shell_seeds(1.0, 10_000, everywhere=True)
+    seeds = shell_seeds(*data_of(trainer).seed_views(view_of_shell, "shell"), 1.0, 10_000)
     red, green, blue = seeds.colours.T
     assert len(seeds.points) > 100
     assert not ((red > green + 0.3) & (blue > green + 0.3)).any()
@@ -373,7 +373,6 @@ def test_normal_consistency_leaves_out_pixels_with_a_cue():
     torch.testing.assert_close(term(with_cue), expected)
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_masked_view_is_measured_where_it_is_kept(scene, tmp_path):
     paint_all(scene)
     cli.cast(scene)
@@ -387,7 +386,6 @@ def test_a_masked_view_is_measured_where_it_is_kept(scene, tmp_path):
     assert "mask" in data_of(trainer).cached_train[0]
 
 
-@pytest.mark.usefixtures("eager")
 def test_a_fully_masked_photograph_is_refused_by_name(scene, tmp_path):
     paint(scene / "masks" / "frame_00002.png", left=48)
     with pytest.raises(SystemExit, match=r"shellgs: the mask .*masks/frame_00002.png is black everywhere"):

@@ -1,4 +1,4 @@
-"""Seeds on a wall of known position, colour and resolution, and on a skybox."""
+"""Seeds on a wall of known position, colour and resolution."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from scipy.spatial import KDTree
 from training_runs import data_of, model_of, trainer_of
 
 from shellgs_method.errors import SceneError
-from shellgs_method.gaussians.densification import SkyboxStrategy
 from shellgs_method.gaussians.initial import MAX_SEEDS, OPACITY, SEED_SPACING, SKYBOX_SEEDS, sfm_points
-from shellgs_method.gaussians.seeds import SKYBOX_RADIUS, SeededView, Seeds, SkyView, shell_seeds, skybox_seeds
+from shellgs_method.gaussians.seeds import SeededView, Seeds, shell_seeds, view_of_surface
+from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import WEIGHT_BEHIND, SurfaceWeights
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.reference import Reference
@@ -97,17 +97,16 @@ def test_seeds_are_spread_more_widely_if_there_are_too_many():
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_shell_and_skybox(
-    eager, pristine_scene, tmp_path, primitive
-):
+def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_shell_and_skybox(pristine_scene, tmp_path, primitive):
     def choose(config):
         config.pipeline.model.primitive = primitive
 
     trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
     model, data = model_of(trainer), data_of(trainer)
     sfm = model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
-    n, on_shell = sfm.num_points, data.shell_seeds(SEED_SPACING, MAX_SEEDS, everywhere=False)
-    seeds = Seeds(*map(np.concatenate, zip(on_shell, data.skybox_seeds(SKYBOX_SEEDS), strict=True)))
+    n, on_shell = sfm.num_points, shell_seeds(*data.seed_views(view_of_surface, "shell"), SEED_SPACING, MAX_SEEDS)
+    in_sky = skybox_seeds(*data.seed_views(view_of_sky), data.sfm_points.double().numpy(), SKYBOX_SEEDS)
+    seeds = Seeds(*map(np.concatenate, zip(on_shell, in_sky, strict=True)))
     assert len(on_shell.points) > 50
     torch.testing.assert_close(model.means[:n], sfm.means)
     torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
@@ -121,9 +120,9 @@ def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_shell_and_skybox
     torch.testing.assert_close(model.opacities.sigmoid(), torch.full((model.num_points, 1), OPACITY["shell"]))
 
 
-@pytest.mark.parametrize(("count", "said"), [(3, "has 3 SfM points"), (0, "has no SfM points")])
-def test_too_few_sfm_points_are_counted(count, said):
-    with pytest.raises(SceneError, match=f"{said} to start from, of at least 4"):
+@pytest.mark.parametrize(("count", "found"), [(3, "has 3 SfM points"), (0, "has no SfM points")])
+def test_too_few_sfm_points_are_counted(count, found):
+    with pytest.raises(SceneError, match=f"{found} to start from, of at least 4"):
         sfm_points((torch.zeros(count, 3), torch.zeros(count, 3)))
 
 
@@ -138,69 +137,3 @@ def test_a_method_with_seeds_is_an_error_without_shell_maps(scene, tmp_path):
     shutil.rmtree(scene / "cues" / "shell")
     with pytest.raises(SystemExit, match="run `shellgs cast SCENE` first"):
         trainer_of(scene, tmp_path, "shellgs_metric")
-
-
-def sky_view(mask: torch.Tensor | None = None) -> SkyView:
-    """A view along z, red above and blue below."""
-    image = torch.zeros(HEIGHT, WIDTH, 3)
-    image[: HEIGHT // 2, :, 0] = image[HEIGHT // 2 :, :, 2] = 1
-    return SkyView(
-        camera((1.0, 0.0, 0.0)), image, torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool) if mask is None else mask
-    )
-
-
-def skybox_of(views: list[SkyView], count: int = 500):
-    points = np.array([[1.0, 0.0, 3.0]] * 200 + [[1.0, 0.0, 100.0]])  # an outlier among points 3 away
-    return skybox_seeds(views, len(views) * WIDTH * HEIGHT, points, count)
-
-
-def test_a_skybox_is_spread_evenly_over_a_sphere_around_the_cameras():
-    count, centre, radius = 500, [1, 0, 0], SKYBOX_RADIUS * 3
-    seeds = skybox_of([sky_view()], count)
-    np.testing.assert_allclose(np.linalg.norm(seeds.points - centre, axis=1), radius)
-    np.testing.assert_allclose(seeds.points + radius * seeds.normals, np.tile(centre, (count, 1)), atol=1e-9)
-    cell = radius * np.sqrt(4 * np.pi / count)  # side of a square of each point's share of the sphere
-    neighbours = KDTree(seeds.points).query(seeds.points, k=2)[0][:, 1]
-    assert 0.75 * cell < neighbours.min() <= neighbours.max() < 1.2 * cell
-    # every direction, not only those near a point, is within two standard deviations of a Gaussian
-    directions = np.random.default_rng(0).normal(size=(10_000, 3))
-    on_sphere = centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    assert (KDTree(seeds.points).query(on_sphere)[0] < 2 * 0.5 * seeds.spacing[0]).all()
-
-
-def test_a_skybox_has_the_colours_of_the_directions_that_views_show():
-    seeds = skybox_of([sky_view()], 2000)
-    x, y, z = (seeds.points - [1, 0, 0]).T / (SKYBOX_RADIUS * 3)
-    visible = (z > 0.5) & (abs(x / z) < 0.5 * WIDTH / FOCAL) & (abs(y / z) < 0.5 * HEIGHT / FOCAL)
-    assert visible.sum() > 20
-    np.testing.assert_allclose(seeds.colours[visible & (y < -0.1)], [[1, 0, 0]] * (visible & (y < -0.1)).sum())
-    np.testing.assert_allclose(seeds.colours[visible & (y > 0.1)], [[0, 0, 1]] * (visible & (y > 0.1)).sum())
-
-
-def test_masked_pixels_do_not_colour_a_skybox():
-    mask = torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.bool)
-    assert [len(each) for each in skybox_of([sky_view(mask)])] == [0, 0, 0, 0]
-    mask[: HEIGHT // 2] = True
-    np.testing.assert_allclose(skybox_of([sky_view(mask)]).colours, [[1, 0, 0]] * 500)
-
-
-def test_a_skybox_is_coloured_by_what_is_off_the_shell(eager, pristine_scene, tmp_path):
-    data = data_of(trainer_of(pristine_scene, tmp_path, "shellgs"))
-    for batch in data.cached_train:
-        batch["image"] = torch.where(batch["shell_mask"], torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
-    np.testing.assert_array_equal(data.skybox_seeds(300).colours, [[0, 0, 1]] * 300)
-
-
-def test_pruning_by_size_spares_the_skybox(eager, pristine_scene, tmp_path):
-    def choose(config):
-        config.pipeline.model.init = "shell"
-
-    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=choose)
-    model, optimizers = model_of(trainer), trainer.optimizers.optimizers
-    n, strategy = model.num_points, model.strategy
-    assert isinstance(strategy, SkyboxStrategy)
-    strategy.prune_opa = 0.0
-    model.scales.data[:5], model.scales.data[5:300] = 0.0, -5.0  # as large as the region of the cameras, and small
-    strategy._prune_gs(model.gauss_params, optimizers, model.strategy_state, strategy.reset_every + 1)
-    assert model.num_points == n - 5
-    assert model.strategy_state["scene_scale"] == 1.0

@@ -20,7 +20,8 @@ from viser import SceneApi
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from shellgs_method.evaluation import Rendering
-from shellgs_method.evaluation.regions import reference_errors, reference_maps, regions
+from shellgs_method.evaluation.pixels import reference_maps
+from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera, positions

@@ -25,6 +25,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View, to_camera
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.undistortion import undistort
+from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
 from shellgs_method.geometry.precision import mesh_step
@@ -36,7 +37,7 @@ from shellgs_method.registration.positions import SurveyedPositions, align_posit
 from shellgs_method.registration.proposal import Candidate
 from shellgs_method.registration.proposal import _main_wall as main_wall
 from shellgs_method.registration.refinement import refine
-from shellgs_method.registration.repetition import facade_axes, scan_shifts
+from shellgs_method.registration.repetition import scan_shifts
 from shellgs_method.registration.report import shell_edges, write_report
 from shellgs_method.registration.validation import LIMITS, Limit, validate
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, cast_views, load_shell

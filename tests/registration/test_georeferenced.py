@@ -108,7 +108,6 @@ def test_maps_of_a_national_scene_agree_with_the_local_ones(national, pristine_s
         assert close.mean() > 0.999  # except for pixels on the edge of a sill
 
 
-@pytest.mark.usefixtures("eager")
 def test_exports_of_a_national_scene_agree_with_those_of_the_local_one(national, pristine_scene, tmp_path):
     """Both have the same shell, and so the same frame."""
     if (national / "sparse").exists():

@@ -51,7 +51,7 @@ def render(
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_moments_are_those_of_the_splats_own_depths(eager, primitive):
+def test_moments_are_those_of_the_splats_own_depths(primitive):
     """The splats' weights are composited as one-hot features."""
     random = torch.Generator().manual_seed(0)
     gaussians = {
@@ -98,7 +98,7 @@ def test_the_mode_of_one_thin_layer_is_close_to_its_mean():
             assert mode_of(depths.tolist(), weights.tolist()) == pytest.approx(mean, rel=limit)
 
 
-def test_no_pixel_has_a_mode_between_a_wall_and_what_is_in_front_of_it(eager):
+def test_no_pixel_has_a_mode_between_a_wall_and_what_is_in_front_of_it():
     back, _ = wall(0.0)
     front = {name: values[back["means"][:, 0] < 0.1] for name, values in back.items()}
     back["means"] = back["means"] + torch.tensor([0.0, 0.0, 3.0])
@@ -115,7 +115,7 @@ def test_no_pixel_has_a_mode_between_a_wall_and_what_is_in_front_of_it(eager):
     assert between[1] == 0
 
 
-def test_what_is_behind_the_surface_does_not_move_its_depth_and_normals(eager):
+def test_what_is_behind_the_surface_does_not_move_its_depth_and_normals():
     """Half a wall's opacity and a second wall behind it, of another direction, look like the first wall alone."""
     (front, normal), (back, _) = wall(0.0), wall(0.3)
     back["means"] = back["means"] + torch.tensor([0.0, 0.0, 5.0])
@@ -151,18 +151,18 @@ def error(geometry: Geometry, normal: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("primitive", "depth"), [("2d", "expected"), ("2d", "median"), ("2d", "plane"), ("3d", "plane")]
 )
-def test_depths_of_ray_intersections_are_those_of_the_wall(eager, primitive, depth, yaw):
+def test_depths_of_ray_intersections_are_those_of_the_wall(primitive, depth, yaw):
     gaussians, normal = wall(yaw)
     assert error(render(gaussians, primitive, depth), normal).max() < 1e-4
 
 
-def test_the_depth_of_centres_is_wrong_on_a_receding_wall(eager):
+def test_the_depth_of_centres_is_wrong_on_a_receding_wall():
     gaussians, normal = wall(0.9)
     assert error(render(gaussians, "3d", "expected"), normal).max() > 0.01
 
 
 @pytest.mark.parametrize("primitive", ["2d", "3d"])
-def test_normals_and_depth_normals_of_a_wall_are_right(eager, primitive):
+def test_normals_and_depth_normals_of_a_wall_are_right(primitive):
     gaussians, normal = wall(0.9)
     geometry = render(gaussians, primitive, "plane")
     opaque = (geometry.alpha > 0.9)[..., 0]
@@ -182,7 +182,7 @@ def test_only_plane_depth_depends_on_the_rotation_of_gaussians(depth, moves):
     assert geometry_channels(gaussians, CAMERA, depth)[1].requires_grad == moves
 
 
-def test_a_faint_disc_without_median_depth_has_its_expected_depth(eager):
+def test_a_faint_disc_without_median_depth_has_its_expected_depth():
     gaussians, _ = wall(0.0)
     one = {name: value[430:431] for name, value in gaussians.items()}  # the middle one
     geometry = render(one, "2d", "median", opacity=0.3)
@@ -191,7 +191,7 @@ def test_a_faint_disc_without_median_depth_has_its_expected_depth(eager):
     torch.testing.assert_close(geometry.depth[seen], torch.full_like(geometry.depth[seen], 5.0))
 
 
-def test_depth_is_positive_and_finite_for_planes_seen_edge_on(eager):
+def test_depth_is_positive_and_finite_for_planes_seen_edge_on():
     gaussians, _ = wall(math.pi / 2 - 1e-3)
     geometry = render(gaussians, "3d", "plane")
     assert geometry.depth.isfinite().all()

@@ -173,7 +173,7 @@ def test_a_refused_setting_leaves_no_folder(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_used_settings_of_nerfstudio_do_what_they_say(pristine_scene, tmp_path, monkeypatch, eager):
+def test_used_settings_of_nerfstudio_do_what_they_say(pristine_scene, tmp_path, monkeypatch):
     logged = set()
     monkeypatch.setattr(writer, "put_dict", lambda name, scalar_dict, step: logged.update({name, *scalar_dict}))
 

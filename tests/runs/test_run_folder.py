@@ -28,8 +28,6 @@ LAST = "nerfstudio_models/step-000000001.ckpt"
 NAMES = Path("outputs/scene/photo-gs/run")
 """Folder of a run, relative to where it was trained."""
 
-pytestmark = pytest.mark.usefixtures("eager")
-
 
 def write_run(folder: Path, output_dir: Path, data: Path, method: str = "photo-gs") -> Path:
     """The config.yml of a run trained on ``data`` with ``--output-dir output_dir``; its folder has no checkpoint."""
@@ -160,7 +158,6 @@ def trained(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     root = tmp_path_factory.mktemp("projects")
     shutil.copytree(pristine_scene, root / "a/scene")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SHELLGS_COMPILE", "0")
         patch.chdir(root / "a")
         trainer = trainer_of(Path("scene"), Path("outputs"), "photo_gs", iterations=2)
         trainer.config.save_config()

@@ -34,16 +34,14 @@ LAST = "nerfstudio_models/step-000000001.ckpt"
 @pytest.fixture(scope="module")
 def pristine_run(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a photo-gs run of two iterations; not to be changed."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SHELLGS_COMPILE", "0")
-        trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("runs"), "photo_gs", iterations=2)
-        trainer.config.save_config()
-        trainer.train()
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("runs"), "photo_gs", iterations=2)
+    trainer.config.save_config()
+    trainer.train()
     return trainer.base_dir
 
 
 @pytest.fixture
-def run(pristine_run: Path, tmp_path: Path, eager) -> Path:
+def run(pristine_run: Path, tmp_path: Path) -> Path:
     """A copy of the run that a test may change."""
     folder = Path(shutil.copytree(pristine_run, tmp_path / pristine_run.relative_to(pristine_run.parents[2])))
     config = folder / "config.yml"

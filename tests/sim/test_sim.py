@@ -20,6 +20,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.frame import Frame
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import moved_into
 from shellgs_method.sim.collision.collider import Collider, leaks, make_collider, standing_before, thickness
 from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
@@ -29,7 +30,7 @@ from shellgs_method.sim.collision.planes import find_planes
 from shellgs_method.sim.deviations import find_deviations
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo, bake
-from shellgs_method.sim.rays import Surface, outward
+from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import RECESS, Layout, building, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk
@@ -37,19 +38,19 @@ from shellgs_method.synthetic.path import walk
 LAYOUT = Layout(bays=2, storeys=2)
 
 
-def surface_of(mesh: Any) -> Surface:
+def surface_of(mesh: Any) -> Triangles:
     """Convert a mesh of trimesh, whose types are incomplete."""
-    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return Triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def box(low, high, subdivided: float | None = None) -> Surface:
+def box(low, high, subdivided: float | None = None) -> Triangles:
     mesh = trimesh.creation.box(bounds=[low, high])
     return surface_of(mesh.subdivide_to_size(subdivided) if subdivided else mesh)
 
 
-def visible(surface: Surface, eyes: np.ndarray) -> np.ndarray:
+def visible(surface: Triangles, eyes: np.ndarray) -> np.ndarray:
     points, _ = surface.samples(4000)
-    return points[np.any([surface.sees(np.broadcast_to(eye, points.shape), points, 5e-3) for eye in eyes], axis=0)]
+    return points[np.any([surface.sees(eye, points, 5e-3) for eye in eyes], axis=0)]
 
 
 @pytest.fixture(scope="module")
@@ -59,16 +60,16 @@ def eyes() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def facade(eyes) -> Surface:
+def facade(eyes) -> Triangles:
     """The shell of a small building, wound towards the cameras in front of it."""
     mesh = shell(LAYOUT)
-    return outward(Surface(mesh.vertices, mesh.triangles), eyes)[0]
+    return outward(Triangles(mesh.vertices, mesh.triangles), eyes)[0]
 
 
 @pytest.fixture(scope="module")
-def nothing() -> Surface:
+def nothing() -> Triangles:
     """A reconstruction without anything in front of the shell."""
-    return Surface(np.eye(3), np.array([[0, 1, 2]]))
+    return Triangles(np.eye(3), np.array([[0, 1, 2]]))
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +148,7 @@ def test_the_collider_matches_the_visible_shell(collider, facade, eyes):
 def test_windows_stay_recesses(collider):
     opening = LAYOUT.openings[0]
     place = np.array([[opening.centre, -5, (opening.z0 + opening.z1) / 2]])
-    assert collider.surface.cast(place, np.array([[0, 1.0, 0]]))[0] == pytest.approx(5 + RECESS, abs=1e-4)
+    assert collider.surface.cast(place, np.array([[0, 1.0, 0]])).t == pytest.approx(5 + RECESS, abs=1e-4)
 
 
 @pytest.mark.parametrize("most", [40, 12])
@@ -178,9 +179,9 @@ def test_surfaces_in_front_of_the_shell_are_in_the_collider_but_not_those_beside
     assert standing[of_planter & front].all()
     assert not standing[~of_planter & front].any()
     made = make_collider(facade, fused, standing)
-    before = made.surface.cast(np.array([[3.0, -3, 1.2]]), np.array([[0, 1.0, 0]]))[0]
+    before = made.surface.cast(np.array([[3.0, -3, 1.2]]), np.array([[0, 1.0, 0]])).t
     assert before == pytest.approx(2.6, abs=0.02)
-    beside = made.surface.cast(np.array([[right + 0.3, -3, 2]]), np.array([[0, 1.0, 0]]))[0]
+    beside = made.surface.cast(np.array([[right + 0.3, -3, 2]]), np.array([[0, 1.0, 0]])).t
     assert np.isinf(beside)
 
 
@@ -310,7 +311,7 @@ def texture_at(textured, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def wall() -> Surface:
+def wall() -> Triangles:
     mesh = trimesh.creation.box(bounds=[[-2, 0, 0], [2, 0.2, 2]]).subdivide_to_size(0.2)
     return surface_of(mesh)
 
@@ -384,13 +385,13 @@ def test_an_object_that_hides_the_wall_is_not_in_its_texture(wall):
     """A post 50 cm in front of the wall, black in the photograph, and grey where no photograph sees."""
     camera = frontal(0.0)
     post = trimesh.creation.box(bounds=[[-0.1, -0.6, -1], [0.1, -0.5, 3]])
-    together = Surface(
+    together = Triangles(
         np.concatenate([wall.vertices, post.vertices]), np.concatenate([wall.faces, post.faces + len(wall.vertices)])
     )
     photo = photo_of(camera)
     pose = np.linalg.inv(camera.viewmat.numpy())
     rays = camera.rays().numpy() @ pose[:3, :3].T
-    hit = surface_of(post).cast(np.broadcast_to(pose[:3, 3], rays.shape), rays)[1] >= 0
+    hit = surface_of(post).cast(pose[:3, 3], rays).triangle >= 0
     black = photo._replace(image=np.where(hit[..., None], 0, photo.image).astype(np.uint8))
     textured = bake(together, np.full((len(together.vertices), 3), 99.0), [black])
     behind = np.stack([np.zeros(20), np.zeros(20), np.linspace(0.2, 1.8, 20)], axis=1)
@@ -399,7 +400,7 @@ def test_an_object_that_hides_the_wall_is_not_in_its_texture(wall):
     assert np.abs(texture_at(masked, behind) - 99).max() < 3
 
 
-def shell_and_bump() -> tuple[Surface, Surface]:
+def shell_and_bump() -> tuple[Triangles, Triangles]:
     """A wall of 4 x 2 m, and a reconstruction 12 cm in front of it on 0.8 x 0.5 m."""
     flat = surface_of(trimesh.creation.box(bounds=[[-2, 0, 0], [2, 3, 2]]))
     built = [
@@ -457,7 +458,7 @@ def test_photographs_take_precedence_over_the_reconstruction():
 def test_a_turned_building_has_the_same_collider(facade, nothing, collider):
     """Planes and parts do not depend on the axes."""
     turn = Rotation.from_euler("z", 31, degrees=True).as_matrix()
-    turned = Surface(facade.vertices @ turn.T, facade.faces)
+    turned = Triangles(facade.vertices @ turn.T, facade.faces)
     made = make_collider(turned, nothing, np.array([False]))
     assert len(made.parts) == len(collider.parts)
     points, _ = collider.surface.samples(500)

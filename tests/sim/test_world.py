@@ -20,21 +20,23 @@ from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
+from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, make_collider
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.formats.usd import compliance_errors, import_pxr, write_usd_layers, write_usd_world
+from shellgs_method.sim.formats.usd import compliance_errors, write_usd_layers, write_usd_world
 from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
 from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.look.renders import rendered
 from shellgs_method.sim.look.texture import TexturedMesh
 from shellgs_method.sim.look.visual import write_visual
-from shellgs_method.sim.rays import Surface, outward
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
 from shellgs_method.sim.trials.engine import beams, compiled, import_mujoco, lidar, load, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
+from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import Layout, shell
 from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk as stroll
@@ -50,11 +52,11 @@ def eyes() -> np.ndarray:
 @pytest.fixture(scope="module")
 def collider(eyes) -> Collider:
     mesh = shell(LAYOUT)
-    facade, _ = outward(Surface(mesh.vertices, mesh.triangles), eyes)
+    facade, _ = outward(Triangles(mesh.vertices, mesh.triangles), eyes)
     return make_collider(facade, facade, np.zeros(len(facade.faces), bool))
 
 
-def painted(surface: Surface) -> TexturedMesh:
+def painted(surface: Triangles) -> TexturedMesh:
     """The surface in four colours, by position."""
     uv = (surface.vertices[:, [0, 2]] - surface.vertices[:, [0, 2]].min(0)) / np.ptp(
         surface.vertices[:, [0, 2]], axis=0
@@ -137,7 +139,7 @@ def test_a_lidar_in_mujoco_agrees_with_ray_casting(world, collider, eyes):
     surface = collider.surface
     places, rays = places_before(surface, Front.of(surface, eyes), count=3), beams(6, 40)
     measured = lidar(world / "facade.xml", places, rays, group=3)
-    exact = surface.cast(np.repeat(places, len(rays), axis=0), np.tile(rays, (3, 1)))[0].reshape(3, -1)
+    exact = surface.cast(np.repeat(places, len(rays), axis=0), np.tile(rays, (3, 1))).t.reshape(3, -1)
     with np.errstate(divide="ignore"):
         ground = np.where(rays[:, 2] < 0, places[:, 2:] / -rays[:, 2], np.inf)
     np.testing.assert_allclose(measured, np.minimum(exact, ground), atol=2e-3)
@@ -173,7 +175,7 @@ def test_mujoco_renders_what_a_camera_sees(world, collider):
     rays = camera.rays().numpy() @ pose[:3, :3].T
     surface, look = collider.surface, painted(collider.surface)
     origins = np.broadcast_to(pose[:3, 3], rays.shape)
-    t, face = surface.cast(origins, rays)
+    t, face, _ = surface.cast(origins, rays)
     hit = origins + np.where(np.isfinite(t), t, 0)[..., None] * rays
     weights = trimesh.triangles.points_to_barycentric(
         surface.vertices[surface.faces[face.ravel()]], hit.reshape(-1, 3)
@@ -214,7 +216,7 @@ def test_the_sdf_is_a_static_world(world, collider):
 
 
 def test_usd_of_an_unknown_unit_states_the_metre_in_every_layer(collider, tmp_path):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     building = write_building(tmp_path, collider, metric=False)
     write_usd_world(tmp_path / "facade.usda", [building], metric=False, with_splats=True)
     layers = [tmp_path / "facade.usda", *(tmp_path / "usd").iterdir()]
@@ -228,7 +230,7 @@ def test_usd_of_an_unknown_unit_states_the_metre_in_every_layer(collider, tmp_pa
 
 @pytest.mark.parametrize("look", ["mesh", "splats"])
 def test_the_usd_is_compliant(world, look):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
     assert pxr.UsdGeom.GetStageUpAxis(stage) == "Z"
     assert pxr.UsdGeom.GetStageMetersPerUnit(stage) == 1
@@ -238,7 +240,7 @@ def test_the_usd_is_compliant(world, look):
 
 
 def test_the_compliance_checker_finds_faults(tmp_path):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     stage = pxr.Usd.Stage.CreateNew(str(tmp_path / "bad.usda"))
     stage.DefinePrim("/a", "Mesh")
     stage.GetRootLayer().Save()
@@ -246,7 +248,7 @@ def test_the_compliance_checker_finds_faults(tmp_path):
 
 
 def test_usd_colliders_are_the_parts(world, collider):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
     prims = [prim for prim in stage.Traverse() if prim.HasAPI(pxr.UsdPhysics.MeshCollisionAPI)]
     assert len(prims) == len(collider.parts)
@@ -256,7 +258,7 @@ def test_usd_colliders_are_the_parts(world, collider):
 
 
 def test_splats_in_usd_are_the_gaussians(world):
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     splats = some_splats()
     stage = pxr.Usd.Stage.Open(str(world / "usd" / "splats.usdc"))
     prim = stage.GetDefaultPrim()
@@ -306,12 +308,10 @@ def test_two_buildings_are_one_world(collider, tmp_path):
 @pytest.fixture(scope="module")
 def config(pristine_scene: Path, tmp_path_factory) -> Path:
     """A short run on the tiny scene."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SHELLGS_COMPILE", "0")
-        trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "shellgs_metric", iterations=10)
-        trainer.train()
-        trainer.save_checkpoint(10)
-        trainer.config.save_config()
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("run"), "shellgs_metric", iterations=10)
+    trainer.train()
+    trainer.save_checkpoint(10)
+    trainer.config.save_config()
     return trainer.base_dir / "config.yml"
 
 
@@ -326,7 +326,7 @@ def quick(monkeypatch) -> None:
 SMALL = SimSettings(faces=4000)
 
 
-def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, capsys):
+def test_the_command_writes_the_whole_folder(config, tmp_path, quick, capsys):
     out = tmp_path / "facade sim"
     cli.sim((config, out), SMALL)
     said = capsys.readouterr().out
@@ -340,7 +340,7 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, eager, cap
     frame = json.loads((out / "frame.json").read_text())
     assert frame["up"] == "z"
     assert frame["offset"] == [row[3] for row in frame["to_national"][:3]]
-    corner = Surface(*joined_file(out)).vertices
+    corner = Triangles(*joined_file(out)).vertices
     building = transformed(transformed(corner, np.array(frame["to_national"])), np.linalg.inv(SHELL_FROM_BUILDING))
     assert building[:, 0].min() > -1.5
     assert building[:, 0].max() < 19.5
@@ -364,7 +364,7 @@ def joined_file(out: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def test_a_run_without_a_shell_reports_its_frame(config, eager, monkeypatch):
+def test_a_run_without_a_shell_reports_its_frame(config, monkeypatch):
     monkeypatch.setattr(TrainedRun, "shell", None)
     built = Reconstruction.of(TrainedRun.load(config), SMALL.faces, None, None, None)
     said: list[str] = []
@@ -372,7 +372,7 @@ def test_a_run_without_a_shell_reports_its_frame(config, eager, monkeypatch):
     assert "has no aligned shell: the frame is the scene's" in said[0]
     assert built.shell is None
     assert not built.frame.metric
-    fused, seen = outward(Surface(np.asarray(built.fused.vertices), np.asarray(built.fused.faces)), built.eyes)
+    fused, seen = outward(Triangles(np.asarray(built.fused.vertices), np.asarray(built.fused.faces)), built.eyes)
     assert len(make_collider(None, fused, seen, most=20).parts) <= 20
 
 

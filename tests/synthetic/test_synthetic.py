@@ -90,9 +90,11 @@ def test_depth_on_the_wall_is_the_depth_of_its_plane(facade):
     """The wall is y = 0: with rays of z = 1 in the camera, depth = -origin.y / direction.y."""
     for camera in facade.cameras:
         origin, directions = rays(camera)
-        cue, hits = facade.truth(camera), facade.daylight.world.cast(origin, directions)
+        cue, world = facade.truth(camera), facade.daylight.world
+        hits = world.cast(origin, directions)
         point_y = origin[1] + hits.t * directions[..., 1]
-        wall = (hits.material == Material.WALL) & (np.abs(point_y) < 1e-3) & (np.abs(hits.normal[..., 1]) > 0.9)
+        of_wall = world.material[hits.triangle] == Material.WALL
+        wall = of_wall & (np.abs(point_y) < 1e-3) & (np.abs(hits.normal[..., 1]) > 0.9)
         assert wall.mean() > 0.1
         expected = UNITS_PER_METRE * -origin[1] / directions[..., 1]
         np.testing.assert_allclose(cue.depth[wall], expected[wall], rtol=1e-5)
@@ -101,7 +103,8 @@ def test_depth_on_the_wall_is_the_depth_of_its_plane(facade):
 def test_normals_of_the_panes_are_the_facades_in_the_camera_frame(facade):
     for camera in facade.cameras:
         origin, directions = rays(camera)
-        glass = facade.daylight.world.cast(origin, directions).material == Material.GLASS
+        world = facade.daylight.world
+        glass = world.material[world.cast(origin, directions).triangle] == Material.GLASS
         expected = camera.viewmat[:3, :3].numpy() @ [0.0, -1.0, 0.0]
         np.testing.assert_allclose(facade.truth(camera).normal[glass], np.tile(expected, (glass.sum(), 1)), atol=1e-3)
 
@@ -116,7 +119,8 @@ def test_panes_lie_at_the_recess_in_building_and_shell():
 def test_true_normals_face_the_camera_and_the_mask_excludes_street_and_sky(facade):
     for camera in facade.cameras:
         cue = facade.truth(camera)
-        material = facade.daylight.world.cast(*rays(camera)).material
+        world = facade.daylight.world
+        material = world.material[world.cast(*rays(camera)).triangle]
         assert (np.sum(cue.normal * camera.rays().numpy(), axis=-1)[cue.mask] < 0).all()
         assert not cue.mask[material > Material.RAILING].any()
         assert (cue.depth[material == 255] == 0).all()
@@ -239,7 +243,7 @@ def test_wrong_points_are_mirror_images_in_the_panes(facade):
     wrong = points.positions[points.is_mirrored]
     assert wrong[:, 1].max() > 10.0
     mirrored = (wrong * [1, -1, 1] + [0, 2 * RECESS, 0]).astype(np.float32)
-    distance = facade.daylight.world._triangles.distance(mirrored)
+    distance = facade.daylight.world.distance(mirrored)
     assert distance.max() < 4 * NOISE * 35
 
 

@@ -13,11 +13,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from shellgs_method.errors import SceneError
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
 from shellgs_method.sim.collision.parts import Part, joined, prism
 from shellgs_method.sim.collision.patches import convex_patches
 from shellgs_method.sim.collision.planes import Plane, find_planes, grid_in, polygons_of
-from shellgs_method.sim.rays import Surface, spread
+from shellgs_method.sim.winding import spread
 
 THICKNESS = 0.3
 """Depth of parts behind a surface in metres, unless the building is known to be thinner."""
@@ -54,12 +55,14 @@ class Collider:
     filled: float
 
     @cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> Triangles:
         """All parts as one mesh."""
-        return Surface(*joined(self.parts))
+        return Triangles(*joined(self.parts))
 
 
-def make_collider(shell: Surface | None, fused: Surface, standing: Bool[np.ndarray, " F"], most: int = 256) -> Collider:
+def make_collider(
+    shell: Triangles | None, fused: Triangles, standing: Bool[np.ndarray, " F"], most: int = 256
+) -> Collider:
     """Build collision geometry: prisms behind the shell's planes, and patches of the surfaces that are left.
 
     Args:
@@ -96,7 +99,7 @@ def make_collider(shell: Surface | None, fused: Surface, standing: Bool[np.ndarr
 
 
 def standing_before(
-    shell: Surface, fused: Surface, eyes: Float64[np.ndarray, "E 3"], least: float, count: int = 24
+    shell: Triangles, fused: Triangles, eyes: Float64[np.ndarray, "E 3"], least: float, count: int = 24
 ) -> Bool[np.ndarray, " F"]:
     """Mask of a surface's triangles that are visible, above the ground and over ``least`` metres in front of the shell.
 
@@ -114,8 +117,8 @@ def standing_before(
     places = fused.centres[near]
     seeing, backed = np.zeros(len(near)), np.zeros(len(near))
     for eye in spread(eyes, count):
-        visible = fused.sees(np.broadcast_to(eye, places.shape), places, 0.02)
-        _, behind = shell.cast(np.broadcast_to(eye, places.shape), places - eye)
+        visible = fused.sees(eye, places, 0.02)
+        behind = shell.cast(eye, places - eye).triangle
         seeing += visible
         backed += visible & (behind >= 0)
     standing = np.zeros(len(fused.faces), bool)
@@ -123,7 +126,7 @@ def standing_before(
     return standing
 
 
-def _patch_parts(groups: Sequence[tuple[Surface, np.ndarray]], most: int) -> list[Part]:
+def _patch_parts(groups: Sequence[tuple[Triangles, np.ndarray]], most: int) -> list[Part]:
     """At most ``most`` parts for groups of triangles, shared out among the surfaces by area."""
     parts, areas = [], [surface.areas[group].sum() for surface, group in groups]
     for surface in dict.fromkeys(surface for surface, _ in groups):
@@ -133,7 +136,7 @@ def _patch_parts(groups: Sequence[tuple[Surface, np.ndarray]], most: int) -> lis
     return sorted(parts, key=_size, reverse=True)[:most]
 
 
-def _prisms(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Part], float]:
+def _prisms(planes: Sequence[Plane], shell: Triangles, most: int) -> tuple[list[Part], float]:
     """Prisms behind planes, at most ``most``, and the cubic metres of air that merging them fills."""
     depths = [thickness(plane, shell) for plane in planes]
 
@@ -153,16 +156,16 @@ def _prisms(planes: Sequence[Plane], shell: Surface, most: int) -> tuple[list[Pa
     return sorted(parts, key=_size, reverse=True)[:most], spent
 
 
-def _air(plane: Plane, area: shapely.Geometry, shell: Surface) -> float:
+def _air(plane: Plane, area: shapely.Geometry, shell: Triangles) -> float:
     """Cubic metres of air between an area of a plane and the shell behind it; none inside the building."""
     pieces = [piece for piece in polygons_of(area) if piece.area > 1e-4]
     total = 0.0
     for piece in pieces:
         points = plane.to_space(grid_in(piece, max(0.05, float(np.sqrt(piece.area)) / 10)))
         outwards = np.broadcast_to(plane.normal, points.shape)
-        _, ahead = shell.cast(points, outwards)
+        ahead = shell.cast(points, outwards).triangle
         inside = (ahead >= 0) & (shell.normals[ahead] @ plane.normal > 0.2)
-        behind = np.minimum(shell.cast(points, -outwards)[0], DEEP)
+        behind = np.minimum(shell.cast(points, -outwards).t, DEEP)
         total += piece.area * float(np.where(inside, 0.0, behind).mean())
     return total
 
@@ -171,7 +174,7 @@ def _size(part: Part) -> float:
     return float(np.prod(np.sort(np.ptp(part.vertices, axis=0))[1:]))
 
 
-def _facing(plane: Plane, shell: Surface) -> Plane:
+def _facing(plane: Plane, shell: Triangles) -> Plane:
     """The plane with its normal on the side that most of its triangles face."""
     if shell.areas[plane.faces] @ (shell.normals[plane.faces] @ plane.normal) >= 0:
         return plane
@@ -179,11 +182,11 @@ def _facing(plane: Plane, shell: Surface) -> Plane:
     return replace(plane, axes=plane.axes * np.array([[-1.0], [1], [-1]]), outline=mirrored)
 
 
-def thickness(plane: Plane, shell: Surface) -> float:
+def thickness(plane: Plane, shell: Triangles) -> float:
     """Depth in metres that parts can have behind a plane without leaving the building."""
     points = plane.samples(max(0.1, np.sqrt(plane.outline.area) / 20))
     back = np.broadcast_to(-plane.normal, points.shape)
-    t, hit = shell.cast(points + 0.01 * back, back)
+    t, hit, _ = shell.cast(points + 0.01 * back, back)
     leaves = (hit >= 0) & (shell.normals[hit] @ plane.normal < -0.2)
     free = np.where(leaves, t + 0.01, THICKNESS)
     return float(np.clip(np.quantile(free, 0.1), THINNEST, THICKNESS))
@@ -229,14 +232,14 @@ def connected(faces: Int64[np.ndarray, "F 3"], chosen: Int64[np.ndarray, " C"]) 
     return np.split(chosen[order], np.flatnonzero(np.diff(label[order])) + 1)
 
 
-def leaks(collider: Surface, shell: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 20_000) -> float:
+def leaks(collider: Triangles, shell: Triangles, eyes: Float64[np.ndarray, "E 3"], count: int = 20_000) -> float:
     """Share of the camera rays that reach the shell and pass 10 cm behind it without hitting the collision geometry."""
     points, _ = shell.samples(count)
     origins = eyes[np.arange(count) % len(eyes)]
     away = points - origins
     length = np.linalg.norm(away, axis=1)
     directions = away / length[:, None]
-    reached = shell.cast(origins, directions)[0]
+    reached = shell.cast(origins, directions).t
     visible = reached > length - 0.01
-    through = collider.cast(origins, directions)[0] > length + 0.1
+    through = collider.cast(origins, directions).t > length + 0.1
     return float((visible & through).sum() / max(visible.sum(), 1))

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.geometry.camera import Camera, positions, project
-from shellgs_method.sim.rays import Surface
+from shellgs_method.geometry.camera import Camera, in_view, positions
+from shellgs_method.geometry.triangles import Triangles
 
 COUNT = 40_000
 SLANT = 0.17
@@ -40,9 +40,9 @@ class Distances:
 
 
 def both_ways(
-    collider: Surface,
-    other: Surface,
-    shell: Surface | None,
+    collider: Triangles,
+    other: Triangles,
+    shell: Triangles | None,
     cameras: Sequence[Camera],
     before: float,
 ) -> dict[str, Distances]:
@@ -67,17 +67,16 @@ def both_ways(
     return {name: distances for name, distances in found.items() if distances is not None}
 
 
-def visible(surface: Surface, cameras: Sequence[Camera]) -> Float64[np.ndarray, "N 3"]:
+def visible(surface: Triangles, cameras: Sequence[Camera]) -> Float64[np.ndarray, "N 3"]:
     """Random points of a surface, above the ground and visible in the image of some camera."""
     points, faces = surface.samples(COUNT)
     above = points[:, 2] > 0.02
     points, normals = points[above], surface.normals[faces[above]]
     seen = np.zeros(len(points), bool)
     for camera, eye in zip(cameras, positions(cameras), strict=True):
-        pixels, depth = project(camera, points)
-        inside = (depth > 0) & (pixels > 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
+        inside, _, _ = in_view(camera, points)
         towards = eye - points
         steep = np.abs((normals * towards).sum(1)) > SLANT * np.linalg.norm(towards, axis=1)
         asked = np.flatnonzero(inside & steep & ~seen)
-        seen[asked] = surface.sees(np.broadcast_to(eye, (len(asked), 3)), points[asked], 5e-3)
+        seen[asked] = surface.sees(eye, points[asked], 5e-3)
     return points[seen]

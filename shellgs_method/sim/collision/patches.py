@@ -7,8 +7,8 @@ import heapq
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.rays import Surface
 
 EVEN = 0.02
 """Standard deviation from its plane, in metres, up to which a patch is not split further."""
@@ -16,7 +16,9 @@ FEWEST = 4
 """Minimum number of triangles in a patch; smaller ones are noise."""
 
 
-def convex_patches(surface: Surface, groups: list[Int64[np.ndarray, " F"]], most: int, thickness: float) -> list[Part]:
+def convex_patches(
+    surface: Triangles, groups: list[Int64[np.ndarray, " F"]], most: int, thickness: float
+) -> list[Part]:
     """Cover groups of triangles with convex parts: the costliest patch is split in two until there are ``most``.
 
     A patch's part is the hull of its corners and of copies moved backwards, so that it is solid however thin the
@@ -44,7 +46,7 @@ def convex_patches(surface: Surface, groups: list[Int64[np.ndarray, " F"]], most
     return [part for patch in patches if (part := _thickened(surface, patch, thickness)) is not None]
 
 
-def _patch(surface: Surface, faces: np.ndarray) -> tuple[float, int, np.ndarray]:
+def _patch(surface: Triangles, faces: np.ndarray) -> tuple[float, int, np.ndarray]:
     """A patch with its negative cost, to sort by."""
     corners, areas = surface.vertices[surface.faces[faces]], surface.areas[faces]
     centres = corners.mean(axis=1)
@@ -53,7 +55,7 @@ def _patch(surface: Surface, faces: np.ndarray) -> tuple[float, int, np.ndarray]
     return -float(areas.sum() * np.sqrt(max(across, 0.0))), int(faces[0]), faces
 
 
-def _halved(surface: Surface, faces: np.ndarray) -> list[np.ndarray]:
+def _halved(surface: Triangles, faces: np.ndarray) -> list[np.ndarray]:
     """Split a patch in two across its longest direction."""
     centres = surface.vertices[surface.faces[faces]].mean(axis=1)
     along = (centres - centres.mean(0)) @ np.linalg.svd(centres - centres.mean(0), full_matrices=False)[2][0]
@@ -61,7 +63,7 @@ def _halved(surface: Surface, faces: np.ndarray) -> list[np.ndarray]:
     return [faces[first], faces[~first]]
 
 
-def _thickened(surface: Surface, faces: np.ndarray, thickness: float) -> Part | None:
+def _thickened(surface: Triangles, faces: np.ndarray, thickness: float) -> Part | None:
     normal = surface.areas[faces] @ surface.normals[faces]
     length = np.linalg.norm(normal)
     if length < 1e-12:

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
+from shellgs_method.geometry.axes import wall_axes
+from shellgs_method.geometry.planes import fitted_plane, largest_plane
 from shellgs_method.geometry.triangles import area_vectors
 
-HYPOTHESES, VOTERS = 200, 4000
 AGREEMENT = np.cos(np.radians(20))
 """Minimum cosine between a triangle's normal and its plane's: scans are noisy."""
 LEAST_AREA = 0.02
@@ -67,8 +68,7 @@ def find_planes(
 ) -> tuple[list[Plane], Int64[np.ndarray, " R"]]:
     """The planes of a mesh, the largest first, and the triangles that lie on none.
 
-    Each RANSAC hypothesis (Fischler and Bolles 1981) comes from one triangle and is scored by area on a sample of the
-    others. Pieces of a plane need not touch, so that all panes of a facade are one.
+    Pieces of a plane need not touch, so that all panes of a facade are one.
 
     Args:
         vertices: in metres.
@@ -89,7 +89,7 @@ def find_planes(
         (float(np.clip(1.5 * np.sqrt(2 * areas[left].mean()), tolerance, 0.1)), 0.1) if scanned else (0.0, 0.005)
     )
     while len(left):
-        chosen = _largest(corners[left], normals[left], areas[left], tolerance, rng)
+        chosen = largest_plane(corners[left], tolerance, rng, normals[left], AGREEMENT, areas[left])
         members = left[chosen]
         if areas[members].sum() < least:
             rest.append(left)
@@ -106,42 +106,6 @@ def find_planes(
     return planes, np.sort(np.concatenate(rest)) if rest else np.empty(0, np.int64)
 
 
-def _largest(
-    corners: np.ndarray, normals: np.ndarray, areas: np.ndarray, tolerance: float, rng: np.random.Generator
-) -> Bool[np.ndarray, " F"]:
-    """Mask of the triangles on the plane with the most area, refitted until it stops growing."""
-    centres = corners.mean(axis=1)
-
-    def on(points: np.ndarray, axes: np.ndarray, among: np.ndarray | slice) -> np.ndarray:
-        offsets = np.einsum("hc,hc->h", points, axes)
-        near = (np.abs(corners[among] @ axes.T - offsets) <= tolerance).all(axis=1)
-        return near & (np.abs(normals[among] @ axes.T) > AGREEMENT)
-
-    share = areas / areas.sum()
-    count = min(HYPOTHESES, len(areas))
-    hypotheses = rng.choice(len(areas), count, replace=False, p=share) if (share > 0).sum() >= count else slice(None)
-    voters = rng.permutation(len(areas))[:VOTERS]
-    votes = areas[voters] @ on(centres[hypotheses], normals[hypotheses], voters)
-    best = np.arange(len(areas))[hypotheses][votes.argmax()]
-    members = on(centres[[best]], normals[[best]], slice(None))[:, 0]
-    members[best] = True
-    for _ in range(5):
-        origin, axis = _fit(corners[members], areas[members])
-        grown = on(origin[None], axis[None], slice(None))[:, 0]
-        if areas[grown].sum() <= areas[members].sum() * (1 + 1e-9):
-            break
-        members = grown
-    return members
-
-
-def _fit(corners: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares plane through triangles, weighted by area: a point and a normal."""
-    weights, points = np.repeat(areas, 3), corners.reshape(-1, 3)
-    origin = weights @ points / weights.sum()
-    spread = points - origin
-    return origin, np.linalg.eigh((weights[:, None] * spread).T @ spread)[1][:, 0]
-
-
 def _outlined(
     corners: np.ndarray,
     normals: np.ndarray,
@@ -155,25 +119,17 @@ def _outlined(
     """The plane of triangles with their union as its outline; None if that is too small."""
     if areas.sum() < LEAST_AREA:
         return None
-    origin, normal = _fit(corners, areas)
+    origin, normal = fitted_plane(corners, areas)
     if areas @ (normals @ normal) < 0:  # to the side that most of them face
         normal = -normal
-    axes = upright_axes(normal)
+    up = [0.0, 0, 1] if np.hypot(*normal[:2]) > 1e-3 else [0.0, normal[2], 0]  # u is along x on level planes
+    axes = wall_axes(normal, np.array(up))
     flat = (corners - origin) @ axes[:2].T
     triangles = shapely.buffer(shapely.polygons(flat), gap / 2, join_style="mitre", mitre_limit=2)
     union = shapely.union_all(triangles).buffer(-gap / 2 - even, join_style="mitre", mitre_limit=2)
     smooth = union.buffer(even, join_style="mitre", mitre_limit=2).simplify(max(tolerance, even))
     outline = _pieces(smooth, crumb)
     return None if outline.area < LEAST_AREA else Plane(origin, axes, outline, faces)
-
-
-def upright_axes(normal: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Axes u, v and the normal, right-handed, with u horizontal and v upwards, or u along x for a level plane."""
-    u = np.array([-normal[1], normal[0], 0.0])
-    u = u / np.linalg.norm(u) if np.linalg.norm(u) > 1e-3 else np.array([1.0, 0, 0])
-    u = u - (u @ normal) * normal
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(normal, u), normal])
 
 
 def _pieces(shape: shapely.Geometry, least: float) -> shapely.MultiPolygon:

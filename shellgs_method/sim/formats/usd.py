@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,10 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from shellgs_method.export.meshes import set_unit
 from shellgs_method.export.splats import Splats
-from shellgs_method.files.atomic import unfinished
-from shellgs_method.machine.extras import import_extra
+from shellgs_method.files.usd import add_mesh, import_pxr, make_collider, new_stage
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.world import Building
 from shellgs_method.sim.look.texture import TexturedMesh
@@ -37,15 +34,15 @@ def write_usd_layers(folder: Path, mesh: TexturedMesh, parts: Sequence[Part], sp
     Returns:
         Whether this USD supports splats: their schema is standard since 26.03.
     """
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     (folder / LAYERS).mkdir(exist_ok=True)
-    with _Stage(pxr, folder / LAYERS / "visual.usdc", metric) as stage:
+    with new_stage(pxr, folder / LAYERS / "visual.usdc", "z", metric) as stage:
         _visual(pxr, stage, mesh)
-    with _Stage(pxr, folder / LAYERS / "collision.usdc", metric) as stage:
+    with new_stage(pxr, folder / LAYERS / "collision.usdc", "z", metric) as stage:
         _colliders(pxr, stage, parts)
     if not hasattr(pxr.UsdVol, "ParticleField3DGaussianSplat"):
         return False
-    with _Stage(pxr, folder / LAYERS / "splats.usdc", metric) as stage:
+    with new_stage(pxr, folder / LAYERS / "splats.usdc", "z", metric) as stage:
         _particles(pxr, stage, splats)
     return True
 
@@ -55,8 +52,9 @@ def write_usd_world(path: Path, buildings: Sequence[Building], metric: bool, wit
 
     Mesh and splats show the same surface: a variant set ``look`` of each building selects one of them.
     """
-    pxr = import_pxr()
-    with _Stage(pxr, path, metric, root="World") as stage:
+    pxr = import_pxr("sim")
+    with new_stage(pxr, path, "z", metric) as stage:
+        pxr.UsdGeom.Xform.Define(stage, "/World")
         scene = pxr.UsdPhysics.Scene.Define(stage, "/World/physics")
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0, 0, -1))
         scene.CreateGravityMagnitudeAttr(9.81)
@@ -82,7 +80,7 @@ def write_usd_world(path: Path, buildings: Sequence[Building], metric: bool, wit
 
 def compliance_errors(stage: Path | Any) -> list[str]:
     """Errors that usd-core's own validators, those of ``usdchecker``, find in a stage or its file; a line each."""
-    pxr = import_pxr()
+    pxr = import_pxr("sim")
     registry = pxr.UsdValidation.ValidationRegistry()
     validators = registry.GetOrLoadAllValidators()
     if isinstance(stage, Path):
@@ -97,33 +95,9 @@ def _refer(pxr: SimpleNamespace, stage, prim, building: Building, child: str) ->
     made.GetReferences().AddReference(f"./{building.path(f'{LAYERS}/{child}.usdc')}")
 
 
-class _Stage:
-    """A z-up stage with its unit; the file gets its name once it is complete."""
-
-    def __init__(self, pxr: SimpleNamespace, path: Path, metric: bool, root: str = "") -> None:
-        self._path, self._temporary = path, unfinished(path, path.suffix)
-        self._stage = pxr.Usd.Stage.CreateNew(str(self._temporary))
-        pxr.UsdGeom.SetStageUpAxis(self._stage, "Z")
-        set_unit(pxr.UsdGeom, self._stage, metric)
-        if root:
-            self._stage.SetDefaultPrim(pxr.UsdGeom.Xform.Define(self._stage, f"/{root}").GetPrim())
-
-    def __enter__(self):
-        return self._stage
-
-    def __exit__(self, failed, *_) -> None:
-        try:
-            if failed is None:
-                self._stage.GetRootLayer().Save()
-                os.replace(self._temporary, self._path)
-        finally:
-            self._temporary.unlink(missing_ok=True)
-
-
 def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh) -> None:
-    root = pxr.UsdGeom.Xform.Define(stage, "/visual")
-    stage.SetDefaultPrim(root.GetPrim())
-    prim = _mesh(pxr, stage, "/visual/mesh", mesh.vertices, mesh.faces)
+    pxr.UsdGeom.Xform.Define(stage, "/visual")
+    prim = add_mesh(pxr, stage, "/visual/mesh", mesh.vertices, mesh.faces)
     prim.CreateDoubleSidedAttr(True)
     uv = np.ascontiguousarray(mesh.uv, np.float32)
     primvars = pxr.UsdGeom.PrimvarsAPI(prim)
@@ -154,24 +128,10 @@ def _shader(pxr: SimpleNamespace, stage, path: str, kind: str):
 def _colliders(pxr: SimpleNamespace, stage, parts: Sequence[Part]) -> None:
     """Add static colliders, as convex hulls, which the parts already are."""
     root = pxr.UsdGeom.Xform.Define(stage, "/collision")
-    stage.SetDefaultPrim(root.GetPrim())
     pxr.UsdGeom.Imageable(root).CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
     for number, part in enumerate(parts):
-        prim = _mesh(pxr, stage, f"/collision/part_{number:03d}", part.vertices, part.faces)
-        pxr.UsdPhysics.CollisionAPI.Apply(prim.GetPrim())
-        collider = pxr.UsdPhysics.MeshCollisionAPI.Apply(prim.GetPrim())
-        collider.CreateApproximationAttr(pxr.UsdPhysics.Tokens.convexHull)
-
-
-def _mesh(pxr: SimpleNamespace, stage, path: str, vertices: np.ndarray, faces: np.ndarray):
-    prim = pxr.UsdGeom.Mesh.Define(stage, path)
-    points = np.ascontiguousarray(vertices, np.float32)
-    prim.CreatePointsAttr(pxr.Vt.Vec3fArray.FromNumpy(points))
-    prim.CreateFaceVertexCountsAttr(pxr.Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
-    prim.CreateFaceVertexIndicesAttr(pxr.Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).ravel()))
-    prim.CreateExtentAttr(pxr.Vt.Vec3fArray.FromNumpy(np.stack([points.min(0), points.max(0)])))
-    prim.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
-    return prim
+        prim = add_mesh(pxr, stage, f"/collision/part_{number:03d}", part.vertices, part.faces)
+        make_collider(pxr, prim, "convexHull")
 
 
 def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
@@ -181,7 +141,6 @@ def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
     means, quats, scales, opacities, harmonics = (column[kept].float() for column in columns)
     quats = torch.nn.functional.normalize(quats, dim=-1)
     field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/splats")
-    stage.SetDefaultPrim(field.GetPrim())
 
     def array(kind, values: torch.Tensor):
         return kind.FromNumpy(np.ascontiguousarray(values.numpy(), np.float32))
@@ -196,13 +155,3 @@ def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
     reach = 3 * sizes.amax(dim=1, keepdim=True)
     if len(means):
         field.CreateExtentAttr([tuple((means - reach).amin(0).tolist()), tuple((means + reach).amax(0).tolist())])
-
-
-def import_pxr() -> SimpleNamespace:
-    """Import the modules of usd-core.
-
-    Raises:
-        SceneError: usd-core is not installed, or too old.
-    """
-    names = "Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade", "UsdValidation", "UsdVol", "Vt"
-    return SimpleNamespace(**{name: import_extra(f"pxr.{name}", "usd-core", "sim", "USD") for name in names})

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.registration.report import shell_edges
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.sim.look.texture import Photo
-from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
 
 LARGEST = 1280
@@ -66,7 +66,7 @@ def rendered(path: Path, cameras: Sequence[Camera], group: int = 2) -> list[UInt
     return images
 
 
-def overlaid(photo: Photo, collider: Surface) -> UInt8[np.ndarray, "H W 3"]:
+def overlaid(photo: Photo, collider: Triangles) -> UInt8[np.ndarray, "H W 3"]:
     """A photograph with the edges of the collision geometry drawn on it."""
     mesh = ShellMesh(collider.vertices, collider.faces)
     image = photo.image.copy()

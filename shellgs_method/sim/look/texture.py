@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.sparse import coo_matrix, csc_array, hstack
 
 from shellgs_method.geometry.camera import Camera, project
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.machine.extras import import_extra
-from shellgs_method.sim.rays import Surface
 
 SHARPNESS = 6.0
 """Exponent of the view weights: the best views of a point dominate, yet blend into each other."""
@@ -57,7 +57,7 @@ class TexturedMesh:
 
 
 def bake(
-    surface: Surface, colours: Float64[np.ndarray, "V 3"], photos: Sequence[Photo], texel: float | None = None
+    surface: Triangles, colours: Float64[np.ndarray, "V 3"], photos: Sequence[Photo], texel: float | None = None
 ) -> TexturedMesh:
     """Unwrap a surface and texture it from photographs, or with its own colours where no photograph sees it.
 
@@ -98,7 +98,7 @@ def bake(
     return TexturedMesh(surface.vertices[vertex], faces, uv, image, float((best > 0).mean()))
 
 
-def _weights(surface: Surface, photo: Photo) -> Float64[np.ndarray, " V"]:
+def _weights(surface: Triangles, photo: Photo) -> Float64[np.ndarray, " V"]:
     """Pixels per square metre of the surface at each vertex in a photograph, 0 where it is not visible."""
     camera, vertices = photo.camera, surface.vertices
     pixels, depth = project(camera, vertices)
@@ -106,7 +106,7 @@ def _weights(surface: Surface, photo: Photo) -> Float64[np.ndarray, " V"]:
     edge = np.minimum.reduce([*pixels.T, *([width, height] - pixels).T]) / (0.05 * min(width, height))
     seen = np.flatnonzero((depth > 0.1) & (edge > 0))
     eye = camera.position.double().numpy()
-    seen = seen[surface.sees(np.broadcast_to(eye, (len(seen), 3)), vertices[seen], SLACK)]
+    seen = seen[surface.sees(eye, vertices[seen], SLACK)]
     if photo.mask is not None:
         row, column = np.minimum(pixels[seen][:, ::-1].astype(int), np.array([height, width]) - 1).T
         seen = seen[photo.mask[row, column]]
@@ -123,7 +123,7 @@ def _weights(surface: Surface, photo: Photo) -> Float64[np.ndarray, " V"]:
     return np.where(np.isfinite(lowest), lowest, 0.0)
 
 
-def _vertex_normals(surface: Surface) -> Float64[np.ndarray, "V 3"]:
+def _vertex_normals(surface: Triangles) -> Float64[np.ndarray, "V 3"]:
     count = len(surface.vertices)
     rows, columns = surface.faces.ravel(), np.repeat(np.arange(len(surface.faces)), 3)
     gather = coo_matrix((np.repeat(surface.areas, 3), (rows, columns)), shape=(count, len(surface.faces)))
@@ -141,7 +141,7 @@ def _sample(photo: Photo, points: Float64[np.ndarray, "N 3"]) -> Float32[np.ndar
 
 
 def _atlas(
-    surface: Surface, texel: float
+    surface: Triangles, texel: float
 ) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, "M 2"], Int64[np.ndarray, "F 3"], tuple[int, int]]:
     """For each atlas vertex its mesh vertex and its UV in [0, 1]², the faces, and the texture's height and width."""
     xatlas = import_extra("xatlas", "xatlas", "sim", "a texture")

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.front import Front
-from shellgs_method.sim.rays import Surface
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
 
 GRAVITY = 9.81
@@ -81,7 +81,7 @@ class Walk:
 
 
 def throw(
-    path: Path, surface: Surface, eyes: Float64[np.ndarray, "E 3"], count: int = 200, seconds: float = 4
+    path: Path, surface: Triangles, eyes: Float64[np.ndarray, "E 3"], count: int = 200, seconds: float = 4
 ) -> Throws:
     """Throw spheres and boxes at 5 to 15 m/s at the visible surface of a world: half at any point, half at corners.
 
@@ -116,7 +116,7 @@ def throw(
         mujoco.mj_step(model, data)
         energy = np.maximum(energy, _energy(model, data, bodies) - launched)
         now = data.xpos[bodies].copy()
-        through |= (surface.cast(before, now - before)[0] <= 1) | (now[:, 2] < 0)
+        through |= (surface.cast(before, now - before).t <= 1) | (now[:, 2] < 0)
         before = now
         depth[:], support[:] = 0, 0
         touching = model.geom_bodyid[data.contact.geom]
@@ -135,7 +135,7 @@ def throw(
     )
 
 
-def walk(path: Path, surface: Surface, front: Front, speed: float = 1.4) -> Walk:
+def walk(path: Path, surface: Triangles, front: Front, speed: float = 1.4) -> Walk:
     """Push an upright capsule against a facade and along it; where something stops it, it steps back.
 
     Args:
@@ -186,7 +186,7 @@ def _energy(model, data, bodies: np.ndarray) -> Float64[np.ndarray, " N"]:
 
 
 def _launches(
-    surface: Surface, eyes: np.ndarray, count: int, rng: np.random.Generator
+    surface: Triangles, eyes: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
     """Positions to throw from, 1.5 to 4 m from a visible target, and velocities."""
     starts, velocities = [], []

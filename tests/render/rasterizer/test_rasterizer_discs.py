@@ -15,8 +15,6 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine import compilation
 from shellgs_method.render.rasterizer import quats_to_rotations, rasterize
 
-pytestmark = pytest.mark.usefixtures("eager")
-
 MAPS = ("inverse_depth", "median_depth", "distortion")
 FACING = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
 
