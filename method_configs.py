@@ -63,20 +63,14 @@ shellgs_metric = _method(
     "3D Gaussians initialised on an aligned facade shell and kept within its tolerance: the recommended method",
     FacadeModelConfig(
         cues="shell",
-        shell_counts="uncontradicted",
-        geometry_of="surface",
+        init="shell",
+        trust="photographs",
         depth="mode",
-        ignore_transients=True,
-        seeds="shell",
-        skybox_seeds=2500,  # or the sky is painted in front of what is beside the building
-        init_opacity=0.5,
         densify_grad_thresh=THRESHOLD_METRIC,
-        wide_gradient=4.0,  # with this threshold, what is beside the building would be a blur
         extra=ExtraLossConfig(
             empty_space=1.0,
             normal_consistency=0.1,  # continues walls beyond the shell
             normal_consistency_from=3000,
-            normal_consistency_on="without_cue",
         ),
     ),
 )

@@ -28,18 +28,18 @@ from rich.table import Table
 
 from benchmarks.scenes import Scene
 from dataparsers.cameras import pinhole_camera
-from shellgs_method import model as model_module
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.model import FacadeModel
+from shellgs_method.render import view
 from shellgs_method.render.rasterizer import rasterize
 from shellgs_method.runs.config_file import load_config
 from shellgs_method.trainer import FacadeTrainer, FacadeTrainerConfig
 
 PARTS = {
-    "colours": (FacadeModel, "_colours"),
-    "geometry channels": (model_module, "geometry_channels"),
-    "rasterize": (model_module, "rasterize"),
-    "depth and normals": (model_module, "rendered_geometry"),
+    "colours": (view, "view_colours"),
+    "geometry channels": (view, "geometry_channels"),
+    "rasterize": (view, "rasterize"),
+    "depth and normals": (view, "rendered_geometry"),
     "metrics": (FacadeModel, "get_metrics_dict"),
     "losses": (FacadeModel, "get_loss_dict"),
     "backward": (torch.Tensor, "backward"),

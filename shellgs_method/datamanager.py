@@ -20,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from dataparsers.cameras import pinhole_camera, pinhole_cameras
+from shellgs_method.bounds import Length
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
@@ -189,7 +190,7 @@ class FacadeDataManagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: FacadeDataManager)
     holdout: Literal["none", "A", "B"] = "none"
     """Vertical bands of the facade that cues leave out and metrics are limited to: every other one, A or B."""
-    band_width: float = 2.0
+    band_width: Length = 2.0
     """Width of a band in metres, or in scene units where the shell maps have no scale."""
 
 

@@ -1,9 +1,9 @@
-"""The model of every method: primitive x cues, and the weights of the losses."""
+"""The model of every method: primitive x cues, and the weights of the losses, as nerfstudio takes them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, NoReturn, Optional
+from typing import Annotated, Any, Literal, NoReturn, Optional
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,64 +11,36 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.model_components import renderers
-from nerfstudio.models.splatfacto import (
-    RGB2SH,
-    SH2RGB,
-    SplatfactoModel,
-    SplatfactoModelConfig,
-    num_sh_bases,
-    random_quat_tensor,
-)
+from nerfstudio.models.splatfacto import SH2RGB, SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
 from torch import Tensor, nn
 from tyro.conf import Suppress
 
 from dataparsers.cameras import pinhole_camera
+from shellgs_method.bounds import Bounds, Count, FromOne, Share, Weight
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
-from shellgs_method.evaluation.pixels import kept_pixels, photometric_pixels, reference_maps
+from shellgs_method.evaluation.pixels import kept_pixels
 from shellgs_method.evaluation.regions import masked_image_errors, reference_errors, references
-from shellgs_method.gaussians.densification import GradientStrategy, MCMCConfig, MCMCStrategy, SkyboxStrategy
+from shellgs_method.gaussians.densification import GradientStrategy, SkyboxStrategy
+from shellgs_method.gaussians.initial import OPACITY, Init, InitialGaussians, sfm_points
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.geometry.nearest import point_tree
-from shellgs_method.losses import PAPER_ITERATIONS, PhotometricLoss, flattening_loss
-from shellgs_method.losses.objective import CueLosses, ExtraLossConfig, GeometryLossConfig, self_losses
+from shellgs_method.losses import PAPER_ITERATIONS
+from shellgs_method.losses.objective import Cues, ExtraLossConfig, GeometryLossConfig, Objective, Trust, ViewLosses
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.machine.threads import ThreadsByLoad
-from shellgs_method.render.maps import (
-    DISC_LOG_THICKNESS,
-    DepthKind,
-    Geometry,
-    Primitive,
-    depth_powers,
-    geometry_channels,
-    mode_of_depth,
-    rendered_geometry,
-    squared_depths,
-)
+from shellgs_method.render.maps import DepthKind, Geometry, Primitive
 from shellgs_method.render.panorama import is_pinhole, render_around
-from shellgs_method.render.rasterizer import rasterize, spherical_harmonics
+from shellgs_method.render.view import ViewRenderer
 from shellgs_method.runs.host import NO_FIELD, NO_RAYS, NO_RGBA, refuse
-from shellgs_method.runs.limits import MIN_POINTS
 
-MIN_RESET_EVERY = 1000
-"""Fewest iterations between two opacity resets: opacities recover no faster in a short run."""
 SURFACE_EVERY = 500
 """Most iterations of a run of 30 000 between two searches for the Gaussians behind the shell. A centre moves by at most
 its learning rate in each: once densification is over, by centimetres in between."""
-MAX_KEPT_PIXELS = 3_000_000
-"""Most pixels of training views whose losses are cached, at some 80 bytes each."""
-
-
-class ViewLosses(NamedTuple):
-    """Losses of one view against its photograph and its cue."""
-
-    photometric: PhotometricLoss
-    cue: CueLosses | None
-    with_cue: Bool[Tensor, "H W 1"] | None
-    """Pixels with a cue, believed or not; None in a view without a map."""
+DEGREE_EVERY = 1000
+"""Iterations of a run of 30 000 between two degrees of the spherical harmonics."""
 
 
 @dataclass
@@ -78,48 +50,42 @@ class FacadeModelConfig(SplatfactoModelConfig):
     _target: type = field(default_factory=lambda: FacadeModel)
     primitive: Primitive = "3d"
     """3d: Gaussians; 2d: the discs of 2D Gaussian Splatting."""
-    cues: Literal["none", "mono", "shell"] = "none"
+    cues: Cues = "none"
     """Maps that supervise the geometry."""
-    geometry: GeometryLossConfig = field(default_factory=GeometryLossConfig)
-    """Losses against the cues."""
-    # Values, not factories: an older config.yml without these settings finds them on the class.
-    extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
-    """Terms beyond the paper."""
+    init: Init = "sfm"
+    """Where the first Gaussians are: at the SfM points, or also on the shell, as densely as the photographs resolve it,
+    and on a sphere around the scene, for the sky and what is far."""
+    trust: Trust = "shell"
+    """What counts where photographs contradict the shell. With photographs, it neither supervises nor is seeded where
+    they show something in front of it or the background; what they show behind it, in windows, is no part of depth and
+    normals; and what only one of them shows in front of it, which has moved, is left out of the photometric loss."""
     depth: DepthKind = "expected"
     """Depth that is rendered and supervised: expected, median (discs only), plane (of the composited plane), or mode
     (of the heavier of two layers; expected in training)."""
-    shell_counts: Literal["everywhere", "uncontradicted"] = "everywhere"
-    """Where the shell supervises and is seeded: everywhere, or not where photographs show something in front of it."""
-    geometry_of: Literal["everything", "surface"] = "everything"
-    """Gaussians that make up depth and normals: all, or all but those behind the shell, which show what windows reflect
-    or let through. There are seeds for these where photographs show something behind the shell."""
-    ignore_transients: bool = False
-    """Leave out of the photometric loss what moved: what only one photograph shows in front of the shell."""
-    densification: Literal["default", "mcmc"] = "default"
-    """default: clone, split and prune by the gradient; mcmc: relocate and add by opacity, up to a cap."""
-    mcmc: MCMCConfig = MCMCConfig()  # noqa: RUF009
-    """Settings of mcmc."""
-    wide_gradient: float = 1.0
-    """Factor on the gradient that densifies Gaussians wider than a twentieth of the image; 1 in 3DGS."""
-    seeds: Literal["none", "shell"] = "none"
-    """Initial Gaussians besides those at the SfM points: none, or spread over the shell."""
-    seed_spacing: float = 4.0
-    """Spacing of the seeds, in pixels of the closest view."""
-    max_seeds: int = 200_000
-    """Most seeds; the spacing is increased where it would give more."""
-    skybox_seeds: int = 0
-    """Initial Gaussians on a sphere around the scene, for the sky and what is far."""
-    init_opacity: float = 0.1
-    """Opacity of the initial Gaussians; 0.1 in 3DGS."""
+    geometry: GeometryLossConfig = field(default_factory=GeometryLossConfig)
+    """Losses against the cues."""
+    # A value, not a factory: an older config.yml without this setting finds it on the class.
+    extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
+    """Terms beyond the paper."""
 
     background_color: Literal["random", "black", "white"] = "black"
-    cull_alpha_thresh: float = 0.005
-    cull_scale_thresh: float = 0.1
-    densify_grad_thresh: float = 0.0002
-    stop_screen_size_at: int = 0
+    sh_degree: Annotated[int, Bounds(0, 3, int)] = 3
+    warmup_length: Count = 500
+    stop_split_at: Count = 15_000
+    refine_every: FromOne = 100
+    cull_alpha_thresh: Share = 0.005
+    cull_scale_thresh: Weight = 0.1
+    densify_grad_thresh: Weight = 0.0002
 
     # Settings of splatfacto and nerfstudio's base model that these methods do not use.
     use_absgrad: Suppress[bool] = False
+    densify_size_thresh: Suppress[float] = 0.01
+    reset_alpha_every: Suppress[int] = 30
+    sh_degree_interval: Suppress[int] = 1000
+    ssim_lambda: Suppress[float] = 0.2
+    cull_screen_size: Suppress[float] = 0.15
+    split_screen_size: Suppress[float] = 0.05
+    stop_screen_size_at: Suppress[int] = 0
     num_downscales: Suppress[int] = 0
     resolution_schedule: Suppress[int] = 3000
     random_init: Suppress[bool] = False
@@ -161,36 +127,33 @@ class FacadeModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Create Gaussians at the SfM points."""
+        config, metadata = self.config, self.kwargs["metadata"]
         self._check_settings()
-        points, colours = self._seed_points()
-        spacing = point_tree(points.numpy()).query(points.numpy(), k=MIN_POINTS)[0][:, 1:].mean(axis=1)
-        scales = torch.from_numpy(spacing).float()[:, None].repeat(1, 3)
-        self.gauss_params = nn.ParameterDict()
-        self._add_gaussians(points, colours, scales, random_quat_tensor(len(points)))
-        self.camera_optimizer = self.config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
-        self.background_color = get_color(
-            "black" if self.config.background_color == "random" else self.config.background_color
-        )
+        self._initial = InitialGaussians(config.primitive, config.sh_degree, OPACITY[config.init])
+        first = self._initial.at_points(*sfm_points(self.seed_points))
+        self.gauss_params = nn.ParameterDict({name: nn.Parameter(values) for name, values in first.items()})
+        self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        self.background_color = get_color("black" if config.background_color == "random" else config.background_color)
         self.crop_box = None
+        self.metres_per_unit: float | None = metadata.get("metres_per_unit")
+        self.objective = Objective(
+            config.cues, config.trust, config.geometry, config.extra, self.metres_per_unit, metadata.get("shell_error")
+        )
+        self.renderer = ViewRenderer(config.primitive, config.depth, moments=config.extra.empty_space > 0)
         self.info: dict[str, Any] = {}
         self.geometry: Geometry | None = None
         self.surface_weights: SurfaceWeights | None = None
         self.register_buffer("surface", None)
-        self._views: dict[int, ViewLosses] = {}
         self._threads = ThreadsByLoad()
-        self.metres_per_unit: float | None = self.kwargs["metadata"].get("metres_per_unit")
-        self.step = 0
-        self.log_every = 1
+        self.step, self.log_every = 0, 1
         self.plan(PAPER_ITERATIONS)
 
     @property
     def training_cues(self) -> set[str]:
         """Kinds of maps that the training views need."""
-        return {self.config.cues, "shell" if self._needs_points_of_shell else "none"} - {"none"}
-
-    @property
-    def _needs_points_of_shell(self) -> bool:
-        return self.config.seeds == "shell" or self.config.geometry_of == "surface"
+        config = self.config
+        points_of_shell = config.init == "shell" or config.trust == "photographs"
+        return {config.cues, "shell" if points_of_shell else "none"} - {"none"}
 
     def _check_settings(self) -> None:
         config = self.config
@@ -200,109 +163,34 @@ class FacadeModel(SplatfactoModel):
             raise SceneError(
                 "empty_space needs the depths of the centres: set pipeline.model.depth to expected or mode"
             )
-        if self._needs_points_of_shell and "shell" not in self.kwargs["metadata"]["cues"]:
-            raise SceneError("seeds on the shell need its maps, and there are none: run `shellgs cast SCENE` first")
-        if config.cues != "none" and config.cues not in self.kwargs["metadata"]["cues"]:
-            method, command = {"shell": ("shellgs", "cast"), "mono": ("mono-gs", "mono")}[config.cues]
+        for kind in sorted(self.training_cues - set(self.kwargs["metadata"]["cues"])):
+            command = {"shell": "cast", "mono": "mono"}[kind]
             raise SceneError(
-                f"{method} needs the {config.cues} maps of the scene, and there are none: "
+                f"this method needs the {kind} maps of the scene, and there are none: "
                 f"run `shellgs {command} SCENE` first, or train photo-gs"
             )
 
-    def _seed_points(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-        count = 0 if self.seed_points is None else len(self.seed_points[0])
-        if self.seed_points is None or count < MIN_POINTS:
-            raise SceneError(
-                f"the scene has {count or 'no'} SfM points to start from, of at least {MIN_POINTS}: its COLMAP model "
-                "or ply_file_path has too few"
-            )
-        points, colours = self.seed_points[0].float(), self.seed_points[1].float() / 255
-        if self.config.densification == "mcmc":
-            kept = torch.randperm(len(points))[: self.config.mcmc.cap_max]
-            points, colours = points[kept], colours[kept]
-        return points, colours
-
-    def room_for(self, most: int) -> int:
-        """Number of seeds, at most ``most``, that the cap of ``mcmc`` leaves.
-
-        Raises:
-            SceneError: it leaves none.
-        """
-        if self.config.densification != "mcmc":
-            return most
-        cap = self.config.mcmc.cap_max
-        if cap <= self.num_points:
-            raise SceneError(
-                f"--pipeline.model.mcmc.cap-max {cap} is used up by the first {self.num_points} Gaussians, and leaves "
-                "no room for the seeds on the shell or of the skybox: raise it, or switch them off"
-            )
-        return min(most, cap - self.num_points)
-
     def add_seeds(self, seeds: Seeds) -> None:
         """Add flat initial Gaussians at seeds."""
-        points, normals, colours, spacing = (torch.from_numpy(each).float() for each in seeds)
-        scales = spacing[:, None] * spacing.new_tensor([0.5, 0.5, 0.05])
-        x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(dim=-1)
-        quats = torch.stack([1 + z, -y, x, 0 * z], dim=-1)  # from the third axis to the normal, or its opposite
-        self._add_gaussians(points, colours, scales, quats)
-
-    def _add_gaussians(
-        self,
-        means: Float[Tensor, "N 3"],
-        colours: Float[Tensor, "N 3"],
-        scales: Float[Tensor, "N 3"],
-        quats: Float[Tensor, "N 4"],
-    ) -> None:
-        scales = scales.clamp_min(1e-6).log()
-        if self.config.primitive == "2d":
-            scales[:, 2] = DISC_LOG_THICKNESS
-        added = {
-            "means": means,
-            "scales": scales,
-            "quats": quats,
-            "features_dc": RGB2SH(colours),
-            "features_rest": torch.zeros(len(means), num_sh_bases(self.config.sh_degree) - 1, 3),
-            "opacities": torch.full((len(means), 1), self.config.init_opacity).logit(),
-        }
-        for name, new in added.items():
-            if name in self.gauss_params:
-                old = self.gauss_params[name].data
-                new = torch.cat([old, new.to(old)])
-            self.gauss_params[name] = nn.Parameter(new)
+        for name, new in self._initial.at_seeds(seeds).items():
+            old = self.gauss_params[name].data
+            self.gauss_params[name] = nn.Parameter(torch.cat([old, new.to(old)]))
 
     def plan(self, num_iterations: int) -> None:
         """Scale every schedule to a run of ``num_iterations``."""
-        self.num_iterations = num_iterations
-        self.strategy = self._strategy(num_iterations / PAPER_ITERATIONS)
-        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
-
-    def _strategy(self, shrink: float) -> GradientStrategy | MCMCStrategy:
-        """Densification strategy of a run ``shrink`` times as long as the config's."""
-        config = self.config
-        start, stop = round(config.warmup_length * shrink), round(config.stop_split_at * shrink)
-        # Not scaled: a Gaussian that was just split needs time to settle in a short run too, or all split again.
-        every = config.refine_every
-        if config.densification == "mcmc":
-            return MCMCStrategy(config.mcmc.cap_max, start, stop, every, config.mcmc.noise)
-        reset_every = config.reset_alpha_every * every
-        reset_every = max(round(reset_every * shrink), min(MIN_RESET_EVERY, reset_every))
-        strategy = SkyboxStrategy if config.skybox_seeds > 0 else GradientStrategy
-        return strategy(
-            refine_start_iter=start,
-            refine_stop_iter=stop,
-            refine_every=every,
+        config, self.num_iterations = self.config, num_iterations
+        strategy = SkyboxStrategy if config.init == "shell" else GradientStrategy
+        self.strategy = strategy(
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=config.stop_split_at,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
             prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=config.densify_size_thresh,
-            grow_scale2d=config.split_screen_size,
             prune_scale3d=config.cull_scale_thresh,
-            prune_scale2d=config.cull_screen_size,
-            refine_scale2d_stop_iter=round(config.stop_screen_size_at * shrink),
-            reset_every=reset_every,
-            absgrad=config.use_absgrad,
+            grow_grad2d=config.densify_grad_thresh,
             key_for_gradient="gradient_2dgs" if config.primitive == "2d" else "means2d",
-            wide_gradient=config.wide_gradient,
-        )
+        ).for_run(num_iterations)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def get_training_callbacks(self, training_callback_attributes):
         """Splatfacto's callbacks, after scaling the schedules to the trainer's run."""
@@ -311,22 +199,6 @@ class FacadeModel(SplatfactoModel):
         self.plan(trainer.config.max_num_iterations)
         self.log_every = trainer.config.logging.steps_per_log
         return super().get_training_callbacks(training_callback_attributes)
-
-    def step_post_backward(self, step: int) -> None:
-        """Densify and prune."""
-        if isinstance(self.strategy, GradientStrategy):
-            self.strategy.pause_refine_after_reset = self._refinement_pause(step, self.strategy.reset_every)
-        super().step_post_backward(step)
-        if self.config.primitive == "2d":  # a split divides all scales
-            self.scales.data[:, 2] = DISC_LOG_THICKNESS
-
-    def _refinement_pause(self, step: int, reset_every: int) -> int:
-        """Iterations without densification after an opacity reset, until each photograph was trained on again.
-
-        As in splatfacto, but at most half of the reset interval: splatfacto never densifies a scene of many
-        photographs. There is no pause before the first reset, where gsplat would also wait.
-        """
-        return min(self.num_train_data + self.config.refine_every, reset_every // 2) if step >= reset_every else 0
 
     def load_state_dict(self, dict, **kwargs):
         """Load in place: the optimizers are built already and must keep the same parameters."""
@@ -345,9 +217,17 @@ class FacadeModel(SplatfactoModel):
 
     @property
     def _gaussians(self) -> dict[str, Tensor]:
-        """The parameters, and ``surface``, the weight of each Gaussian in depth and normals, if they differ in it."""
+        """The Gaussians to render: all, or in the viewer those inside its crop box."""
         self.update_surface()
-        return dict(self.gauss_params) | ({} if self.surface is None else {"surface": self.surface})
+        gaussians = dict(self.gauss_params) | ({} if self.surface is None else {"surface": self.surface})
+        if self.crop_box is None or self.training:
+            return gaussians
+        inside = self.crop_box.within(self.means).squeeze(-1)
+        return {name: values[inside] for name, values in gaussians.items()}
+
+    def coverage(self, camera: Camera) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
+        """:meth:`ViewRenderer.coverage` of a training view."""
+        return self.renderer.coverage(self._gaussians, camera, self._renders_geometry)
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Optional[OrientedBox] = None) -> dict[str, Tensor]:
         """Render one camera outside training, within a crop box if given.
@@ -378,36 +258,35 @@ class FacadeModel(SplatfactoModel):
         if not isinstance(camera, Cameras):
             refuse(NO_RAYS)
         self._threads.follow()
-        pinhole = pinhole_camera(camera)
-        background = self._get_background_color()
+        pinhole, background = pinhole_camera(camera), self._get_background_color()
         surface_every = max(1, round(SURFACE_EVERY * self.num_iterations / PAPER_ITERATIONS))
         if self.training and self.step % surface_every == 0:
             self.surface = None
-        gaussians = self._inside_crop()
+        gaussians = self._gaussians
         if len(gaussians["means"]) == 0:
             return _nothing(pinhole, background)
-        features, origin = self._features(gaussians, pinhole, background)
-        composited, alpha, self.info = self._rasterize(gaussians, features, pinhole)
+        degree = min(int(self.step / (DEGREE_EVERY * self.num_iterations / PAPER_ITERATIONS)), self.config.sh_degree)
+        densifies = self.training and self.step < self.strategy.refine_stop_iter
+        rgb, alpha, self.geometry, self.info = self.renderer(
+            gaussians, pinhole, background, degree, self._renders_geometry, densifies
+        )
         if self.training:
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
-        outputs = {
-            "rgb": (composited[..., :3] + background).clamp(0, 1),
-            "accumulation": alpha,
-            "background": background if self.training else background.expand(pinhole.height, pinhole.width, 3),
-        }
-        self.geometry = None
-        if self._renders_geometry:
-            surface = composited[..., -1:] if "surface" in gaussians else None
-            self.geometry = rendered_geometry(
-                composited[..., 3:], alpha, self.info, pinhole, self.config.depth, origin, surface
-            )
+        outputs = {"rgb": rgb, "accumulation": alpha, "background": background}
+        if not self.training:
+            outputs["background"] = background.expand(pinhole.height, pinhole.width, 3)
+        if self.geometry is not None:
             outputs["depth"] = self.geometry.depth
             if self.config.depth == "mode" and not self.training:
-                outputs["depth"] = self._mode_of_depth(outputs["depth"], gaussians, features, pinhole)
+                outputs["depth"] = self.renderer.mode_of_depth(self.geometry.depth, gaussians, pinhole)
             outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
         return outputs
+
+    @property
+    def _renders_geometry(self) -> bool:
+        return not self.training or self.objective.needs_geometry
 
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: object) -> NoReturn:
         """Refuse what commands for radiance fields ask for."""
@@ -416,80 +295,6 @@ class FacadeModel(SplatfactoModel):
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> NoReturn:
         """Refuse an output of ns-render that mixes two."""
         refuse(NO_RGBA)
-
-    def _mode_of_depth(
-        self,
-        expected: Float[Tensor, "H W 1"],
-        gaussians: dict[str, Tensor],
-        features: Float[Tensor, "N C"],
-        camera: Camera,
-    ) -> Float[Tensor, "H W 1"]:
-        """:func:`mode_of_depth` of a view, given its expected depth and the features that were composited."""
-        _, depths = geometry_channels(gaussians, camera, "expected")
-        powers, median = depth_powers(depths, gaussians.get("surface"))
-        # As many features as before, for which the kernels are compiled.
-        padded = torch.cat([powers, torch.zeros_like(features[:, powers.shape[1] :])], dim=-1)
-        composited, _, _ = self._rasterize(gaussians, padded, camera)
-        return mode_of_depth(expected, composited[..., : powers.shape[1]], median)
-
-    def coverage(self, camera: Camera) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
-        """Area of a training view that each Gaussian covers, and whether it reaches into the view, occluded or not.
-
-        The area is the sum of its compositing weights over the pixels.
-        """
-        gaussians = self._gaussians
-        # As many features as in training, for which the kernels are compiled.
-        features, _ = self._features(gaussians, camera, self._get_background_color())
-        features = torch.zeros_like(features, requires_grad=True)
-        composited, _, info = self._rasterize(gaussians, features, camera)
-        (weights,) = torch.autograd.grad(composited[..., 0].sum(), features)
-        return weights[:, 0], self._in_view(info)
-
-    def _features(
-        self, gaussians: dict[str, Tensor], camera: Camera, background: Float[Tensor, "3"]
-    ) -> tuple[Float[Tensor, "N C"], Float[Tensor, ""] | None]:
-        """Features to composite, and the origin of the squared depths if these are among them."""
-        # Colours minus the background, so that the photometric gradient of alpha comes through the colours too.
-        colours, origin = self._colours(gaussians, camera) - background, None
-        if not self._renders_geometry:
-            return colours, origin
-        channels = [*geometry_channels(gaussians, camera, self.config.depth)]
-        if self.config.extra.empty_space > 0:
-            squares, origin = squared_depths(channels[-1])
-            channels.append(squares)
-        if "surface" in gaussians:
-            surface = gaussians["surface"]
-            channels = [*(channel * surface for channel in channels), surface]
-        return torch.cat([colours, *channels], dim=-1), origin
-
-    def _rasterize(
-        self, gaussians: dict[str, Tensor], features: Float[Tensor, "N C"], camera: Camera
-    ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W 1"], dict[str, Any]]:
-        # Only gradients of colours densify, not those of the geometry; telling them apart costs gsplat a second pass.
-        strategy = self.strategy
-        densifies = self.training and isinstance(strategy, GradientStrategy) and self.step < strategy.refine_stop_iter
-        return rasterize(
-            gaussians["means"],
-            gaussians["quats"],
-            gaussians["scales"].exp(),
-            gaussians["opacities"].sigmoid().squeeze(-1),
-            features,
-            camera,
-            self.config.primitive,
-            n_densifying=3 if self._renders_geometry and densifies else None,
-        )
-
-    @property
-    def _renders_geometry(self) -> bool:
-        return not self.training or self._supervises_geometry
-
-    def _in_view(self, info: dict[str, Any]) -> Bool[Tensor, "N"]:
-        return info["radii"][0] > 0
-
-    @property
-    def _supervises_geometry(self) -> bool:
-        extra = self.config.extra
-        return self.config.cues != "none" or extra.normal_consistency > 0 or extra.distortion > 0
 
     @property
     def colors(self) -> Float[Tensor, "N 3"]:
@@ -506,74 +311,29 @@ class FacadeModel(SplatfactoModel):
         of_crop = renderers.BACKGROUND_COLOR_OVERRIDE  # a context of ns-render and the viewer
         return super()._get_background_color() if of_crop is None or self.training else of_crop.to(self.device)
 
-    def _inside_crop(self) -> dict[str, Tensor]:
-        """The Gaussians, or in the viewer those inside its crop box."""
-        if self.crop_box is None or self.training:
-            return self._gaussians
-        inside = self.crop_box.within(self.means).squeeze(-1)
-        return {name: values[inside] for name, values in self._gaussians.items()}
-
-    def _colours(self, gaussians: dict[str, Tensor], camera: Camera) -> Float[Tensor, "N 3"]:
-        """View-dependent colours; one more degree of harmonics every ``sh_degree_interval`` iterations."""
-        interval = self.config.sh_degree_interval * self.num_iterations / PAPER_ITERATIONS
-        degree = min(int(self.step / interval), self.config.sh_degree)
-        coefficients = gaussians["features_dc"][:, None], gaussians["features_rest"]
-        harmonics = spherical_harmonics(degree, gaussians["means"] - camera.position, *coefficients)
-        return (harmonics + 0.5).clamp_min(0)
-
     def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
         """Metrics of a training view, in the steps in which they are logged."""
         if self.training and self.step % self.log_every > 0:
             return {}
-        target = self._view_losses(batch, outputs["background"]).photometric.target
+        target = self._view(batch, outputs["background"]).photometric.target
         error = (outputs["rgb"].detach() - target).square()
         psnr = -10 * weighted_mean(error, kept_pixels(batch, target)).log10()
         return {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """Photometric loss R and losses of the geometry last rendered, against the cue where the view has a map."""
-        config, progress = self.config, self.step / self.num_iterations
-        view = self._view_losses(batch, outputs["background"])
-        losses = {"photometric": view.photometric(outputs["rgb"])}
-        if self.geometry is not None:
-            kept = kept_pixels(batch, outputs["rgb"])
-            losses |= self_losses(self.geometry, config.extra, progress, kept, view.with_cue)
-            if view.cue is not None:
-                losses |= view.cue(self.geometry, progress)
-        return losses | self._shape_losses()
+        """The objective's terms of the view that was rendered last."""
+        view, progress = self._view(batch, outputs["background"]), self.step / self.num_iterations
+        losses = self.objective(view, batch, outputs["rgb"], self.geometry, progress)
+        return losses | self.objective.of_shapes(self.scales, self.info["radii"][0] > 0)
 
-    def _view_losses(self, batch: dict, background: Tensor) -> ViewLosses:
-        """Losses of a batch's view; those of training views are cached while there is room."""
-        index = batch["image_idx"]
-        if self.training and index in self._views:
-            return self._views[index]
-        config = self.config
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), background)
-        kept = photometric_pixels(batch, target, config.ignore_transients)
-        cue = with_cue = None
-        if f"{config.cues}_depth" in batch:
-            with_cue = batch[f"{config.cues}_mask"].to(self.device)
-            maps = reference_maps(batch, config.cues, self.device, config.shell_counts == "everywhere")
-            shell_error = self.kwargs["metadata"].get("shell_error")
-            cue = CueLosses(maps, config.geometry, config.extra, self.metres_per_unit, shell_error)
-        view = ViewLosses(PhotometricLoss(target, kept, config.ssim_lambda), cue, with_cue)
-        changes = config.background_color == "random" and batch["image"].shape[-1] == 4
-        room = MAX_KEPT_PIXELS // target[..., 0].numel()
-        if self.training and not changes and len(self._views) < room:
-            self._views[index] = view
-        return view
+    def _view(self, batch: dict, background: Tensor) -> ViewLosses:
+        changes = self.config.background_color == "random" and batch["image"].shape[-1] == 4
+        return self.objective.view(
+            batch, lambda: self._photograph(batch, background), keep=self.training and not changes
+        )
 
-    def _shape_losses(self) -> dict[str, Tensor]:
-        """Losses on the opacities and scales of the Gaussians."""
-        config, losses = self.config, {}
-        if config.extra.flattening > 0:
-            losses["flattening"] = config.extra.flattening * flattening_loss(
-                self.scales.exp(), self._in_view(self.info)
-            )
-        if config.densification == "mcmc":
-            losses["opacity"] = config.mcmc.opacity * self.opacities.sigmoid().mean()
-            losses["scale"] = config.mcmc.scale * self.scales.exp().mean()
-        return losses
+    def _photograph(self, batch: dict, background: Tensor) -> Float[Tensor, "H W 3"]:
+        return self.composite_with_background(self.get_gt_img(batch["image"]), background)
 
     @torch.no_grad()
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
@@ -581,10 +341,10 @@ class FacadeModel(SplatfactoModel):
 
         Every method has both: the shell is a reference even where it is not a cue.
         """
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        normal = colours_to_normals(outputs["normal"])
+        target = self._photograph(batch, outputs["background"])
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
+        normal = colours_to_normals(outputs["normal"])
         rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
         metrics = masked_image_errors(rendering.rgb, target, batch, self.metres_per_unit)
         metrics |= reference_errors(rendering, camera, batch, self.metres_per_unit)

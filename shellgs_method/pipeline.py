@@ -18,6 +18,7 @@ from torch import Tensor
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
+from shellgs_method.gaussians.initial import MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.seeds import shell_seeds, view_behind_shell, view_of_shell, view_of_surface
 from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
@@ -69,18 +70,17 @@ class FacadePipeline(VanillaPipeline):
     def _add_seeds(self) -> None:
         model, data = self.model, self.datamanager
         config = model.config
-        spacing, most = config.seed_spacing, config.max_seeds
-        if config.seeds == "shell":
-            view_of = view_of_shell if config.shell_counts == "everywhere" else view_of_surface
-            model.add_seeds(shell_seeds(*data.seed_views(view_of, "shell"), spacing, model.room_for(most)))
-        if config.geometry_of == "surface" and config.primitive == "3d":
-            shell = shell_seeds(*data.seed_views(view_of_shell, "shell"), spacing, most)
+        if config.init == "shell":
+            view_of = view_of_shell if config.trust == "shell" else view_of_surface
+            model.add_seeds(shell_seeds(*data.seed_views(view_of, "shell"), SEED_SPACING, MAX_SEEDS))
+        if config.trust == "photographs" and config.primitive == "3d":
+            shell = shell_seeds(*data.seed_views(view_of_shell, "shell"), SEED_SPACING, MAX_SEEDS)
             model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
             behind = data.seed_views(view_behind_shell, "shell")
-            model.add_seeds(shell_seeds(*behind, spacing, model.room_for(most)))
-        if config.skybox_seeds > 0:
-            points, count = data.sfm_points.double().numpy(), model.room_for(config.skybox_seeds)
-            model.add_seeds(skybox_seeds(*data.seed_views(view_of_sky), points, count))
+            model.add_seeds(shell_seeds(*behind, SEED_SPACING, MAX_SEEDS))
+        if config.init == "shell":
+            points = data.sfm_points.double().numpy()
+            model.add_seeds(skybox_seeds(*data.seed_views(view_of_sky), points, SKYBOX_SEEDS))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint's Gaussians.

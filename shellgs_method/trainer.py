@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from tyro.conf import Suppress
 
+from shellgs_method.bounds import Rate
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.gaussians.pruning import broken, unshaped
@@ -60,7 +61,7 @@ class RunLengthDecayConfig(SchedulerConfig):
     """Exponential decay of the learning rate over the whole run."""
 
     _target: type = field(default_factory=lambda: RunLengthDecay)
-    lr_final: float = 1.6e-6
+    lr_final: Rate = 1.6e-6
     """Learning rate at the end of the run."""
     max_steps: Suppress[int] = 30_000
     """Length of the run; the trainer sets it to its number of iterations."""

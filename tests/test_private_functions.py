@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DATAMANAGER = "nerfstudio.data.datamanagers.full_images_datamanager"
 PRIVATE = [
-    ("shellgs_method/files/photographs.py", DATAMANAGER, "_undistort_image", "camera distortion_params data image K"),
+    ("shellgs_method/files/undistortion.py", DATAMANAGER, "_undistort_image", "camera distortion_params data image K"),
     (
         "dataparsers/facade.py",
         "nerfstudio.data.dataparsers.base_dataparser",
@@ -40,13 +40,6 @@ PRIVATE = [
             "_grow_gs": "self params optimizers state step",
             "_prune_gs": "self params optimizers state step",
         }.items()
-    ),
-    ("shellgs_method/gaussians/densification.py", "gsplat.strategy.ops", "_multinomial_sample", "weights n"),
-    (
-        "shellgs_method/gaussians/densification.py",
-        "gsplat.strategy.ops",
-        "_update_param_with_optimizer",
-        "param_fn optimizer_fn params optimizers names",
     ),
     ("shellgs_method/machine/compilation.py", "torch._dynamo", "mark_dynamic", "t index"),
     ("shellgs_method/machine/compilation.py", "torch._dynamo", "maybe_mark_dynamic", "t index"),

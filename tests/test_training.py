@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from training_runs import data_of, held_out, model_of, render, trainer_of
 
 import benchmarks.step
-import shellgs_method.model
+import shellgs_method.render.view
 from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
@@ -99,13 +99,13 @@ def test_gradients_that_densify_are_kept_apart_only_until_densification_stops(tr
     monkeypatch.setattr(model, "training", True)
     monkeypatch.setattr(model, "step", step)
     monkeypatch.setattr(model.strategy, "refine_stop_iter", 10)
-    given, rasterize = [], shellgs_method.model.rasterize
+    given, rasterize = [], shellgs_method.render.view.rasterize
 
     def watched(*args, n_densifying):
         given.append(n_densifying)
         return rasterize(*args, n_densifying=n_densifying)
 
-    monkeypatch.setattr(shellgs_method.model, "rasterize", watched)
+    monkeypatch.setattr(shellgs_method.render.view, "rasterize", watched)
     outputs = model.get_outputs(camera)
     assert given == apart
     outputs["depth"].sum().backward()
@@ -125,25 +125,16 @@ def test_metrics_of_training_views_are_computed_in_the_steps_that_log_them(train
 
 def test_losses_of_a_training_view_are_cached_while_there_is_room(trained, monkeypatch):
     model, (_, batch), outputs = model_of(trained), held_out(trained), render(trained)
-    assert len(model._views) == 8  # of 10, two are held out
-    monkeypatch.setattr(model, "_views", {})
-    held_out_view = model._view_losses(batch, outputs["background"])
-    assert model._view_losses(batch, outputs["background"]) is not held_out_view  # its index is also a training view's
+    assert len(model.objective._views) == 8  # of 10, two are held out
+    monkeypatch.setattr(model.objective, "_views", {})
+    held_out_view = model._view(batch, outputs["background"])
+    assert model._view(batch, outputs["background"]) is not held_out_view  # its index is also a training view's
     monkeypatch.setattr(model, "training", True)
-    kept = model._view_losses(batch, outputs["background"])
-    assert model._view_losses(batch, outputs["background"]) is kept
+    kept = model._view(batch, outputs["background"])
+    assert model._view(batch, outputs["background"]) is kept
     full = batch | {"image_idx": 7}
-    monkeypatch.setattr("shellgs_method.model.MAX_KEPT_PIXELS", 48 * 32)
-    assert model._view_losses(full, outputs["background"]) is not model._view_losses(full, outputs["background"])
-
-
-@pytest.mark.parametrize(("step", "pause"), [(0, 0), (999, 0), (1000, 108), (2500, 108)])
-def test_densification_pauses_after_a_reset_until_each_photograph_was_seen(trained, step, pause):
-    assert model_of(trained)._refinement_pause(step, reset_every=1000) == pause
-
-
-def test_densification_does_not_pause_from_one_reset_to_the_next(trained):
-    assert model_of(trained)._refinement_pause(300, reset_every=100) == 50
+    monkeypatch.setattr("shellgs_method.losses.objective.MAX_KEPT_PIXELS", 48 * 32)
+    assert model._view(full, outputs["background"]) is not model._view(full, outputs["background"])
 
 
 def test_training_improves_image_and_normals(trained, pristine_scene, tmp_path):
@@ -287,14 +278,12 @@ def test_a_resumed_run_trains_the_restored_parameters_to_the_planned_end(pristin
     assert (model.opacities.detach() - saved["opacities"]).abs().max() > 0.05
 
 
-@pytest.mark.parametrize("densification", ["default", "mcmc"])
-def test_a_resumed_run_ends_as_one_that_was_never_stopped(pristine_scene, tmp_path, monkeypatch, densification):
+def test_a_resumed_run_ends_as_one_that_was_never_stopped(pristine_scene, tmp_path, monkeypatch):
     """To the last digit, on one thread: Gaussians, moments, sums of gradients, the order of views, random numbers."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
     def change(config):
         densify_early(config)
-        config.pipeline.model.densification = densification
         config.steps_per_save, config.save_only_latest_checkpoint = 8, False
 
     before = torch.get_num_threads()
@@ -416,7 +405,7 @@ def test_a_held_out_view_without_a_map_has_image_metrics_only(scene, tmp_path):
 
 def test_a_shell_method_on_a_scene_without_shell_maps_ends_with_one_sentence(scene, tmp_path):
     shutil.rmtree(scene / "cues" / "shell")
-    with pytest.raises(SystemExit, match=r"shellgs needs the shell maps .* run `shellgs cast"):
+    with pytest.raises(SystemExit, match=r"this method needs the shell maps .* run `shellgs cast"):
         trainer_of(scene, tmp_path)
 
 

@@ -22,6 +22,7 @@ from shellgs_method.files.atomic import atomic_write, fingerprint
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.scene import SceneLayout, ScenePaths
 from shellgs_method.runs.ablations import ABLATIONS
+from shellgs_method.runs.config_file import renamed
 from shellgs_method.runs.folders import recover_folder
 from shellgs_method.trainer import FacadeTrainerConfig
 
@@ -238,7 +239,7 @@ class Run:
         recover_folder(self.folder)
         path, settings = self._recorded, self.settings
         if self._begun:
-            before = _recorded_settings(path)
+            before = renamed(_recorded_settings(path), settings)
             # An earlier version did not write all settings: those that it lacks had their defaults or did not exist.
             known = settings | default_settings(self.variant.method) | before
             changed = [key for key in settings if settings[key] != known[key]]

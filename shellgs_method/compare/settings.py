@@ -90,7 +90,7 @@ def scene_settings(scene: Path, config: TrainerConfig) -> dict[str, str]:
     }
     model = config.pipeline.model
     # Maps that every method is measured against, including checked maps, and those that this one is trained on.
-    kinds = {"shell", "checked", "truth", getattr(model, "cues", "none"), getattr(model, "seeds", "none")}
+    kinds = {"shell", "checked", "truth", getattr(model, "cues", "none")}
     for kind in find_cues(scene):
         if kind in kinds:
             manifest = CueMaps.open(scene, kind).manifest

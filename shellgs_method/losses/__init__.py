@@ -3,32 +3,27 @@
 L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C normal smoothness; the others are off in the
 paper's setting. Masks are true where a pixel counts; an empty mask gives a differentiable zero.
 
-A class ``…Loss`` is the function ``…_loss`` for many renders of one view: what depends on the view alone is computed
-once. On a CPU both run as fused loops, see :mod:`shellgs_method.machine.compilation`.
+A class ``…Loss`` is the loss of many renders of one view: what depends on the view alone is computed once. On a CPU
+all run as fused loops, see :mod:`shellgs_method.machine.compilation`.
 """
 
-from shellgs_method.losses.depth import NccLoss, ncc_loss, vid2sim_ncc_loss
-from shellgs_method.losses.normal import NormalLoss, normal_loss
-from shellgs_method.losses.photometric import PhotometricLoss, photometric_loss
+from shellgs_method.losses.depth import NccLoss, vid2sim_ncc_loss
+from shellgs_method.losses.empty_space import EmptySpaceLoss
+from shellgs_method.losses.normal import NormalLoss
+from shellgs_method.losses.photometric import PhotometricLoss
 from shellgs_method.losses.schedules import PAPER_ITERATIONS, ExponentialDecay
 from shellgs_method.losses.self_consistency import flattening_loss, normal_consistency_loss
-from shellgs_method.losses.smoothness import SmoothnessLoss, smoothness_loss
-from shellgs_method.losses.surface import PointToPlaneLoss, point_to_plane_loss
+from shellgs_method.losses.smoothness import SmoothnessLoss
 
 __all__ = [
     "PAPER_ITERATIONS",
+    "EmptySpaceLoss",
     "ExponentialDecay",
     "NccLoss",
     "NormalLoss",
     "PhotometricLoss",
-    "PointToPlaneLoss",
     "SmoothnessLoss",
     "flattening_loss",
-    "ncc_loss",
     "normal_consistency_loss",
-    "normal_loss",
-    "photometric_loss",
-    "point_to_plane_loss",
-    "smoothness_loss",
     "vid2sim_ncc_loss",
 ]

@@ -14,7 +14,22 @@ from shellgs_method.machine.compilation import run_fused
 
 
 class NccLoss:
-    """:func:`ncc_loss` for many renders of one view."""
+    """Mean of 1 - NCC over the patches centred on pixels in the mask, in [0, 2].
+
+    Means and variances are over a patch's valid pixels. The loss is invariant to scale and shift of the rendered
+    inverse depth, and a plane's inverse depth is linear in the pixel: the loss depends on the direction of a plane's
+    tilt, not on its amount. A patch is ignored if too few of its pixels are valid or if the target has no structure to
+    correlate (a frontal plane).
+
+    Args:
+        target: the cue's 1/z.
+        mask: true where the target is valid.
+        window: side of a patch in pixels, odd.
+        min_valid: minimum share of valid pixels in a patch.
+        eps: smallest standard deviation of a patch, relative to the target's mean in it; 0.001 is 1 cm at 10 m, the
+            accuracy of shells and alignments. Below it the target counts as flat, and a flatter render is treated
+            as if it had this contrast, which bounds the gradient.
+    """
 
     def __init__(
         self,
@@ -38,7 +53,7 @@ class NccLoss:
         self._patches, self._share = (per_pixel, variance, floor, used.to(y)), 1 / used.sum().clamp_min(1).to(y)
 
     def __call__(self, inverse_depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
-        """Loss of one render."""
+        """Loss of one render, whose 1/z is finite wherever the mask is true."""
         return self._share * _Ncc.apply(inverse_depth[..., 0], self)
 
     def correlate(self, x: Float[Tensor, "H W"]) -> list[Tensor]:
@@ -50,34 +65,6 @@ class NccLoss:
         """Gradient of the sum w.r.t. the inverse depth."""
         padded = [F.pad(each, self._around) for each in gradient_terms]
         return run_fused(_gradient, x, self._target, self._valid, *padded, self._window, varying=2)
-
-
-def ncc_loss(
-    inverse_depth: Float[Tensor, "H W 1"],
-    target: Float[Tensor, "H W 1"],
-    mask: Bool[Tensor, "H W 1"],
-    window: int = 9,
-    min_valid: float = 0.5,
-    eps: float = 1e-3,
-) -> Float[Tensor, ""]:
-    """Mean of 1 - NCC over the patches centred on pixels in the mask, in [0, 2].
-
-    Means and variances are over a patch's valid pixels. The loss is invariant to scale and shift of the rendered
-    inverse depth, and a plane's inverse depth is linear in the pixel: the loss depends on the direction of a plane's
-    tilt, not on its amount. A patch is ignored if too few of its pixels are valid or if the target has no structure to
-    correlate (a frontal plane).
-
-    Args:
-        inverse_depth: rendered 1/z, finite wherever the mask is true.
-        target: the cue's 1/z.
-        mask: true where the target is valid.
-        window: side of a patch in pixels, odd.
-        min_valid: minimum share of valid pixels in a patch.
-        eps: smallest standard deviation of a patch, relative to the target's mean in it; 0.001 is 1 cm at 10 m, the
-            accuracy of shells and alignments. Below it the target counts as flat, and a flatter render is treated
-            as if it had this contrast, which bounds the gradient.
-    """
-    return NccLoss(target, mask, window, min_valid, eps)(inverse_depth)
 
 
 class _Ncc(torch.autograd.Function):
@@ -179,7 +166,7 @@ def _gradient(
 def vid2sim_ncc_loss(
     inverse_depth: Float[Tensor, "H W 1"], target: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]
 ) -> Float[Tensor, ""]:
-    """Patch NCC as in Vid2Sim's released code, for comparison; :func:`ncc_loss` is the intended formula.
+    """Patch NCC as in Vid2Sim's released code, for comparison; :class:`NccLoss` is the intended formula.
 
     Patches of 3 x 3 pixels are centred by one mean over all patches of the image, pixels outside the mask count as
     zeros, eps is absolute, and the average is over all pixels. A view with an empty mask gives zero.

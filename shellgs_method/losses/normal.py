@@ -19,30 +19,22 @@ def unit(normal: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
 
 
 class NormalLoss:
-    """:func:`normal_loss` for many renders of one view."""
+    """Mean of 1 - cos of the angle between two normal maps in the same frame, in [0, 2].
+
+    The angle is signed: a normal opposite to the target costs 2. Evaluation uses unsigned angles.
+
+    Args:
+        target: the cue's normals.
+        mask: true where the target is valid.
+    """
 
     def __init__(self, target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"]):
         weights = mean_weights(mask, like=target)
         self._target, self._total = unit(target).where(mask, 0.0) * weights, weights.sum()
 
     def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Loss of one render."""
+        """Loss of one render, given its normals of any length, as composited."""
         return self._total - run_fused(_cosines, normal, self._target, varying=2)
-
-
-def normal_loss(
-    normal: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"]
-) -> Float[Tensor, ""]:
-    """Mean of 1 - cos of the angle between two normal maps in the same frame, in [0, 2].
-
-    The angle is signed: a normal opposite to the target costs 2. Evaluation uses unsigned angles.
-
-    Args:
-        normal: rendered normals of any length, as composited.
-        target: the cue's normals.
-        mask: true where the target is valid.
-    """
-    return NormalLoss(target, mask)(normal)
 
 
 def _cosines(normal: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:

@@ -1,35 +1,45 @@
-"""Geometric loss terms, weighted for the iteration. Terms of weight 0 are not computed."""
+"""The training loss: which terms, over which pixels, with which weights, when. Terms of weight 0 are not computed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, Optional
+from typing import Annotated, Literal, NamedTuple, Optional
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from shellgs_method.bounds import Bounds, Count, Weight
+from shellgs_method.evaluation.pixels import kept_pixels, photometric_pixels, reference_maps
 from shellgs_method.geometry.reference import Reference
 from shellgs_method.losses import (
     PAPER_ITERATIONS,
+    EmptySpaceLoss,
     ExponentialDecay,
     NccLoss,
     NormalLoss,
-    PointToPlaneLoss,
+    PhotometricLoss,
     SmoothnessLoss,
+    flattening_loss,
     normal_consistency_loss,
-    normal_loss,
     vid2sim_ncc_loss,
 )
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.render.maps import Geometry
 
+Cues = Literal["none", "mono", "shell"]
+Trust = Literal["shell", "photographs"]
+
+MAX_KEPT_PIXELS = 3_000_000
+"""Most pixels of training views whose losses are cached, at some 80 bytes each."""
 SOLID = 0.5
 """Opacity that the shell must have where what is behind it may be seen through it."""
 TOLERANCES = (0.05, 0.15)
 """Smallest and largest tolerance in metres: with less, images of Herz-Jesu lost more than its surface gained."""
+DISTORTION_FROM = 3000
+"""First iteration of the distortion, as in 2DGS."""
 
 
 @dataclass
@@ -44,44 +54,29 @@ class GeometryLossConfig:
     """Weight γ(t) of normal smoothness."""
     ncc: Literal["local", "vid2sim"] = "local"
     """local: the paper's equation; vid2sim: as in the baseline's released code."""
-    ncc_window: int = 9
+    ncc_window: Annotated[int, Bounds(3, 101, int, odd=True)] = 9
     """Patch side of the local NCC in pixels."""
-    ncc_eps: float = 1e-3
-    """Contrast of a patch, relative to its depth, below which the local NCC treats it as flat."""
 
 
 @dataclass(frozen=True)
 class ExtraLossConfig:
     """Terms beyond the paper's objective, each off at 0. Lengths are in scene units if metres are unknown."""
 
-    normal_consistency: float = 0.0
-    """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05)."""
-    normal_consistency_from: int = 7000
+    normal_consistency: Weight = 0.0
+    """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05).
+    Only of pixels without a cue, so that walls continue beyond the shell, but not what photographs show before it."""
+    normal_consistency_from: Count = 7000
     """First iteration of that term."""
-    normal_consistency_on: Literal["everywhere", "without_cue"] = "everywhere"
-    """Pixels of that term: all, or those without a cue, so that walls continue beyond the shell, but not what
-    photographs show in front of it."""
-    distortion: float = 0.0
+    distortion: Weight = 0.0
     """Weight of the depth distortion of 2DGS; discs only."""
-    distortion_from: int = 3000
-    """First iteration of that term."""
-    depth_normal: float = 0.0
+    depth_normal: Weight = 0.0
     """Weight of the normal loss on normals of the rendered depth, which moves Gaussians; N only rotates them."""
-    point_to_plane: float = 0.0
-    """Weight of the logarithm of the distance from the cue's tangent plane, in metres."""
-    empty_space: float = 0.0
-    """Weight of the same loss on all splats of a pixel instead of their mean depth, which may be right with splats in
-    front of and behind the shell."""
-    empty_space_from: int = 0
-    """First iteration of that term."""
-    tolerance: Optional[float] = None
-    """Distance from the plane without cost, in metres. If not set: the shell's error by the metrics of its alignment,
-    clamped to 5 to 15 cm; 5 cm if it was not validated."""
-    occlusion_gate: float = 0.0
-    """Distance in metres in front of the cue beyond which a pixel's rendered depth counts as an occluder's."""
-    occlusion_gate_from: int = 3000
-    """First iteration of all cue terms if there is a gate; by then the photographs have shaped the occluders."""
-    flattening: float = 0.0
+    empty_space: Weight = 0.0
+    """Weight of E, the logarithm of the distance in metres of all splats of a pixel from the cue."""
+    tolerance: Optional[Weight] = None
+    """Distance without cost in E, in metres. If not set: the shell's error by the metrics of its alignment, clamped to
+    5 to 15 cm; 5 cm if it was not validated."""
+    flattening: Weight = 0.0
     """Weight of the mean smallest scale of visible Gaussians, in units of the rescaled world (Vid2Sim: 100)."""
 
     def tolerance_for(self, shell_error: float | None) -> float:
@@ -92,8 +87,83 @@ class ExtraLossConfig:
         return min(max(shell_error or 0.0, low), high)
 
 
+class ViewLosses(NamedTuple):
+    """Losses of one view against its photograph and its cue."""
+
+    photometric: PhotometricLoss
+    cue: CueLosses | None
+    with_cue: Bool[Tensor, "H W 1"] | None
+    """Pixels with a cue, believed or not; None in a view without a map."""
+
+
+class Objective:
+    """The loss of a run, for batches of its views.
+
+    Args:
+        cues: maps that supervise the geometry.
+        trust: what counts where photographs contradict the shell.
+        paper: terms against the cues.
+        extra: terms beyond the paper.
+        metres_per_unit: metres per unit of the world; None if unknown.
+        shell_error: error of the shell's alignment in metres; None if unknown.
+    """
+
+    def __init__(
+        self,
+        cues: Cues,
+        trust: Trust,
+        paper: GeometryLossConfig,
+        extra: ExtraLossConfig,
+        metres_per_unit: float | None,
+        shell_error: float | None = None,
+    ):
+        self.cues, self.trust, self.paper, self.extra = cues, trust, paper, extra
+        self.metres_per_unit, self.shell_error = metres_per_unit, shell_error
+        self._views: dict[int, ViewLosses] = {}
+
+    @property
+    def needs_geometry(self) -> bool:
+        """Whether a term is of depth or normals."""
+        return self.cues != "none" or self.extra.normal_consistency > 0 or self.extra.distortion > 0
+
+    def view(self, batch: dict, photograph: Callable[[], Float[Tensor, "H W 3"]], keep: bool) -> ViewLosses:
+        """Losses of a batch's view; with ``keep``, cached by its index while there is room."""
+        index = batch["image_idx"]
+        if keep and index in self._views:
+            return self._views[index]
+        target = photograph()
+        kept, cue, with_cue = photometric_pixels(batch, target, self.trust == "photographs"), None, None
+        if f"{self.cues}_depth" in batch:
+            with_cue = batch[f"{self.cues}_mask"].to(target.device)
+            maps = reference_maps(batch, self.cues, target.device, everywhere=self.trust == "shell")
+            cue = CueLosses(maps, self.paper, self.extra, self.metres_per_unit, self.shell_error)
+        view = ViewLosses(PhotometricLoss(target, kept), cue, with_cue)
+        if keep and len(self._views) < MAX_KEPT_PIXELS // target[..., 0].numel():
+            self._views[index] = view
+        return view
+
+    def __call__(
+        self, view: ViewLosses, batch: dict, rgb: Float[Tensor, "H W 3"], geometry: Geometry | None, progress: float
+    ) -> dict[str, Tensor]:
+        """Weighted terms of a rendered view of a batch, at ``progress`` in [0, 1] of the run."""
+        losses = {"photometric": view.photometric(rgb)}
+        if geometry is not None:
+            losses |= self_losses(geometry, self.extra, progress, kept_pixels(batch, rgb), view.with_cue)
+            if view.cue is not None:
+                losses |= view.cue(geometry, progress)
+        return losses
+
+    def of_shapes(self, log_scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> dict[str, Tensor]:
+        """Weighted terms of the Gaussians' shapes in the rescaled world, over those that a view shows."""
+        weight = self.extra.flattening
+        return {"flattening": weight * flattening_loss(log_scales.exp(), visible)} if weight > 0 else {}
+
+
 class CueLosses:
-    """:func:`cue_losses` for many renders of one view; what depends on its maps alone is computed once."""
+    """Weighted terms that compare renders of one view with a cue's maps; what depends on these alone is computed once.
+
+    If metres are unknown, lengths are in units of nerfstudio's rescaled world.
+    """
 
     def __init__(
         self,
@@ -104,39 +174,23 @@ class CueLosses:
         shell_error: float | None = None,
     ):
         self.cue, self.paper, self.extra, self.metres = cue, paper, extra, metres_per_unit or 1.0
-        self.shell_error = shell_error
-        self._from_plane: PointToPlaneLoss | None = None
+        self.tolerance = extra.tolerance_for(shell_error)
+        self._splats: EmptySpaceLoss | None = None
 
     def __call__(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
         """Weighted terms of one render, at ``progress`` in [0, 1] of the run."""
         paper, extra = self.paper, self.extra
-        if extra.occlusion_gate > 0:
-            return self._gated(geometry, progress)
         terms = {
             "depth": (paper.depth(progress), lambda: self._ncc(1 / geometry.depth.clamp_min(1e-6))),
             "normal": (paper.normal(progress), lambda: self._normal(geometry.normal)),
             "smoothness": (paper.smoothness(progress), lambda: self._smoothness(geometry.normal)),
             "depth_normal": (
                 extra.depth_normal,
-                lambda: normal_loss(geometry.depth_normal, self.cue.normal, self.cue.mask & _known(geometry)),
+                lambda: NormalLoss(self.cue.normal, self.cue.mask & _known(geometry))(geometry.depth_normal),
             ),
-            "point_to_plane": (extra.point_to_plane, lambda: self._point_to_plane(geometry)(geometry.depth)),
-            "empty_space": (
-                extra.empty_space if progress >= extra.empty_space_from / PAPER_ITERATIONS else 0.0,
-                lambda: self._point_to_plane(geometry).of_all(self._squares(geometry), _opacity(geometry)),
-            ),
+            "empty_space": (extra.empty_space, lambda: self._empty_space(geometry)),
         }
         return {name: weight * term() for name, (weight, term) in terms.items() if weight > 0}
-
-    def _gated(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
-        """Weighted terms over the pixels without an occluder in front of the cue."""
-        gate = self.extra.occlusion_gate
-        if progress < self.extra.occlusion_gate_from / PAPER_ITERATIONS:
-            return {}
-        near = self.metres * (self.cue.depth - geometry.depth.detach()) < gate
-        without_gate = replace(self.extra, occlusion_gate=0.0)
-        unoccluded = self.cue._replace(mask=self.cue.mask & near)
-        return CueLosses(unoccluded, self.paper, without_gate, self.metres, self.shell_error)(geometry, progress)
 
     @cached_property
     def _ncc(self) -> Callable[[Tensor], Tensor]:
@@ -144,7 +198,7 @@ class CueLosses:
         inverse_depth = torch.where(mask, 1 / self.cue.depth, 0.0)
         if self.paper.ncc == "vid2sim":
             return lambda x: vid2sim_ncc_loss(x, inverse_depth, mask)
-        return NccLoss(inverse_depth, mask, self.paper.ncc_window, eps=self.paper.ncc_eps)
+        return NccLoss(inverse_depth, mask, self.paper.ncc_window)
 
     @cached_property
     def _normal(self) -> NormalLoss:
@@ -154,31 +208,12 @@ class CueLosses:
     def _smoothness(self) -> SmoothnessLoss:
         return SmoothnessLoss(self.cue.depth, self.cue.mask)
 
-    def _squares(self, geometry: Geometry) -> Tensor:
-        assert geometry.moments is not None
-        return geometry.moments.about(self.cue.depth, geometry.solid)
-
-    def _point_to_plane(self, geometry: Geometry) -> PointToPlaneLoss:
-        if self._from_plane is None:
+    def _empty_space(self, geometry: Geometry) -> Tensor:
+        if self._splats is None:
             depth, normal, mask = self.cue
-            rays, tolerance = geometry.camera.rays(), self.extra.tolerance_for(self.shell_error)
-            self._from_plane = PointToPlaneLoss(depth, normal, rays, mask, self.metres, tolerance)
-        return self._from_plane
-
-
-def cue_losses(
-    geometry: Geometry,
-    cue: Reference,
-    paper: GeometryLossConfig,
-    extra: ExtraLossConfig,
-    progress: float,
-    metres_per_unit: float | None,
-) -> dict[str, Tensor]:
-    """Weighted terms that compare rendered geometry with a cue's maps, at ``progress`` in [0, 1] of the run.
-
-    If metres are unknown, ``extra``'s lengths are in units of nerfstudio's rescaled world.
-    """
-    return CueLosses(cue, paper, extra, metres_per_unit)(geometry, progress)
+            self._splats = EmptySpaceLoss(depth, normal, geometry.camera.rays(), mask, self.metres, self.tolerance)
+        assert geometry.moments is not None
+        return self._splats(geometry.moments.about(self.cue.depth, geometry.solid), _opacity(geometry))
 
 
 def self_losses(
@@ -190,21 +225,19 @@ def self_losses(
 ) -> dict[str, Tensor]:
     """Weighted terms of 2DGS on the rendered geometry, without a cue, at ``progress`` in [0, 1] of the run.
 
-    They are means over the pixels kept by the user's mask; normal consistency may be 0 in those ``with_cue``.
+    They are means over the pixels kept by the user's mask; normal consistency is 0 in those ``with_cue``.
     """
     iteration = progress * PAPER_ITERATIONS
     losses = {}
     if extra.normal_consistency > 0 and iteration >= extra.normal_consistency_from:
-        where = kept
-        if extra.normal_consistency_on == "without_cue" and with_cue is not None:
-            where = kept & ~with_cue
+        where = kept if with_cue is None else kept & ~with_cue
         share = where.sum() / kept.sum().clamp_min(1)  # a pixel weighs the same however few count
         losses["normal_consistency"] = (
             extra.normal_consistency
             * share
             * normal_consistency_loss(geometry.normal, geometry.depth_normal, geometry.alpha, where)
         )
-    if extra.distortion > 0 and iteration >= extra.distortion_from:
+    if extra.distortion > 0 and iteration >= DISTORTION_FROM:
         assert geometry.distortion is not None
         losses["distortion"] = extra.distortion * weighted_mean(geometry.distortion, kept)
     return losses

@@ -12,7 +12,16 @@ from shellgs_method.losses.ssim import SsimTarget, ssim
 
 
 class PhotometricLoss:
-    """:func:`photometric_loss` for many renders of one view."""
+    """(1 - w) L1 + w (1 - SSIM), averaged over the masked pixels (Kerbl et al. 2023, eq. 7).
+
+    SSIM's windows extend beyond the mask; there the render is replaced by the photograph, so that pixels outside the
+    mask get no gradient.
+
+    Args:
+        target: photograph, in [0, 1].
+        mask: true where a pixel counts; all pixels by default.
+        ssim_weight: weight w of the structural term.
+    """
 
     def __init__(
         self, target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"] | None = None, ssim_weight: float = 0.2
@@ -26,29 +35,9 @@ class PhotometricLoss:
         return made
 
     def __call__(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Loss of one render."""
+        """Loss of one render, of colours in [0, 1]."""
         if self.mask is not None:
             rgb = rgb.where(self.mask, self.target)
         l1, dissimilarity = (rgb - self.target).abs(), 1 - ssim(rgb, self._ssim_target)
         errors = (1 - self.ssim_weight) * l1 + self.ssim_weight * dissimilarity
         return errors.mean() if self.mask is None else weighted_mean(errors, self.mask)
-
-
-def photometric_loss(
-    rgb: Float[Tensor, "H W 3"],
-    target: Float[Tensor, "H W 3"],
-    mask: Bool[Tensor, "H W 1"] | None = None,
-    ssim_weight: float = 0.2,
-) -> Float[Tensor, ""]:
-    """(1 - w) L1 + w (1 - SSIM), averaged over the masked pixels (Kerbl et al. 2023, eq. 7).
-
-    SSIM's windows extend beyond the mask; there the render is replaced by the photograph, so that pixels outside the
-    mask get no gradient.
-
-    Args:
-        rgb: rendered colours in [0, 1].
-        target: photograph, in [0, 1].
-        mask: true where a pixel counts; all pixels by default.
-        ssim_weight: weight w of the structural term.
-    """
-    return PhotometricLoss(target, mask, ssim_weight)(rgb)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from shellgs_method.bounds import Weight
+
 PAPER_ITERATIONS = 30_000
 """Run length that the iteration numbers of configs refer to; for other lengths they are scaled in proportion."""
 
@@ -17,9 +19,9 @@ class ExponentialDecay:
     stays 0; a positive weight cannot decay to 0.
     """
 
-    initial: float
+    initial: Weight
     """Weight at the first iteration."""
-    final: float
+    final: Weight
     """Weight at the last iteration."""
 
     def __post_init__(self) -> None:

@@ -13,7 +13,15 @@ from shellgs_method.machine.compilation import run_fused
 
 
 class SmoothnessLoss:
-    """:func:`smoothness_loss` for many renders of one view."""
+    """Edge-aware smoothness of the rendered normals, Σ w a / Σ w (Vid2Sim's geometry consistency).
+
+    ``a`` is the mean of 1 - cos between a pixel's normal and those to its left and above; ``w`` falls from 1 at the
+    smoothest pixel in the mask to 0 at the steepest.
+
+    Args:
+        target_depth: the cue's z-depth.
+        mask: true where the target is valid.
+    """
 
     def __init__(self, target_depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]):
         smoothness = _smoothness(target_depth, mask)
@@ -21,24 +29,8 @@ class SmoothnessLoss:
         self._weights = (smoothness / total.where(total > 0, 1.0))[1:, 1:]
 
     def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Loss of one render."""
+        """Loss of one render, given its normals of any length, as composited."""
         return run_fused(_roughness, normal, self._weights, varying=2)
-
-
-def smoothness_loss(
-    normal: Float[Tensor, "H W 3"], target_depth: Float[Tensor, "H W 1"], mask: Bool[Tensor, "H W 1"]
-) -> Float[Tensor, ""]:
-    """Edge-aware smoothness of the rendered normals, Σ w a / Σ w (Vid2Sim's geometry consistency).
-
-    ``a`` is the mean of 1 - cos between a pixel's normal and those to its left and above; ``w`` falls from 1 at the
-    smoothest pixel in the mask to 0 at the steepest.
-
-    Args:
-        normal: rendered normals of any length, as composited.
-        target_depth: the cue's z-depth.
-        mask: true where the target is valid.
-    """
-    return SmoothnessLoss(target_depth, mask)(normal)
 
 
 def _roughness(normal: Float[Tensor, "H W 3"], weights: Float[Tensor, "H-1 W-1 1"]) -> Float[Tensor, ""]:

@@ -9,7 +9,7 @@ def _off(*terms: str) -> tuple[str, ...]:
 
 _FLATTENED = ("--pipeline.model.extra.flattening", "100")
 _DISCS = ("--pipeline.model.primitive", "2d", "--pipeline.model.cull-alpha-thresh", "0.05")
-_METRIC = ("--pipeline.model.extra.point-to-plane", "1")
+_EMPTY_SPACE = ("--pipeline.model.extra.empty-space", "1")
 
 ABLATIONS: dict[str, tuple[str, ...]] = {
     # The paper's ablations: terms left out (its ablation table), and extras of the baseline.
@@ -24,10 +24,8 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "shellgs-2d": ("shellgs", *_DISCS),
     "shellgs-plane": ("shellgs", "--pipeline.model.depth", "plane"),
     "shellgs-normals-of-depth": ("shellgs", "--pipeline.model.extra.depth-normal", "0.1"),
-    "shellgs-point-to-plane": ("shellgs", *_METRIC),
-    "shellgs-2d-point-to-plane": ("shellgs", *_DISCS, *_METRIC),
-    "shellgs-occlusion-gate": ("shellgs", "--pipeline.model.extra.occlusion-gate", "0.5"),
-    "shellgs-mcmc": ("shellgs", "--pipeline.model.densification", "mcmc"),
+    "shellgs-empty-space": ("shellgs", *_EMPTY_SPACE),
+    "shellgs-2d-empty-space": ("shellgs", *_DISCS, *_EMPTY_SPACE),
     # Supervised in half of the facade's bands, evaluated in the other half.
     "shellgs-without-a": ("shellgs", "--pipeline.datamanager.holdout", "A"),
     "shellgs-without-b": ("shellgs", "--pipeline.datamanager.holdout", "B"),

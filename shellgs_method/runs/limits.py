@@ -3,96 +3,50 @@
 from __future__ import annotations
 
 import errno
-import math
 import socket
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any, NamedTuple
 
 import torch
-from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from dataparsers.facade import FacadeDataParserConfig
+from shellgs_method.bounds import COUNT, FROM_ONE, LENGTH, RATE, TINY, WEIGHT, Bounds, bounds_of
 from shellgs_method.errors import SceneError
 
+PORT, SEED = Bounds(1, 65535, int), Bounds(0, 2**32 - 1, int)
 
-class Limits(NamedTuple):
-    """Range of a setting."""
-
-    least: float
-    most: float = math.inf
-    kind: type = float
-    odd: bool = False
-
-    def __str__(self) -> str:
-        what = {int: "an odd whole number" if self.odd else "a whole number", float: "a number"}[self.kind]
-        least = "above 0" if self.least == TINY else f"from {self.least:g}"
-        return f"{what} {least}" + (f" to {self.most:g}" if self.most < math.inf else "")
-
-    def hold(self, value: Any) -> bool:
-        """Whether a value is in the range."""
-        if not isinstance(value, int if self.kind is int else (int, float)) or isinstance(value, bool):
-            return False
-        return self.least <= value <= self.most and math.isfinite(value) and not (self.odd and value % 2 == 0)
-
-
-TINY = 1e-30
-MIN_POINTS = 4
-"""Fewest points to start from: a point and its three neighbours, whose distance is its scale."""
-COUNT, FROM_ONE = Limits(0, 1e9, int), Limits(1, 1e9, int)
-WEIGHT, SHARE, LENGTH, RATE = Limits(0, 1e6), Limits(0, 1), Limits(TINY, 1e6), Limits(TINY, 1e3)
-PORT = Limits(1, 65535, int)
-
-LIMITS = {
-    "max_num_iterations": FROM_ONE,
-    "steps_per_log": FROM_ONE,
-    "steps_per_save": COUNT,
-    "steps_per_eval_batch": COUNT,
-    "steps_per_eval_image": COUNT,
-    "steps_per_eval_all_images": COUNT,
-    "max_buffer_size": FROM_ONE,
-    "max_log_size": COUNT,
-    "seed": Limits(0, 2**32 - 1, int),
-    "train_cameras_sampling_seed": Limits(0, 2**32 - 1, int),
-    "fps_reset_every": FROM_ONE,
-    "websocket_port": PORT,
-    "websocket_port_default": PORT,
-    "max_num_display_images": Limits(-1, 1e9, int),
-    "jpeg_quality": Limits(1, 100, int),
-    "camera_frustum_scale": LENGTH,
-    "lr": RATE,
-    "lr_final": RATE,
-    "eps": RATE,
-    "weight_decay": WEIGHT,
-    "band_width": LENGTH,
-    "camera_res_scale_factor": Limits(TINY, 1),
-    "warmup_length": COUNT,
-    "stop_split_at": COUNT,
-    "stop_screen_size_at": COUNT,
-    "refine_every": FROM_ONE,
-    "reset_alpha_every": FROM_ONE,
-    "densify_grad_thresh": WEIGHT,
-    "densify_size_thresh": WEIGHT,
-    "wide_gradient": WEIGHT,
-    "split_screen_size": WEIGHT,
-    "cull_scale_thresh": WEIGHT,
-    "cull_screen_size": WEIGHT,
-    "cull_alpha_thresh": SHARE,
-    "ssim_lambda": SHARE,
-    "sh_degree": Limits(0, 3, int),
-    "sh_degree_interval": FROM_ONE,
-    "seed_spacing": LENGTH,
-    "max_seeds": FROM_ONE,
-    "skybox_seeds": Limits(0, 1e6, int),
-    "init_opacity": Limits(0.01, 0.99),
-    "cap_max": Limits(MIN_POINTS, 1e9, int),
-    "noise": Limits(0, 1e12),
-    "ncc_window": Limits(3, 101, int, odd=True),
-    "ncc_eps": Limits(TINY, 1),
+OF_NERFSTUDIO: dict[type, dict[str, Bounds]] = {
+    TrainerConfig: {
+        "max_num_iterations": FROM_ONE,
+        "steps_per_save": COUNT,
+        "steps_per_eval_batch": COUNT,
+        "steps_per_eval_image": COUNT,
+        "steps_per_eval_all_images": COUNT,
+    },
+    LoggingConfig: {"steps_per_log": FROM_ONE, "max_buffer_size": FROM_ONE},
+    LocalWriterConfig: {"max_log_size": COUNT},
+    MachineConfig: {"seed": SEED},
+    ViewerConfig: {
+        "websocket_port": PORT,
+        "websocket_port_default": PORT,
+        "max_num_display_images": Bounds(-1, 1e9, int),
+        "jpeg_quality": Bounds(1, 100, int),
+        "camera_frustum_scale": LENGTH,
+    },
+    OptimizerConfig: {"lr": RATE, "eps": RATE},
+    AdamOptimizerConfig: {"weight_decay": WEIGHT},
+    FullImageDatamanagerConfig: {
+        "train_cameras_sampling_seed": SEED,
+        "fps_reset_every": FROM_ONE,
+        "camera_res_scale_factor": Bounds(TINY, 1),
+    },
 }
-"""Ranges by the name of a setting; other numbers of the losses are weights and lengths from 0, ``…_from`` are steps."""
-_LOSSES = ("pipeline.model.geometry.", "pipeline.model.extra.", "pipeline.model.mcmc.")
+"""Bounds of settings that nerfstudio's own classes declare; those of ours are written at their fields."""
 
 _ONE_DEVICE = "a run is trained on one device, and `shellgs compare --jobs` trains several runs at a time"
 _VIEWS = "in training, held-out views are drawn one at a time, and `ns-eval` measures all of them"
@@ -126,6 +80,7 @@ class Setting(NamedTuple):
     path: str
     value: Any
     field: Field
+    bounds: Bounds | None = None
 
     @property
     def is_changed(self) -> bool:
@@ -149,9 +104,10 @@ def settings(config: Any, path: str = "") -> Iterator[Setting]:
         for key, value in config.items():
             yield from settings(value, f"{path}{key}.")
     elif is_dataclass(config) and not isinstance(config, type):
+        bounds = _bounds(type(config))
         for field in fields(config):
             value = getattr(config, field.name)
-            yield Setting(path + field.name, value, field)
+            yield Setting(path + field.name, value, field, bounds.get(field.name))
             yield from settings(value, f"{path}{field.name}.")
 
 
@@ -161,16 +117,15 @@ def check_settings(config: Any) -> None:
     Raises:
         SceneError: names the first such setting and its range.
     """
-    for path, value, _ in settings(config):
-        limits = _limits(path)
-        if limits and isinstance(value, (int, float)) and not limits.hold(value):
-            raise SceneError(f"{path} cannot be {value}: give {limits}")
+    for path, value, _, bounds in settings(config):
+        if bounds and isinstance(value, (int, float)) and not bounds.hold(value):
+            raise SceneError(f"{path} cannot be {value}: give {bounds}")
 
 
-def _limits(path: str) -> Limits | None:
-    name = path.rpartition(".")[2]
-    others = (COUNT if name.endswith("_from") else WEIGHT) if path.startswith(_LOSSES) else None
-    return LIMITS.get(name, others)
+def _bounds(config: type) -> dict[str, Bounds]:
+    """Bounds of a class of settings, by the names of its fields."""
+    ours = bounds_of(config) if config.__module__.startswith(("shellgs_method.", "dataparsers.")) else {}
+    return ours | {name: each for base in config.__mro__ for name, each in OF_NERFSTUDIO.get(base, {}).items()}
 
 
 def check_training(config: TrainerConfig) -> None:

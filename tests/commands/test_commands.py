@@ -140,7 +140,7 @@ def test_a_missing_shell_ends_ns_train_with_one_sentence(demo, in_process, tmp_p
         (scene / name).symlink_to(demo / "scene" / name)
     monkeypatch.chdir(tmp_path)
     output = in_process("ns-train", "shellgs", "--data", scene, "--vis", "tensorboard")
-    assert output.startswith("refused: shellgs: shellgs needs the shell maps")
+    assert output.startswith("refused: shellgs: this method needs the shell maps")
 
 
 def test_shellgs_cast_takes_a_shell_and_its_matrix(demo, shellgs, tmp_path):

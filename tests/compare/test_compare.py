@@ -600,7 +600,7 @@ def test_a_setting_that_an_earlier_version_lacked_counts_as_its_default(pristine
     finish_all([run])
     path = run.folder / "settings.json"
     before = json.loads(path.read_text())
-    del before["pipeline.model.seeds"]
+    del before["pipeline.model.init"]
     path.write_text(json.dumps(before))
     assert not finish_all(fake_grid([pristine_scene], ["shellgs"], tmp_path / "out"))
     del before["pipeline.model.densify_grad_thresh"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +12,12 @@ from scipy.spatial import KDTree
 from training_runs import data_of, model_of, trainer_of
 
 from shellgs_method.errors import SceneError
-from shellgs_method.gaussians.seeds import SeededView, shell_seeds, view_of_shell
+from shellgs_method.gaussians.initial import MAX_SEEDS, OPACITY, SEED_SPACING, SKYBOX_SEEDS, sfm_points
+from shellgs_method.gaussians.seeds import SeededView, Seeds, shell_seeds, view_of_surface
+from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import WEIGHT_BEHIND, SurfaceWeights
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.reference import Reference
-from shellgs_method.model import FacadeModel
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 from shellgs_method.render.rasterizer import quats_to_rotations
 
@@ -97,15 +97,17 @@ def test_seeds_are_spread_more_widely_if_there_are_too_many():
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(pristine_scene, tmp_path, primitive):
+def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_shell_and_skybox(pristine_scene, tmp_path, primitive):
     def choose(config):
-        config.pipeline.model.primitive, config.pipeline.model.skybox_seeds = primitive, 0
+        config.pipeline.model.primitive = primitive
 
     trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
-    model, sfm = model_of(trainer), model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
-    spacing, most = model.config.seed_spacing, model.config.max_seeds
-    n, seeds = sfm.num_points, shell_seeds(*data_of(trainer).seed_views(view_of_shell, "shell"), spacing, most)
-    assert len(seeds.points) > 50
+    model, data = model_of(trainer), data_of(trainer)
+    sfm = model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
+    n, on_shell = sfm.num_points, shell_seeds(*data.seed_views(view_of_surface, "shell"), SEED_SPACING, MAX_SEEDS)
+    in_sky = skybox_seeds(*data.seed_views(view_of_sky), data.sfm_points.double().numpy(), SKYBOX_SEEDS)
+    seeds = Seeds(*map(np.concatenate, zip(on_shell, in_sky, strict=True)))
+    assert len(on_shell.points) > 50
     torch.testing.assert_close(model.means[:n], sfm.means)
     torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
     thin = quats_to_rotations(model.quats[n:])[..., 2]
@@ -115,13 +117,13 @@ def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_the_shell(pristi
     assert (scales[:, 2] < 0.11 * scales[:, :2].amin(dim=-1)).all()
     assert primitive == "3d" or (model.scales[:, 2] == DISC_LOG_THICKNESS).all()
     torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+    torch.testing.assert_close(model.opacities.sigmoid(), torch.full((model.num_points, 1), OPACITY["shell"]))
 
 
 @pytest.mark.parametrize(("count", "found"), [(3, "has 3 SfM points"), (0, "has no SfM points")])
 def test_too_few_sfm_points_are_counted(count, found):
-    model = SimpleNamespace(seed_points=(torch.zeros(count, 3), torch.zeros(count, 3)))
     with pytest.raises(SceneError, match=f"{found} to start from, of at least 4"):
-        FacadeModel._seed_points(model)  # pyright: ignore[reportArgumentType]
+        sfm_points((torch.zeros(count, 3), torch.zeros(count, 3)))
 
 
 def test_without_shell_maps_in_any_training_view_there_are_no_seeds():

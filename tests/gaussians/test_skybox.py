@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from nerfstudio.models.splatfacto import SH2RGB
 from scipy.spatial import KDTree
 from training_runs import data_of, model_of, trainer_of
 
@@ -61,26 +60,17 @@ def test_masked_pixels_do_not_colour_a_skybox():
     np.testing.assert_allclose(skybox_of([sky_view(mask)]).colours, [[1, 0, 0]] * 500)
 
 
-def test_a_run_starts_with_a_skybox_coloured_off_the_shell(pristine_scene, tmp_path):
-    def choose(config):
-        config.pipeline.model.seeds, config.pipeline.model.skybox_seeds = "none", 300
-
-    trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
-    model, data = model_of(trainer), data_of(trainer)
-    n, points = model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs")).num_points, data.sfm_points.numpy()
-    seeds = skybox_seeds(*data.seed_views(view_of_sky), points, 300)
-    assert model.num_points - n == 300
-    torch.testing.assert_close(model.means[n:], torch.from_numpy(seeds.points).float())
-    torch.testing.assert_close(SH2RGB(model.features_dc[n:]), torch.from_numpy(seeds.colours).float())
+def test_a_skybox_is_coloured_by_what_is_off_the_shell(pristine_scene, tmp_path):
+    data = data_of(trainer_of(pristine_scene, tmp_path, "shellgs"))
     for batch in data.cached_train:
         batch["image"] = torch.where(batch["shell_mask"], torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
-    seeds = skybox_seeds(*data.seed_views(view_of_sky), points, 300)
+    seeds = skybox_seeds(*data.seed_views(view_of_sky), data.sfm_points.numpy(), 300)
     np.testing.assert_array_equal(seeds.colours, [[0, 0, 1]] * 300)
 
 
 def test_pruning_by_size_spares_the_skybox(pristine_scene, tmp_path):
     def choose(config):
-        config.pipeline.model.skybox_seeds = 1000
+        config.pipeline.model.init = "shell"
 
     trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=choose)
     model, optimizers = model_of(trainer), trainer.optimizers.optimizers

@@ -383,7 +383,7 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
     model, data = model_of(trainer), data_of(trainer)
     index = [view.name for view in data.train_dataset.views].index(name)
     batch = next(batch for batch in data.cached_train if batch["image_idx"] == index)
-    losses = model._view_losses(batch, torch.zeros(3))
+    losses = model._view(batch, torch.zeros(3))
     kept = losses.photometric.mask
     assert kept is not None
     assert losses.cue is not None
@@ -391,9 +391,9 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
     assert left_out[square].mean() > 0.9
     assert left_out.sum() < 2 * 14 * 14  # with a margin of 2 pixels
     assert losses.cue.cue.mask[..., 0].numpy()[square].mean() > 0.9
-    model.config.ignore_transients = False
-    model._views.clear()
-    assert model._view_losses(batch, torch.zeros(3)).photometric.mask is None
+    model.objective.trust = "shell"
+    model.objective._views.clear()
+    assert model._view(batch, torch.zeros(3)).photometric.mask is None
 
 
 def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):

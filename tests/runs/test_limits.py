@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from dataclasses import is_dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +17,8 @@ from training_runs import data_of, model_of, trainer_of
 
 import method_configs
 from shellgs_method.errors import SceneError
-from shellgs_method.runs.limits import Setting, check_training, settings
+from shellgs_method.runs.limits import OF_NERFSTUDIO, Setting, check_training, settings
+from shellgs_method.trainer import FusedAdamConfig
 
 USED = """
     output_dir experiment_name project_name timestamp vis data relative_model_dir load_scheduler steps_per_save
@@ -33,10 +34,8 @@ USED = """
     pipeline.datamanager.cache_images_type pipeline.datamanager.train_cameras_sampling_strategy
     pipeline.datamanager.train_cameras_sampling_seed pipeline.datamanager.fps_reset_every
     pipeline.model.warmup_length pipeline.model.refine_every pipeline.model.background_color
-    pipeline.model.cull_alpha_thresh pipeline.model.cull_scale_thresh pipeline.model.reset_alpha_every
-    pipeline.model.densify_grad_thresh pipeline.model.densify_size_thresh pipeline.model.sh_degree_interval
-    pipeline.model.cull_screen_size pipeline.model.split_screen_size pipeline.model.stop_screen_size_at
-    pipeline.model.ssim_lambda pipeline.model.stop_split_at pipeline.model.sh_degree
+    pipeline.model.cull_alpha_thresh pipeline.model.cull_scale_thresh pipeline.model.densify_grad_thresh
+    pipeline.model.stop_split_at pipeline.model.sh_degree
     optimizer.lr optimizer.eps optimizer.weight_decay optimizer.max_norm
 """
 """Inherited settings that change what a run does, by the end of their path."""
@@ -103,6 +102,25 @@ def test_an_inherited_setting_is_used_or_a_change_of_it_is_refused(setting):
 def test_the_defaults_of_all_methods_pass():
     for method in ("shellgs", "shellgs_metric", "mono_gs", "photo_gs", "two_dgs"):
         check_training(getattr(method_configs, method).config)
+
+
+@dataclass
+class OfAnotherPlugin:
+    """Settings with names of ours and nerfstudio's."""
+
+    eps: float = 0.0
+    flattening: float = -1.0
+
+
+def test_settings_of_other_classes_have_no_bounds():
+    assert replace(PHOTO_GS, optimizers={"means": {"optimizer": OfAnotherPlugin(), "scheduler": None}})
+    with pytest.raises(SceneError, match=r"optimizers.means.optimizer.eps cannot be 0.0: give a number above 0"):
+        replace(PHOTO_GS, optimizers={"means": {"optimizer": FusedAdamConfig(lr=1.0, eps=0.0), "scheduler": None}})
+
+
+@pytest.mark.parametrize("config", OF_NERFSTUDIO, ids=lambda each: each.__name__)
+def test_bounds_of_nerfstudios_classes_name_their_settings(config):
+    assert OF_NERFSTUDIO[config].keys() <= vars(config)["__annotations__"].keys()
 
 
 def test_a_trained_run_with_an_unused_setting_still_loads():

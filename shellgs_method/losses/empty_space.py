@@ -1,0 +1,64 @@
+"""E: distance in metres between the shell and everything along a ray."""
+
+from __future__ import annotations
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from shellgs_method.losses.normal import unit
+from shellgs_method.losses.reduction import mean_weights
+from shellgs_method.machine.compilation import run_fused
+
+BEHIND = 1.0
+"""Distance behind the shell in metres at which the remaining transmittance is assumed to end."""
+REACH = 0.2
+"""Distance beyond the tolerance in metres at which the loss has half of its largest gradient."""
+
+
+class EmptySpaceLoss:
+    """Mean of log(1 + max(0, e - tolerance) / REACH) REACH, with e the root mean square distance of a pixel's splats.
+
+    The distance is in metres, from the shell's tangent plane at the pixel. Unlike the NCC, the loss depends on scale,
+    offset and the amount of a plane's tilt, and unlike one of the mean depth, it sees haze in front of the shell and
+    what shows through behind it. As the distance is along the shell's normal, a wall at a grazing angle counts no more
+    than a frontal one; the logarithm keeps objects in front of the shell from dominating the gradient. The remaining
+    transmittance counts as if it ended a metre (:data:`BEHIND`) behind the shell.
+
+    Args:
+        target_depth: the cue's z-depth.
+        target_normal: the cue's normals.
+        rays: ray through each pixel, z = 1.
+        mask: true where the target is valid.
+        metres_per_unit: metres per unit of the depths.
+        tolerance: distance in metres without cost, for errors of the shell's alignment.
+    """
+
+    def __init__(
+        self,
+        target_depth: Float[Tensor, "H W 1"],
+        target_normal: Float[Tensor, "H W 3"],
+        rays: Float[Tensor, "H W 3"],
+        mask: Bool[Tensor, "H W 1"],
+        metres_per_unit: float = 1.0,
+        tolerance: float = 0.0,
+    ):
+        slope = (unit(target_normal) * rays).sum(dim=-1, keepdim=True).abs()
+        self._slope = (metres_per_unit * slope).where(mask, 0.0)
+        self._weights = mean_weights(mask, like=target_depth)
+        self._tolerance = target_depth.new_full((1, 1, 1), tolerance)
+
+    def __call__(self, squares: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
+        """Loss of one render, given Σ w (z - target)², not divided by alpha, and alpha = Σ w."""
+        return run_fused(_beyond, squares, alpha, self._slope, self._weights, self._tolerance, varying=2)
+
+
+def _beyond(
+    squares: Float[Tensor, "H W 1"],
+    alpha: Float[Tensor, "H W 1"],
+    slope: Float[Tensor, "H W 1"],
+    weights: Float[Tensor, "H W 1"],
+    tolerance: Float[Tensor, "1 1 1"],
+) -> Float[Tensor, ""]:
+    squares = slope * slope * squares + BEHIND**2 * (1 - alpha).relu()
+    beyond = (squares.clamp_min(1e-8).sqrt() - tolerance).relu()
+    return (weights * (beyond / REACH).log1p() * REACH).sum()
