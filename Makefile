@@ -13,7 +13,7 @@ test: .venv/dev .venv/checked  ## install; format, lint, types, imports, tests
 	$(BIN)/ruff check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/lint-imports --no-cache
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 docs: .venv/docs  ## the pages, in build/docs; broken links are errors
 	$(BIN)/sphinx-build -W --keep-going -q docs build/docs

@@ -22,7 +22,7 @@ from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_view
 from shellgs_method.files.cue_maps import CueMaps, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.occlusion import check_views
-from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 from shellgs_method.synthetic.appearance import Daylight, developed, exposed, rays
 from shellgs_method.synthetic.geometry import Material, Mesh, box, merge
@@ -53,7 +53,7 @@ def main(width: int = 320, views: int = 40, seed: int = 0, passers_by: bool = Fa
         held_out, photographs = held_out_names(parsed), read_views(parsed)
         moving = add_passers_by(facade, photographs, held_out, config.supersampling) if passers_by else {}
         start = time.perf_counter()
-        cast_views(scene, photographs, Alignment.load(scene / ALIGNMENT))
+        cast_views(PlacedShell.load(scene, photographs, Alignment.load(scene / ALIGNMENT)))
         cast = time.perf_counter() - start
         seconds = check_views(scene, photographs, held_out).seconds
         print(f"{views} views of {width} x {config.height}")

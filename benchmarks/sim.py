@@ -18,8 +18,8 @@ import open3d  # noqa: F401  # before CoACD, after which it cannot be imported
 import tyro
 from rich.console import Console
 from rich.table import Table
-from scipy.spatial import KDTree
 
+from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import Collider, leaks, make_collider
@@ -123,7 +123,7 @@ def _deviations(console: Console, chapter: Chapter) -> None:
     claimed = seen & found.flagged & (found.distance > 0)
     lacking = np.nan_to_num(along_normals(small, small.centres, chapter.truth)) > BEFORE
     # A place between two bars of a railing deviates as much as one behind a bar.
-    away, _ = KDTree(small.centres[lacking]).query(small.centres)
+    away, _ = point_tree(small.centres[lacking]).query(small.centres)
     beside = np.asarray(away) < EDGE
     exact, near = (
         small.areas[claimed & true].sum() / max(small.areas[claimed].sum(), 1e-9) for true in (lacking, beside)

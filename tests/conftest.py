@@ -17,7 +17,7 @@ from torch._inductor.exc import InvalidCxxCompiler
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import notice
 from shellgs_method.machine import compilation
-from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 os.environ.setdefault("SHELLGS_COMPILE", "0")  # kernels take longer to compile, or to load, than these tests to run
@@ -35,7 +35,7 @@ def pristine_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = tmp_path_factory.mktemp("facade") / "scene"
     write_scene(scene, FacadeConfig(width=48, height=32, views=10, points=300, supersampling=1))
     views = read_views(FacadeDataParserConfig(data=scene))
-    cast_views(scene, views, Alignment.load(scene / ALIGNMENT))
+    cast_views(PlacedShell.load(scene, views, Alignment.load(scene / ALIGNMENT)))
     return scene
 
 

@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.files.photographs import View
+from shellgs_method.shell import Alignment, PlacedShell, cast_views
+from shellgs_method.shell.cast import CastSummary
 
 
 def parse(scene: Path, split: str = "train", **config) -> DataparserOutputs:
@@ -77,3 +79,10 @@ def house() -> trimesh.Trimesh:
 def scan(n: int = 12_000, noise: float = 0.004, seed: int = 0) -> np.ndarray:
     points = np.asarray(trimesh.sample.sample_surface(house(), n, seed=seed)[0])
     return points + np.random.default_rng(seed).normal(0, noise, points.shape)
+
+
+def cast(scene: Path, views: list[View], alignment: Alignment, max_image_size: int | None = None) -> CastSummary:
+    """Cast a scene's shell by an alignment and record this, as `shellgs cast` does."""
+    shell = PlacedShell.load(scene, views, alignment)
+    alignment.record(scene, views)
+    return cast_views(shell, max_image_size=max_image_size)

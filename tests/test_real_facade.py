@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nerfstudio.data.utils.colmap_parsing_utils import read_points3D_binary
+from scenes import cast
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.cue_maps import CueMaps
-from shellgs_method.shell import Alignment, cast_views
+from shellgs_method.shell import Alignment
 
 DATA = Path(os.environ.get("SHELLGS_DATA", Path(__file__).parents[2] / "shared" / "data"))
 SCENES = {"herz-jesu-p25": "herz_jesu_survey.ply", "south-building-26": "south_building_survey.ply"}
@@ -27,7 +28,7 @@ def test_the_cast_shell_agrees_with_the_sfm_points(tmp_path: Path, name: str):
     shell = f"shell/{SCENES[name]}"
     alignment = Alignment.from_matrix_file(scene / "shell" / "shell_to_scene.txt", shell)
     views = read_views(FacadeDataParserConfig(data=scene))[::8]
-    cast_views(scene, views, alignment, max_image_size=384)
+    cast(scene, views, alignment, max_image_size=384)
     maps = CueMaps.open(scene, "shell")
     cloud = read_points3D_binary(scene / "colmap" / "sparse" / "0" / "points3D.bin")
     points = np.array([point.xyz for point in cloud.values()])

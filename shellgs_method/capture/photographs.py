@@ -7,7 +7,6 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -89,15 +88,6 @@ def add_photograph(source: Path, target: Path) -> None:
         os.link(source.resolve(), target)
     except OSError:  # another file system
         shutil.copyfile(source, target)
-
-
-def has_transparency(photograph: Path) -> bool:
-    """Whether a photograph may have transparent pixels, by its header; a damaged one is refused when it is read."""
-    if photograph.suffix.lower() in (".jpg", ".jpeg"):
-        return False
-    with suppress(Exception), Image.open(photograph) as image:
-        return image.has_transparency_data
-    return False
 
 
 def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) -> None:

@@ -24,7 +24,6 @@ from shellgs_method.capture.photographs import (
     find_masks,
     find_photographs,
     group_by_lens,
-    has_transparency,
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work, listing
@@ -100,6 +99,8 @@ class _Capture:
     """One capture: its inputs, the keys of its stages, and the stages."""
 
     def __init__(self, source: Path, scene: Path, config: CaptureConfig, progress: Progress):
+        from shellgs_method.files.photographs import has_alpha  # imports torch, which is slow
+
         self.source, self.scene, self.config, self.progress = source, scene, config, progress
         self.is_video = source.is_file()
         self.photographs = {source.name: source} if self.is_video else find_photographs(source)
@@ -112,9 +113,7 @@ class _Capture:
         if config.masks:
             self.masks = find_masks(self.photographs, source, config.masks)
         # Photographs with transparent pixels have a mask without a file.
-        self.transparent = (
-            [] if self.is_video else [n for n, path in self.photographs.items() if has_transparency(path)]
-        )
+        self.transparent = [] if self.is_video else [n for n, path in self.photographs.items() if has_alpha(path)]
         self.masked = [name for name in self.photographs if name in self.masks or name in self.transparent]
         # Keys of all that each stage depends on; a stage depends on all earlier ones.
         self.photographs_key = fingerprint(listing(self.photographs), config.frames if self.is_video else None)

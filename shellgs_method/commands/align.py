@@ -65,11 +65,13 @@ def align(
         place_by_picks,
         place_by_positions,
         refined,
-        validate_placement,
     )
     from shellgs_method.registration.frames import ShellPlace
+    from shellgs_method.registration.report import write_report
     from shellgs_method.registration.sfm_frame import check_points
+    from shellgs_method.registration.validation import validate
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
+    from shellgs_method.shell.cast import renew_error
 
     starts = [start for start in (matrix, picks, positions) if start]
     if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
@@ -84,29 +86,34 @@ def align(
     views, points = read_views(layout), read_sparse_points(layout)
     check_points(points, views)
     name = relative_path(shell, scene) if shell else ""
+    place = ShellPlace(shell) if shell and (picks or positions) else None
     if accept:
         placement = place_as_proposed(scene / PROPOSAL, scene, views)
     elif shell is None:
         placement = place_as_before(scene / ALIGNMENT, views)
     elif matrix:
         placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
-    elif picks:
-        placement = place_by_picks(picks, views, ShellPlace(shell), name, metres_per_shell_unit)
-    elif positions:
-        placement = place_by_positions(positions, views, ShellPlace(shell), name, metres_per_shell_unit)
+    elif picks and place:
+        placement = place_by_picks(picks, views, place, name, metres_per_shell_unit)
+    elif positions and place:
+        placement = place_by_positions(positions, views, place, name, metres_per_shell_unit)
     else:
         method, unit = mesher or "planes", metres_per_shell_unit
         unaligned = load_shell(shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
         placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
     placement = replace(placement, alignment=placement.alignment.meshed_by(mesher))
-    mesh = placement.alignment.load_shell(scene, views)
+    mesh = placement.alignment.load_shell(scene, views, place.geometry if place else None)
     misplacement = misplaced(placement, mesh, views, points)
     if refine is not None and misplacement:
         raise SceneError(f"the alignment cannot be refined: {misplacement}")
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
-    validation = validate_placement(scene, placement, mesh, views, points, target)
+    validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
+    write_report(scene / REPORT, mesh, validation, placement.history)
+    if validation.verdict != "refused":
+        validation.validated(views).save(target)
+        renew_error(scene)
     _show_alignment(scene, target, placement, validation)
     if validation.verdict == "refused":
         why = f"{misplacement}; " if misplacement else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Optional
 
@@ -48,8 +49,10 @@ def cast(
     """
     from dataparsers.facade import FacadeDataParserConfig, read_views
     from shellgs_method.files.cue_maps import CueMaps, relative_path
-    from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+    from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 
+    if max_image_size is not None and max_image_size < 1:
+        raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
     if (shell is None) != (matrix is None):
         raise SceneError("--shell and --matrix go together: give both or neither")
     if matrix is None and (any(global_shift) or metres_per_shell_unit != 1):
@@ -67,11 +70,15 @@ def cast(
     aligned = alignment.meshed_by(mesher)
     if aligned != alignment and alignment.verdict:
         console.print(f"The alignment was validated with another mesher: run `shellgs align {scene}` again.")
-    summary = cast_views(scene, views, aligned, max_image_size=max_image_size, flags=paths.flags)
-    if summary.meshing:
-        console.print(f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}: {summary.meshing}")
+    start = time.monotonic()
+    placed = PlacedShell.load(scene, views, aligned)
+    if meshing := placed.mesh.meshing:
+        console.print(f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}: {meshing}")
+    aligned.record(scene, views)
+    summary = cast_views(placed, max_image_size=max_image_size, flags=paths.flags)
+    seconds = time.monotonic() - start
     console.print(
-        f"{summary.cast} views cast, {summary.skipped} already there, in {summary.seconds:.1f} s; the shell is visible "
+        f"{summary.cast} views cast, {summary.skipped} already there, in {seconds:.1f} s; the shell is visible "
         f"in {summary.seeing} of {len(views)} views and covers {summary.supported:.0%} of their pixels."
     )
     if check:

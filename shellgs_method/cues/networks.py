@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shellgs_method.errors import SceneError
+from shellgs_method.machine.extras import import_extra
 
 if TYPE_CHECKING:
     import torch
@@ -98,15 +99,13 @@ class DepthAnything:
         from shellgs_method.files.photographs import load_photograph
 
         try:
-            from transformers import AutoImageProcessor, DepthAnythingForDepthEstimation
-        except ImportError as error:
-            raise SceneError(
-                f"Depth Anything needs the package transformers ({error}): pip install 'shellgs[mono]', {ELSEWHERE}"
-            ) from error
+            transformers = import_extra("transformers", "transformers", "mono", "Depth Anything")
+        except SceneError as error:
+            raise SceneError(f"{error}, {ELSEWHERE}") from error
         weights = fetch_weights(self.weights, ["*.json", "*.safetensors"])
         try:
-            processor = AutoImageProcessor.from_pretrained(weights.folder)
-            model = DepthAnythingForDepthEstimation.from_pretrained(weights.folder).eval()
+            processor = transformers.AutoImageProcessor.from_pretrained(weights.folder)
+            model = transformers.DepthAnythingForDepthEstimation.from_pretrained(weights.folder).eval()
         except Exception as error:  # reading any configuration may raise anything
             raise _unusable(self.weights, "Depth Anything", error) from error
         torch.nn.Module.to(model, _device())

@@ -14,7 +14,7 @@ from shellgs_method.files import colmap, transforms
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.geometry.camera import in_view
-from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import Step, cloud_step, warn_of_coarse
 
 
@@ -104,7 +104,7 @@ def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:
 
 def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:
     """Indices of the points that are finite and near the others."""
-    near = sound(positions)
+    near = inliers(positions)
     if not near.all():
         notice(
             f"{(~near).sum()} of {len(positions)} SfM points of {layout.data} are NaN, infinite or absurdly far away, "

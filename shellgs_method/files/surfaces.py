@@ -65,9 +65,6 @@ def read_geometry(path: Path) -> Geometry:
         geometry = read(path)
     except SceneError:
         raise
-    except ModuleNotFoundError as error:
-        extra = "e57" if suffix == ".e57" else "las"
-        raise SceneError(f"the shell {path} needs {error.name}: run `pip install 'shellgs[{extra}]'`") from error
     except Exception as error:  # each format's reader raises errors of its own for a damaged file
         raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason(error)})") from error
     return geometry if len(geometry.faces) else _without_misses(geometry, path)

@@ -1,4 +1,4 @@
-"""Find stray points: NaN, infinite, or absurdly far from all others."""
+"""Find outliers among points: NaN, infinite, or absurdly far from all others."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ FAR = 1e6
 """Times the median distance from the centre: one point that far would cost the others their precision."""
 
 
-def sound(points: Float64[np.ndarray, "N 3"], far: float = FAR) -> Bool[np.ndarray, " N"]:
+def inliers(points: Float64[np.ndarray, "N 3"], far: float = FAR) -> Bool[np.ndarray, " N"]:
     """Mask of the points that are finite and at most ``far`` times as far from the centre as the median point."""
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():

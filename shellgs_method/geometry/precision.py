@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int64
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.geometry.camera import Camera, positions
-from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.outliers import inliers
 
 FINE = 0.05
 """Metres up to which a step does no harm: half of it, the largest error, is less than the scatter of SfM points."""
@@ -22,7 +22,7 @@ _NOTICED = 0.005  # of the spread of the coordinates: 5 cm of a facade
 _FEW = 8
 """Distinct values from which a common divisor is no chance."""
 _SAMPLE = 100_000
-_STRAY = 100.0  # times the median distance from the median point
+_OUTLIER = 100.0  # times the median distance from the median point
 _FAR = 1000.0  # times the extent: where the digits before the point leave few behind it
 _FORMATS = ((2, 24, 2), *((10, digits, 4) for digits in range(4, 10)))
 """Base and digits of floating formats, and how many distinct values must need the last digit: every second binary one
@@ -109,7 +109,7 @@ def warn_of_coarse(step: Step, points: Float64[np.ndarray, "N 3"], what: str) ->
 
 @dataclass(frozen=True)
 class _Values:
-    """A sample of coordinates without strays.
+    """A sample of coordinates without outliers.
 
     Attributes:
         points: the coordinates.
@@ -126,7 +126,7 @@ class _Values:
             points = points[np.random.default_rng(0).integers(len(points), size=_SAMPLE)]
         if len(points) < _FEW:
             return cls(np.zeros((1, 3)), 0.0)
-        points = points[sound(points, _STRAY)]
+        points = points[inliers(points, _OUTLIER)]
         return cls(points, 64 * float(np.spacing(np.abs(points).max())))
 
     def step(self, *, is_damaged: bool = False, is_far: bool | None = None) -> Step:

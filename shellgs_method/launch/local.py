@@ -108,7 +108,7 @@ def follow(
     waiting = list(commands)
     current = waiting[0]
     with (
-        log.open("a", buffering=1) if log else nullcontext() as file,  # line by line: a run can take hours
+        log.open("a", 1, "utf8") if log else nullcontext() as file,  # line by line: a run can take hours
         subprocess.Popen(
             command_in_turn(commands, BIN),
             stdout=subprocess.PIPE,

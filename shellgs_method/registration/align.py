@@ -1,10 +1,9 @@
-"""Find an alignment from picks, camera positions or coarse registration, refine it, and validate it."""
+"""Find an alignment from picks, camera positions or coarse registration, and refine it."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.bound_cameras import BoundCameras
-from shellgs_method.files.cue_maps import CueMaps, source_hash
 from shellgs_method.files.photographs import View
 from shellgs_method.files.surfaces import up_axis
 from shellgs_method.geometry.axes import facade_axes
@@ -26,8 +23,7 @@ from shellgs_method.registration.picks import align_picks, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import propose
 from shellgs_method.registration.refinement import refine
-from shellgs_method.registration.report import write_report
-from shellgs_method.registration.validation import Validation, rounding_of, steps_in_metres, validate
+from shellgs_method.registration.validation import rounding_of, steps_in_metres
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.surface import ShellSurface
@@ -194,28 +190,3 @@ def refined(
         history=[*placement.history, sentence],
         correspondences=measured_again(placement.correspondences, moved),
     )
-
-
-def validate_placement(
-    scene: Path, placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, target: Path
-) -> Validation:
-    """Validate a placement, write the report, and write the alignment with its metrics to ``target`` unless refused.
-
-    Maps cast with the same alignment stay valid: they are bound to its matrix, and get the new error.
-    """
-    validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
-    write_report(scene / REPORT, mesh, validation, placement.history)
-    if validation.verdict == "refused":
-        return validation
-    validated = replace(
-        placement.alignment,
-        verdict=validation.verdict,
-        metrics=validation.metrics(),
-        cameras=BoundCameras.of(views),
-    )
-    validated.save(target)
-    with suppress(FileNotFoundError, SceneError):  # no maps, or damaged ones, which is reported when they are read
-        maps = CueMaps.open(scene, "shell")
-        if maps.manifest.sources.get(target.relative_to(scene).as_posix()) == source_hash(target):
-            maps.with_error(validated.error)
-    return validation

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from shellgs_method.errors import SceneError
 from shellgs_method.files.surfaces import read_geometry
 from shellgs_method.geometry.nearest import point_tree
-from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.triangles import area_vectors, sampled
 from shellgs_method.registration.sfm_frame import first_slip, in_degrees
 
@@ -31,6 +31,7 @@ class ShellPlace:
         path: the shell's file.
 
     Attributes:
+        geometry: what the file holds.
         middle: centre of the shell.
         size: diagonal of its box.
 
@@ -40,13 +41,13 @@ class ShellPlace:
     """
 
     def __init__(self, path: Path) -> None:
-        geometry = read_geometry(path)
+        self.geometry = geometry = read_geometry(path)
         points = geometry.vertices
         if len(geometry.faces) and geometry.faces.max() < len(points):
             areas = np.linalg.norm(area_vectors(points, geometry.faces), axis=1)
             if np.isfinite(areas).all() and areas.any():
                 points = sampled(points, geometry.faces, areas, _SAMPLES)[0]
-        points = points[sound(points)]
+        points = points[inliers(points)]
         if len(points) == 0:
             raise SceneError(f"the shell {path} has no points")
         points = np.random.default_rng(0).permutation(points)[:_SAMPLES]

@@ -1,4 +1,4 @@
-"""The bay test: with repeated windows, a shell may fit as well one bay further along, or one storey higher.
+"""The repetition test: with repeated windows, a shell may fit as well one bay further along, or one storey higher.
 
 Distances between points and surface do not reveal a displacement by exactly one bay; only the ends of the facade and
 interruptions of its rhythm do. So the test shifts the shell along the points and compares the fit at each shift.

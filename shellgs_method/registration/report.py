@@ -135,8 +135,8 @@ def _body(
         yield f"{100 * validation.bias:+.1f} cm along the normal, positive in front of the shell.</p>"
         yield img(plots["distances"], "histogram of the distances")
     if "shifts" in plots:
-        yield "<h2>Bay test</h2><p>Fit of the shell to the points when it is shifted along the facade and upwards. "
-        yield f"Another peak of {RIVALRY:.0%} or more of the one at 0 makes the alignment ambiguous.</p>"
+        yield "<h2>Repetition test</h2><p>Fit of the shell to the points when it is shifted along the facade and "
+        yield f"upwards. Another peak of {RIVALRY:.0%} or more of the one at 0 makes the alignment ambiguous.</p>"
         yield img(plots["shifts"], "fit by shift")
         rows = (
             (scan.name, f"{k:+d} × {scan.period:.2f} m", f"{fit:.2f}")

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import positions, upwards
@@ -124,8 +125,13 @@ class Validation:
     @property
     def reasons(self) -> list[str]:
         """Checks that are not good, the worst first, in words."""
-        faults = sorted((c for c in self.checks if c.verdict != "good"), key=lambda c: -_ORDER.index(c.verdict))
-        return [f"{check.name}: {check.value} ({check.limits}); {check.why}" for check in faults]
+        not_good = sorted((c for c in self.checks if c.verdict != "good"), key=lambda c: -_ORDER.index(c.verdict))
+        return [f"{check.name}: {check.value} ({check.limits}); {check.why}" for check in not_good]
+
+    def validated(self, views: Sequence[View]) -> Alignment:
+        """The alignment with its verdict and metrics, bound to the cameras of the views that it was validated with."""
+        cameras = BoundCameras.of(views)
+        return replace(self.alignment, verdict=self.verdict, metrics=self.metrics(), cameras=cameras)
 
     def share_within(self, metres: float) -> float:
         """Share of the points near the shell that are less than ``metres`` from it."""

@@ -1,7 +1,7 @@
 """The facade shell: loaded, meshed, placed in the scene, and cast into each camera."""
 
 from shellgs_method.shell.alignment import ALIGNMENT, Alignment
-from shellgs_method.shell.cast import cast_views
+from shellgs_method.shell.cast import PlacedShell, cast_views
 from shellgs_method.shell.clouds import Mesher, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell
 from shellgs_method.shell.raycast import ShellCaster
@@ -11,6 +11,7 @@ __all__ = [
     "ALIGNMENT",
     "Alignment",
     "Mesher",
+    "PlacedShell",
     "ShellCaster",
     "ShellMesh",
     "ShellSurface",

@@ -16,6 +16,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, read_json, remove_leftovers
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.photographs import View
+from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
@@ -121,12 +122,13 @@ class Alignment:
             return self
         return replace(self, mesher=mesher, verdict="", metrics={})
 
-    def load_shell(self, scene: Path, views: Sequence[View]) -> ShellMesh:
+    def load_shell(self, scene: Path, views: Sequence[View], geometry: Geometry | None = None) -> ShellMesh:
         """Load the shell's mesh, in its own frame; the mesh of a point cloud is cached in ``scene/shell``.
 
         Args:
             scene: the scene's folder.
             views: photographs of the shell, whose cameras orient the normals of a point cloud.
+            geometry: what the shell's file holds, if it was read already.
 
         Raises:
             FileNotFoundError: the shell is missing.
@@ -136,6 +138,7 @@ class Alignment:
         viewpoints = transformed(cameras, np.linalg.inv(self.shell_to_scene))
         return load_shell(
             scene / self.shell,
+            geometry=geometry,
             cache=scene / "shell",
             viewpoints=viewpoints,
             mesher=self.mesher,
@@ -153,6 +156,13 @@ class Alignment:
         with atomic_write(path) as file:
             lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
             file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
+
+    def record(self, scene: Path, views: Sequence[View]) -> None:
+        """Write a scene's alignment, bound to the cameras of its views; a file that says the same keeps its verdict."""
+        path = scene / ALIGNMENT
+        known = Alignment.load(path) if path.is_file() else None
+        if known is None or not known.places_like(self) or known.cameras.changed(views):
+            replace(self, cameras=BoundCameras.of(views)).save(path)
 
     @classmethod
     def load(cls, path: Path) -> Alignment:

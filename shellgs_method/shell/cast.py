@@ -1,11 +1,11 @@
-"""Cast the shell maps of all views of a scene."""
+"""Cast a shell in its place in a scene into all views."""
 
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,13 +14,13 @@ from jaxtyping import Bool
 from rich.progress import track
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.bound_cameras import BoundCameras
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMap, CueMaps, source_hash
 from shellgs_method.files.photographs import View, load_mask
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.precision import FINE, camera_step, refuse_coarse
 from shellgs_method.shell.alignment import ALIGNMENT, Alignment
 from shellgs_method.shell.clouds import VERSION, Meshing
+from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
 
 log = logging.getLogger(__name__)
@@ -38,80 +38,93 @@ class CastSummary:
         skipped: number of views that already had a map for this camera, shell and alignment.
         seeing: number of views with at least one pixel on the shell.
         supported: share of the pixels of all views that lie on the shell.
-        seconds: wall time.
-        meshing: how a point cloud was meshed; None if the shell is a mesh.
     """
 
     cast: int
     skipped: int
     seeing: int
     supported: float
-    seconds: float
-    meshing: Meshing | None
 
 
-def cast_views(
-    scene: Path,
-    views: Sequence[View],
-    alignment: Alignment,
-    *,
-    max_image_size: int | None = None,
-    flags: str = "",
-) -> CastSummary:
-    """Cast the scene's shell into views and store the maps in ``scene/cues/shell``.
+@dataclass(frozen=True)
+class PlacedShell:
+    """A shell in its place in a scene, where some of the views show it.
 
-    Views with an intact map for the same camera, shell and alignment are skipped, so that an interrupted run resumes
-    where it stopped. ``scene/shell/alignment.json``, which the maps are bound to, is written if it holds another
-    alignment. Nothing is written unless the shell is visible in some view.
-
-    The shell lacks trees, cars and whatever else stands in front of it: :func:`check_views` finds such occluders, and
-    black pixels of ``scene/shell/masks/<image's name>.png``, if that file exists, are removed from the view's mask, as
-    are those of the photograph's own mask.
-
-    Args:
+    Attributes:
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
         alignment: the shell's file, its similarity to the scene, and the mesher of a point cloud.
+        mesh: the shell in its own frame.
+        caster: the shell in the scene's frame.
+    """
+
+    scene: Path
+    views: Sequence[View]
+    alignment: Alignment
+    mesh: ShellMesh
+    caster: ShellCaster
+
+    @classmethod
+    def load(cls, scene: Path, views: Sequence[View], alignment: Alignment) -> PlacedShell:
+        """Load a scene's shell, and refuse what cannot be cast; nothing is written but the mesh of a point cloud.
+
+        Raises:
+            FileNotFoundError: the shell is missing.
+            SceneError: the alignment was found for other cameras, the shell or the masks cannot be used, or no camera
+                sees it.
+        """
+        alignment.check_cameras(scene, views)
+        shell, cameras = scene / alignment.shell, [view.camera for view in views]
+        mesh = alignment.load_shell(scene, views)
+        refuse_coarse(camera_step(cameras).scaled(alignment.metres_per_unit), f"the cameras of {scene}")
+        step = mesh.step.scaled(alignment.metres_per_shell_unit)
+        if step.coarsest > FINE:
+            log.warning(
+                "the coordinates of %s are stored in steps of %s: the maps are up to half of that off",
+                shell,
+                step.in_words(),
+            )
+        caster = ShellCaster(mesh, alignment.shell_to_scene)
+        _check_placement(caster, cameras, shell)
+        if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):
+            raise SceneError(f"the masks of {scene} are black everywhere in every view: white is kept")
+        return cls(scene, views, alignment, mesh, caster)
+
+
+def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: str = "") -> CastSummary:
+    """Cast a shell into its views and store the maps in ``cues/shell`` of its scene.
+
+    The maps are bound to ``shell/alignment.json`` of the scene, which must hold the shell's alignment, as
+    :meth:`Alignment.record` writes it. Views with an intact map for the same camera, shell and alignment are skipped,
+    so that an interrupted run resumes where it stopped.
+
+    The shell lacks trees, cars and whatever else stands in front of it: :func:`check_views` finds such occluders, and
+    black pixels of ``shell/masks/<image's name>.png`` of the scene, if that file exists, are removed from the view's
+    mask, as are those of the photograph's own mask.
+
+    Args:
+        shell: the shell in its place.
         max_image_size: longer side of the photographs to cast for; None for their own size.
         flags: command-line flags that select the same photographs, with a leading blank.
 
     Raises:
-        FileNotFoundError: the shell is missing.
-        SceneError: the alignment was found for other cameras, the shell cannot be used, or no camera sees it.
+        FileNotFoundError: the scene has no alignment.
+        SceneError: its alignment is another one.
     """
-    start = time.monotonic()
-    if max_image_size is not None and max_image_size < 1:
-        raise SceneError(f"the longer side of the maps must be at least 1 pixel, not {max_image_size}")
-    alignment.check_cameras(scene, views)
-    shell = scene / alignment.shell
-    cameras = [view.camera for view in views]
-    mesh = alignment.load_shell(scene, views)
-    refuse_coarse(camera_step(cameras).scaled(alignment.metres_per_unit), f"the cameras of {scene}")
-    step = mesh.step.scaled(alignment.metres_per_shell_unit)
-    if step.coarsest > FINE:
-        log.warning(
-            "the coordinates of %s are stored in steps of %s: the maps are up to half of that off",
-            shell,
-            step.in_words(),
-        )
-    caster = ShellCaster(mesh, alignment.shell_to_scene)
-    _check_placement(caster, cameras, shell)
-    if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):
-        raise SceneError(f"the masks of {scene} are black everywhere in every view: white is kept")
-    saved = scene / ALIGNMENT
-    known = Alignment.load(saved) if saved.is_file() else None
-    if known is None or not known.places_like(alignment) or known.cameras.changed(views):  # else it keeps its verdict
-        replace(alignment, cameras=BoundCameras.of(views)).save(saved)
+    scene, views, meshing = shell.scene, shell.views, shell.mesh.meshing
+    recorded = Alignment.load(scene / ALIGNMENT)
+    if not recorded.places_like(shell.alignment):
+        raise SceneError(f"{scene / ALIGNMENT} has changed since the shell was loaded: run the same command again")
     (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a source of the maps: a mask painted later makes them stale
     maps = CueMaps.create(
         scene,
         "shell",
-        command=_command(max_image_size, mesh.meshing) + flags,
-        sources=[shell, saved, scene / MASKS, *_mask_sources(scene, views)],
-        revisions={"mesher": f"{mesh.meshing.mesher} {VERSION}"} if mesh.meshing else {},
-        metres_per_unit=alignment.metres_per_unit,
+        command=_command(max_image_size, meshing) + flags,
+        sources=[scene / recorded.shell, scene / ALIGNMENT, scene / MASKS, *_mask_sources(scene, views)],
+        revisions={"mesher": f"{meshing.mesher} {VERSION}"} if meshing else {},
+        metres_per_unit=recorded.metres_per_unit,
         max_image_size=max_image_size,
-        error=Alignment.load(saved).error,
+        error=recorded.error,
     )
     cast = 0
     with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast: at most two are in memory
@@ -120,7 +133,7 @@ def cast_views(
             view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
             if maps.current(view.name, view.camera):
                 continue
-            cue = _unoccluded(caster.cast(view.camera), view, scene)
+            cue = _unoccluded(shell.caster.cast(view.camera), view, scene)
             if written:
                 written.result()
             written = writer.submit(maps.write, view.name, cue, view.camera)
@@ -133,9 +146,15 @@ def cast_views(
         skipped=len(views) - cast,
         seeing=int(np.count_nonzero(supported)),
         supported=float(np.mean(supported)),
-        seconds=time.monotonic() - start,
-        meshing=mesh.meshing,
     )
+
+
+def renew_error(scene: Path) -> None:
+    """Give maps cast by a scene's alignment the error that it has now; they stay valid, being bound to its matrix."""
+    with suppress(FileNotFoundError, SceneError):  # no maps, or damaged ones, which is reported when they are read
+        maps = CueMaps.open(scene, "shell")
+        if maps.manifest.sources.get(ALIGNMENT.as_posix()) == source_hash(scene / ALIGNMENT):
+            maps.with_error(Alignment.load(scene / ALIGNMENT).error)
 
 
 def _command(max_image_size: int | None, meshing: Meshing | None) -> str:

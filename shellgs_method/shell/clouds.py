@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.nearest import point_tree
-from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.planes import largest_plane
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.machine.open3d import import_open3d, reason
@@ -95,7 +95,7 @@ def mesh_cloud(
     Raises:
         SceneError: the points make no surface.
     """
-    usable = sound(points)
+    usable = inliers(points)
     if not usable.any():
         raise SceneError("the point cloud has no points" if len(points) == 0 else "all points are NaN or infinite")
     if not usable.all():
@@ -147,7 +147,7 @@ class _Cloud:
 
     @classmethod
     def of(cls, points: np.ndarray, viewpoints: np.ndarray) -> _Cloud:
-        low, high = np.percentile(points, [1, 99], axis=0)  # stray points far away must not change the extent
+        low, high = np.percentile(points, [1, 99], axis=0)  # outliers must not change the extent
         extent = np.max(high - low) or np.ptp(points, axis=0).max()
         legacy = _legacy(points)
         points = np.asarray((legacy.voxel_down_sample(extent / CELLS) if extent > 0 else legacy).points)

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float64, Int64
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.surfaces import read_geometry
-from shellgs_method.geometry.outliers import sound
+from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
 from shellgs_method.geometry.triangles import area_vectors
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
@@ -83,6 +84,7 @@ def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, 
 def load_shell(
     path: Path,
     *,
+    geometry: Geometry | None = None,
     cache: Path | None = None,
     viewpoints: Float64[np.ndarray, "V 3"] | None = None,
     mesher: Mesher = "planes",
@@ -98,6 +100,7 @@ def load_shell(
     Args:
         path: a mesh (ply, obj, glb, gltf, stl, off) or a cloud (ply, pcd, xyz, pts, txt, asc, csv, las, laz, e57; the
             last three need the extras ``las`` and ``e57``).
+        geometry: what the file holds, if it was read already.
         cache: folder for the mesh of a point cloud; None for no cache.
         viewpoints: positions that see the surface, in the shell's frame. They orient the normals of a cloud whose file
             has no scanner positions. A mesh cached for other viewpoints is made again.
@@ -114,11 +117,11 @@ def load_shell(
     if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, viewpoints)):
         refuse_coarse(mesh.step.scaled(metres_per_unit), f"the coordinates of {path}")
         return mesh
-    geometry = read_geometry(path)
+    geometry = geometry or read_geometry(path)
     try:
         if len(geometry.faces) or not len(geometry.vertices):
             used = _referenced(geometry.vertices, geometry.faces)
-            mesh = ShellMesh(*_referenced(*_without_strays(*used, path)))
+            mesh = ShellMesh(*_referenced(*_without_outliers(*used, path)))
             step = mesh_step(mesh.vertices, mesh.faces)
             refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
             return replace(_with_area(mesh, path), step=step)
@@ -176,9 +179,9 @@ def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> S
         return None
 
 
-def _without_strays(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Drop vertices that are not finite or absurdly far away, and their triangles."""
-    kept = sound(vertices, _FAR)
+    kept = inliers(vertices, _FAR)
     if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
         return vertices, faces
     usable = kept[faces].all(axis=1)

@@ -26,12 +26,11 @@ from shellgs_method.capture.photographs import (
     find_masks,
     find_photographs,
     group_by_lens,
-    has_transparency,
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
-from shellgs_method.files.photographs import load_mask, load_photograph
+from shellgs_method.files.photographs import has_alpha, load_mask, load_photograph
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 QUIET = Progress(disable=True)
@@ -288,7 +287,7 @@ def test_what_is_transparent_in_a_photograph_is_masked_and_black(tmp_path):
     pixels = np.array(photograph().convert("RGBA"))
     pixels[:12] = (255, 0, 255, 0)
     Image.fromarray(pixels).save(tmp_path / "a.png")
-    assert has_transparency(tmp_path / "a.png")
+    assert has_alpha(tmp_path / "a.png")
     add_photograph(tmp_path / "a.png", tmp_path / "work.png")
     add_mask(None, tmp_path / "a.png", tmp_path / "work.png", tmp_path / "kept.png")
     with Image.open(tmp_path / "work.png") as image, Image.open(tmp_path / "kept.png") as kept:

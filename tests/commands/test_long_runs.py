@@ -24,7 +24,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.map_files import MapRecord
 from shellgs_method.files.photographs import View
-from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 pytestmark = pytest.mark.hours
@@ -68,7 +68,8 @@ def training(scene: Path, steps: int, *more: object) -> list[object]:
 
 
 def cast(scene: Path) -> None:
-    cast_views(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment.load(scene / ALIGNMENT))
+    views = read_views(FacadeDataParserConfig(data=scene))
+    cast_views(PlacedShell.load(scene, views, Alignment.load(scene / ALIGNMENT)))
 
 
 def test_nothing_grows_in_the_second_half_of_a_long_training(tmp_path: Path):

@@ -411,7 +411,7 @@ def test_a_matrix_in_a_damaged_npy_is_refused(scene, shellgs, damage):
     assert "matrix.npy: this is not a 4x4 matrix" in refused(shellgs, scene, *words)
 
 
-def test_stray_sfm_points_are_left_out_and_counted(scene, caplog):
+def test_outliers_among_sfm_points_are_left_out_and_counted(scene, caplog):
     folder = model(scene)
     for k, point in enumerate(("1e12 0 0", "nan 0 0")):
         with (folder / "points3D.txt").open("a") as file:

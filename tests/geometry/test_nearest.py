@@ -10,7 +10,7 @@ import numpy as np
 from shellgs_method.geometry.nearest import point_tree
 
 
-def test_the_nearest_points_are_found_beside_a_stray_one_and_among_equal_ones():
+def test_the_nearest_points_are_found_beside_an_outlier_and_among_equal_ones():
     rng = np.random.default_rng(0)
     wall = rng.uniform(-10, 10, (200, 3)) * [1, 0, 1]
     points = np.concatenate([wall, wall[:50], [[1e7, -1e7, 1e7]]])

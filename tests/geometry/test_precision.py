@@ -75,7 +75,7 @@ def cameras(positions: np.ndarray, stored: Callable[[np.ndarray], np.ndarray] = 
         (lambda points: np.concatenate([single(points), [[1e-3, 0, 0]]]), [1 / 32, 1 / 2, 2**-16]),
         (lambda points: points, [0, 0, 0]),
     ],
-    ids=["single", "six digits", "eight digits", "decimetres", "scaled integers", "shifted", "a stray", "double"],
+    ids=["single", "six digits", "eight digits", "decimetres", "scaled integers", "shifted", "an outlier", "double"],
 )
 def test_the_step_of_a_cloud_is_what_its_file_could_tell_apart(stored: Callable, expected: list[float]):
     np.testing.assert_allclose(cloud_step(stored(measured())).lengths, expected, rtol=1e-6)

@@ -14,7 +14,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from scenes import write_colmap
+from scenes import cast, write_colmap
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -40,7 +40,7 @@ from shellgs_method.registration.refinement import refine
 from shellgs_method.registration.repetition import scan_shifts
 from shellgs_method.registration.report import shell_edges, write_report
 from shellgs_method.registration.validation import LIMITS, Limit, validate
-from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, cast_views, load_shell
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
 from shellgs_method.shell import alignment as alignment_module
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.surface import ShellSurface
@@ -594,7 +594,7 @@ def test_an_invalid_line_of_a_positions_file_is_refused_with_its_number(rigged, 
         read_positions(tmp_path / "geo.txt", rigged[0])
 
 
-# The bay test
+# The repetition test
 
 
 def test_the_sizes_of_bays_and_storeys_are_measured_on_the_shell(surface, points, survey_from_scene):
@@ -842,7 +842,7 @@ def test_maps_of_an_alignment_to_other_cameras_are_refused_even_if_they_are_of_t
     bound = (scene / ALIGNMENT).read_bytes()
     move_cameras(scene, displaced(0.1, 1.0, 0.0, seed=3))
     views = scene_views(scene)
-    cast_views(scene, views, replace(Alignment.load(scene / ALIGNMENT), cameras=BoundCameras()))
+    cast(scene, views, replace(Alignment.load(scene / ALIGNMENT), cameras=BoundCameras()))
     (scene / ALIGNMENT).write_bytes(bound)
     maps = CueMaps.open(scene, "shell")
     with pytest.raises(SceneError, match=r"aligned to other cameras: .* run `shellgs align .* then `shellgs cast"):

@@ -17,7 +17,7 @@ from shellgs_method.export.frame import scene_frame
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.sparse_points import read_sparse_points
-from shellgs_method.shell import ALIGNMENT, Alignment, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 
 NATIONAL = np.array([410_123.25, 5_413_987.5, 250.125])
 MILLIMETRE = 1e-3
@@ -96,7 +96,7 @@ def test_the_transform_saved_by_nerfstudio_keeps_national_coordinates(national, 
 
 def test_maps_of_a_national_scene_agree_with_the_local_ones(national, pristine_scene):
     views = read_views(FacadeDataParserConfig(data=national))
-    cast_views(national, views, Alignment.load(national / ALIGNMENT))
+    cast_views(PlacedShell.load(national, views, Alignment.load(national / ALIGNMENT)))
     here, there = (CueMaps.open(scene, "shell") for scene in (pristine_scene, national))
     for local, view in zip(read_views(FacadeDataParserConfig(data=pristine_scene)), views, strict=True):
         one, other = here.read(local.name, local.camera), there.read(view.name, view.camera)
@@ -113,7 +113,7 @@ def test_exports_of_a_national_scene_agree_with_those_of_the_local_one(national,
     if (national / "sparse").exists():
         pytest.skip("its points are different")
     views = read_views(FacadeDataParserConfig(data=national))
-    cast_views(national, views, Alignment.load(national / ALIGNMENT))
+    cast_views(PlacedShell.load(national, views, Alignment.load(national / ALIGNMENT)))
     placed = []
     for name, scene in (("here", pristine_scene), ("there", national)):
         trainer = trainer_of(scene, tmp_path / name, "photo_gs")

@@ -13,6 +13,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scenes import cast
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
@@ -21,7 +22,7 @@ from shellgs_method.evaluation.panels import supervision_panel
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, cast_views, load_shell
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, ShellCaster, ShellMesh, cast_views, load_shell
 
 K = torch.tensor([[60.0, 0, 32], [0, 62, 23], [0, 0, 1]], dtype=torch.float64)
 TURN = Rotation.from_euler("xyz", [20, -35, 130], degrees=True).as_matrix()
@@ -289,7 +290,7 @@ def write_doubles(path: Path, vertices: np.ndarray, faces: np.ndarray, form: str
 
 def test_few_digits_of_a_shell_are_said_with_its_maps(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     write_doubles(tmp_path / "shell/few.ply", *surveyed(), form="{:.1f}")
-    cast_views(tmp_path, VIEWS, Alignment(np.linalg.inv(similarity(1.0, TURN, GEOREFERENCE)), "shell/few.ply"))
+    cast(tmp_path, VIEWS, Alignment(np.linalg.inv(similarity(1.0, TURN, GEOREFERENCE)), "shell/few.ply"))
     assert "few.ply are stored in steps of 0.1 x 0.1 x 0.1 m" in caplog.text
 
 
@@ -418,7 +419,7 @@ VIEWS = [view(f"images/{k}.jpg", camera_at([k - 2.0, 0, 0])) for k in range(5)]
 
 
 def test_every_view_gets_the_map_of_its_camera(tmp_path: Path, alignment: Alignment):
-    summary = cast_views(tmp_path, VIEWS, alignment)
+    summary = cast(tmp_path, VIEWS, alignment)
     maps, caster = CueMaps.open(tmp_path, "shell"), ShellCaster(box(), np.eye(4))
     expected = [caster.cast(view.camera) for view in VIEWS]
     for (name, camera), cue in zip(((view.name, view.camera) for view in VIEWS), expected, strict=True):
@@ -430,7 +431,7 @@ def test_every_view_gets_the_map_of_its_camera(tmp_path: Path, alignment: Alignm
 
 
 def test_maps_are_cast_at_the_requested_size(tmp_path: Path, alignment: Alignment):
-    cast_views(tmp_path, VIEWS, alignment, max_image_size=32)
+    cast(tmp_path, VIEWS, alignment, max_image_size=32)
     maps = CueMaps.open(tmp_path, "shell")
     assert maps.manifest.max_image_size == 32
     assert maps.read(VIEWS[0].name, VIEWS[0].camera.shrunk(32)) is not None
@@ -441,7 +442,7 @@ def test_maps_are_cast_at_the_requested_size(tmp_path: Path, alignment: Alignmen
 def test_the_maps_manifest_stores_the_scale_in_metres(tmp_path: Path):
     save(tmp_path / "shell" / "box.ply", ShellMesh(1000 * box().vertices, box().faces))
     millimetres = Alignment(similarity(0.0005, np.eye(3), np.zeros(3)), "shell/box.ply", metres_per_shell_unit=0.001)
-    cast_views(tmp_path, [view("images/x.jpg", camera_at([0, 0, -5]))], millimetres)
+    cast(tmp_path, [view("images/x.jpg", camera_at([0, 0, -5]))], millimetres)
     assert CueMaps.open(tmp_path, "shell").manifest.metres_per_unit == pytest.approx(2)
 
 
@@ -458,52 +459,60 @@ def test_an_interrupted_cast_resumes_where_it_stopped(
 
     monkeypatch.setattr(CueMaps, "write", interrupted_at_the_third)
     with pytest.raises(KeyboardInterrupt):
-        cast_views(tmp_path, VIEWS, alignment)
+        cast(tmp_path, VIEWS, alignment)
     monkeypatch.undo()
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
-    summary = cast_views(tmp_path, VIEWS, alignment)
+    summary = cast(tmp_path, VIEWS, alignment)
     assert (summary.cast, summary.skipped, summary.seeing) == (3, 2, 5)
     assert len(before) == 2
     assert all(path.stat().st_mtime_ns == written_at for path, written_at in before.items())
 
 
 def test_a_damaged_map_is_made_again(tmp_path: Path, alignment: Alignment):
-    cast_views(tmp_path, VIEWS, alignment)
+    cast(tmp_path, VIEWS, alignment)
     path = tmp_path / "cues/shell/images/1.jpg.npz"
     path.write_bytes(path.read_bytes()[:-40])
-    assert cast_views(tmp_path, VIEWS, alignment).cast == 1
+    assert cast(tmp_path, VIEWS, alignment).cast == 1
     assert CueMaps.open(tmp_path, "shell").read(VIEWS[1].name, VIEWS[1].camera) is not None
 
 
 def test_all_maps_are_made_again_for_another_alignment(tmp_path: Path, alignment: Alignment):
-    cast_views(tmp_path, VIEWS, alignment)
+    cast(tmp_path, VIEWS, alignment)
     moved = Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shell)
-    assert cast_views(tmp_path, VIEWS, moved).cast == 5
+    assert cast(tmp_path, VIEWS, moved).cast == 5
     saved = Alignment.load(tmp_path / ALIGNMENT)
     assert saved.places_like(moved)
     assert sorted(saved.cameras.cameras) == [view.name for view in VIEWS]
 
 
+def test_maps_are_not_bound_to_another_alignment_than_they_are_cast_by(tmp_path: Path, alignment: Alignment):
+    shell = PlacedShell.load(tmp_path, VIEWS, alignment)
+    Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shell).record(tmp_path, VIEWS)
+    with pytest.raises(SceneError, match=r"alignment\.json has changed since the shell was loaded"):
+        cast_views(shell)
+    assert not (tmp_path / "cues").exists()
+
+
 def test_casting_with_the_same_alignment_keeps_its_file(tmp_path: Path, alignment: Alignment):
     kept = tmp_path / ALIGNMENT
     kept.write_text(json.dumps({"shell_to_scene": np.eye(4).tolist(), "shell": alignment.shell, "residuals": [1, 2]}))
-    cast_views(tmp_path, VIEWS, alignment)
+    cast(tmp_path, VIEWS, alignment)
     assert json.loads(kept.read_text())["residuals"] == [1, 2]
 
 
 def test_a_shell_that_no_camera_sees_is_refused_before_anything_is_written(tmp_path: Path, alignment: Alignment):
-    cast_views(tmp_path, VIEWS, alignment)
+    cast(tmp_path, VIEWS, alignment)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     behind = Alignment(similarity(1, np.eye(3), np.array([0, 0, -50.0])), alignment.shell)
     with pytest.raises(SceneError, match=r"no camera sees the shell .*box\.ply.*alignment"):
-        cast_views(tmp_path, VIEWS, behind)
+        cast(tmp_path, VIEWS, behind)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_one_camera_that_sees_the_shell_is_enough(tmp_path: Path, alignment: Alignment):
     views = [view(f"images/{k}.jpg", camera_at([0, 0, 20.0 + k])) for k in range(40)]
     views[37] = view("images/37.jpg", camera_at([0, 0, 0]))
-    summary = cast_views(tmp_path, views, alignment)
+    summary = cast(tmp_path, views, alignment)
     assert (summary.cast, summary.seeing) == (40, 1)
 
 
@@ -511,15 +520,15 @@ def test_one_camera_that_sees_the_shell_is_enough(tmp_path: Path, alignment: Ali
 def test_units_off_by_a_factor_of_1000_cause_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: float):
     save(tmp_path / "shell" / "wall.ply", wall())
     views = [view(f"images/{k}.jpg", camera_at([k * 5.0, 0, 0])) for k in range(3)]
-    cast_views(tmp_path, views, Alignment(np.diag([1.0, 1, 1, 1]), "shell/wall.ply"))
+    cast(tmp_path, views, Alignment(np.diag([1.0, 1, 1, 1]), "shell/wall.ply"))
     assert "units" not in caplog.text
-    cast_views(tmp_path, views, Alignment(np.diag([scale, scale, scale, 1]), "shell/wall.ply"))
+    cast(tmp_path, views, Alignment(np.diag([scale, scale, scale, 1]), "shell/wall.ply"))
     assert "check the alignment's scale" in caplog.text
 
 
 def test_no_views_are_refused(tmp_path: Path, alignment: Alignment):
     with pytest.raises(SceneError, match="no views"):
-        cast_views(tmp_path, [], alignment)
+        cast(tmp_path, [], alignment)
 
 
 # Images and masks
@@ -557,7 +566,7 @@ def test_a_view_that_sees_nothing_has_a_panel(tmp_path: Path):
 
 
 def test_black_pixels_of_a_mask_are_left_out_of_the_map(tmp_path: Path, alignment: Alignment):
-    cast_views(tmp_path, VIEWS, alignment)
+    cast(tmp_path, VIEWS, alignment)
     before = CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)
     height, width = VIEWS[2].camera.height, VIEWS[2].camera.width
     painted = np.full((height, width), 255, np.uint8)
@@ -565,7 +574,7 @@ def test_black_pixels_of_a_mask_are_left_out_of_the_map(tmp_path: Path, alignmen
     path = tmp_path / "shell" / "masks" / "images" / "2.jpg.png"
     path.parent.mkdir(parents=True)
     Image.fromarray(painted).save(path)
-    cast_views(tmp_path, VIEWS, alignment)
+    cast(tmp_path, VIEWS, alignment)
     after = CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)
     assert before is not None
     assert after is not None
@@ -574,7 +583,7 @@ def test_black_pixels_of_a_mask_are_left_out_of_the_map(tmp_path: Path, alignmen
 
 
 def test_a_mask_painted_after_the_cast_makes_the_maps_stale(tmp_path: Path, alignment: Alignment):
-    cast_views(tmp_path, VIEWS, alignment)
+    cast(tmp_path, VIEWS, alignment)
     assert CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera) is not None
     path = tmp_path / "shell" / "masks" / "images" / "2.jpg.png"
     path.parent.mkdir(parents=True)

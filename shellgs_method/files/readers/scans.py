@@ -13,6 +13,7 @@ import numpy as np
 
 from shellgs_method.files.headers import check_las
 from shellgs_method.files.readers.contents import NO_FACES, Geometry, left_out
+from shellgs_method.machine.extras import import_extra
 
 _SCRIPT = Path(__file__).with_name("scan_script.py")  # run as a file, to import none of the package's libraries
 
@@ -21,13 +22,12 @@ def read_las(path: Path) -> Geometry:
     """Read a LAS or LAZ file.
 
     Raises:
-        ModuleNotFoundError: laspy or its backend is not installed.
+        SceneError: laspy or its backend is not installed.
         ValueError: the file is damaged.
     """
-    import laspy  # noqa: F401
-
-    if path.suffix.lower() == ".laz":
-        import lazrs  # noqa: F401  # laspy would not say which of its backends to install
+    import_extra("laspy", "laspy", "las", f"the shell {path}")
+    if path.suffix.lower() == ".laz":  # laspy would not say which of its backends to install
+        import_extra("lazrs", "lazrs", "las", f"the shell {path}")
     check_las(path)
     return _read(path)
 
@@ -36,11 +36,10 @@ def read_e57(path: Path) -> Geometry:
     """Read an E57 file, in the frame of its scans' poses.
 
     Raises:
-        ModuleNotFoundError: pye57 is not installed.
+        SceneError: pye57 is not installed.
         ValueError: the file is damaged.
     """
-    import pye57  # noqa: F401
-
+    import_extra("pye57", "pye57", "e57", f"the shell {path}")
     return _read(path)
 
 
