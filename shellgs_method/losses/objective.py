@@ -132,7 +132,8 @@ class Objective:
         if keep and index in self._views:
             return self._views[index]
         target = photograph()
-        kept, cue, with_cue = photometric_pixels(batch, target, self.trust == "photographs"), None, None
+        kept = photometric_pixels(batch, target, ignore_transients=self.trust == "photographs")
+        cue = with_cue = None
         if f"{self.cues}_depth" in batch:
             with_cue = batch[f"{self.cues}_mask"].to(target.device)
             maps = reference_maps(batch, self.cues, target.device, everywhere=self.trust == "shell")
