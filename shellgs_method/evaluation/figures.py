@@ -24,7 +24,7 @@ class Panel(NamedTuple):
     rgb: Float[Tensor, "H W 3"]
     normal: Float[Tensor, "H W 3"]
     error: Float[Tensor, "H W 1"]
-    """Unsigned angle to the reference's normals in degrees, from :func:`angular_error`."""
+    """Unsigned angle to the reference's normals in degrees, from :func:`~shellgs_method.evaluation.angular_error`."""
     mask: Bool[Tensor, "H W 1"]
     """True where the reference has a normal; other pixels are grey."""
 

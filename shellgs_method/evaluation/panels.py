@@ -52,7 +52,7 @@ def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap
     Magenta is what they show behind it, in windows.
 
     Args:
-        views: photograph, map by :func:`~shellgs_method.shell.check_views` and shell map of each.
+        views: photograph, map by :func:`~shellgs_method.occlusion.check_views` and shell map of each.
 
     Returns:
         The figure; save it with ``.savefig(path)``.

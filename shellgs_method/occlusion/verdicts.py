@@ -78,7 +78,7 @@ class Verdicts:
 
 
 def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarray, "N 3"] | None = None) -> Verdicts:
-    """Sum the maps of :func:`~shellgs_method.shell.check_views` over the views.
+    """Sum the maps of :func:`~shellgs_method.occlusion.check_views` over the views.
 
     Args:
         scene: the scene's folder.

@@ -98,9 +98,9 @@ def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: 
     :meth:`Alignment.record` writes it. Views with an intact map for the same camera, shell and alignment are skipped,
     so that an interrupted run resumes where it stopped.
 
-    The shell lacks trees, cars and whatever else stands in front of it: :func:`check_views` finds such occluders, and
-    black pixels of ``shell/masks/<image's name>.png`` of the scene, if that file exists, are removed from the view's
-    mask, as are those of the photograph's own mask.
+    The shell lacks trees, cars and whatever else stands in front of it: :mod:`shellgs_method.occlusion` finds such
+    occluders, and black pixels of ``shell/masks/<image's name>.png`` of the scene, if that file exists, are removed
+    from the view's mask, as are those of the photograph's own mask.
 
     Args:
         shell: the shell in its place.
