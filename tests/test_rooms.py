@@ -8,20 +8,15 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-ROOMS = re.findall(
-    r"shellgs_method\.(\w+)", (ROOT / "pyproject.toml").read_text().partition("layers = [")[2].partition("]")[0]
-)
-PLAIN = [
-    "render/rasterizer",
-    "losses",
-    "gaussians",
-    "evaluation",
-    "occlusion",
-    "registration",
-    "shell",
-    "files",
-    "geometry",
-]
+PROJECT = (ROOT / "pyproject.toml").read_text()
+
+
+def listed(name: str) -> list[str]:
+    """Modules of the package in a list of pyproject.toml, without its name."""
+    return re.findall(r"shellgs_method\.([\w.]+)", PROJECT.partition(f"{name} = [")[2].partition("]")[0])
+
+
+ROOMS, PLAIN = listed("layers"), listed("source_modules")
 
 
 def entries(folder: Path) -> set[str]:
@@ -40,7 +35,7 @@ def test_tests_are_found_by_the_name_of_the_room():
 
 
 def test_plain_rooms_are_imported_without_nerfstudio():
-    folders = [ROOT / "shellgs_method" / room for room in PLAIN]
+    folders = [(ROOT / "shellgs_method").joinpath(*room.split(".")) for room in PLAIN]
     paths = [path for folder in folders for path in folder.rglob("*.py") if not path.stem.endswith(("__", "_script"))]
     modules = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in paths]
     code = f"import sys, {', '.join(modules)}; print([name for name in sys.modules if name.startswith('nerfstudio')])"

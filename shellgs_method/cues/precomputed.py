@@ -173,7 +173,7 @@ def _in_view(view: View, values: Float[np.ndarray, "h w C"], valid: np.ndarray) 
     from shellgs_method.files.undistortion import undistort
 
     height, width = valid.shape
-    calibrated = view.lens or view.camera
+    calibrated = view.calibrated
     if abs(width / height / (calibrated.width / calibrated.height) - 1) > ASPECT_TOLERANCE:
         raise SceneError(
             f"the map of view {view.name!r} is {width}x{height} pixels, not the aspect ratio of its photograph "

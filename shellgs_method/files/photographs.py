@@ -40,6 +40,11 @@ class View:
     mask: Path | None = None
     turned: bool = False
 
+    @property
+    def calibrated(self) -> Lens | Camera:
+        """The camera that the photograph was taken with, before it is undistorted."""
+        return self.lens or self.camera
+
 
 def load_photograph(view: View) -> UInt8[np.ndarray, "H W 3"]:
     """The photograph as 8-bit RGB: upright, undistorted, at the size of its camera; black where it is transparent.
@@ -187,8 +192,7 @@ def _undistorted(view: View, image: Image.Image, path: Path) -> UInt8[np.ndarray
 
 
 def _calibrated_size(view: View) -> tuple[int, int]:
-    calibrated = view.lens or view.camera
-    return calibrated.width, calibrated.height
+    return view.calibrated.width, view.calibrated.height
 
 
 def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:

@@ -26,11 +26,9 @@ def undistort(lens: Lens, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float64[np
         cy=K[1, 2],
         width=lens.width,
         height=lens.height,
-        distortion_params=torch.tensor(lens.distortion)[None],
         camera_type=CameraType.FISHEYE if lens.fisheye else CameraType.PERSPECTIVE,
     )[0]
-    parameters = np.asarray(camera.distortion_params)
-    pinhole, image, _ = _undistort_image(camera, parameters, {}, image, camera.get_intrinsics_matrices().numpy().copy())
+    pinhole, image, _ = _undistort_image(camera, np.array(lens.distortion, np.float32), {}, image, K.numpy().copy())
     return pinhole.astype(np.float64), image
 
 

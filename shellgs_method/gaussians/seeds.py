@@ -47,6 +47,9 @@ class Seeds(NamedTuple):
     """Distance to neighbouring seeds, in the units of the points."""
 
 
+NO_SEEDS = Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+
+
 class _Samples(NamedTuple):
     points: Float[ndarray, "S 3"]
     normals: Float[ndarray, "S 3"]
@@ -122,7 +125,7 @@ def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, mo
     stride = max(1, int(np.ceil((num_pixels / MAX_SAMPLES) ** 0.5)))
     lifted = [_lift(view, index, stride) for index, view in enumerate(views)]
     if not any(len(samples.points) for samples in lifted):
-        return Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        return NO_SEEDS
     samples = _Samples(*map(np.concatenate, zip(*lifted, strict=True)))
     while True:
         points, normals, apart = _thinned(samples, spacing)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from shellgs_method.evaluation.pixels import kept_pixels
-from shellgs_method.gaussians.seeds import Seeds, photograph_of
+from shellgs_method.gaussians.seeds import NO_SEEDS, Seeds, photograph_of
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.nearest import point_tree
 
@@ -77,7 +77,7 @@ def skybox_seeds(views: Iterable[SkyView], num_pixels: int, sfm_points: Float[nd
         colours.append(image[mask].double().cpu().numpy())
     directions, colours = np.concatenate(directions), np.concatenate(colours)
     if not len(directions):
-        return Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        return NO_SEEDS
     centre, towards = positions(cameras).mean(axis=0), _fibonacci_sphere(count)
     radius = RADIUS * np.percentile(np.linalg.norm(sfm_points - centre, axis=1), 99)
     k = min(PIXELS_PER_COLOUR, len(directions))

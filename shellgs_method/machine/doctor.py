@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Iterator
 from typing import NamedTuple
 
-OPEN3D_LIBRARIES = "libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
+from shellgs_method.machine.open3d import LIBRARIES
 
 
 class Finding(NamedTuple):
@@ -32,7 +32,7 @@ def install_system_libraries() -> None:
     """Install the system libraries of Open3D, if it fails to load and apt-get may be used."""
     if not _open3d().works and hasattr(os, "geteuid") and os.geteuid() == 0 and shutil.which("apt-get"):
         environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
-        for command in (["update", "-qq"], ["install", "-qq", "-y", *OPEN3D_LIBRARIES.split()]):
+        for command in (["update", "-qq"], ["install", "-qq", "-y", *LIBRARIES.split()]):
             subprocess.run(["apt-get", *command], env=environment, stdout=subprocess.DEVNULL, check=False)
 
 
@@ -46,7 +46,7 @@ def _torchvision() -> Finding:
 
 
 def _open3d() -> Finding:
-    return _import("Open3D", "open3d", f"as root, apt-get install {OPEN3D_LIBRARIES}")
+    return _import("Open3D", "open3d", f"as root, apt-get install {LIBRARIES}")
 
 
 def _import(subject: str, module: str, remedy: str) -> Finding:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from types import ModuleType
 
+LIBRARIES = "libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
+"""Debian's packages of these."""
+
 
 def import_open3d() -> ModuleType:
     """Return Open3D, or raise an ImportError that names the system libraries its wheel needs."""
@@ -12,8 +15,7 @@ def import_open3d() -> ModuleType:
         import open3d
     except (ImportError, OSError) as error:
         raise ImportError(
-            f"Open3D cannot be loaded ({error}); it needs system libraries: "
-            "apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
+            f"Open3D cannot be loaded ({error}); it needs system libraries: apt-get install {LIBRARIES}"
         ) from error
     return open3d
 
