@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine.elementwise import Value, elementwise
 
 
 def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[Tensor, "H W 3"]:
@@ -21,13 +24,26 @@ def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[T
 
 
 def normals_along_rays(depth: Float[Tensor, "H W 1"], rays: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    """:func:`normals_from_depth` given the camera's rays, which are scaled to z = 1; a kernel for ``run_fused``."""
-    # Coordinate by coordinate, since loops are vectorised along the last dimension, which should be long.
-    points = [pad(depth[..., 0] * ray, (1, 1, 1, 1)) for ray in rays.unbind(-1)]
-    a = [each[1:-1, 2:] - each[1:-1, :-2] for each in points]  # right - left
-    b = [each[:-2, 1:-1] - each[2:, 1:-1] for each in points]  # top - bottom
+    """:func:`normals_from_depth` given the camera's rays, which are scaled to z = 1."""
+    if min(depth.shape[:2]) < 3:
+        return torch.zeros_like(rays) + 0 * depth
+    points = depth * rays
+    around = points[1:-1, 2:], points[1:-1, :-2], points[:-2, 1:-1], points[2:, 1:-1]
+    (normal,) = elementwise(_normal, points[1:-1, 1:-1], *around)
+    return pad(normal, (0, 0, 1, 1, 1, 1))
+
+
+def _normal(
+    centre: Sequence[Value],
+    right: Sequence[Value],
+    left: Sequence[Value],
+    top: Sequence[Value],
+    bottom: Sequence[Value],
+) -> list[list[Value]]:
+    a = [one - other for one, other in zip(right, left, strict=True)]
+    b = [one - other for one, other in zip(top, bottom, strict=True)]
     normal = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    length = (normal[0].square() + normal[1].square() + normal[2].square()).clamp_min(1e-36).sqrt()
-    known = points[2] > 0
-    complete = known[1:-1, 1:-1] & known[1:-1, 2:] & known[1:-1, :-2] & known[:-2, 1:-1] & known[2:, 1:-1]
-    return torch.stack([torch.where(complete, each / length, 0.0) for each in normal], dim=-1)
+    squared = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+    length = torch.sqrt(torch.clamp_min(squared, 1e-36))
+    known = (centre[2] > 0) & (right[2] > 0) & (left[2] > 0) & (top[2] > 0) & (bottom[2] > 0)
+    return [[torch.where(known, each / length, 0.0) for each in normal]]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import operator
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -9,8 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import unfold
 
-from shellgs_method.losses.windows import shifted, window_sums
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.losses.windows import in_windows, shifted, window_sums
+from shellgs_method.machine.elementwise import Value, elementwise
 
 
 class NccLoss:
@@ -39,18 +43,20 @@ class NccLoss:
         min_valid: float = 0.5,
         eps: float = 1e-3,
     ):
-        self._around, self._window = (window // 2,) * 4, target.new_ones(1, 1, window)
-        mask, ones = mask[..., 0], [1.0] * window
+        self._around, self._ones = (window // 2,) * 4, (1.0,) * window
+        mask = mask[..., 0]
         y = target[..., 0].where(mask, 0.0)
         self._valid = F.pad(mask.to(y), self._around)
-        n, sums = window_sums([self._valid, F.pad(y, self._around)], ones)
+        n, sums = window_sums([self._valid, F.pad(y, self._around)], self._ones)
         per_pixel = 1 / n.clamp_min(0.5)
         # Fill pixels outside the mask with values close to those inside, for patches centred there.
         self._target = F.pad(y.where(mask, sums * per_pixel), self._around)
-        mean, _, variance, _ = _moments(self._target, self._target, self._valid, per_pixel, window)
+        rows = _row_sums(self._target, self._target, self._valid, window)
+        mean, _, variance, _ = (each[..., 0] for each in elementwise(_moments, *rows, per_pixel[..., None]))
         floor = (eps * mean).square()
         used = mask & (n > min_valid * window**2 - 0.5) & (variance > floor)
-        self._patches, self._share = (per_pixel, variance, floor, used.to(y)), 1 / used.sum().clamp_min(1).to(y)
+        self._patches = [each[..., None] for each in (per_pixel, variance, floor, used.to(y))]
+        self._share = 1 / used.sum().clamp_min(1).to(y)
 
     def __call__(self, inverse_depth: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
         """Loss of one render, whose 1/z is finite wherever the mask is true."""
@@ -59,12 +65,16 @@ class NccLoss:
     def correlate(self, x: Float[Tensor, "H W"]) -> list[Tensor]:
         """Padded inverse depth, sum of the patches' losses, and the other arguments of :meth:`gradient`."""
         x = F.pad(x, self._around).where(self._valid > 0, self._target)
-        return [x, *run_fused(_correlate, x, self._target, self._valid, *self._patches, self._window, varying=2)]
+        rows = _row_sums(x, self._target, self._valid, len(self._ones))
+        losses, *gradient_terms = (each[..., 0] for each in elementwise(_correlate, *rows, *self._patches))
+        return [x, losses.sum(), *gradient_terms]
 
     def gradient(self, x: Float[Tensor, "H+2r W+2r"], *gradient_terms: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
         """Gradient of the sum w.r.t. the inverse depth."""
-        padded = [F.pad(each, self._around) for each in gradient_terms]
-        return run_fused(_gradient, x, self._target, self._valid, *padded, self._window, varying=2)
+        sums = window_sums([F.pad(each, self._around) for each in gradient_terms], self._ones)
+        r = self._around[0]
+        inside = [each[r:-r, r:-r] if r else each for each in (x, self._target, self._valid)]
+        return elementwise(_gradient, *(each[..., None] for each in (*inside, *sums)))[0][..., 0]
 
 
 class _Ncc(torch.autograd.Function):
@@ -81,86 +91,73 @@ class _Ncc(torch.autograd.Function):
         return gradient * ctx.view.gradient(*ctx.saved_tensors), None
 
 
-def _correlate(
-    x: Float[Tensor, "H+2r W+2r"],
-    y: Float[Tensor, "H+2r W+2r"],
-    valid: Float[Tensor, "H+2r W+2r"],
-    per_pixel: Float[Tensor, "H W"],
-    variance_y: Float[Tensor, "H W"],
-    floor: Float[Tensor, "H W"],
-    weights: Float[Tensor, "H W"],
-    window: Float[Tensor, "1 1 w"],
-) -> tuple[Tensor, ...]:
-    """Sum of the patches' losses; and a, a E[y], b and b E[x] of each patch, the terms of the gradient.
-
-    The gradient at a pixel is the sum of a (y - E[y]) + b (x - E[x]) over the patches that contain it.
-
-    Args:
-        x: rendered inverse depth.
-        y: target inverse depth.
-        valid: 1 where a pixel counts, else 0.
-        per_pixel: one over the number of valid pixels, per patch, like the following.
-        variance_y: variance of the target.
-        floor: smallest variance that counts as contrast.
-        weights: 1, or 0 for a patch that is ignored.
-        window: tensor as wide as a patch.
-    """
-    mean_x, mean_y, variance_x, covariance = _moments(x, y, valid, per_pixel, window.shape[2])
-    # Clamp rather than add the floor: a perfect match is exactly 1, and scale does not matter above the floor.
-    product = torch.where(weights > 0, torch.maximum(variance_x, floor) * variance_y, 1.0)
-    ncc = covariance / product.sqrt()
-    a = -weights * per_pixel / product.sqrt()
-    b = torch.where((weights > 0) & (variance_x > floor), weights * per_pixel * ncc / variance_x, 0.0)
-    return (weights * (1 - ncc)).sum(), a, a * mean_y, b, b * mean_x
+def _row_sums(
+    x: Float[Tensor, "H+2r W+2r"], y: Float[Tensor, "H+2r W+2r"], valid: Float[Tensor, "H+2r W+2r"], size: int
+) -> list[Float[Tensor, "H W 1"]]:
+    """Sums over the rows of each patch, as arguments of :func:`_moments`."""
+    half = size // 2
+    sums = (each[..., 0] for each in elementwise(_of_row, *shifted([x, y, valid], size, dim=1)))
+    inside = slice(half, x.shape[1] - half)
+    return [*shifted([x[:, inside], y[:, inside], *sums], size, dim=0)]
 
 
-def _moments(
-    x: Float[Tensor, "H+2r W+2r"],
-    y: Float[Tensor, "H+2r W+2r"],
-    valid: Float[Tensor, "H+2r W+2r"],
-    per_pixel: Float[Tensor, "H W"],
-    size: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Means of x and y, variance of x, and covariance, over the valid pixels of each patch.
+def _of_row(*values: Sequence[Value]) -> list[list[Value]]:
+    """Number of valid pixels of a row, and sums of x, y, x² and x y relative to its central value.
 
     E[x²] - E[x]² of nearly equal values loses all digits in float32. To keep the summands small, each row of a patch is
     summed relative to its central value, and the rows relative to the central value of the patch.
     """
-    half = size // 2
-    x0, y0 = (shifted(each, size, dim=1)[half] for each in (x, y))
-    n = sum_x = sum_y = sum_xx = sum_xy = torch.zeros(())
-    for xi, yi, mi in zip(*(shifted(each, size, dim=1) for each in (x, y, valid)), strict=True):
-        dx, dy = xi - x0, mi * (yi - y0)
-        n, sum_x, sum_y = n + mi, sum_x + mi * dx, sum_y + dy
-        sum_xx, sum_xy = sum_xx + mi * dx * dx, sum_xy + dx * dy
-    rows = zip(*(shifted(each, size, dim=0) for each in (x0, y0, n, sum_x, sum_y, sum_xx, sum_xy)), strict=True)
-    x0, y0 = (shifted(each, size, dim=0)[half] for each in (x0, y0))
-    sum_x = sum_y = sum_xx = sum_xy = torch.zeros(())
-    for xi, yi, ni, xs, ys, xxs, xys in rows:
-        dx, dy = xi - x0, yi - y0
-        moved_x, moved_y = xs + ni * dx, ys + ni * dy
-        sum_x, sum_y = sum_x + moved_x, sum_y + moved_y
-        sum_xx, sum_xy = sum_xx + xxs + dx * (xs + moved_x), sum_xy + xys + dx * ys + dy * moved_x
-    mean_x, mean_y = sum_x * per_pixel, sum_y * per_pixel
-    covariance = sum_xy * per_pixel - mean_x * mean_y
-    return x0 + mean_x, y0 + mean_y, sum_xx * per_pixel - mean_x * mean_x, covariance
+    xs, ys, valid = in_windows(values, len(values) // 3)
+    x0, y0 = xs[len(xs) // 2], ys[len(ys) // 2]
+    terms = []
+    for x, y, m in zip(xs, ys, valid, strict=True):
+        dx, dy = m * (x - x0), m * (y - y0)
+        terms.append((m, dx, dy, dx * (x - x0), dx * (y - y0)))
+    return [[functools.reduce(operator.add, each)] for each in zip(*terms, strict=True)]
+
+
+def _moments(*values: Sequence[Value]) -> list[list[Value]]:
+    """Means of x and y, variance of x, and covariance, over the valid pixels of a patch, from its rows' sums."""
+    *rows, (per_pixel,) = values
+    xs, ys, *sums = in_windows(rows, len(rows) // 7)
+    x0, y0 = xs[len(xs) // 2], ys[len(ys) // 2]
+    terms = []
+    for x, y, n, sum_x, sum_y, sum_xx, sum_xy in zip(xs, ys, *sums, strict=True):
+        dx, dy = x - x0, y - y0
+        moved_x, moved_y = sum_x + n * dx, sum_y + n * dy
+        terms.append((moved_x, moved_y, sum_xx + dx * (sum_x + moved_x), sum_xy + dx * sum_y + dy * moved_x))
+    x, y, xx, xy = (per_pixel * functools.reduce(operator.add, each) for each in zip(*terms, strict=True))
+    return [[x0 + x], [y0 + y], [xx - x * x], [xy - x * y]]
+
+
+def _correlate(*values: Sequence[Value]) -> list[list[Value]]:
+    """Loss of a patch; and a, a E[y], b and b E[x] of it, the terms of the gradient.
+
+    The gradient at a pixel is the sum of a (y - E[y]) + b (x - E[x]) over the patches that contain it. After the rows'
+    sums of the rendered (x) and the target's (y) inverse depth come one over the number of valid pixels, the target's
+    variance, the smallest variance that counts as contrast, and a weight: 1, or 0 for a patch that is ignored.
+    """
+    *rows, (per_pixel,), (variance_y,), (floor,), (weight,) = values
+    (mean_x,), (mean_y,), (variance_x,), (covariance,) = _moments(*rows, [per_pixel])
+    # Clamp rather than add the floor: a perfect match is exactly 1, and scale does not matter above the floor.
+    product = torch.sqrt(torch.where(weight > 0, torch.maximum(variance_x, floor) * variance_y, 1.0))
+    ncc = covariance / product
+    a = -weight * per_pixel / product
+    b = torch.where((weight > 0) & (variance_x > floor), weight * per_pixel * ncc / variance_x, 0.0)
+    return [[weight * (1 - ncc)], [a], [a * mean_y], [b], [b * mean_x]]
 
 
 def _gradient(
-    x: Float[Tensor, "H+2r W+2r"],
-    y: Float[Tensor, "H+2r W+2r"],
-    valid: Float[Tensor, "H+2r W+2r"],
-    a: Float[Tensor, "H+2r W+2r"],
-    a_mean_y: Float[Tensor, "H+2r W+2r"],
-    b: Float[Tensor, "H+2r W+2r"],
-    b_mean_x: Float[Tensor, "H+2r W+2r"],
-    window: Float[Tensor, "1 1 w"],
-) -> Float[Tensor, "H W"]:
-    """Gradient from the outputs of :func:`_correlate`."""
-    size = window.shape[2]
-    x, y, valid = (shifted(shifted(each, size, 0)[size // 2], size, 1)[size // 2] for each in (x, y, valid))
-    a, a_mean_y, b, b_mean_x = window_sums([a, a_mean_y, b, b_mean_x], [1.0] * size)
-    return valid * (y * a - a_mean_y + x * b - b_mean_x)
+    x: Sequence[Value],
+    y: Sequence[Value],
+    valid: Sequence[Value],
+    a: Sequence[Value],
+    a_mean_y: Sequence[Value],
+    b: Sequence[Value],
+    b_mean_x: Sequence[Value],
+) -> list[list[Value]]:
+    """Gradient at a pixel, from the window sums of the last four outputs of :func:`_correlate`."""
+    return [[valid[0] * (y[0] * a[0] - a_mean_y[0] + x[0] * b[0] - b_mean_x[0])]]
 
 
 def vid2sim_ncc_loss(

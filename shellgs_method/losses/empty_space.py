@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from shellgs_method.losses.normal import unit
 from shellgs_method.losses.reduction import mean_weights
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.machine.elementwise import Value, elementwise
 
 BEHIND = 1.0
 """Distance behind the shell in metres at which the remaining transmittance is assumed to end."""
@@ -45,20 +48,20 @@ class EmptySpaceLoss:
         slope = (unit(target_normal) * rays).sum(dim=-1, keepdim=True).abs()
         self._slope = (metres_per_unit * slope).where(mask, 0.0)
         self._weights = mean_weights(mask, like=target_depth)
-        self._tolerance = target_depth.new_full((1, 1, 1), tolerance)
+        self._tolerance = target_depth.new_tensor([tolerance])
 
     def __call__(self, squares: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:
         """Loss of one render, given Σ w (z - target)², not divided by alpha, and alpha = Σ w."""
-        return run_fused(_beyond, squares, alpha, self._slope, self._weights, self._tolerance, varying=2)
+        return elementwise(_beyond, squares, alpha, self._slope, self._weights, self._tolerance)[0].sum()
 
 
 def _beyond(
-    squares: Float[Tensor, "H W 1"],
-    alpha: Float[Tensor, "H W 1"],
-    slope: Float[Tensor, "H W 1"],
-    weights: Float[Tensor, "H W 1"],
-    tolerance: Float[Tensor, "1 1 1"],
-) -> Float[Tensor, ""]:
-    squares = slope * slope * squares + BEHIND**2 * (1 - alpha).relu()
-    beyond = (squares.clamp_min(1e-8).sqrt() - tolerance).relu()
-    return (weights * (beyond / REACH).log1p() * REACH).sum()
+    square: Sequence[Value],
+    alpha: Sequence[Value],
+    slope: Sequence[Value],
+    weight: Sequence[Value],
+    tolerance: Sequence[Value],
+) -> list[list[Value]]:
+    squared = slope[0] * slope[0] * square[0] + BEHIND**2 * torch.relu(1 - alpha[0])
+    beyond = torch.relu(torch.sqrt(torch.clamp_min(squared, 1e-8)) - tolerance[0])
+    return [[weight[0] * torch.log(1 + beyond / REACH) * REACH]]

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from shellgs_method.losses.reduction import mean_weights
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.machine.elementwise import Value, dot, elementwise
+
+SHORTEST = 1e-3
+"""Length of the shortest normal that is normalized."""
 
 
 def unit(normal: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    """Normalize normals; those shorter than 1e-3, where hardly anything was composited, stay shorter than 1.
+    """Normalize normals; those shorter than :data:`SHORTEST`, where hardly anything was composited, stay shorter than 1.
 
     This also bounds the gradient to a thousand times the incoming one.
     """
-    return normalize(normal, dim=-1, eps=1e-3)
+    return normalize(normal, dim=-1, eps=SHORTEST)
 
 
 class NormalLoss:
@@ -34,8 +40,14 @@ class NormalLoss:
 
     def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """Loss of one render, given its normals of any length, as composited."""
-        return self._total - run_fused(_cosines, normal, self._target, varying=2)
+        return self._total - elementwise(_cosines, normal, self._target)[0].sum()
 
 
-def _cosines(normal: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-    return (unit(normal) * target).sum()
+def _cosines(normal: Sequence[Value], target: Sequence[Value]) -> list[list[Value]]:
+    return [[dot(unit_vector(normal), target)]]
+
+
+def unit_vector(normal: Sequence[Value]) -> list[Value]:
+    """:func:`unit` of one normal, by its coordinates."""
+    length = torch.sqrt(torch.clamp_min(dot(normal, normal), SHORTEST**2))
+    return [each / length for each in normal]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from shellgs_method.losses.reduction import mean_weights, weighted_mean
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.machine.elementwise import Value, dot, elementwise
 
 
 def normal_consistency_loss(
@@ -28,13 +30,11 @@ def normal_consistency_loss(
         mask: pixels that count; all by default.
     """
     weights = mean_weights(torch.ones_like(alpha, dtype=torch.bool) if mask is None else mask, like=alpha)
-    return weights.sum() - run_fused(_agreement, normal, depth_normal, weights * alpha.detach(), varying=2)
+    return weights.sum() - elementwise(_agreement, normal, depth_normal, weights * alpha.detach())[0].sum()
 
 
-def _agreement(
-    normal: Float[Tensor, "H W 3"], depth_normal: Float[Tensor, "H W 3"], weights: Float[Tensor, "H W 1"]
-) -> Float[Tensor, ""]:
-    return (weights * normal * depth_normal).sum()
+def _agreement(normal: Sequence[Value], depth_normal: Sequence[Value], weight: Sequence[Value]) -> list[list[Value]]:
+    return [[weight[0] * dot(normal, depth_normal)]]
 
 
 def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> Float[Tensor, ""]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from kornia.filters import spatial_gradient
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
-from shellgs_method.losses.normal import unit
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.losses.normal import unit_vector
+from shellgs_method.machine.elementwise import Value, dot, elementwise
 
 
 class SmoothnessLoss:
@@ -30,14 +32,15 @@ class SmoothnessLoss:
 
     def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """Loss of one render, given its normals of any length, as composited."""
-        return run_fused(_roughness, normal, self._weights, varying=2)
+        neighbours = normal[1:, 1:], normal[1:, :-1], normal[:-1, 1:]
+        return elementwise(_roughness, *neighbours, self._weights)[0].sum()
 
 
-def _roughness(normal: Float[Tensor, "H W 3"], weights: Float[Tensor, "H-1 W-1 1"]) -> Float[Tensor, ""]:
-    normal = unit(normal)
-    left = (normal[1:, 1:] * normal[1:, :-1]).sum(dim=-1, keepdim=True)
-    above = (normal[1:, 1:] * normal[:-1, 1:]).sum(dim=-1, keepdim=True)
-    return (weights * (1 - (left + above) / 2)).sum()
+def _roughness(
+    normal: Sequence[Value], left: Sequence[Value], above: Sequence[Value], weight: Sequence[Value]
+) -> list[list[Value]]:
+    normal = unit_vector(normal)
+    return [[weight[0] * (1 - (dot(normal, unit_vector(left)) + dot(normal, unit_vector(above))) / 2)]]
 
 
 @torch.no_grad()

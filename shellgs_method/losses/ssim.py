@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from shellgs_method.losses.windows import window_sums
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.machine.elementwise import Value, elementwise, in_cpp
 
 RADIUS = 5
 _GAUSSIAN = [math.exp(-0.5 * (i / 1.5) ** 2) for i in range(-RADIUS, RADIUS + 1)]
-TAPS = [tap / sum(_GAUSSIAN) for tap in _GAUSSIAN]
+TAPS = tuple(tap / sum(_GAUSSIAN) for tap in _GAUSSIAN)
 C1, C2 = 0.01**2, 0.03**2
 
 
@@ -64,7 +64,10 @@ def ssim(rgb: Float[Tensor, "H W 3"], target: SsimTarget) -> Float[Tensor, "H W 
 class _Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x, y, mean, variance):
-        similarity, *grad_moments = run_fused(_similarity, x, y, mean, variance, varying=2)
+        moments = [*_blur(x, x * x, x * y), mean, variance]
+        similarity, *grad_moments = (
+            each[..., 0] for each in elementwise(_similarity, *(moment[..., None] for moment in moments))
+        )
         ctx.save_for_backward(x, y, *grad_moments)
         return similarity
 
@@ -74,43 +77,31 @@ class _Ssim(torch.autograd.Function):
         x, y, *grad_moments = ctx.saved_tensors
         around = (6 * RADIUS, 6 * RADIUS, 2 * RADIUS, 2 * RADIUS)
         grad_moments = [F.pad(gradient * each, around) for each in grad_moments]
-        return run_fused(_gradient, x, y, *grad_moments, varying=2), None, None, None
+        # W.r.t. the padded image from those w.r.t. the windows' means, blurred by the same, symmetric window.
+        grad_x, grad_xx, grad_xy = _blur(*grad_moments)
+        return grad_x + 2 * x * grad_xx + y * grad_xy, None, None, None
 
 
 def _similarity(
-    x: Float[Tensor, "H+10 X+30"],
-    y: Float[Tensor, "H+10 X+30"],
-    mean_y: Float[Tensor, "H X"],
-    variance_y: Float[Tensor, "H X"],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    mean_x: Sequence[Value],
+    mean_xx: Sequence[Value],
+    mean_xy: Sequence[Value],
+    mean_y: Sequence[Value],
+    variance_y: Sequence[Value],
+) -> list[list[Value]]:
     """SSIM, and its derivatives w.r.t. the windows' means of x, x² and x y."""
-    mean_x, mean_xx, mean_xy = _blur(x, x * x, x * y)
-    cross, squares = 2 * mean_x * mean_y + C1, mean_x * mean_x + mean_y * mean_y + C1
-    covariance = 2 * (mean_xy - mean_x * mean_y) + C2
-    variances = mean_xx - mean_x * mean_x + variance_y + C2
+    (x,), (xx,), (xy,), (y,), (yy,) = mean_x, mean_xx, mean_xy, mean_y, variance_y
+    cross, squares = 2 * x * y + C1, x * x + y * y + C1
+    covariance, variances = 2 * (xy - x * y) + C2, xx - x * x + yy + C2
     similarity = cross * covariance / (squares * variances)
     grad_xx, grad_xy = -similarity / variances, 2 * cross / (squares * variances)
-    grad_x = (
-        2 * (mean_y * covariance / variances - mean_x * similarity) / squares - mean_y * grad_xy - 2 * mean_x * grad_xx
-    )
-    return similarity, grad_x, grad_xx, grad_xy
-
-
-def _gradient(
-    x: Float[Tensor, "H+10 X+30"],
-    y: Float[Tensor, "H+10 X+30"],
-    grad_x: Float[Tensor, "H+20 X+60"],
-    grad_xx: Float[Tensor, "H+20 X+60"],
-    grad_xy: Float[Tensor, "H+20 X+60"],
-) -> Float[Tensor, "H+10 X+30"]:
-    """Gradient w.r.t. the padded image from those w.r.t. the windows' means, blurred by the same, symmetric window."""
-    grad_x, grad_xx, grad_xy = _blur(grad_x, grad_xx, grad_xy)
-    return grad_x + 2 * x * grad_xx + y * grad_xy
+    grad_x = 2 * (y * covariance / variances - x * similarity) / squares - y * grad_xy - 2 * x * grad_xx
+    return [[similarity], [grad_x], [grad_xx], [grad_xy]]
 
 
 def _blur(*images: Float[Tensor, "H+10 X+30"]) -> Sequence[Float[Tensor, "H X"]]:
-    """Gaussian means of the windows inside images: one loop if compiled, else kornia's convolutions."""
-    if torch.compiler.is_compiling():
+    """Gaussian means of the windows inside images: loops in C++, or kornia's convolutions."""
+    if in_cpp(*images):
         return window_sums(images, TAPS, channels=3)
     taps = images[0].new_tensor([TAPS])
     stacked = torch.stack(images).unflatten(2, (-1, 3)).permute(0, 3, 1, 2)

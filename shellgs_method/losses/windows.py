@@ -1,34 +1,46 @@
-"""Window sums of images stored as [height, width * channels].
-
-Inductor makes two loops of two dimensions; with the channels as a third dimension, it vectorises over these three.
-"""
+"""Window sums of images stored as [height, width * channels]: along rows, then along columns."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from shellgs_method.machine.elementwise import Function, Value, dot, elementwise
 
-def shifted(x: Float[Tensor, "H X"], size: int, dim: int, channels: int = 1) -> list[Tensor]:
-    """Values at each position of a window that moves down (dim 0) or right (dim 1) inside the image."""
+
+def shifted(
+    images: Sequence[Float[Tensor, "H X"]], size: int, dim: int, channels: int = 1
+) -> Iterator[Float[Tensor, "h x 1"]]:
+    """Values at each position of a window that moves down (dim 0) or right (dim 1) inside each image; views."""
     step = channels if dim == 1 else 1
-    length = x.shape[dim] - (size - 1) * step
-    return [x.narrow(dim, i * step, length) for i in range(size)]
+    for x in images:
+        length = x.shape[dim] - (size - 1) * step
+        yield from (x.narrow(dim, i * step, length)[..., None] for i in range(size))
 
 
 def window_sums(
-    images: Sequence[Float[Tensor, "H X"]], taps: Sequence[float], channels: int = 1
-) -> list[Float[Tensor, "h x"]]:
+    images: Sequence[Float[Tensor, "H X"]], taps: tuple[float, ...], channels: int = 1
+) -> Sequence[Float[Tensor, "h x"]]:
     """Sums over square windows inside images of one size, weighted by the product of ``taps`` along both sides."""
-    # All in one image, side by side, since compiling takes time for each operation.
-    width = images[0].shape[1]
-    x = torch.cat([*images], dim=1)
-    for dim in (0, 1):
-        weighted = [tap * each for tap, each in zip(taps, shifted(x, len(taps), dim, channels), strict=True)]
-        x = functools.reduce(torch.add, weighted)
-    inside = width - (len(taps) - 1) * channels
-    return [x.narrow(1, i * width, inside) for i in range(len(images))]
+    for dim in (1, 0):
+        images = [each[..., 0] for each in elementwise(_weighted(taps), *shifted(images, len(taps), dim, channels))]
+    return images
+
+
+@functools.cache
+def _weighted(taps: tuple[float, ...]) -> Function:
+    """The function that sums windows of each image."""
+
+    def weighted(*values: Sequence[Value]) -> list[list[Value]]:
+        return [[dot(window, taps)] for window in in_windows(values, len(taps))]
+
+    return weighted
+
+
+def in_windows(values: Sequence[Sequence[Value]], size: int) -> Iterator[list[Value]]:
+    """The values of each window among those that :func:`shifted` gave."""
+    for i in range(0, len(values), size):
+        yield [value for (value,) in values[i : i + size]]

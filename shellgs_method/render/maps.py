@@ -6,7 +6,7 @@ is the same for both primitives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -17,8 +17,8 @@ from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_along_rays
-from shellgs_method.machine.compilation import run_fused
-from shellgs_method.render.rasterizer.projection import dot, rotate, rotated_axes, to_camera
+from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.render.rasterizer.projection import rotate, rotated_axes, to_camera
 
 Primitive = Literal["3d", "2d"]
 DepthKind = Literal["expected", "median", "plane", "mode"]
@@ -82,7 +82,7 @@ class Geometry:
     @cached_property
     def depth_normal(self) -> Float[Tensor, "H W 3"]:
         """Unit normals of the depth, zero on the image border."""
-        return run_fused(normals_along_rays, self.depth, self.camera.rays().to(self.depth), varying=2)
+        return normals_along_rays(self.depth, self.camera.rays().to(self.depth))
 
 
 def geometry_channels(
@@ -94,7 +94,7 @@ def geometry_channels(
     centre), else the forward depth of the centre.
     """
     splats = (gaussians[name] for name in ("means", "quats", "scales"))
-    normals, along, depths = run_fused(_normals_and_depths, *splats, camera.viewmat[None], strided=True)
+    normals, along, depths = elementwise(_normals_and_depths, *splats, camera.viewmat.flatten())
     return normals, along if depth == "plane" else depths
 
 
@@ -144,20 +144,17 @@ def mode_of_depth(
 
 
 def _normals_and_depths(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    viewmat: Float[Tensor, "1 4 4"],
-) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"], Float[Tensor, "N 1"]]:
-    """Normals, n·m, and depths of the centres."""
-    centres = to_camera(means, viewmat)
-    axes = [rotate(axis, viewmat) for axis in rotated_axes(quats)]
-    x, y, z = scales.detach().unbind(-1)
+    mean: Sequence[Value], quat: Sequence[Value], scale: Sequence[Value], viewmat: Sequence[Value]
+) -> list[list[Value]]:
+    """Normal, n·m, and depth of the centre."""
+    centre = to_camera(mean, viewmat)
+    axes = [rotate(axis, viewmat) for axis in rotated_axes(quat)]
+    x, y, z = scale
     first, second = (x <= y) & (x <= z), y <= z
     shortest = [torch.where(first, a, torch.where(second, b, c)) for a, b, c in zip(*axes, strict=True)]
-    along = dot(shortest, centres)
-    normals = torch.stack([torch.where(along > 0, -each, each) for each in shortest], dim=-1)
-    return normals[0], -along.abs()[0, :, None], centres[2][0, :, None]
+    along = dot(shortest, centre)
+    normal = [torch.where(along > 0, -each, each) for each in shortest]
+    return [normal, [-torch.abs(along)], [centre[2]]]
 
 
 def rendered_geometry(

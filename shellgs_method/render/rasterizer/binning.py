@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.machine.elementwise import Value, elementwise
 
 TILE = 8  # pixels along the side of a tile
 
@@ -48,10 +51,10 @@ class Bins:
         return -(-self.width // TILE)
 
 
-def touches(ellipses: Float[Tensor, "*batch 7"], size: Float[Tensor, "1 2"]) -> Bool[Tensor, "*batch"]:
-    """Whether the bounding boxes of ellipses touch an image of the given width and height."""
-    centres, reach = ellipses[..., :2], ellipses[..., 5:]
-    return ((centres + reach > 0) & (centres - reach < size)).all(dim=-1)
+def touches(ellipse: Sequence[Value], size: Sequence[Value]) -> Value:
+    """Whether the bounding box of an ellipse touches an image of the given width and height."""
+    (x, y, *_, reach_x, reach_y), (width, height) = ellipse, size
+    return (x + reach_x > 0) & (y + reach_y > 0) & (x - reach_x < width) & (y - reach_y < height)
 
 
 @torch.no_grad()
@@ -65,9 +68,11 @@ def bin_splats(outlines: Float[Tensor, "N O 7"], width: int, height: int) -> Bin
         width: image width in pixels.
         height: image height in pixels.
     """
-    size = outlines.new_tensor([[width, height]])
-    splat, row = count_up(*run_fused(_rows, outlines, size))
-    strip, tile = count_up(*run_fused(_columns, outlines, splat, row, size))
+    size, outlines = outlines.new_tensor([width, height]), outlines.flatten(1)
+    (rows,) = elementwise(_rows, outlines, size)
+    splat, row = count_up(*rows.int().unbind(1))
+    (columns,) = elementwise(_columns, outlines.index_select(0, splat), row.to(size)[:, None], size)
+    strip, tile = count_up(*columns.int().unbind(1))
     # The entries are front to back, and a stable sort keeps that order within a tile.
     strip = strip.index_select(0, stable_order(tile))
     splats = F.pad(splat.index_select(0, strip), (0, 1), value=len(outlines))
@@ -84,47 +89,51 @@ def stable_order(keys: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     return keys.sort(stable=True).indices
 
 
-def _rows(outlines: Float[Tensor, "N O 7"], size: Float[Tensor, "1 2"]) -> tuple[Int[Tensor, "N"], Int[Tensor, "N"]]:
-    """First row of tiles of each splat, and number of rows."""
-    v, reach = outlines[..., 1], outlines[..., 6]
-    return _tiles_between((v - reach).amin(-1), (v + reach).amax(-1), size[:, 1])
+def _rows(outlines: Sequence[Value], size: Sequence[Value]) -> list[Sequence[Value]]:
+    """First row of tiles of a splat, and number of rows."""
+    spans = [(v - reach, v + reach) for _, v, _, _, _, _, reach in _ellipses(outlines)]
+    return [_tiles_between(*_around(spans), size[1])]
 
 
-def _columns(
-    outlines: Float[Tensor, "N O 7"], splat: Int[Tensor, "M"], row: Int[Tensor, "M"], size: Float[Tensor, "1 2"]
-) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"]]:
-    """First tile of each splat in a row of tiles, and number of tiles.
+def _columns(outlines: Sequence[Value], row: Sequence[Value], size: Sequence[Value]) -> list[Sequence[Value]]:
+    """First tile of a splat in a row of tiles, and number of tiles.
 
     At height y above its centre, the ellipse A x² + 2 B x y + C y² = 1 spans
     x = -B/A y ± sqrt((1 - y² / reach_y²) / A), and it is widest where y = ∓B/C reach_x.
     """
-    u, v, A, B, C, reach_x, reach_y = outlines[splat].unbind(-1)
-    top = (row * TILE)[:, None] + 0.5 - v
-    above, below = torch.maximum(top, -reach_y), torch.minimum(top + (TILE - 1), reach_y)
-    widest = -B / C * reach_x
-
-    def half_width(y: Tensor) -> Tensor:
-        return ((1 - (y / reach_y).square()).clamp_min(0) / A).sqrt()
-
-    y_right = torch.minimum(torch.maximum(widest, above), below)
-    y_left = torch.minimum(torch.maximum(-widest, above), below)
-    left = u - B / A * y_left - half_width(y_left)
-    right = u - B / A * y_right + half_width(y_right)
-    meets = above <= below
-    left = torch.where(meets, left, torch.inf).amin(-1)
-    right = torch.where(meets, right, -torch.inf).amax(-1)
-    first, n_tiles = _tiles_between(left, right, size[:, 0])
-    return row * ((size[:, 0].int() + (TILE - 1)) // TILE) + first, n_tiles
+    spans, (row,), (width, _) = [], row, size
+    for u, v, A, B, C, reach_x, reach_y in _ellipses(outlines):
+        top = row * TILE + 0.5 - v
+        above, below = torch.maximum(top, -reach_y), torch.minimum(top + (TILE - 1), reach_y)
+        widest = -B / C * reach_x
+        y_right = torch.minimum(torch.maximum(widest, above), below)
+        y_left = torch.minimum(torch.maximum(-widest, above), below)
+        left, right = u - B / A * y_left, u - B / A * y_right
+        half_widths = [torch.sqrt(torch.relu(1 - (y / reach_y) * (y / reach_y)) / A) for y in (y_left, y_right)]
+        meets = above <= below
+        left = torch.where(meets, left - half_widths[0], math.inf)
+        right = torch.where(meets, right + half_widths[1], -math.inf)
+        spans.append((left, right))
+    first, n_tiles = _tiles_between(*_around(spans), width)
+    return [[row * torch.floor((width + (TILE - 1)) / TILE) + first, n_tiles]]
 
 
-def _tiles_between(
-    low: Float[Tensor, "n"], high: Float[Tensor, "n"], n_pixels: Float[Tensor, "1"]
-) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+def _ellipses(outlines: Sequence[Value]) -> list[Sequence[Value]]:
+    return [outlines[i : i + 7] for i in range(0, len(outlines), 7)]
+
+
+def _around(spans: Sequence[tuple[Value, Value]]) -> tuple[Value, Value]:
+    """From the least to the greatest of some spans."""
+    lows, highs = zip(*spans, strict=True)
+    return functools.reduce(torch.minimum, lows), functools.reduce(torch.maximum, highs)
+
+
+def _tiles_between(low: Value, high: Value, n_pixels: Value) -> tuple[Value, Value]:
     """First tile and number of tiles with a pixel centre between two coordinates, along one side of the image."""
-    first = torch.minimum((low - 0.5).ceil().clamp_min(0), n_pixels).int()
-    last = torch.minimum((high - 0.5).floor().clamp_min(-1), n_pixels - 1).int()
-    n_tiles = torch.where(last >= first, last // TILE - first // TILE + 1, 0)
-    return first // TILE, n_tiles
+    first = torch.minimum(torch.relu(torch.ceil(low - 0.5)), n_pixels)
+    last = torch.minimum(torch.clamp_min(torch.floor(high - 0.5), -1.0), n_pixels - 1)
+    first_tile, last_tile = torch.floor(first / TILE), torch.floor(last / TILE)
+    return first_tile, torch.where(last >= first, last_tile - first_tile + 1, 0.0)
 
 
 def count_up(first: Int[Tensor, "n"], times: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:

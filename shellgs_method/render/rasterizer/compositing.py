@@ -17,10 +17,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from shellgs_method.machine.compilation import fused
 from shellgs_method.render.rasterizer.binning import TILE, Bins, stable_order
 from shellgs_method.render.rasterizer.kernels import TRANSMITTANCE_MIN, Kernels
-from shellgs_method.render.rasterizer.plans import CHUNK, LANES, Plan, Strips, after_a_row
+from shellgs_method.render.rasterizer.loops import Loops
+from shellgs_method.render.rasterizer.plans import CHUNK, LANES, Plan, Strips
 
 # Tiles per batch, and chunks between checks of which tiles are still active. Small batches stay in a CPU's cache, large
 # ones need fewer kernel calls; a GPU is only busy with large ones, and each check makes the host wait for it.
@@ -79,43 +79,42 @@ class _Composite(torch.autograd.Function):
         columns = [each.index_select(0, order) for each in (means2d, shapes, features)]
         table = F.pad(torch.cat([*columns, features.new_ones(len(order), 1)], dim=1), (0, 0, 0, 1))
         table[-1, : kernels.n_shape] = table.new_tensor(kernels.null_shape)  # pads a tile's last chunk
-        canvas, done = _composite_tiles(table, bins, kernels)
+        loops = Loops(kernels, features.shape[1] + 1, None if probed is None else n_densifying)
+        canvas, done = _composite_tiles(table, bins, loops)
         ctx.save_for_backward(table, order)
-        ctx.n, ctx.bins, ctx.done, ctx.kernels = len(means2d), bins, done, kernels
-        ctx.n_densifying = None if probed is None else n_densifying
+        ctx.n, ctx.bins, ctx.done, ctx.loops = len(means2d), bins, done, loops
         return _untile(canvas[:-1], bins)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, gradients):
         table, order = ctx.saved_tensors
-        grad_rows = _gradients(_tile(gradients, ctx.bins), table, ctx.done, ctx.kernels, ctx.n_densifying)
-        n_shape, n_params = ctx.kernels.n_shape, table.shape[1]
+        grad_rows = _gradients(_tile(gradients, ctx.bins), table, ctx.done, ctx.loops)
+        n_shape, n_params = ctx.loops.kernels.n_shape, table.shape[1]
         widths = [2, n_shape - 2, n_params - n_shape - 1, 1, grad_rows.shape[1] - n_params]
         means2d, shapes, features, _, probed = (
             table.new_zeros(ctx.n, each.shape[1]).index_copy_(0, order, each)
             for each in grad_rows[:-1].split(widths, dim=1)
         )
-        return means2d, shapes, features, None if ctx.n_densifying is None else probed, None, None, None, None
+        return means2d, shapes, features, None if ctx.loops.n_first is None else probed, None, None, None, None
 
 
 def _composite_tiles(
-    table: Float[Tensor, "N+1 K"], bins: Bins, kernels: Kernels
+    table: Float[Tensor, "N+1 K"], bins: Bins, loops: Loops
 ) -> tuple[Float[Tensor, "tiles+1 C P"], list[_Composited]]:
     """Totals of all tiles, and the plans that the backward pass retraces."""
-    n_totals = table.shape[1] - kernels.n_shape + kernels.n_maps
-    canvas = table.new_zeros(len(bins.counts), n_totals, TILE * TILE)
+    canvas = table.new_zeros(len(bins.counts), loops.n_totals, TILE * TILE)
     done = []
     # Tiles with similar numbers of splats finish together.
     busiest_first = bins.counts.argsort(descending=True)[: int((bins.counts > 0).sum())]
     tiles_per_batch, chunks_per_look = CPU_BATCHES if table.device.type == "cpu" else GPU_BATCHES
     for tiles in busiest_first.split(tiles_per_batch) if len(busiest_first) else ():
         plan = Plan.of(Strips.whole(tiles, bins), bins, table)
-        left, transmittance = _composite_whole(plan, canvas, table, kernels, chunks_per_look)
+        left, transmittance = _composite_whole(plan, canvas, table, loops, chunks_per_look)
         done.append(_Composited(plan))
         if len(left):
             strips = left.cut(min(MAX_STRIPS, max(1, tiles_per_batch // len(left))))
-            done.append(_composite_strips(strips, transmittance[strips.rows], canvas, table, bins, kernels))
+            done.append(_composite_strips(strips, transmittance[strips.rows], canvas, table, bins, loops))
     return canvas, done
 
 
@@ -123,14 +122,14 @@ def _composite_whole(
     plan: Plan,
     canvas: Float[Tensor, "tiles+1 C P"],
     table: Float[Tensor, "N+1 K"],
-    kernels: Kernels,
+    loops: Loops,
     chunks_per_look: int,
 ) -> tuple[Strips, Float[Tensor, "left P"]]:
     """Composite whole tiles into ``canvas`` until few are active: what is left of these, and its transmittance."""
     strips, sums = plan.strips, _zeros(plan, canvas)
     counts = F.pad(strips.counts, (0, plan.n_lanes - len(strips))).view(-1, LANES)
     ones = table.new_ones(len(strips), TILE * TILE)
-    for before, behind, brightest in _walk(plan, ones, sums, table, kernels):
+    for before, behind, brightest in _walk(plan, ones, sums, table, loops):
         plan.transmittances.append(before)
         n_done, n_chunks = len(plan.transmittances), len(plan.ends)
         if n_done < n_chunks and n_done % chunks_per_look > 0:
@@ -151,17 +150,17 @@ def _composite_strips(
     canvas: Float[Tensor, "tiles+1 C P"],
     table: Float[Tensor, "N+1 K"],
     bins: Bins,
-    kernels: Kernels,
+    loops: Loops,
 ) -> _Composited:
     """Composite the rest of tiles, cut into strips, into ``canvas``; ``transmittance`` is that before the rest."""
     plan = Plan.of(strips, bins, table)
-    through = _transmittance_through(plan, _zeros(plan, canvas), table, kernels)
+    through = _transmittance_through(plan, _zeros(plan, canvas), table, loops)
     before = transmittance * strips.product_before(through)
     before, behind = (torch.where(each > TRANSMITTANCE_MIN, each, 0.0) for each in (before, before * through))
     reached = before.amax(1) > 0
     plan = Plan.of(strips[reached], bins, table)
     sums = _zeros(plan, canvas)
-    for before_chunk, *_ in _walk(plan, before[reached], sums, table, kernels):
+    for before_chunk, *_ in _walk(plan, before[reached], sums, table, loops):
         plan.transmittances.append(before_chunk)
     totals = plan.by_strip(sums)
     canvas.index_add_(0, plan.strips.tiles, totals)
@@ -169,15 +168,15 @@ def _composite_strips(
 
 
 def _transmittance_through(
-    plan: Plan, unused: list[Float[Tensor, "G P V"]], table: Float[Tensor, "N+1 K"], kernels: Kernels
+    plan: Plan, unused: list[Float[Tensor, "G P V"]], table: Float[Tensor, "N+1 K"], loops: Loops
 ) -> Float[Tensor, "n P"]:
     """Transmittance through each strip alone, of pixels that never stop.
 
-    The kernel that composites serves, as it is compiled already; what it composites, into ``unused``, is not needed.
+    The loop that composites serves; what it composites, into ``unused``, is not needed.
     """
     through = torch.empty_like(unused[0])
     ones = table.new_ones(len(plan.strips), TILE * TILE)
-    for _, behind, _ in _walk(plan, ones, unused, table, kernels, stop=-1.0):
+    for _, behind, _ in _walk(plan, ones, unused, table, loops, stop=-1.0):
         through[: len(behind)] = behind
     return plan.by_strip([through])[:, 0]
 
@@ -187,20 +186,16 @@ def _walk(
     transmittance: Float[Tensor, "n P"],
     sums: list[Float[Tensor, "G P V"]],
     table: Float[Tensor, "N+1 K"],
-    kernels: Kernels,
+    loops: Loops,
     stop: float = TRANSMITTANCE_MIN,
 ) -> Iterator[tuple[Float[Tensor, "g P V"], Float[Tensor, "g P V"], Float[Tensor, "g V"]]]:
     """Add a plan to ``sums`` chunk by chunk: transmittance before and behind a chunk, and the maximum of the latter."""
     (behind,) = plan.side_by_side(transmittance[:, None])
-    pixels, stops = _pixels(table), _stops(plan, table, stop)
-    forward = None
     for i in range(len(plan.ends)):
         rows = plan.splats[plan.chunk(i)]
         n = len(rows)
         before = behind[:n]
-        args = before, [each[:n] for each in sums], table, rows, plan.centres[:n], *pixels, stops[:n]
-        forward = forward or fused(kernels.forward, *args)
-        behind, brightest = forward(*args)
+        behind, brightest = loops.forward(before, [each[:n] for each in sums], table, rows, plan.centres[:n], stop)
         yield before, behind, brightest
 
 
@@ -208,18 +203,17 @@ def _gradients(
     gradients: Float[Tensor, "tiles+1 C P"],
     table: Float[Tensor, "N+1 K"],
     done: list[_Composited],
-    kernels: Kernels,
-    n_densifying: int | None,
+    loops: Loops,
 ) -> Float[Tensor, "N+1 K+probed"]:
     """Gradients of the table's rows from those of the composited totals, followed by those of the probed parameters."""
-    grad_table = table.new_zeros(len(table), table.shape[1] + (0 if n_densifying is None else kernels.n_probed))
-    behind = table.new_zeros(len(gradients), 1 if n_densifying is None else 2, TILE * TILE)
+    grad_table = table.new_zeros(len(table), loops.n_columns)
+    behind = table.new_zeros(len(gradients), loops.n_groups, TILE * TILE)
     for group in _in_groups(done[::-1], MAX_SUMMED // (CHUNK * LANES * grad_table[0].nbytes)):
         splats = torch.cat([each.plan.splats[: each.plan.n_composited] for each in group])
-        grad_rows = after_a_row(table.new_empty(len(splats) + 1, *splats.shape[1:], grad_table.shape[1]))
+        grad_rows = table.new_empty(*splats.shape, loops.n_columns)
         parts = grad_rows.split([each.plan.n_composited for each in group])
         for each, part in zip(group, parts, strict=True):
-            _backward_plan(each, part, gradients, behind, table, kernels, n_densifying)
+            _backward_plan(each, part, gradients, behind, table, loops)
         grad_table += _sum_by_splat(grad_rows.flatten(0, 2), splats.flatten(), len(table))
     return grad_table
 
@@ -230,43 +224,27 @@ def _backward_plan(
     gradients: Float[Tensor, "tiles+1 C P"],
     behind: Float[Tensor, "tiles+1 groups P"],
     table: Float[Tensor, "N+1 K"],
-    kernels: Kernels,
-    n_densifying: int | None,
+    loops: Loops,
 ) -> None:
     """Fill in the gradients of a plan's splats, and update ``behind`` to the state before them."""
     plan, strips = done.plan, done.plan.strips
     of_strips = gradients[strips.tiles]
-    if done.totals is None:
-        behind_strips = behind[strips.tiles]
-    else:
-        behind_strips = _behind_strips(done, of_strips, kernels, n_densifying)
+    behind_strips = behind[strips.tiles] if done.totals is None else _behind_strips(done, of_strips, loops)
     gradients_here, behind_here = plan.side_by_side(of_strips), plan.side_by_side(behind_strips)
-    pixels, stops = _pixels(table), _stops(plan, table, TRANSMITTANCE_MIN)
-    backward = None
-    for i, transmittance in reversed([*enumerate(plan.transmittances)]):
-        rows, n = plan.chunk(i), len(transmittance)
-        totals = [gradient[:n] for gradient in gradients_here]
-        groups = (totals, []) if n_densifying is None else (totals[:n_densifying], totals[n_densifying:])
-        args = (
-            *(transmittance, [each[:n] for each in behind_here], *groups),
-            *(grad_rows[rows], table, plan.splats[rows], plan.centres[:n], *pixels, stops[:n]),
-        )
-        backward = backward or fused(kernels.backward, *args)
-        backward(*args)
+    for i, before in reversed([*enumerate(plan.transmittances)]):
+        rows, n = plan.chunk(i), len(before)
+        behinds, totals = ([each[:n] for each in lanes] for lanes in (behind_here, gradients_here))
+        loops.backward(before, behinds, totals, grad_rows[rows], table, plan.splats[rows], plan.centres[:n])
     first = strips.ranks == 0
     behind[strips.tiles[first]] = plan.by_strip(behind_here)[first]
 
 
-def _behind_strips(
-    done: _Composited, gradients: Float[Tensor, "n C P"], kernels: Kernels, n_densifying: int | None
-) -> Float[Tensor, "n groups P"]:
-    """``behind`` (see :func:`~.kernels.backward_step`) at the end of each strip."""
+def _behind_strips(done: _Composited, gradients: Float[Tensor, "n C P"], loops: Loops) -> Float[Tensor, "n groups P"]:
+    """``behind`` (see :func:`~.kernels.step_back`) at the end of each strip."""
     assert done.totals is not None
     assert done.behind is not None
-    n_sums = done.totals.shape[1] - kernels.n_unweighted
-    received = (gradients * done.totals)[:, :n_sums]
-    groups = [received] if n_densifying is None else [received[:, :n_densifying], received[:, n_densifying:]]
-    received = torch.stack([group.sum(1) for group in groups], dim=1)
+    received = (gradients * done.totals).unbind(1)
+    received = torch.stack([torch.stack(list(group)).sum(0) for group in loops.groups(received)], dim=1)
     transmittance = done.behind[:, None]
     return torch.where(transmittance > 0, done.plan.strips.sum_behind(received) / transmittance, 0.0)
 
@@ -289,20 +267,9 @@ def _in_groups(done: list[_Composited], max_rows: int) -> Iterator[list[_Composi
         yield group
 
 
-def _pixels(table: Tensor) -> tuple[Float[Tensor, "1 P 1"], Float[Tensor, "1 P 1"]]:
-    """Pixel coordinates relative to the tile's centre."""
-    side = torch.arange(TILE, dtype=table.dtype, device=table.device) + 0.5 - TILE / 2
-    return side.repeat(TILE)[None, :, None], side.repeat_interleave(TILE)[None, :, None]
-
-
 def _zeros(plan: Plan, canvas: Float[Tensor, "tiles+1 C P"]) -> list[Float[Tensor, "G P V"]]:
     """Totals of the lanes before anything is composited."""
     return [canvas.new_zeros(plan.n_groups, TILE * TILE, LANES) for _ in range(canvas.shape[1])]
-
-
-def _stops(plan: Plan, table: Tensor, stop: float) -> Float[Tensor, "G 1 V"]:
-    """Transmittance at which pixels stop, see :mod:`~.kernels`."""
-    return table.new_full((plan.n_groups, 1, LANES), stop)
 
 
 def _untile(canvas: Float[Tensor, "tiles C P"], bins: Bins) -> Float[Tensor, "height width C"]:

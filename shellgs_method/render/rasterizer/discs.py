@@ -7,18 +7,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.compilation import detached, run_fused
+from shellgs_method.machine.elementwise import Value, dot, elementwise
 from shellgs_method.render.rasterizer.binning import touches
 from shellgs_method.render.rasterizer.projection import (
     NEAR_PLANE,
     Projection,
-    cross,
     cutoffs,
-    dot,
     halvings,
     rotate,
     rotated_axes,
@@ -49,71 +47,69 @@ def project_discs(
     The centres in the camera frame are computed from ``means2d`` and depths, so that the gradient w.r.t. ``means2d``
     is the full effect of moving the disc parallel to the screen: hence two kernels, with ``means2d`` between them.
     """
-    views = stack_cameras(cameras)
-    means2d, depths, in_front = run_fused(_project_centres, means, *views, strided=True)
-    shapes, outlines, covars2d, visible = run_fused(
-        _project, means2d, depths, quats, scales, opacities, *views, strided=True
-    )
-    projection = Projection(means2d, shapes, depths.detach(), outlines, covars2d, visible & in_front)
+    views, opacities = stack_cameras(cameras), opacities[:, None]
+    means2d, depths, in_front = elementwise(_project_centres, means, *views[:2])
+    shapes, outlines, covars2d, visible = elementwise(_project, means2d, depths, quats, scales, opacities, *views)
+    visible = (visible[..., 0] > 0) & (in_front[..., 0] > 0)
+    projection = Projection(means2d, shapes, depths[..., 0].detach(), outlines.unflatten(-1, (2, 7)), covars2d, visible)
     if not with_probe:
         return projection
-    probe = detached(means2d).requires_grad_()
-    fixed = (each.detach() for each in (quats, scales, opacities))
-    shapes = run_fused(_project, probe, detached(depths), *fixed, *views, strided=True)[0]
+    probe = means2d.detach().requires_grad_()
+    fixed = (each.detach() for each in (depths, quats, scales, opacities))
+    shapes = elementwise(_project, probe, *fixed, *views)[0]
     return replace(projection, probe=probe, probed=torch.cat([probe, shapes[..., :-1]], dim=-1))  # all but n
 
 
 def _project_centres(
-    means: Float[Tensor, "N 3"],
-    viewmats: Float[Tensor, "B 4 4"],
-    intrinsics: Float[Tensor, "B 4 1"],
-    size: Float[Tensor, "1 2"],
-) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
-    """Means2d, depths, and whether the depth is beyond the near plane; if not, it is set to 1."""
-    del size
-    fx, fy, cx, cy = intrinsics.unbind(1)
-    x, y, z = to_camera(means, viewmats)
-    in_front = z.detach() >= NEAR_PLANE
+    mean: Sequence[Value], viewmat: Sequence[Value], intrinsics: Sequence[Value]
+) -> list[Sequence[Value]]:
+    """Means2d, depth, and whether the depth is beyond the near plane, 1 or 0; if not, it is set to 1."""
+    fx, fy, cx, cy = intrinsics
+    x, y, z = to_camera(mean, viewmat)
+    in_front = z >= NEAR_PLANE
     z = torch.where(in_front, z, 1.0)  # a culled splat must not put a division by 0 into the gradients
-    return torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1), z, in_front
+    return [[fx * x / z + cx, fy * y / z + cy], [z], [torch.where(in_front, 1.0, 0.0)]]
 
 
 def _project(
-    means2d: Float[Tensor, "B N 2"],
-    z: Float[Tensor, "B N"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    viewmats: Float[Tensor, "B 4 4"],
-    intrinsics: Float[Tensor, "B 4 1"],
-    size: Float[Tensor, "1 2"],
-) -> tuple[Tensor, ...]:
-    fx, fy, cx, cy = intrinsics.unbind(1)
-    rays = [(means2d[..., 0] - cx) / fx, (means2d[..., 1] - cy) / fy, torch.ones_like(z)]
-    tangents_u, tangents_v, normals = (rotate(axis, viewmats) for axis in rotated_axes(quats))
+    mean2d: Sequence[Value],
+    depth: Sequence[Value],
+    quat: Sequence[Value],
+    scale: Sequence[Value],
+    opacity: Sequence[Value],
+    viewmat: Sequence[Value],
+    intrinsics: Sequence[Value],
+    size: Sequence[Value],
+) -> list[Sequence[Value]]:
+    """Shape, two outlines, covariance, and whether the disc is visible, 1 or 0."""
+    (z,), (opacity,), (fx, fy, cx, cy) = depth, opacity, intrinsics
+    rays = [(mean2d[0] - cx) / fx, (mean2d[1] - cy) / fy]
+    tangents_u, tangents_v, normals = (rotate(axis, viewmat) for axis in rotated_axes(quat))
 
-    facing = dot(normals, rays)
-    shows = facing.detach().abs() > EDGE_ON * dot(rays, rays).detach().sqrt()
+    facing = normals[0] * rays[0] + normals[1] * rays[1] + normals[2]
+    length = torch.sqrt(rays[0].detach() * rays[0].detach() + rays[1].detach() * rays[1].detach() + 1)
+    shows = torch.abs(facing.detach()) > EDGE_ON * length
     facing = torch.where(shows, facing, 1.0)
-    u, v = cross(tangents_v, rays), cross(rays, tangents_u)
-    scale_u, scale_v = scales[:, 0], scales[:, 1]
+    u = tangents_v[1] - tangents_v[2] * rays[1], tangents_v[2] * rays[0] - tangents_v[0]  # of t_v × ray
+    v = tangents_u[2] * rays[1] - tangents_u[1], tangents_u[0] - tangents_u[2] * rays[0]  # of ray × t_u
+    scale_u, scale_v, *_ = scale
     halves = math.sqrt(0.5 / math.log(2))  # exp(-u²/2) = 2^-(halves u)²
     shape_u, shape_v = halves / (scale_u * facing), halves / (scale_v * facing)
-    shapes = [shape_u * u[0] / fx, shape_u * u[1] / fy, shape_v * v[0] / fx, shape_v * v[1] / fy]
+    shape = [shape_u * u[0] / fx, shape_u * u[1] / fy, shape_v * v[0] / fx, shape_v * v[1] / fy]
     inverse_depth = [1 / z, normals[0] / (fx * z * facing), normals[1] / (fy * z * facing)]
-    shapes = torch.stack([*shapes, *inverse_depth, halvings(opacities).expand_as(z)], dim=-1)
+    shape = [*shape, *inverse_depth, halvings(opacity)]
 
     axes = ((tangents_u, scale_u), (tangents_v, scale_v))
-    half_axes = [[(scale * each).detach() for each in axis] for axis, scale in axes]
-    cutoff = cutoffs(opacities)
-    x, y = ((z * each).detach() for each in rays[:2])
-    outline, covars2d = _outlines(x, y, z.detach(), half_axes, cutoff.sqrt(), intrinsics, size)
-    radius = (cutoff / 2).sqrt().expand_as(z)
-    conic = [1 / radius.square(), torch.zeros_like(z), 1 / radius.square()]
-    low_pass = torch.stack([*means2d.detach().unbind(-1), *conic, radius, radius], dim=-1)
-    outlines = torch.stack([outline, low_pass], dim=-2)
-    visible = shows & (cutoff > 0) & touches(outlines, size).any(dim=-1)
-    return shapes, outlines, covars2d, visible
+    half_axes = [[(length * each).detach() for each in axis] for axis, length in axes]
+    cutoff, z = cutoffs(opacity), z.detach()
+    x, y = ((z * each).detach() for each in rays)
+    outline, covars2d = _outline(x, y, z, half_axes, torch.sqrt(cutoff), intrinsics, size)
+    radius, none = torch.sqrt(cutoff / 2), 0 * cutoff
+    conic = 1 / (radius * radius)
+    low_pass = [*(each.detach() for each in mean2d), conic, none, conic, radius, radius]
+    visible = shows & (cutoff > 0)
+    reached = torch.where(touches(outline, size), 1.0, torch.where(touches(low_pass, size), 1.0, 0.0))
+    return [shape, [*outline, *low_pass], covars2d, [torch.where(visible, reached, 0.0)]]
 
 
 def disc_maps(
@@ -131,21 +127,21 @@ def disc_maps(
     return {"inverse_depth": inverse_depth, "median_depth": median_depth, "distortion": distortion}
 
 
-def _outlines(
-    x: Float[Tensor, "B N"],
-    y: Float[Tensor, "B N"],
-    z: Float[Tensor, "B N"],
-    half_axes: Sequence[Sequence[Float[Tensor, "B N"]]],
-    radius: Float[Tensor, "N"],
-    intrinsics: Float[Tensor, "B 4 1"],
-    size: Float[Tensor, "1 2"],
-) -> tuple[Float[Tensor, "B N 7"], Float[Tensor, "B N 3"]]:
-    """Ellipses around discs of a radius in half-axes, and the covariances of the discs as if seen from afar.
+def _outline(
+    x: Value,
+    y: Value,
+    z: Value,
+    half_axes: Sequence[Sequence[Value]],
+    radius: Value,
+    intrinsics: Sequence[Value],
+    size: Sequence[Value],
+) -> tuple[list[Value], list[Value]]:
+    """Ellipse around a disc of a radius in half-axes, and the covariance of the disc as if seen from afar.
 
     Where the whole disc is well in front of the camera, the ellipse is exact, plus a tenth of a pixel in quadrature.
     Else it surrounds the projected box of the disc, clipped at the near plane and at the image border.
     """
-    fx, fy, cx, cy = intrinsics.unbind(1)
+    (fx, fy, cx, cy), (width, height) = intrinsics, size
     # A disc's point (u, v) is at (across, down)·(u, v) / (z + along·(u, v)) from the projected centre.
     along = [axis[2] for axis in half_axes]
     across = [fx * (axis[0] - x / z * axis[2]) for axis in half_axes]
@@ -154,32 +150,33 @@ def _outlines(
     x_along, y_along, along_squared = dot(across, along), dot(down, along), dot(along, along)
     area = across[0] * down[1] - across[1] * down[0]
 
-    in_front = radius * along_squared.sqrt() < 0.95 * z
+    in_front = radius * torch.sqrt(along_squared) < 0.95 * z
     # The dual conic of the circle |(u, v)| = radius.
-    scale = radius.square() / torch.where(in_front, z.square() - radius.square() * along_squared, 1.0)
+    scale = radius * radius / torch.where(in_front, z * z - radius * radius * along_squared, 1.0)
     centre_x, centre_y = fx * x / z + cx - scale * x_along, fy * y / z + cy - scale * y_along
     slack = 0.01
-    covar_xx = scale * xx + (scale * x_along).square() + slack
-    covar_xy = scale * xy + scale.square() * x_along * y_along
-    covar_yy = scale * yy + (scale * y_along).square() + slack
-    determinant = (scale * area).square() * (1 + scale * along_squared) + slack * (covar_xx + covar_yy - slack)
+    shift_x, shift_y = scale * x_along, scale * y_along
+    covar_xx = scale * xx + shift_x * shift_x + slack
+    covar_xy = scale * xy + shift_x * shift_y
+    covar_yy = scale * yy + shift_y * shift_y + slack
+    scaled = scale * area
+    determinant = scaled * scaled * (1 + scale * along_squared) + slack * (covar_xx + covar_yy - slack)
 
-    reach_x, reach_y, reach_z = (radius * dot(each, each).sqrt() for each in zip(*half_axes, strict=True))
-    nearest, farthest = (z - reach_z).clamp_min(NEAR_PLANE), z + reach_z
+    reach_x, reach_y, reach_z = (radius * torch.sqrt(dot(each, each)) for each in zip(*half_axes, strict=True))
+    nearest, farthest = torch.clamp_min(z - reach_z, NEAR_PLANE), z + reach_z
 
-    def box(centre: Tensor, reach: Tensor, focal: Tensor, principal: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    def box(centre: Value, reach: Value, focal: Value, principal: Value, size: Value) -> tuple[Value, Value]:
         low, high = centre - reach, centre + reach
         low = focal * torch.minimum(low / nearest, low / farthest) + principal
         high = focal * torch.maximum(high / nearest, high / farthest) + principal
-        low, high = (torch.minimum(each.clamp_min(0), size) for each in (low, high))
-        return (low + high) / 2, ((high - low) / 2).clamp_min(slack) * math.sqrt(2)
+        low, high = (torch.minimum(torch.relu(each), size) for each in (low, high))
+        return (low + high) / 2, torch.clamp_min((high - low) / 2, slack) * math.sqrt(2)
 
-    box_x, box_reach_x = box(x, reach_x, fx, cx, size[:, :1])
-    box_y, box_reach_y = box(y, reach_y, fy, cy, size[:, 1:])
+    box_x, box_reach_x = box(x, reach_x, fx, cx, width)
+    box_y, box_reach_y = box(y, reach_y, fy, cy, height)
     conic = [covar_yy / determinant, -covar_xy / determinant, covar_xx / determinant]
-    exact = [centre_x, centre_y, *conic, covar_xx.sqrt(), covar_yy.sqrt()]
-    conic = [1 / box_reach_x.square(), torch.zeros_like(z), 1 / box_reach_y.square()]
+    exact = [centre_x, centre_y, *conic, torch.sqrt(covar_xx), torch.sqrt(covar_yy)]
+    conic = [1 / (box_reach_x * box_reach_x), 0 * z, 1 / (box_reach_y * box_reach_y)]
     around_box = [box_x, box_y, *conic, box_reach_x, box_reach_y]
     outline = [torch.where(in_front, *each) for each in zip(exact, around_box, strict=True)]
-    covars2d = torch.stack([xx / z.square() + LOW_PASS, xy / z.square(), yy / z.square() + LOW_PASS], dim=-1)
-    return torch.stack(outline, dim=-1), covars2d
+    return outline, [xx / (z * z) + LOW_PASS, xy / (z * z), yy / (z * z) + LOW_PASS]

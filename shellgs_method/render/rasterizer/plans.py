@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from shellgs_method.render.rasterizer.binning import TILE, Bins, count_up
 
 CHUNK = 8  # splats per kernel call
 LANES = 16  # strips side by side in the innermost dimension
-MIN_GROUPS = 2  # a kernel compiled for one group does not serve more
 
 
 @dataclass(frozen=True)
@@ -102,20 +101,18 @@ class Plan:
     @classmethod
     def of(cls, strips: Strips, bins: Bins, table: Float[Tensor, "N+1 K"]) -> Plan:
         """Put strips into lanes, and look up their splats."""
-        n_groups = max(MIN_GROUPS, -(-len(strips) // LANES))
+        n_groups = -(-len(strips) // LANES)
         padding = 0, n_groups * LANES - len(strips)
         tiles, starts, counts = (
             F.pad(each, padding).view(-1, LANES) for each in (strips.tiles, strips.starts, strips.counts)
         )
         centres = torch.stack([tiles % bins.columns, tiles // bins.columns], dim=1) * TILE + TILE / 2
         n_chunks = -(-counts.amax(1) // CHUNK)
-        n_chunks[1] = n_chunks[0]
         to_do = torch.arange(int(n_chunks[0]), device=tiles.device)[:, None] < n_chunks
         chunk, group = to_do.nonzero(as_tuple=True)
         rank = (chunk[:, None] * CHUNK + torch.arange(CHUNK, device=tiles.device))[..., None]
         position = torch.where(rank < counts[group][:, None], starts[group][:, None] + rank, len(bins.splats) - 1)
-        position = F.pad(position, (0, 0, 0, 0, 1, 0))
-        splats = after_a_row(bins.splats.index_select(0, position.flatten()).view_as(position))
+        splats = bins.splats.index_select(0, position.flatten()).view_as(position)
         return cls(strips, centres.to(table), splats, to_do.sum(1).cumsum(0).tolist())
 
     @property
@@ -146,8 +143,3 @@ class Plan:
     def by_strip(self, channels: list[Float[Tensor, "G P V"]]) -> Float[Tensor, "n C P"]:
         """The inverse of :meth:`side_by_side`."""
         return torch.stack(channels, -1).permute(0, 2, 3, 1).flatten(0, 1)[: len(self.strips)]
-
-
-def after_a_row(padded: Shaped[Tensor, "1+rows *shape"]) -> Shaped[Tensor, "rows *shape"]:
-    """All rows but the first: no slice of them starts the storage, for which a kernel would be compiled once more."""
-    return padded[1:]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.machine.elementwise import Value, dot, elementwise
 from shellgs_method.render.rasterizer.binning import touches
 
 NEAR_PLANE = 0.01
@@ -78,34 +77,45 @@ def project_gaussians(
     The shapes are a, b, c and n of the exponent a dx² + b dx dy + c dy² + n, see :func:`halvings`; none depends on the
     screen position of the centre.
     """
-    projected = run_fused(_project, means, quats, scales, opacities, *stack_cameras(cameras), strided=True)
-    probe = projected[0].detach().requires_grad_() if with_probe else None
-    return Projection(*projected, probe=probe, probed=probe)
+    means2d, shapes, depths, outlines, covars2d, visible = elementwise(
+        _project, means, quats, scales, opacities[:, None], *stack_cameras(cameras)
+    )
+    probe = means2d.detach().requires_grad_() if with_probe else None
+    return Projection(
+        means2d,
+        shapes,
+        depths[..., 0],
+        outlines[..., None, :],
+        covars2d,
+        visible[..., 0] > 0,
+        probe=probe,
+        probed=probe,
+    )
 
 
 def _project(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, "N"],
-    viewmats: Float[Tensor, "B 4 4"],
-    intrinsics: Float[Tensor, "B 4 1"],
-    size: Float[Tensor, "1 2"],
-) -> tuple[Tensor, ...]:
-    fx, fy, cx, cy = intrinsics.unbind(1)
-    x, y, z = to_camera(means, viewmats)
-    depths = z.detach()
-    in_front = depths >= NEAR_PLANE
+    mean: Sequence[Value],
+    quat: Sequence[Value],
+    scale: Sequence[Value],
+    opacity: Sequence[Value],
+    viewmat: Sequence[Value],
+    intrinsics: Sequence[Value],
+    size: Sequence[Value],
+) -> list[Sequence[Value]]:
+    """The fields of :class:`Projection`, in this order; ``visible`` is 1 or 0."""
+    (fx, fy, cx, cy), (width, height), (opacity,) = intrinsics, size, opacity
+    x, y, z = to_camera(mean, viewmat)
+    depth = z.detach()
+    in_front = depth >= NEAR_PLANE
     z = torch.where(in_front, z, 1.0)  # a culled splat must not put a division by 0 into the gradients
     x, y = x / z, y / z
-    means2d = torch.stack([fx * x + cx, fy * y + cy], dim=-1)
+    means2d = [fx * x + cx, fy * y + cy]
 
     # Far off screen the linearised projection diverges: clamp its slope to 15 % of the image beyond the borders.
-    width, height = size.unbind(-1)
     x = torch.minimum(torch.maximum(x, -(cx + 0.15 * width) / fx), (1.15 * width - cx) / fx)
     y = torch.minimum(torch.maximum(y, -(cy + 0.15 * height) / fy), (1.15 * height - cy) / fy)
-    axes = zip(rotated_axes(quats), scales.unbind(1), strict=True)
-    half_axes = [rotate([scale * each for each in axis], viewmats) for axis, scale in axes]
+    axes = zip(rotated_axes(quat), scale, strict=True)
+    half_axes = [rotate([length * each for each in axis], viewmat) for axis, length in axes]
     across = [fx / z * (axis[0] - x * axis[2]) for axis in half_axes]
     down = [fy / z * (axis[1] - y * axis[2]) for axis in half_axes]
 
@@ -114,17 +124,17 @@ def _project(
     area = cross(across, down)
     determinant = dot(area, area) + LOW_PASS * (xx + yy) + LOW_PASS**2
     xx, yy = xx + LOW_PASS, yy + LOW_PASS
-    n = halvings(opacities).expand_as(depths)
     halving = math.log(2) * determinant
-    shapes = torch.stack([0.5 * yy / halving, -xy / halving, 0.5 * xx / halving, n], dim=-1)
+    shape = [0.5 * yy / halving, -xy / halving, 0.5 * xx / halving, halvings(opacity)]
 
     xx, xy, yy, determinant = xx.detach(), xy.detach(), yy.detach(), determinant.detach()
-    cutoff = cutoffs(opacities)
-    extent, reach = cutoff * determinant, [(cutoff * xx).sqrt(), (cutoff * yy).sqrt()]
-    outline = torch.stack([*means2d.detach().unbind(-1), yy / extent, -xy / extent, xx / extent, *reach], dim=-1)
+    cutoff = cutoffs(opacity)
+    extent = cutoff * determinant
+    reach = torch.sqrt(cutoff * xx), torch.sqrt(cutoff * yy)
+    outline = [*(each.detach() for each in means2d), yy / extent, -xy / extent, xx / extent, *reach]
     # The ellipse of a splat too large for single precision is NaN.
-    visible = in_front & (cutoff > 0) & extent.isfinite() & touches(outline, size)
-    return means2d, shapes, depths, outline[..., None, :], torch.stack([xx, xy, yy], dim=-1), visible
+    visible = in_front & (cutoff > 0) & (extent < math.inf) & touches(outline, size)
+    return [means2d, shape, [depth], outline, [xx, xy, yy], [torch.where(visible, 1.0, 0.0)]]
 
 
 def three_sigmas(covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Int[Tensor, "B N"]:
@@ -136,59 +146,53 @@ def three_sigmas(covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"])
 
 def stack_cameras(
     cameras: Sequence[Camera],
-) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 4 1"], Float[Tensor, "1 2"]]:
-    """Viewmats, intrinsics, and the common size, as a tensor so that kernels are not recompiled for each size."""
+) -> tuple[Float[Tensor, "B 1 16"], Float[Tensor, "B 1 4"], Float[Tensor, "2"]]:
+    """Viewmats, intrinsics, and the common width and height."""
     Ks = torch.stack([camera.K for camera in cameras])
-    intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], dim=1)[..., None]
-    size = Ks.new_tensor([[cameras[0].width, cameras[0].height]])
-    return torch.stack([camera.viewmat for camera in cameras]), intrinsics, size
+    intrinsics = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]], dim=1)
+    size = Ks.new_tensor([cameras[0].width, cameras[0].height])
+    return torch.stack([camera.viewmat for camera in cameras]).flatten(1)[:, None], intrinsics[:, None], size
 
 
-def to_camera(points: Float[Tensor, "N 3"], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N"]]:
-    """Transform points from the world to the camera frames."""
-    return [row + viewmats[:, i, 3, None] for i, row in enumerate(rotate(points.unbind(1), viewmats))]
+# Vectors are lists of their coordinates, and matrices of their rows' values, one row after another.
 
 
-def rotate(vectors: Sequence[Float[Tensor, "N"]], viewmats: Float[Tensor, "B 4 4"]) -> list[Float[Tensor, "B N"]]:
-    """Rotate vectors, given and returned by their coordinates, from the world to the camera frames.
-
-    Unlike a matrix product, a sum of three products fuses with the operations around it, and unlike coordinates in the
-    last dimension, splats in it are vectorised.
-    """
-    return [dot([viewmats[:, i, j, None] for j in range(3)], vectors) for i in range(3)]
+def to_camera(point: Sequence[Value], viewmat: Sequence[Value]) -> list[Value]:
+    """Transform a point from the world to the camera frame."""
+    return [each + viewmat[4 * i + 3] for i, each in enumerate(rotate(point, viewmat))]
 
 
-def dot(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
-    """Scalar product of vectors given by their coordinates."""
-    return functools.reduce(torch.add, [x * y for x, y in zip(a, b, strict=True)])
+def rotate(vector: Sequence[Value], viewmat: Sequence[Value]) -> list[Value]:
+    """Rotate a vector from the world to the camera frame."""
+    return [dot(viewmat[4 * i : 4 * i + 3], vector) for i in range(3)]
 
 
-def cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:
-    """Vector product of vectors given by their coordinates."""
+def cross(a: Sequence[Value], b: Sequence[Value]) -> list[Value]:
+    """Vector product."""
     return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def halvings(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+def halvings(opacity: Value) -> Value:
     """How many times alpha has halved below its maximum at a splat's centre."""
     # Fainter splats are culled; they must not put a division by 0 into the gradients.
-    return (ALPHA_MAX / opacities.clamp_min(ALPHA_MIN / 2)).log2()
+    return torch.log2(ALPHA_MAX / torch.clamp_min(opacity, ALPHA_MIN / 2))
 
 
-def cutoffs(opacities: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+def cutoffs(opacity: Value) -> Value:
     """Squared Mahalanobis distance within which alpha may reach 1/255; 0 for a splat too faint to count."""
     # The slack exceeds rounding errors, so that binning never loses a pixel that the kernel would count.
-    return (2 * (opacities.detach() / ALPHA_MIN).log() + 1e-3).clamp_min(0)
+    return torch.relu(2 * torch.log(opacity.detach() / ALPHA_MIN) + 1e-3)
 
 
 def quats_to_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z) of any norm."""
-    return torch.stack([torch.stack(axis, dim=-1) for axis in rotated_axes(quats)], dim=-1)
+    return torch.stack([torch.stack(axis, dim=-1) for axis in rotated_axes(quats.unbind(1))], dim=-1)
 
 
-def rotated_axes(quats: Float[Tensor, "N 4"]) -> list[list[Float[Tensor, "N"]]]:
-    """Columns of the rotation matrices, by their coordinates."""
-    w, x, y, z = quats.unbind(1)
-    double = 2 / (w * w + x * x + y * y + z * z).clamp_min(1e-24)
+def rotated_axes(quat: Sequence[Value]) -> list[list[Value]]:
+    """Columns of the rotation matrix of a quaternion (w, x, y, z) of any norm."""
+    w, x, y, z = quat
+    double = 2 / torch.clamp_min(w * w + x * x + y * y + z * z, 1e-24)
     return [
         [1 - double * (y * y + z * z), double * (x * y + w * z), double * (x * z - w * y)],
         [double * (x * y - w * z), 1 - double * (x * x + z * z), double * (y * z + w * x)],

@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.compilation import run_fused
 from shellgs_method.render.rasterizer import gsplat_backend
 from shellgs_method.render.rasterizer.binning import bin_splats, stable_order
 from shellgs_method.render.rasterizer.compositing import composite
@@ -111,7 +110,7 @@ def _rasterize(
     projection = project(means, quats, scales, opacities, cameras, with_probe=n_densifying is not None)
     views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
     composited, alpha, maps = torch.stack(views).split([features.shape[1], 1, kernels.n_maps], dim=-1)
-    radii = run_fused(three_sigmas, projection.covars2d, projection.visible)
+    radii = three_sigmas(projection.covars2d, projection.visible)
     centres = projection.means2d if projection.probe is None else projection.probe
     return Renders(composited, alpha, maps, centres, radii)
 

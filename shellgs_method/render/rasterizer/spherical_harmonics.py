@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from shellgs_method.machine.compilation import run_fused
+from shellgs_method.machine.elementwise import Value, dot, elementwise
 
 
 def spherical_harmonics(
@@ -28,34 +28,31 @@ def spherical_harmonics(
     n_harmonics = (degree + 1) ** 2
     if (n_given := sum(part.shape[1] for part in coefficients)) < n_harmonics:
         raise ValueError(f"SH degree {degree} needs {n_harmonics} coefficients, not {n_given}.")
-    # Sum all, times 1 or 0: one kernel per degree would mean four to compile.
-    counts = (torch.arange(n_given, device=directions.device) < n_harmonics).to(directions)[None]
-    return run_fused(_sum, directions, list(coefficients), counts)
+    # Sum all, times 1 or 0: one loop per degree would mean four to compile.
+    counts = (torch.arange(n_given, device=directions.device) < n_harmonics).to(directions)
+    return elementwise(_sum, directions, counts, *(part.flatten(1) for part in coefficients))[0]
 
 
-def _sum(
-    directions: Float[Tensor, "N 3"], coefficients: list[Float[Tensor, "N k 3"]], counts: Float[Tensor, "1 K"]
-) -> Float[Tensor, "N 3"]:
-    terms = [term for part in coefficients for term in part.unbind(1)]
-    harmonics = _harmonics(math.isqrt(len(terms)) - 1, F.normalize(directions, dim=-1))
-    weighted = (
-        (count * harmonic)[:, None] * term
-        for count, harmonic, term in zip(counts.unbind(1), harmonics, terms, strict=True)
-    )
-    return sum(weighted, start=torch.zeros_like(terms[0]))
+def _sum(direction: Sequence[Value], counts: Sequence[Value], *coefficients: Sequence[Value]) -> list[list[Value]]:
+    colours = [value for part in coefficients for value in part]  # three of each term
+    x, y, z = direction
+    length = torch.sqrt(torch.clamp_min(x * x + y * y + z * z, 1e-24))
+    harmonics = _harmonics(math.isqrt(len(counts)) - 1, [x / length, y / length, z / length])
+    weights = [count * harmonic for count, harmonic in zip(counts, harmonics, strict=True)]
+    return [[dot(weights, colours[channel::3]) for channel in range(3)]]
 
 
-def _harmonics(degree: int, directions: Float[Tensor, "N 3"]) -> list[Float[Tensor, "N"]]:
-    """Real harmonics of unit directions, Condon-Shortley phase included.
+def _harmonics(degree: int, direction: Sequence[Value]) -> list[Value]:
+    """Real harmonics of a unit direction, Condon-Shortley phase included.
 
     Recurrences from Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013: of the associated Legendre functions
     without their factor sin(theta)^m, and of sin(theta)^m times the sine and cosine of m phi.
     """
-    x, y, z = directions.unbind(-1)
-    harmonics = [torch.empty(0)] * (degree + 1) ** 2
-    cosine, sine, sectoral = torch.ones_like(x), torch.zeros_like(x), 1.0
+    x, y, z = direction
+    harmonics: list[Value] = [None] * (degree + 1) ** 2
+    cosine, sine, sectoral = 1 + 0 * x, 0 * x, 1.0
     for m in range(degree + 1):
-        below, legendre = torch.zeros_like(z), torch.full_like(z, sectoral)
+        below, legendre = 0 * z, sectoral + 0 * z
         for l in range(m, degree + 1):  # noqa: E741
             norm = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - m) / math.factorial(l + m))
             if m == 0:

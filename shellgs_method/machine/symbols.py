@@ -1,0 +1,201 @@
+"""Symbols in place of tensors: what is computed with them is differentiated, and written as C++."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+
+class Symbol:
+    """A vector of floats in C++: a name or a literal, or an expression of other symbols.
+
+    Args:
+        template: the expression, with a pair of braces for each part.
+        parts: what it is made of.
+        partials: takes the symbol and the gradient w.r.t. it, and returns the gradients w.r.t. the parts.
+    """
+
+    def __init__(self, template: str, *parts: Symbol | float, partials: Callable[..., tuple] = lambda *_: ()):
+        self.template, self.partials = template, partials
+        self.parts = tuple(each if isinstance(each, Symbol) else literal(each) for each in parts)
+
+    def __add__(self, other: Symbol | float) -> Symbol:
+        return Symbol("{} + {}", self, other, partials=lambda _, g: (g, g))
+
+    def __sub__(self, other: Symbol | float) -> Symbol:
+        return Symbol("{} - {}", self, other, partials=lambda _, g: (g, -g))
+
+    def __mul__(self, other: Symbol | float) -> Symbol:
+        return Symbol("{} * {}", self, other, partials=lambda s, g: (g * s.parts[1], g * s.parts[0]))
+
+    def __truediv__(self, other: Symbol | float) -> Symbol:
+        return Symbol("{} / {}", self, other, partials=lambda s, g: (g / s.parts[1], -(g * s) / s.parts[1]))
+
+    def __radd__(self, other: float) -> Symbol:
+        return literal(other) + self
+
+    def __rsub__(self, other: float) -> Symbol:
+        return literal(other) - self
+
+    def __rmul__(self, other: float) -> Symbol:
+        return literal(other) * self
+
+    def __rtruediv__(self, other: float) -> Symbol:
+        return literal(other) / self
+
+    def __neg__(self) -> Symbol:
+        return Symbol("-{}", self, partials=lambda _, g: (-g,))
+
+    def __gt__(self, other: Symbol | float) -> Condition:
+        return Condition("{} > {}", self, other)
+
+    def __ge__(self, other: Symbol | float) -> Condition:
+        return Condition("{} >= {}", self, other)
+
+    def __lt__(self, other: Symbol | float) -> Condition:
+        return Condition("{} < {}", self, other)
+
+    def __le__(self, other: Symbol | float) -> Condition:
+        return Condition("{} <= {}", self, other)
+
+    def detach(self) -> Symbol:
+        """The same without a gradient."""
+        return Symbol("{}", self, partials=lambda *_: (None,))
+
+    @classmethod
+    def __torch_function__(
+        cls, function: Callable[..., Any], types: Any, args: Sequence[Any] = (), kwargs: Any = None
+    ) -> Symbol:
+        return _FUNCTIONS[function](*args)
+
+
+class Condition(Symbol):
+    """Where a comparison is true."""
+
+    def __and__(self, other: Condition) -> Condition:
+        return Condition("{} & {}", self, other)
+
+
+def literal(value: float) -> Symbol:
+    """A number."""
+    number = f"{float(value)!r}f" if math.isfinite(value) else "INFINITY" if value > 0 else "-INFINITY"
+    return Symbol(f"all({number})")
+
+
+def _where(condition: Condition, a: Symbol | float, b: Symbol | float) -> Symbol:
+    return Symbol(
+        "{} ? {} : {}",
+        condition,
+        a,
+        b,
+        partials=lambda _, g: (None, _where(condition, g, 0.0), _where(condition, 0.0, g)),
+    )
+
+
+def _sqrt(x: Symbol) -> Symbol:
+    return Symbol("each<std::sqrt>({})", x, partials=lambda s, g: (0.5 * g / s,))
+
+
+def _log(x: Symbol) -> Symbol:
+    return Symbol("each<std::log>({})", x, partials=lambda s, g: (g / s.parts[0],))
+
+
+_FUNCTIONS: dict[Callable[..., Any], Callable[..., Symbol]] = {
+    torch.where: _where,
+    torch.relu: lambda x: _where(x > 0, x, 0.0),
+    torch.abs: lambda x: _where(x > 0, x, -x),
+    torch.minimum: lambda a, b: _where(a < b, a, b),
+    torch.maximum: lambda a, b: _where(a > b, a, b),
+    torch.clamp_min: lambda x, low: _where(x > low, x, low),
+    torch.sqrt: _sqrt,
+    torch.log: _log,
+    torch.log2: lambda x: _log(x) * (1 / math.log(2)),
+    torch.floor: lambda x: Symbol("each<std::floor>({})", x, partials=lambda *_: (None,)),
+    torch.ceil: lambda x: Symbol("each<std::ceil>({})", x, partials=lambda *_: (None,)),
+}
+
+
+def gradients(outputs: Sequence[tuple[Symbol, Symbol]], inputs: Sequence[Symbol]) -> list[Symbol]:
+    """Gradients w.r.t. symbols, given outputs each with the gradient w.r.t. it (reverse mode)."""
+    order: list[Symbol] = []
+    depends: dict[Symbol, bool] = {each: True for each in inputs}
+
+    def visit(symbol: Symbol) -> bool:
+        if symbol not in depends:
+            depends[symbol] = any([visit(part) for part in symbol.parts])
+            order.append(symbol)
+        return depends[symbol]
+
+    of: dict[Symbol, Symbol] = {}
+
+    def add(symbol: Symbol, gradient: Symbol) -> None:
+        of[symbol] = of[symbol] + gradient if symbol in of else gradient
+
+    for output, gradient in outputs:
+        if visit(output):
+            add(output, gradient)
+    for symbol in reversed(order):
+        if symbol in of and depends[symbol]:
+            for part, gradient in zip(symbol.parts, symbol.partials(symbol, of[symbol]), strict=True):
+                if gradient is not None and depends[part]:
+                    add(part, gradient)
+    return [of.get(each, literal(0.0)) for each in inputs]
+
+
+def statements(results: dict[str, Symbol]) -> str:
+    """C++ that computes symbols, each once, and then writes the results where the keys, with braces, say."""
+    names: dict[Symbol, str] = {}
+    lines: list[str] = []
+
+    def name(symbol: Symbol) -> str:
+        if symbol not in names:
+            expression = symbol.template.format(*map(name, symbol.parts))
+            if symbol.parts:
+                kind, names[symbol] = "mask" if isinstance(symbol, Condition) else "vec", f"t{len(names)}"
+                lines.append(f"const {kind} {names[symbol]} = {expression};")
+            else:
+                names[symbol] = expression
+        return names[symbol]
+
+    written = [f"{target.format(name(symbol))};" for target, symbol in results.items()]
+    return "\n".join([*lines, *written])
+
+
+PRELUDE = """
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+constexpr int V = {lanes};
+typedef float vec __attribute__((vector_size(4 * V)));
+typedef int32_t mask __attribute__((vector_size(4 * V)));
+
+static inline vec all(float value) {{ return vec{{}} + value; }}
+
+// Loops over arrays rather than over the elements of a vector, which GCC takes minutes to compile.
+template <int stride = 1> static inline vec load(const float *from) {{
+    float values[V];
+    for (int v = 0; v < V; ++v) values[v] = from[v * stride];
+    vec loaded;
+    std::memcpy(&loaded, values, sizeof(vec));
+    return loaded;
+}}
+
+template <int stride = 1> static inline void store(float *to, vec stored) {{
+    float values[V];
+    std::memcpy(values, &stored, sizeof(vec));
+    for (int v = 0; v < V; ++v) to[v * stride] = values[v];
+}}
+
+template <float (*function)(float)> static inline vec each(vec x) {{
+    float values[V];
+    std::memcpy(values, &x, sizeof(vec));
+    for (int v = 0; v < V; ++v) values[v] = function(values[v]);
+    std::memcpy(&x, values, sizeof(vec));
+    return x;
+}}
+"""
+"""Start of a source: vectors of the given number of lanes, and what symbols are made of."""
