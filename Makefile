@@ -1,6 +1,6 @@
 PYTHON ?= python3
 BIN := .venv/bin
-.PHONY: demo test docs libraries
+.PHONY: demo test docs
 .NOTPARALLEL:
 
 demo: .venv/checked  ## install; make the synthetic facade, train photo-gs and shellgs-metric on it, compare
@@ -18,17 +18,15 @@ test: .venv/dev .venv/checked  ## install; format, lint, types, imports, tests
 docs: .venv/docs  ## the pages, in build/docs; broken links are errors
 	$(BIN)/sphinx-build -W --keep-going -q docs build/docs
 
-libraries: .venv/shellgs  ## let apt-get install the system libraries that Open3D misses; asks nothing else
-	$(BIN)/shellgs doctor --install-libraries
-
 .venv/checked: .venv/shellgs  # not written where something is missing
 	$(BIN)/shellgs doctor
 	@touch $@
 
 .venv/shellgs: pyproject.toml
+	@$(PYTHON) shellgs_method/machine/system.py
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --editable .
 	@touch $@
 
 .venv/dev .venv/docs: .venv/%: .venv/shellgs

@@ -17,9 +17,11 @@ from torch._inductor.exc import InvalidCxxCompiler
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import notice
 from shellgs_method.machine import compilation
+from shellgs_method.machine.open3d import load_libusb
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
+load_libusb()  # for tests, and modules of nerfstudio, that import Open3D themselves
 os.environ.setdefault("SHELLGS_COMPILE", "0")  # kernels take longer to compile, or to load, than these tests to run
 
 

@@ -9,16 +9,10 @@ from rich.table import Table
 from shellgs_method.commands.common import console
 
 
-def doctor(install_libraries: bool = False) -> None:
-    """Check what this machine can run, and name the remedy for what it cannot.
+def doctor() -> None:
+    """Check what this machine can run, and name the remedy for what it cannot."""
+    from shellgs_method.machine.doctor import examine
 
-    Args:
-        install_libraries: Install missing system libraries, if apt-get is available and permitted.
-    """
-    from shellgs_method.machine.doctor import examine, install_system_libraries
-
-    if install_libraries:
-        install_system_libraries()
     table = Table(title="shellgs doctor")
     for heading in ("", "part", "finding"):
         table.add_column(heading)

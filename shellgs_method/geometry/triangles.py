@@ -55,7 +55,7 @@ class Triangles:
         scene: Open3D's ray casting scene.
 
     Raises:
-        ImportError: Open3D cannot be loaded.
+        SceneError: Open3D cannot be loaded.
     """
 
     def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:

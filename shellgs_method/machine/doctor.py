@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 import os
-import shutil
-import subprocess
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from shellgs_method.machine.open3d import LIBRARIES
+from shellgs_method.errors import SceneError
+from shellgs_method.machine import system
+from shellgs_method.machine.open3d import import_open3d
 
 
 class Finding(NamedTuple):
@@ -28,14 +28,6 @@ def examine() -> Iterator[Finding]:
         yield check()
 
 
-def install_system_libraries() -> None:
-    """Install the system libraries of Open3D, if it fails to load and apt-get may be used."""
-    if not _open3d().works and hasattr(os, "geteuid") and os.geteuid() == 0 and shutil.which("apt-get"):
-        environment = os.environ | {"DEBIAN_FRONTEND": "noninteractive"}
-        for command in (["update", "-qq"], ["install", "-qq", "-y", *LIBRARIES.split()]):
-            subprocess.run(["apt-get", *command], env=environment, stdout=subprocess.DEVNULL, check=False)
-
-
 def _torch() -> Finding:
     return _import("torch", "torch", "pip install torch")
 
@@ -46,7 +38,10 @@ def _torchvision() -> Finding:
 
 
 def _open3d() -> Finding:
-    return _import("Open3D", "open3d", f"as root, apt-get install {LIBRARIES}")
+    try:
+        return Finding("Open3D", True, import_open3d().__version__)
+    except SceneError as error:
+        return Finding("Open3D", False, str(error))
 
 
 def _import(subject: str, module: str, remedy: str) -> Finding:
@@ -57,9 +52,11 @@ def _import(subject: str, module: str, remedy: str) -> Finding:
 
 
 def _compiler() -> Finding:
-    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    detail = compiler or "none: the torch rasterizer runs several times slower; remedy: apt-get install g++"
-    return Finding("C++ compiler", compiler is not None, detail, needed=False)
+    compiler = system.compiler()
+    missing = system.missing_to_compile()
+    remedy = system.install_command(missing.values())
+    detail = f"the torch rasterizer runs several times slower without {', '.join(missing)}; remedy: {remedy}"
+    return Finding("C++ compiler", not missing, detail if missing else compiler or "", needed=False)
 
 
 def _cuda() -> Finding:

@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
+import sys
+from contextlib import suppress
 from types import ModuleType
 
-LIBRARIES = "libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1"
-"""Debian's packages of these."""
+from shellgs_method.errors import SceneError
+from shellgs_method.machine import system
 
 
 def import_open3d() -> ModuleType:
-    """Return Open3D, or raise an ImportError that names the system libraries its wheel needs."""
+    """Return Open3D.
+
+    Raises:
+        SceneError: it cannot be loaded; the message names the command that installs the system libraries it misses.
+    """
+    load_libusb()
     try:
         import open3d
     except (ImportError, OSError) as error:
-        raise ImportError(
-            f"Open3D cannot be loaded ({error}); it needs system libraries: apt-get install {LIBRARIES}"
-        ) from error
+        missing = system.missing_libraries()
+        remedy = (
+            system.install_command(missing.values())
+            if missing
+            else "pip install --force-reinstall open3d libusb-package"
+        )
+        raise SceneError(f"Open3D cannot be loaded ({reason(error)}): {remedy}") from error
     return open3d
+
+
+def load_libusb() -> None:
+    """Load libusb, which Open3D links for cameras that are never used here, from a wheel where the system has none."""
+    if sys.platform == "linux" and not system.loads(system.USB):
+        with suppress(ImportError, OSError):  # Open3D's import says what is missing
+            import libusb_package
+
+            ctypes.CDLL(str(libusb_package.get_library_path()))
 
 
 def reason(error: Exception) -> str:

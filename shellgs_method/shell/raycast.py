@@ -25,7 +25,7 @@ class ShellCaster:
         extent: longest side of the bounding box, in scene units.
 
     Raises:
-        ImportError: Open3D cannot be loaded.
+        SceneError: Open3D cannot be loaded.
     """
 
     def __init__(self, mesh: ShellMesh, shell_to_scene: Float64[np.ndarray, "4 4"]) -> None:

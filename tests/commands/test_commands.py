@@ -174,15 +174,9 @@ def test_doctor_lists_the_parts_of_this_machine(tmp_path):
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
 
 
-@pytest.mark.parametrize("asked", [False, True])
-def test_doctor_runs_apt_get_when_asked_and_names_it_otherwise(shellgs, monkeypatch, asked):
-    commands = []
-    missing = doctor.Finding("Open3D", False, "no libGL; remedy: as root, apt-get install libgl1")
+def test_doctor_ends_with_what_is_needed_and_missing(shellgs, monkeypatch):
+    missing = doctor.Finding("Open3D", False, "no libGL: apt-get install libgl1")
     monkeypatch.setattr(doctor, "_open3d", lambda: missing)
-    monkeypatch.setattr(doctor.os, "geteuid", lambda: 0)
-    monkeypatch.setattr(doctor.shutil, "which", lambda _: "/usr/bin/apt-get")
-    monkeypatch.setattr(doctor.subprocess, "run", lambda words, **_: commands.append(words[:2]))
-    output = shellgs("doctor", *["--install-libraries"] * asked)
-    assert commands == [["apt-get", "update"], ["apt-get", "install"]] * asked
-    assert output.startswith("refused: shellgs: nothing runs here until this is fixed: Open3D: no libGL")
-    assert "as root, apt-get install libgl1" in output
+    assert shellgs("doctor") == (
+        "refused: shellgs: nothing runs here until this is fixed: Open3D: no libGL: apt-get install libgl1"
+    )
