@@ -31,7 +31,7 @@ from rich.console import Console
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, content_hash
 from shellgs_method.launch.job import Job, JobT
-from shellgs_method.launch.local import BIN, PROGRESS_SECONDS, CommandError, finish
+from shellgs_method.launch.local import BIN, CommandError, finish
 from shellgs_method.machine.extras import import_extra
 from shellgs_method.runs.config_file import load_config
 from shellgs_method.runs.folders import replace_folder
@@ -39,6 +39,8 @@ from shellgs_method.runs.folders import replace_folder
 RETRIES = 3
 """Retries of a task whose worker was killed. The killed worker's command ends when its next line cannot be written."""
 
+PROGRESS_SECONDS = 30.0
+"""Seconds between two lines about the runs that are not finished."""
 TIMEOUT = 30
 """Seconds within which a running cluster answers."""
 PIECE = 1 << 26
