@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from shellgs_method.launch.pace import Pace
 from shellgs_method.machine.progress import ITERATION, Stage
@@ -28,15 +28,11 @@ class Work:
         self.label = label
         self.stage = Stage("Starting")
         self._clock, self._start, self._pace = clock, clock(), Pace()
-        self._iteration = 0
         self._told: tuple[str, float] | None = None
 
     def tell(self, stage: Stage) -> None:
         """It does this now."""
-        if stage.what == ITERATION and stage.item is not None:
-            if stage.item < self._iteration:  # nerfstudio repeats the last lines of its table
-                return
-            self._iteration = stage.item
+        if stage.what == ITERATION and stage.item:
             self._pace.report(self._clock(), stage.item)
         self.stage = stage
 
@@ -60,7 +56,7 @@ class Display:
     """Shows concurrent commands while its context lasts."""
 
     def __init__(self, console: Console):
-        self._console, self._works, self._ended = console, list[Work](), threading.Event()
+        self._console, self._works, self._ended = console, dict[str, tuple[Work, TaskID]](), threading.Event()
         columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[work]}")
         self._bars = Progress(*columns, console=console, transient=True)
         self._log = threading.Thread(target=self._tell_log, daemon=True)
@@ -76,23 +72,31 @@ class Display:
     @contextmanager
     def work(self, label: str) -> Iterator[Callable[[Stage], None]]:
         """Show a command while the context lasts; what it yields takes each of its stages."""
+        try:
+            yield self.begin(label)
+        finally:
+            self.end(label)
+
+    def begin(self, label: str) -> Callable[[Stage], None]:
+        """Show a command until :meth:`end`; what is returned takes each of its stages."""
         work = Work(label)
         bar = self._bars.add_task(label, total=None, work=work)
+        self._works[label] = work, bar
 
         def tell(stage: Stage) -> None:
             work.tell(stage)
-            self._bars.update(bar, completed=(work.stage.item or 1) - 1, total=work.stage.total)
+            self._bars.update(bar, completed=(stage.item or 1) - 1, total=stage.total)
 
-        self._works.append(work)
-        try:
-            yield tell
-        finally:
-            self._works.remove(work)
-            self._bars.remove_task(bar)
+        return tell
+
+    def end(self, label: str) -> None:
+        """Show a command no longer."""
+        _, bar = self._works.pop(label)
+        self._bars.remove_task(bar)
 
     def _tell_log(self) -> None:
         while not self._ended.wait(TICK):
-            for work in [*self._works]:
+            for work, _ in [*self._works.values()]:
                 if sentence := work.for_log():
                     self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
 

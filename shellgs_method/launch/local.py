@@ -99,7 +99,7 @@ def follow(
         CommandError: a command failed.
     """
     output: deque[str] = deque(maxlen=LAST_LINES)
-    waiting = list(commands)
+    waiting, iteration = list(commands), 0
     current = waiting[0]
     with (
         log.open("a", 1, "utf8") if log else nullcontext() as file,  # line by line: a run can take hours
@@ -122,6 +122,10 @@ def follow(
                     announce(current := waiting.pop(0))
                     tell(_first_stage(current))
                 elif stage := Stage.read(line):
+                    if stage.what == ITERATION and stage.item:
+                        if stage.item < iteration:  # nerfstudio repeats the last lines of its table
+                            continue
+                        iteration = stage.item
                     tell(stage)
         except BaseException:
             process.terminate()

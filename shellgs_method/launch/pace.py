@@ -24,6 +24,8 @@ class Pace:
 
     def report(self, now: float, iteration: int) -> None:
         """Iteration number ``iteration`` begins at ``now``, in seconds."""
+        if self._reports and iteration < self._reports[-1][1]:  # a killed training that resumes
+            self._reports.clear()
         if not self._reports or iteration > self._reports[-1][1]:
             self._reports.append((now, iteration))
 

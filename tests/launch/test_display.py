@@ -24,17 +24,14 @@ class Clock:
         return self.now
 
 
-def iterations_of(work: Work, clock: Clock, seconds: float, count: int, total: int = 1500) -> None:
-    for _ in range(count):
-        work.tell(Stage(ITERATION, work.stage.item + 1 if work.stage.item else 1, total))
-        clock.now += seconds
-
-
-def test_repeated_lines_of_nerfstudio_do_not_turn_the_count_back():
-    work = Work("scene/shellgs/seed-0", Clock())
-    for iteration in (90, 100, 10, 20, 100, 110):
-        work.tell(Stage(ITERATION, iteration, 1500))
-        assert work.stage.item == max(iteration, 100 if iteration < 90 else 0)
+def test_repeated_lines_of_nerfstudio_do_not_turn_the_count_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "BIN", tmp_path)
+    (tmp_path / "ns-train").write_text(
+        "for step in (90, 100, 10, 20, 100, 110): print(f'{step} (1.00%)   2 s')\nprint('Iteration: 105 of 1500')"
+    )
+    stages: list[Stage] = []
+    follow([["ns-train"]], tell=stages.append)
+    assert [stage.item for stage in stages[1:]] == [92, 102, 102, 112]
 
 
 def test_a_log_tells_each_stage_at_once_and_then_every_ten_seconds_and_less_often_in_a_long_run():

@@ -83,3 +83,11 @@ def test_there_is_no_estimate_after_few_iterations_or_seconds():
         assert slow.left(TOTAL) is None
     slow.report(140.0, 7)
     assert slow.left(TOTAL) == pytest.approx(20.0 * (TOTAL - 6))
+
+
+def test_a_training_that_resumes_elsewhere_is_estimated_anew():
+    pace = Pace()
+    for iteration in range(2, 20):
+        pace.report(2.0 * iteration, iteration)
+    pace.report(100.0, 10)
+    assert pace.left(TOTAL) is None
