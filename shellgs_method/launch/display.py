@@ -39,7 +39,7 @@ class Work:
     def __str__(self) -> str:
         now = self._clock()
         left = self._pace.left(self.stage.total) if self.stage.what == ITERATION and self.stage.total else None
-        estimate = "" if left is None else f", about {_rounded(left)} of training left"
+        estimate = "" if left is None else f", ~{_rounded(left)} of training left"
         return f"{self.stage} ({_clock_time(now - self._start)}{estimate})"
 
     def for_log(self) -> str | None:
@@ -57,8 +57,8 @@ class Display:
 
     def __init__(self, console: Console):
         self._console, self._works, self._ended = console, dict[str, tuple[Work, TaskID]](), threading.Event()
-        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[work]}")
-        self._bars = Progress(*columns, console=console, transient=True)
+        columns = TextColumn("{task.description}"), BarColumn(None), TextColumn("{task.fields[work]}")
+        self._bars = Progress(*columns, console=console, transient=True, expand=True)
         self._log = threading.Thread(target=self._tell_log, daemon=True)
 
     def __enter__(self) -> Display:

@@ -53,6 +53,20 @@ def test_a_log_tells_each_stage_at_once_and_then_every_ten_seconds_and_less_ofte
     assert len(times) < 120
 
 
+def test_the_time_left_is_told_once_it_can_be_estimated():
+    clock = Clock()
+    work = Work("scene/shellgs/seed-0", clock)
+    clock.now = 100.0
+    work.tell(Stage(ITERATION, 2, 1500))
+    assert str(work) == "iteration 2 of 1500 (1:40)"
+    for iteration in range(3, 13):
+        clock.now += 3.0
+        work.tell(Stage(ITERATION, iteration, 1500))
+    assert str(work) == "iteration 12 of 1500 (2:10, ~74 min of training left)"
+    work.tell(Stage("Evaluating view", 1, 8))
+    assert str(work) == "evaluating view 1 of 8 (2:10)"
+
+
 @pytest.mark.parametrize("terminal", [False, True])
 def test_a_command_is_shown_with_the_stages_that_it_prints(tmp_path, monkeypatch, terminal):
     """As a user runs it: a command that takes its time."""
