@@ -6,9 +6,9 @@ from collections import deque
 from itertools import pairwise
 from statistics import median
 
-LEAST, MOST = 5, 30
+LEAST, MOST = 8, 90
 """Numbers of recent intervals between two reports that an estimate is made from."""
-SECONDS = 10.0
+SECONDS = 15.0
 """Least time that they span."""
 
 
