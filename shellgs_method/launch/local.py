@@ -123,7 +123,7 @@ def follow(
                     tell(_first_stage(current))
                 elif stage := Stage.read(line):
                     if stage.what == ITERATION and stage.item:
-                        if stage.item < iteration:  # nerfstudio repeats the last lines of its table
+                        if stage.item <= iteration:  # nerfstudio repeats the last lines of its table
                             continue
                         iteration = stage.item
                     tell(stage)
