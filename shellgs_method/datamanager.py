@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float64, UInt8
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers import full_images_datamanager
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
@@ -29,10 +30,13 @@ from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
 from shellgs_method.files.photographs import View, has_alpha, load_mask, load_photograph
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory
+from shellgs_method.machine.progress import track
 from shellgs_method.runs.host import NoPixelSampler
 
 ViewT = TypeVar("ViewT")
 logger = logging.getLogger(__name__)
+# Nerfstudio's own says nothing in a log.
+full_images_datamanager.track = track  # pyright: ignore[reportPrivateImportUsage]
 
 MIN_SIDE = 11
 """Least side of a photograph in pixels: the size of SSIM's window."""
@@ -299,7 +303,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         maps = dataset.cues[kind] if kind else None
         chosen = [k for k, view in enumerate(dataset.views) if maps is None or maps.record(view.name)]
         cameras, cached = [dataset.camera(k) for k in chosen], self.cached_train
-        views = (view_of(camera, self._with_maps(cached[k])) for k, camera in zip(chosen, cameras, strict=True))
+        shown = track(zip(chosen, cameras, strict=True), "Placing the first Gaussians", len(chosen))
+        views = (view_of(camera, self._with_maps(cached[k])) for k, camera in shown)
         return views, sum(camera.width * camera.height for camera in cameras)
 
     @property

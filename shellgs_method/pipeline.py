@@ -12,7 +12,6 @@ from typing import Any
 import torch
 import torchvision
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-from rich.progress import track
 from torch import Tensor
 
 from shellgs_method.datamanager import FacadeDataManager
@@ -22,6 +21,7 @@ from shellgs_method.gaussians.initial import MAX_SEEDS, SEED_SPACING, SKYBOX_SEE
 from shellgs_method.gaussians.seeds import shell_seeds, view_behind_shell, view_of_shell, view_of_surface
 from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
+from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
 from shellgs_method.runs.host import mend_commands
@@ -158,7 +158,7 @@ class FacadePipeline(VanillaPipeline):
         if output_path is not None:
             output_path.mkdir(parents=True, exist_ok=True)
         views = []
-        for index, (camera, batch) in enumerate(track(data_loader, "Evaluating all images", transient=True)):
+        for index, (camera, batch) in enumerate(track(data_loader, "Evaluating view", len(data_loader))):
             start = perf_counter()
             outputs = self.model.get_outputs_for_camera(camera)
             seconds = perf_counter() - start

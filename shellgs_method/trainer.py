@@ -26,6 +26,7 @@ from shellgs_method.bounds import Rate
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.gaussians.pruning import broken, unshaped
+from shellgs_method.machine.progress import ITERATION, Lines, tell, track
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.runs.folders import held
 from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers, forget_gradients
@@ -97,6 +98,7 @@ class FacadeTrainerConfig(TrainerConfig):
             folder.mkdir(parents=True, exist_ok=True)
             with atomic_write(folder / "config.yml") as file:
                 file.write(written_config(self).encode())
+        tell("Reading the scene")
 
 
 class FacadeTrainer(Trainer):
@@ -119,6 +121,7 @@ class FacadeTrainer(Trainer):
         after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(after_step, self._check_any_left, kwargs={"why": PRUNED}))
         self._skipped = 0
+        self._lines = Lines(ITERATION, self.config.max_num_iterations)
         self._last_step = self.config.max_num_iterations - 1  # later versions of nerfstudio change the setting
 
     def setup_optimizers(self) -> GuardedOptimizers:
@@ -137,6 +140,8 @@ class FacadeTrainer(Trainer):
             return
         with refusals_end_the_program():
             self.pipeline.restore_training()
+            _ = self.pipeline.datamanager.cached_train  # read the photographs here, not in the first iteration
+            tell("Loading kernels")
             super().train()
 
     def train_iteration(self, step: int):
@@ -148,6 +153,7 @@ class FacadeTrainer(Trainer):
             SceneError: too many steps were skipped.
         """
         loss, losses, metrics = super().train_iteration(step)
+        self._lines.at(min(step + 2, self.config.max_num_iterations))
         if self.optimizers.skipped:
             self._report_skipped(step, losses)
         if step % CHECK_EVERY == 0 or self.optimizers.skipped:
@@ -185,7 +191,7 @@ class FacadeTrainer(Trainer):
 
     def _remove_unshaped_gaussians(self) -> None:
         model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
-        cameras = map(dataset.camera, range(len(dataset)))
+        cameras = track(map(dataset.camera, range(len(dataset))), "Looking for unshaped Gaussians", len(dataset))
         if count := self._remove(unshaped(model.means.detach(), model.scales.detach().exp(), cameras, model.coverage)):
             CONSOLE.print(f"{count} Gaussians that the training views have not shaped are removed.")
         self._check_any_left(self.step, "training views show none of them: lower the learning rates")

@@ -21,7 +21,8 @@ from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine import compilation
+from shellgs_method.machine import compilation, progress
+from shellgs_method.machine.progress import Stage
 from shellgs_method.render.maps import geometry_channels
 from shellgs_method.trainer import FacadeTrainer
 
@@ -91,6 +92,28 @@ def test_a_render_outside_training_keeps_no_graph(trained):
     before = graphs()
     render(trained)
     assert graphs() == before
+
+
+def test_a_training_and_an_evaluation_tell_what_they_are_doing(pristine_scene, tmp_path, monkeypatch, capsys):
+    """The launcher shows it."""
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    trainer = trainer_of(pristine_scene, tmp_path, "shellgs_metric", iterations=3)
+    trainer.train()
+    trainer.pipeline.get_average_eval_image_metrics()
+    stages = [str(stage) for line in capsys.readouterr().out.splitlines() if (stage := Stage.read(line))]
+    views, held_out_views = (
+        len(dataset) for dataset in (data_of(trainer).train_dataset, data_of(trainer).eval_dataset)
+    )
+    expected = [
+        f"caching / undistorting train images {views} of {views}",
+        f"placing the first Gaussians 1 of {views}",
+        "loading kernels",
+        "iteration 2 of 3",
+        "iteration 3 of 3",
+        f"looking for unshaped Gaussians 1 of {views}",
+        f"evaluating view 1 of {held_out_views}",
+    ]
+    assert [stage for stage in dict.fromkeys(stages) if stage in expected] == expected
 
 
 @pytest.mark.parametrize(("step", "apart"), [(2, [3]), (9, [3]), (10, [None]), (18, [None])])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,6 +25,12 @@ Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
 PATHS = ScenePaths()
 UpAxis = Literal["y", "z"]
 Mesher = Literal["planes", "bpa", "poisson"]
+
+
+def open_page(path: Path) -> None:
+    """Open an HTML file in the user's browser."""
+    if not webbrowser.open(path.resolve().as_uri()):
+        console.print(f"No browser can be started here: open {path} in one.", highlight=False, soft_wrap=True)
 
 
 def place(frame: Frame) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Optional
 
 import tyro
 
-from shellgs_method.commands.common import PATHS, Paths, console
+from shellgs_method.commands.common import PATHS, Paths, console, open_page
 from shellgs_method.errors import SceneError
 
 
@@ -23,6 +23,7 @@ def compare(
     jobs: int = 1,
     address: Optional[str] = None,
     wandb: Optional[str] = None,
+    open: bool = False,
     paths: Paths = PATHS,
 ) -> None:
     """Train and evaluate methods on scenes, and write the paper's tables and figures and an HTML report.
@@ -41,6 +42,7 @@ def compare(
         jobs: Number of runs at once, with the local launcher.
         address: Address of a running Ray cluster, or auto. If not set: one is started on this machine.
         wandb: Weights & Biases project to log the tables and figures to, as a run. If not set: none.
+        open: Open the report in a browser at the end.
         paths: Paths of the scenes' files.
     """
     from functools import partial
@@ -65,5 +67,7 @@ def compare(
     console.print(f"Tables: {output / 'results.md'}, {output / 'tables'}. Report: {output / 'report.html'}.")
     if wandb:
         log_comparison(wandb, comparison, runs)
+    if open:
+        open_page(output / "report.html")
     if failures := comparison.failures:
         sys.exit(f"shellgs: {len(failures)} of {len(runs)} runs failed: {', '.join(run.label for run in failures)}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from shellgs_method.commands.common import console
+from shellgs_method.commands.common import console, open_page
 from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def demo(
     height: int = 180,
     views: int = 40,
     seed: int = 0,
+    open: bool = False,
 ) -> None:
     """Make a synthetic facade, run the whole pipeline on it, and show tables and images.
 
@@ -39,9 +40,11 @@ def demo(
         height: Height of the photographs in pixels.
         views: Number of photographs.
         seed: Seed of the facade and of the walk past it.
+        open: Open the report in a browser at the end.
     """
     import torch
 
+    from shellgs_method.launch.display import Display
     from shellgs_method.launch.local import BIN, CommandError, follow, launch_locally
     from shellgs_method.synthetic import FacadeConfig
 
@@ -50,8 +53,8 @@ def demo(
     scene = folder / "scene"
     _make(scene, FacadeConfig(width, height, views, seed))
     console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
-    with ThreadPoolExecutor() as pool:
-        cast = pool.submit(follow, [["shellgs", "cast", str(scene)]])
+    with Display(console) as display, display.work("scene") as tell, ThreadPoolExecutor() as pool:
+        cast = pool.submit(follow, [["shellgs", "cast", str(scene)]], tell=tell)
         # Slow to import, so while the shell is cast; nerfstudio first, as its import takes longer from deep in others.
         import nerfstudio.configs.method_configs  # noqa: F401
 
@@ -61,6 +64,8 @@ def demo(
         cast.result()
     except CommandError as error:
         raise SystemExit(f"shellgs: {error}") from error
+    panel = scene / "cues" / "shell" / "panel.png"
+    console.print(f"To look at meanwhile: {panel}, the shell in the photographs.", highlight=False, soft_wrap=True)
     runs = grid([scene], METHODS, [0], iterations, folder)
     # On a CPU two runs at once are faster in total: much of each is single-threaded.
     jobs = 1 if torch.cuda.is_available() else 2
@@ -72,10 +77,12 @@ def demo(
         f"  1. {folder / 'strip.png'}: a held-out view of each method, its normals and their error\n"
         f"  2. {folder / 'report.html'}: all held-out views with sliders between the methods\n"
         f"  3. {viewer} --load-config {runs[-1].config}: walk around {runs[-1].variant.name} in a browser\n"
-        f"The tables above are in {folder / 'results.md'}, a view's shell maps in {scene / 'cues/shell/panel.png'}.",
+        f"The tables above are in {folder / 'results.md'}, a view's shell maps in {panel}.",
         highlight=False,
         soft_wrap=True,
     )
+    if open:
+        open_page(folder / "report.html")
 
 
 def _make(scene: Path, config: FacadeConfig) -> None:

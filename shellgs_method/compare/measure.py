@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float, Float16, UInt8
 from nerfstudio.models.base_model import Model
 from nerfstudio.models.splatfacto import SplatfactoModel
-from rich.progress import track
 from torch import Tensor
 
 from dataparsers.cameras import pinhole_camera
@@ -30,6 +29,7 @@ from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_from_depth
+from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.trained import load_run
 
@@ -103,10 +103,10 @@ def measure(config_path: Path, half: Half | None = None, renders: Path | None = 
     config, pipeline, checkpoint = load_run(config_path, "test")
     model, datamanager = pipeline.model, _held_out_views(config.pipeline.datamanager, half, pipeline.device)
     metres_per_unit = datamanager.train_dataparser_outputs.metadata["metres_per_unit"]
-    metrics = []
+    metrics, views = [], datamanager.fixed_indices_eval_dataloader
     if renders:
         renders.mkdir(parents=True, exist_ok=True)
-    for index, (cameras, batch) in enumerate(track(datamanager.fixed_indices_eval_dataloader, transient=True)):
+    for index, (cameras, batch) in enumerate(track(views, "Evaluating view", len(views))):
         camera = pinhole_camera(cameras)
         outputs = model.get_outputs_for_camera(cameras.to(model.device))
         rendering, photograph = _rendering(model, outputs, camera), _photograph(model, outputs, batch)

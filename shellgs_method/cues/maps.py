@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 
 from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_disparity
 from shellgs_method.cues.normals import disagreement, facing, gradient_normals
@@ -21,6 +20,7 @@ from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.map_files import is_number
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.machine.progress import track
 
 NO_PREDICTION = "there is no prediction for it"
 
@@ -83,7 +83,7 @@ def make_maps(
     )
     fits = Fits.open(maps)
     written = skipped = 0
-    for view in track(views, description="monocular cues"):
+    for view in track(views, "Making monocular cues", len(views)):
         if fits.problem(view.name) or (view.name in fits.views and maps.current(view.name, view.camera)):
             skipped += 1
             continue

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
-from rich.progress import track
 
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
 from shellgs_method.errors import SceneError
@@ -26,6 +25,7 @@ from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.tsdf import DepthView, fuse
+from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.trained import load_run
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
@@ -176,7 +176,7 @@ class TrainedRun:
         """Render all views in the frame, with depth where they are at least half opaque and not masked out."""
         depth_scale = 1 / (self.model_scale * self.frame.scale)
         indexed = [(dataset, index) for dataset in self.datasets for index in range(len(dataset.views))]
-        for dataset, index in track(indexed, "rendering", transient=True):
+        for dataset, index in track(indexed, "Rendering view", len(indexed)):
             outputs = self.model.get_outputs_for_camera(dataset.cameras[index : index + 1].to(self.model.device))
             depth = (outputs["depth"] * depth_scale).where(outputs["accumulation"] >= OPAQUE, 0.0).cpu()
             kept = load_mask(dataset.views[index])

@@ -30,15 +30,19 @@ from rich.console import Console
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.launch.display import Display
 from shellgs_method.launch.job import Job, JobT
-from shellgs_method.launch.local import BIN, PROGRESS_SECONDS, CommandError, finish
+from shellgs_method.launch.local import BIN, CommandError, finish
 from shellgs_method.machine.extras import import_extra
+from shellgs_method.machine.progress import Stage
 from shellgs_method.runs.config_file import load_config
 from shellgs_method.runs.folders import replace_folder
 
 RETRIES = 3
 """Retries of a task whose worker was killed. The killed worker's command ends when its next line cannot be written."""
 
+LOOK_EVERY = 1.0
+"""Seconds between two looks at what the runs are doing."""
 TIMEOUT = 30
 """Seconds within which a running cluster answers."""
 PIECE = 1 << 26
@@ -73,6 +77,8 @@ def launch_on_ray(runs: Sequence[JobT], address: str | None, console: Console) -
         if not address:
             raise SceneError(f"Ray cannot start on this machine ({error})") from error
         raise SceneError(f"there is no Ray cluster at {address}: start one with `ray start --head`") from error
+    from ray.util.queue import Queue
+
     failures: dict[JobT, str] = {}
     launch = uuid4().hex  # another comparison must not resume what this one leaves on a node
     try:
@@ -80,32 +86,38 @@ def launch_on_ray(runs: Sequence[JobT], address: str | None, console: Console) -
         gpus = min(1, int(resources.get("GPU", 0)))  # every method trains on one GPU, if there is one
         at_once = max(1, int(resources.get("GPU" if gpus else "CPU", 1)))
         task = ray.remote(num_gpus=gpus, max_retries=RETRIES)(_finish_on_node)
-        waiting, pending, scenes = list(runs), {}, {}
-        while waiting or pending:
-            while waiting and len(pending) < at_once:  # waiting runs are not packed yet, to save memory
-                run = waiting.pop(0)
-                if run.scene not in scenes:
-                    scenes[run.scene] = content_hash(run.scene), _packed(run.scene, ray.put)
-                scene_key, scene = scenes[run.scene]
-                pending[task.remote(run, launch, run.key, scene_key, scene, _packed(run.folder, ray.put))] = run
-                if run.scene not in {later.scene for later in waiting}:
-                    del scenes[run.scene]
-            ended, _ = ray.wait(list(pending), timeout=PROGRESS_SECONDS)
-            if not ended:
-                running = ", ".join(run.label for run in pending.values())
-                console.print(f"Running: {running}; waiting: {len(waiting)}.", highlight=False)
-                continue
-            run = pending.pop(done := ended[0])
-            try:
-                folder, error = ray.get(done)
-                _store_result(folder, run)
-            except (RayError, tarfile.TarError, OSError) as failure:
-                failures[run] = str(failure)
-                continue
-            if error is not None:
-                failures[run] = error
-            left = len(pending) + len(waiting)
-            console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
+        waiting, pending, scenes, stages = list(runs), {}, {}, Queue(actor_options={"num_cpus": 0})
+        tell: dict[str, Callable[[Stage], None]] = {}  # by the run's key
+        with Display(console) as display:
+            while waiting or pending:
+                while waiting and len(pending) < at_once:  # waiting runs are not packed yet, to save memory
+                    run = waiting.pop(0)
+                    if run.scene not in scenes:
+                        scenes[run.scene] = content_hash(run.scene), _packed(run.scene, ray.put)
+                    packed = *scenes[run.scene], _packed(run.folder, ray.put)
+                    pending[task.remote(run, launch, run.key, *packed, stages)] = run
+                    tell[run.key] = display.begin(run.label)
+                    tell[run.key](Stage("Waiting for a node"))
+                    if run.scene not in {later.scene for later in waiting}:
+                        del scenes[run.scene]
+                ended, _ = ray.wait(list(pending), timeout=LOOK_EVERY)
+                for key, stage in stages.get_nowait_batch(stages.qsize()):
+                    tell[key](stage)
+                if not ended:
+                    continue
+                run = pending.pop(done := ended[0])
+                display.end(run.label)
+                tell[run.key] = lambda _: None  # what it told before it ended may come later
+                try:
+                    folder, error = ray.get(done)
+                    _store_result(folder, run)
+                except (RayError, tarfile.TarError, OSError) as failure:
+                    failures[run] = str(failure)
+                    continue
+                if error is not None:
+                    failures[run] = error
+                left = len(pending) + len(waiting)
+                console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
     finally:
         _remove_copies(launch)
         ray.shutdown()
@@ -145,7 +157,7 @@ def _remove_copies(launch: str) -> None:
 
 
 def _finish_on_node(
-    run: Job, launch: str, key: str, scene_key: str, scene: Pieces, folder: Pieces
+    run: Job, launch: str, key: str, scene_key: str, scene: Pieces, folder: Pieces, stages: Any
 ) -> tuple[Archive, str | None]:
     """The Ray task: finish a run; return its packed folder and, if a command failed, the end of its output.
 
@@ -156,8 +168,14 @@ def _finish_on_node(
         scene_key: identifies the scene's content.
         scene: the scene's folder, packed.
         folder: the run's folder at the start, packed.
+        stages: Ray's queue for pairs of the key and what the run is doing.
     """
     import ray
+    from ray.exceptions import RayError
+
+    def tell(stage: Stage) -> None:
+        with suppress(RayError):  # the run counts, not what is told of it
+            stages.put_nowait((key, stage))
 
     root = _own_folder() / launch
     scenes = root / "scenes" / sha256(scene_key.encode()).hexdigest()
@@ -169,7 +187,7 @@ def _finish_on_node(
         _set_paths_in_config(local)
     error = None
     try:
-        finish(local)
+        finish(local, tell=tell)
     except CommandError as failure:
         error = str(failure)
     result = np.concatenate(_packed(local.folder, lambda piece: piece))

@@ -12,6 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from shellgs_method.machine.progress import tell_imports
+
 PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
 
 
@@ -34,6 +36,7 @@ def heading(command: Sequence[str]) -> str:
 
 def _main() -> None:
     _end_with_parent()
+    tell_imports()
     scripts, commands = Path(sys.argv[1]), json.loads(sys.argv[2])
     for name, *words in commands:
         sys.stdout.write(heading([name, *words]))

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import subprocess
 import sys
-import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from queue import SimpleQueue
 
 import torch
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress, Task
 
+from shellgs_method.launch.display import Display
 from shellgs_method.launch.in_turn import command_in_turn, heading
 from shellgs_method.launch.job import Job, JobT
-from shellgs_method.machine.compilation import nothing_compiled_yet
+from shellgs_method.machine.progress import ITERATION, Stage
 
 BIN = Path(sys.executable).parent
 LAST_LINES = 30
-PROGRESS_SECONDS = 30.0
-"""Seconds between two progress messages where the output is not a terminal."""
-_STEP = re.compile(r"^(\d+) \([\d.]+%\)")  # nerfstudio's progress lines
 
 
 class CommandError(RuntimeError):
@@ -39,16 +34,9 @@ def launch_locally(runs: Iterable[JobT], jobs: int, console: Console) -> dict[Jo
     """Finish all runs, ``jobs`` at once; return the failed ones, with the end of their output. None stops another."""
     runs = list(runs)
     failures: dict[JobT, str] = {}
-    if runs and not torch.cuda.is_available() and nothing_compiled_yet():
-        console.print("The first run compiles the kernels, which takes a minute or two; the others load them.")
-    progress = Progress(console=console, transient=True)
     devices = _devices(jobs)
-    with (
-        progress,
-        progress_in_a_log(console, lambda: map(_status, progress.tasks)),
-        ThreadPoolExecutor(max(jobs, 1)) as pool,
-    ):
-        futures = {pool.submit(_finish_visibly, run, console, progress, devices): run for run in runs}
+    with Display(console) as display, ThreadPoolExecutor(max(jobs, 1)) as pool:
+        futures = {pool.submit(_finish_visibly, run, console, display, devices): run for run in runs}
         try:
             for done, future in enumerate(as_completed(futures), 1):
                 run, outcome = futures[future], "finished"
@@ -66,7 +54,7 @@ def launch_locally(runs: Iterable[JobT], jobs: int, console: Console) -> dict[Jo
 def finish(
     run: Job,
     announce: Callable[[Sequence[str]], None] = lambda _: None,
-    step: Callable[[int], None] = lambda _: None,
+    tell: Callable[[Stage], None] = lambda _: None,
     device: str | None = None,
 ) -> None:
     """Run the remaining commands of a run; their output is appended to log.txt in its folder as it is printed.
@@ -74,7 +62,7 @@ def finish(
     Args:
         run: the run, settled.
         announce: called with each command when it starts.
-        step: called with each iteration that nerfstudio reports.
+        tell: called with each stage that their output tells.
         device: the only GPU that the commands see, as CUDA_VISIBLE_DEVICES names it; all if None.
 
     Raises:
@@ -82,13 +70,19 @@ def finish(
     """
     if commands := run.commands():
         run.folder.mkdir(parents=True, exist_ok=True)
-        follow(commands, announce, step, run.folder / "log.txt", device)
+
+        def tell_of_run(stage: Stage) -> None:
+            if stage.what == ITERATION and stage.item:  # nerfstudio does not say of how many
+                stage = Stage(ITERATION, min(stage.item, run.iterations), run.iterations)
+            tell(stage)
+
+        follow(commands, announce, tell_of_run, run.folder / "log.txt", device)
 
 
 def follow(
     commands: Sequence[Sequence[str]],
     announce: Callable[[Sequence[str]], None] = lambda _: None,
-    step: Callable[[int], None] = lambda _: None,
+    tell: Callable[[Stage], None] = lambda _: None,
     log: Path | None = None,
     device: str | None = None,
 ) -> None:
@@ -97,7 +91,7 @@ def follow(
     Args:
         commands: lists of words.
         announce: called with each command when it starts.
-        step: called with each iteration that nerfstudio reports.
+        tell: called with each stage that their output tells.
         log: file that the output is appended to.
         device: the only GPU that the commands see, as CUDA_VISIBLE_DEVICES names it; all if None.
 
@@ -105,7 +99,7 @@ def follow(
         CommandError: a command failed.
     """
     output: deque[str] = deque(maxlen=LAST_LINES)
-    waiting = list(commands)
+    waiting, iteration = list(commands), 0
     current = waiting[0]
     with (
         log.open("a", 1, "utf8") if log else nullcontext() as file,  # line by line: a run can take hours
@@ -126,13 +120,23 @@ def follow(
                     file.write(line)
                 if waiting and line == heading(waiting[0]):
                     announce(current := waiting.pop(0))
-                elif match := _STEP.match(line):
-                    step(int(match[1]))
+                    tell(_first_stage(current))
+                elif stage := Stage.read(line):
+                    if stage.what == ITERATION and stage.item:
+                        if stage.item <= iteration:  # nerfstudio repeats the last lines of its table
+                            continue
+                        iteration = stage.item
+                    tell(stage)
         except BaseException:
             process.terminate()
             raise
     if process.returncode:
         raise CommandError(f"{current[0]} failed:\n{''.join(output)}")
+
+
+def _first_stage(command: Sequence[str]) -> Stage:
+    """What a command does before it prints anything."""
+    return Stage("Importing nerfstudio" if command[0] == "ns-train" else f"Starting {' '.join(command[:2])}")
 
 
 def _devices(jobs: int) -> SimpleQueue[str | None]:
@@ -145,53 +149,14 @@ def _devices(jobs: int) -> SimpleQueue[str | None]:
     return queue
 
 
-@contextmanager
-def progress_in_a_log(console: Console, statuses: Callable[[], Iterable[str]]) -> Iterator[None]:
-    """Print the status of all runs every :data:`PROGRESS_SECONDS` if the console is no terminal and shows no bars."""
-    stop = threading.Event()
-
-    def report() -> None:
-        while not stop.wait(PROGRESS_SECONDS):
-            for sentence in statuses():
-                console.print(sentence, highlight=False, soft_wrap=True)
-
-    thread = threading.Thread(target=report, daemon=True)
-    if not console.is_terminal:
-        thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        if thread.is_alive():
-            thread.join()
-
-
-def _status(task: Task) -> str:
-    """The progress of a run, in words.
-
-    The time left is estimated from the whole time so far, which is rather too long: nerfstudio reports iterations in
-    bursts, from which rich's own estimate gets a multiple of the speed.
-    """
-    minutes, total = (task.elapsed or 0) / 60, task.total or 0
-    if task.finished:
-        return f"{task.description}: trained in {minutes:.1f} min, evaluating"
-    if not task.completed:
-        return f"{task.description}: starting, {minutes:.1f} min"
-    left = minutes * (total / task.completed - 1)
-    at = f"{task.completed:.0f} of {total:.0f} iterations"
-    return f"{task.description}: {at}, {minutes:.1f} min, at most about {left:.1f} min left"
-
-
-def _finish_visibly(run: Job, console: Console, progress: Progress, devices: SimpleQueue[str | None]) -> None:
-    device, task = devices.get(), progress.add_task(run.label, total=run.iterations)
+def _finish_visibly(run: Job, console: Console, display: Display, devices: SimpleQueue[str | None]) -> None:
+    device = devices.get()
 
     def announce(command: Sequence[str]) -> None:
         console.print(f"[bold]$ {escape(shlex.join(command))}", highlight=False, soft_wrap=True)
-        if command[0] != "ns-train":
-            progress.update(task, completed=run.iterations)
 
     try:
-        finish(run, announce, lambda iteration: progress.update(task, completed=iteration), device)
+        with display.work(run.label) as tell:
+            finish(run, announce, tell, device)
     finally:
         devices.put(device)
-        progress.remove_task(task)

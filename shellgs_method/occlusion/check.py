@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from rich.progress import track
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import workers
 from shellgs_method.occlusion.colours import ColourModel
 from shellgs_method.occlusion.contradiction import (
@@ -104,7 +104,7 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
             return training.compare(view, shell.require(view.name, cameras[view.name]))
 
         with workers() as pool:
-            compared = track(pool.map(compare, missing), "comparing the photographs", len(missing))
+            compared = track(pool.map(compare, missing), "Comparing the photographs", len(missing))
             for view, cue in zip(missing, compared, strict=True):
                 maps.write(view.name, cue, cameras[view.name])
     for unfinished in maps.folder.glob(".*/"):
@@ -140,7 +140,7 @@ class _TrainingViews:
 
         unfinished.mkdir(exist_ok=True)
         with workers() as pool:
-            looks = track(pool.map(look, missing), "looking before the shell", len(missing), disable=not missing)
+            looks = track(pool.map(look, missing), "Looking before the shell", len(missing))
             for name, found in zip(missing, looks, strict=True):
                 content = io.BytesIO()  # on a full disk, numpy's own writing raises an error that does not say so
                 np.save(content, torch.stack(found).numpy(), allow_pickle=False)

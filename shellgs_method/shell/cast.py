@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
-from rich.progress import track
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMap, CueMaps, source_hash
 from shellgs_method.files.photographs import View, load_mask
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.precision import FINE, camera_step, refuse_coarse
+from shellgs_method.machine.progress import track
 from shellgs_method.shell.alignment import ALIGNMENT, Alignment
 from shellgs_method.shell.clouds import VERSION, Meshing
 from shellgs_method.shell.mesh import ShellMesh
@@ -129,7 +129,7 @@ def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: 
     cast = 0
     with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast: at most two are in memory
         written: Future[None] | None = None
-        for full_size in track(views, description="casting the shell"):
+        for full_size in track(views, "Casting the shell", len(views)):
             view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
             if maps.current(view.name, view.camera):
                 continue

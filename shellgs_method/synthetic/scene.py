@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from rich.progress import track
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import unfinished
@@ -20,6 +19,7 @@ from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.machine.open3d import import_open3d
+from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import workers
 from shellgs_method.shell import ALIGNMENT, Alignment
 from shellgs_method.synthetic.appearance import Daylight, developed, exposed, rays
@@ -150,7 +150,7 @@ def _write(scene: Path, config: FacadeConfig) -> None:
     sensor, sfm, network = _generators(config.seed + 1, 3)
     with workers() as pool:
         exposures = pool.map(partial(exposed, facade.daylight, supersampling=config.supersampling), facade.cameras)
-        taken = track(exposures, "synthetic facade", config.views, transient=True)
+        taken = track(exposures, "Rendering the synthetic facade", config.views)
         for name, camera, exposure in zip(names, facade.cameras, taken, strict=True):
             image = developed(exposure, sensor)
             Image.fromarray(image).save(scene / name)

@@ -14,6 +14,7 @@ import trimesh
 from PIL import Image
 
 from shellgs_method.cli import main
+from shellgs_method.commands.common import open_page
 from shellgs_method.machine import doctor
 
 DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20)
@@ -52,6 +53,7 @@ def test_the_demo_writes_a_table_and_images(demo):
 def test_the_demo_prints_its_progress_and_what_to_look_at_first(demo):
     output = demo.with_name("log.txt").read_text()
     assert "A synthetic facade, 10 photographs of 64 x 48 pixels: demo/scene" in output
+    assert output.index("demo/scene/cues/shell/panel.png") < output.index("$ ns-train")
     assert "seed-0 finished, 2 of 2." in output
     first = output[output.index("Look first at") :].splitlines()[1:4]
     assert [(demo.parent / line.split(": ")[0].split()[-1]).exists() for line in first[:2]] == [True, True]
@@ -66,6 +68,23 @@ def test_a_second_demo_keeps_what_the_first_finished(demo, shellgs, monkeypatch)
     assert "Look first at" in output
     assert "$ ns-train" not in output
     assert [path.stat().st_mtime_ns for path in finished] == before
+
+
+def test_the_report_opens_in_the_browser_if_asked_for(demo, tmp_path, monkeypatch):
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$1" >> {tmp_path}/opened\n')
+    browser.chmod(0o755)
+    monkeypatch.setenv("BROWSER", f"{browser} %s")
+    run(*DEMO, cwd=demo.parent)
+    assert not (tmp_path / "opened").exists()
+    run(*DEMO, "--open", cwd=demo.parent)
+    assert (tmp_path / "opened").read_text().strip() == (demo / "report.html").as_uri()
+
+
+def test_without_a_browser_the_page_is_named(monkeypatch, capsys):
+    monkeypatch.setattr("webbrowser.open", lambda _: False)
+    open_page(Path("compare/report.html"))
+    assert "open compare/report.html in one" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

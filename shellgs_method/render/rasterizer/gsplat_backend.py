@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import functools
 import importlib
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from gsplat import (
@@ -29,12 +30,12 @@ from torch import Tensor
 
 from shellgs_method.errors import notice
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.compilation import uninterrupted
 from shellgs_method.render.rasterizer import discs as disc_projection
 from shellgs_method.render.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs, three_sigmas
 from shellgs_method.render.rasterizer.renders import Renders
 
 Backend = Literal["auto", "torch", "gsplat"]
+_Result = TypeVar("_Result")
 
 TILE = 16  # pixels along the side of a tile; gsplat tests no other size
 
@@ -335,8 +336,26 @@ def _stack(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "B 4 4"], Float[Ten
     return viewmats, torch.stack([camera.K for camera in cameras]), cameras[0].width, cameras[0].height
 
 
+def _uninterrupted(function: Callable[[], _Result]) -> Callable[[], _Result]:
+    """Make a function run without the trace hook of its thread, by which nerfstudio's viewer interrupts a render.
+
+    The hook raises at any line, also at those of the compiling, whose errors are explained.
+    """
+
+    @functools.wraps(function)
+    def call() -> _Result:
+        hook = sys.gettrace()
+        sys.settrace(None)
+        try:
+            return function()
+        finally:
+            sys.settrace(hook)
+
+    return call
+
+
 @functools.cache
-@uninterrupted
+@_uninterrupted
 def _kernels_fault() -> str | None:
     """Why gsplat's kernels do not load, None if they do; the first call may compile them, which takes minutes."""
     try:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from shellgs_method.machine.cpp import compiles, load_library
@@ -71,13 +71,12 @@ class Loops:
         before: Float[Tensor, "G P V"],
         totals: list[Float[Tensor, "G P V"]],
         table: Float[Tensor, "N K"],
-        splats: Int[Tensor, "G L V"],
+        splats: Int32[Tensor, "G L V"],
         centres: Float[Tensor, "G 2 V"],
         stop: float = TRANSMITTANCE_MIN,
     ) -> tuple[Float[Tensor, "G P V"], Float[Tensor, "G V"]]:
         """Add a chunk to the totals; return the transmittance behind it, and its maximum over each tile's pixels."""
         if compiled := _compiled(self, table):
-            assert splats.dtype == torch.int32, splats.dtype
             behind, brightest = torch.empty_like(before), before.new_empty(len(before), LANES)
             outputs = [behind, brightest, *totals]
             compiled.forward(
@@ -99,7 +98,7 @@ class Loops:
         gradients: list[Float[Tensor, "G P V"]],
         grad_params: Float[Tensor, "G L V K+probed"],
         table: Float[Tensor, "N K"],
-        splats: Int[Tensor, "G L V"],
+        splats: Int32[Tensor, "G L V"],
         centres: Float[Tensor, "G 2 V"],
     ) -> None:
         """Go through a chunk back to front.
@@ -137,7 +136,7 @@ class Loops:
 
 
 def _look_up(
-    table: Float[Tensor, "N K"], splats: Int[Tensor, "G L V"], centres: Float[Tensor, "G 2 V"]
+    table: Float[Tensor, "N K"], splats: Int32[Tensor, "G L V"], centres: Float[Tensor, "G 2 V"]
 ) -> list[list[Float[Tensor, "G 1 V"]]]:
     """Parameters of each splat of a chunk, with u and v relative to the tiles' centres."""
     u, v, *rest = table[splats].unbind(-1)  # [G L V] each
@@ -168,7 +167,16 @@ def _compiled(loops: Loops, table: Tensor) -> ctypes.CDLL | None:
 
 @functools.cache
 def _library(loops: Loops) -> ctypes.CDLL | None:
+    _keep_freed_memory()
     return load_library(_source(loops))
+
+
+def _keep_freed_memory() -> None:
+    """Make glibc keep some freed memory, which costs 1 ms/MB to get from the system again.
+
+    It keeps up to twice the largest block freed so far, among blocks of up to 32 MB.
+    """
+    torch.empty((32 << 20) - (1 << 16), dtype=torch.uint8)
 
 
 _SOURCE = """
@@ -267,30 +275,34 @@ def _source(loops: Loops) -> str:
     columns = splat_gradients(kernels, shape, _names("sum[{}]", len(added)), loops.n_features)
     backwards = {f"b{i} = {{}}": each for i, each in enumerate(back)}
     backwards |= {f"sum[{i}] += {{}}": each for i, each in enumerate(added)}
-    return PRELUDE.format(lanes=LANES) + _SOURCE.format(
-        chunk=CHUNK,
-        pixels=TILE * TILE,
-        tile=TILE,
-        params=n_params,
-        columns=len(columns),
-        sums=len(added),
-        stop=TRANSMITTANCE_MIN,
-        totals=_listed("float *total{}", n_totals),
-        behinds=_listed("float *behind{}", len(groups)),
-        gradients=_listed("const float *gradient{}", n_totals),
-        load_totals=_each("vec s{0} = load(total{0} + at);", n_totals),
-        composite=_indented(statements(composite)),
-        store_totals=_each("store(total{0} + at, s{0});", n_totals),
-        attenuate=_indented(statements({"alpha = {}": new_alpha, "T = {}": after})),
-        load_gradients="\n".join(
-            [
-                _each("vec b{0} = load(behind{0} + at);", len(groups)),
-                _each("const vec g{0} = load(gradient{0} + at);", n_totals),
-            ]
-        ),
-        step_back=_indented(statements(backwards)),
-        store_behinds=_each("store(behind{0} + at, b{0});", len(groups)),
-        splat_gradients=_indented(statements({f"columns[{i}] = {{}}": each for i, each in enumerate(columns)})),
+    return (
+        '#pragma GCC optimize("O3")\n'
+        + PRELUDE.format(lanes=LANES)
+        + _SOURCE.format(
+            chunk=CHUNK,
+            pixels=TILE * TILE,
+            tile=TILE,
+            params=n_params,
+            columns=len(columns),
+            sums=len(added),
+            stop=TRANSMITTANCE_MIN,
+            totals=_listed("float *total{}", n_totals),
+            behinds=_listed("float *behind{}", len(groups)),
+            gradients=_listed("const float *gradient{}", n_totals),
+            load_totals=_each("vec s{0} = load(total{0} + at);", n_totals),
+            composite=_indented(statements(composite)),
+            store_totals=_each("store(total{0} + at, s{0});", n_totals),
+            attenuate=_indented(statements({"alpha = {}": new_alpha, "T = {}": after})),
+            load_gradients="\n".join(
+                [
+                    _each("vec b{0} = load(behind{0} + at);", len(groups)),
+                    _each("const vec g{0} = load(gradient{0} + at);", n_totals),
+                ]
+            ),
+            step_back=_indented(statements(backwards)),
+            store_behinds=_each("store(behind{0} + at, b{0});", len(groups)),
+            splat_gradients=_indented(statements({f"columns[{i}] = {{}}": each for i, each in enumerate(columns)})),
+        )
     )
 
 
