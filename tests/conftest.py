@@ -11,18 +11,16 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
-from torch._inductor.cpp_builder import get_cpp_compiler
-from torch._inductor.exc import InvalidCxxCompiler
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import notice
-from shellgs_method.machine import compilation
+from shellgs_method.machine import cpp
 from shellgs_method.machine.open3d import load_libusb
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 load_libusb()  # for tests, and modules of nerfstudio, that import Open3D themselves
-os.environ.setdefault("SHELLGS_COMPILE", "0")  # kernels take longer to compile, or to load, than these tests to run
+os.environ.setdefault("SHELLGS_COMPILE", "0")  # kernels take longer to compile than these tests to run
 
 
 @pytest.fixture(autouse=True)
@@ -72,13 +70,10 @@ def shellgs(in_process) -> Callable[..., str]:
 
 @pytest.fixture
 def compiler(monkeypatch) -> None:
-    """Compile kernels from scratch; skip where there is no compiler."""
-    try:
-        get_cpp_compiler()
-    except InvalidCxxCompiler as error:
-        pytest.skip(f"no C++ compiler: {error}")
+    """Run kernels in C++; skip where there is no compiler."""
+    if cpp.cpp_compiler() is None:
+        pytest.skip("no C++ compiler")
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
-    monkeypatch.setattr(compilation, "_failed", set())
 
 
 @pytest.fixture

@@ -41,10 +41,6 @@ PRIVATE = [
             "_prune_gs": "self params optimizers state step",
         }.items()
     ),
-    ("shellgs_method/machine/compilation.py", "torch._dynamo", "mark_dynamic", "t index"),
-    ("shellgs_method/machine/compilation.py", "torch._dynamo", "maybe_mark_dynamic", "t index"),
-    ("shellgs_method/machine/compilation.py", "torch._inductor.cpp_builder", "get_cpp_compiler", ""),
-    ("shellgs_method/machine/compilation.py", "torch._inductor.runtime.cache_dir_utils", "cache_dir", ""),
 ]
 
 

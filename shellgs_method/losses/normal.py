@@ -17,7 +17,8 @@ SHORTEST = 1e-3
 
 
 def unit(normal: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    """Normalize normals; those shorter than :data:`SHORTEST`, where hardly anything was composited, stay shorter than 1.
+    """Normalize normals; those shorter than :data:`SHORTEST`, where hardly anything was composited, stay shorter than
+    1.
 
     This also bounds the gradient to a thousand times the incoming one.
     """

@@ -1,7 +1,7 @@
 """C++ that is written at run time: compiled into libraries that are kept on disk, and loaded.
 
-The folder is ``SHELLGS_CACHE``, by default ``~/.cache/shellgs``. The environment variable ``SHELLGS_COMPILE=0`` switches
-compiling off; then, or without a compiler, the same arithmetic runs in torch, several times slower.
+The folder is ``SHELLGS_CACHE``, by default ``~/.cache/shellgs``. The environment variable ``SHELLGS_COMPILE=0``
+switches compiling off; then, or without a compiler, the same arithmetic runs in torch, several times slower.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _count = itertools.count(1)
 
 def compiles() -> bool:
     """Whether there is a C++ compiler that can be used, and compiling is not switched off."""
-    return os.environ.get("SHELLGS_COMPILE") != "0" and _compiler_works()
+    return os.environ.get("SHELLGS_COMPILE") != "0" and compiler_works()
 
 
 def cpp_compiler() -> str | None:
@@ -87,7 +87,8 @@ def _compile(compiler: str, source: str, library: Path) -> None:
 
 
 @functools.cache
-def _compiler_works() -> bool:
+def compiler_works() -> bool:
+    """Whether a library can be compiled and loaded."""
     return load_library('extern "C" int works() { return 1; }\n') is not None
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from shellgs_method.machine.cpp import compiles, load_library
+from shellgs_method.machine import cpp
 from shellgs_method.machine.symbols import PRELUDE, Symbol, gradients, literal, statements
 
 Value: TypeAlias = Any
@@ -41,7 +41,7 @@ def elementwise(function: Function, *inputs: Float[Tensor, "*#elements k"]) -> t
 
 def in_cpp(*tensors: Tensor) -> bool:
     """Whether loops over tensors are in C++: of float32 on a CPU, with a compiler."""
-    return all(each.dtype == torch.float32 and each.device.type == "cpu" for each in tensors) and compiles()
+    return all(each.dtype == torch.float32 and each.device.type == "cpu" for each in tensors) and cpp.compiles()
 
 
 def dot(a: Sequence[Value], b: Sequence[Value | float]) -> Value:
@@ -138,7 +138,7 @@ def _loop(function: Function, layouts: tuple[tuple[int, int, int], ...]) -> tupl
         *(f"float *y{i} = outputs[{i}] + (row * columns + column) * {len(out)};" for i, out in enumerate(outputs)),
     ]
     body = textwrap.indent("\n".join([*pointers, statements(results)]), 8 * " ")
-    library = load_library(PRELUDE.format(lanes=LANES) + _SOURCE.format(body=body))
+    library = cpp.load_library(PRELUDE.format(lanes=LANES) + _SOURCE.format(body=body))
     return None if library is None else (library, [len(output) for output in outputs])
 
 

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
-from shellgs_method.machine.cpp import compiles, load_library
+from shellgs_method.machine import cpp
 from shellgs_method.machine.symbols import PRELUDE, Symbol, statements
 from shellgs_method.render.rasterizer.binning import TILE
 from shellgs_method.render.rasterizer.kernels import (
@@ -162,13 +162,13 @@ def _at(*tensors: Tensor) -> list[ctypes.c_void_p]:
 
 def _compiled(loops: Loops, table: Tensor) -> ctypes.CDLL | None:
     """The loops in C++, for float32 on a CPU with a compiler."""
-    return _library(loops) if table.dtype == torch.float32 and table.device.type == "cpu" and compiles() else None
+    return _library(loops) if table.dtype == torch.float32 and table.device.type == "cpu" and cpp.compiles() else None
 
 
 @functools.cache
 def _library(loops: Loops) -> ctypes.CDLL | None:
     _keep_freed_memory()
-    return load_library(_source(loops))
+    return cpp.load_library(_source(loops))
 
 
 def _keep_freed_memory() -> None:

@@ -12,7 +12,6 @@ from random_splats import NAMES, make_camera, make_splats, orbit
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine import compilation
 from shellgs_method.render.rasterizer import quats_to_rotations, rasterize
 
 MAPS = ("inverse_depth", "median_depth", "distortion")
@@ -91,7 +90,6 @@ def test_values_and_gradients_match_the_reference_in_float64(make, n, width, hei
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_values_and_gradients_match_the_reference_in_float32(compiled, request):
-    compilation._compiled.cache_clear()
     if compiled:
         request.getfixturevalue("compiler")
     splats, camera = make_splats(100, 3, seed=1), make_camera(53, 38)
@@ -99,8 +97,6 @@ def test_values_and_gradients_match_the_reference_in_float32(compiled, request):
     assert error < 1e-4
     assert max(relative.values()) < 1e-3, relative
     assert left_out < 0.02
-    assert compilation._compiled.cache_info().currsize == (7 if compiled else 0)
-    assert not compilation._failed
 
 
 @pytest.mark.parametrize("scale", [1e-4, 0.3, 50.0])

@@ -7,9 +7,7 @@ import pytest
 import torch
 from scipy import special
 
-from shellgs_method.machine import compilation
 from shellgs_method.render.rasterizer import spherical_harmonics
-from shellgs_method.render.rasterizer.spherical_harmonics import _sum
 
 DIRECTIONS = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
@@ -54,19 +52,17 @@ def test_gradients_match_finite_differences():
     assert torch.autograd.gradcheck(lambda d, c: spherical_harmonics(3, d, c), inputs)
 
 
-def test_compiled_harmonics_of_each_degree_match_plain_torch(compiler):
-    """The degree grows during training; no degree may make later ones fall back to plain torch."""
-    compilation._compiled.cache_clear()
-    directions = DIRECTIONS.float()
-    coefficients = torch.randn(50, 16, 3, requires_grad=True)
-    for degree in range(4):
-        fused = spherical_harmonics(degree, directions, coefficients[:, :1], coefficients[:, 1:])
-        plain = _sum(directions, [coefficients[:, : (degree + 1) ** 2]], torch.ones(1, (degree + 1) ** 2))
-        torch.testing.assert_close(fused, plain)
-        gradients = [torch.autograd.grad(each.square().sum(), coefficients)[0] for each in (fused, plain)]
-        torch.testing.assert_close(*gradients)
-    assert not compilation._failed
-    assert compilation._compiled.cache_info().currsize == 1
+@pytest.mark.parametrize("degree", range(4))
+def test_compiled_harmonics_match_plain_torch(compiler, monkeypatch, degree):
+    directions, random = DIRECTIONS.float().requires_grad_(), torch.Generator().manual_seed(0)
+    coefficients = torch.randn(50, 16, 3, generator=random, requires_grad=True)
+    found = []
+    for compiled in ("1", "0"):
+        monkeypatch.setenv("SHELLGS_COMPILE", compiled)
+        colours = spherical_harmonics(degree, directions, coefficients[:, :1], coefficients[:, 1:])
+        found.append((colours, *torch.autograd.grad(colours.square().sum(), [directions, coefficients])))
+    for compiled, plain in zip(*found, strict=True):
+        torch.testing.assert_close(compiled, plain, rtol=1e-4, atol=1e-5)
 
 
 def test_too_few_coefficients_are_an_error():
