@@ -21,7 +21,7 @@ from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine import progress
+from shellgs_method.machine import cpp, progress
 from shellgs_method.machine.progress import Stage
 from shellgs_method.render.maps import geometry_channels
 from shellgs_method.trainer import FacadeTrainer

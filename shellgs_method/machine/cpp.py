@@ -27,7 +27,6 @@ from shellgs_method.machine.progress import tell
 _FLAGS = (
     "-std=c++17",
     "-O2",
-    "-fvect-cost-model=dynamic",
     "-fno-math-errno",
     "-fno-trapping-math",
     "-ffp-contract=fast",
@@ -75,9 +74,9 @@ def _compile(compiler: str, source: str, library: Path) -> None:
     with tempfile.TemporaryDirectory(dir=library.parent) as folder:
         made, code = Path(folder) / library.name, Path(folder) / "kernel.cpp"
         code.write_text(source)
-        # Without OpenMP, which clang on macOS lacks, loops run in one thread.
-        for options in ((*_FLAGS, "-fopenmp"), (*_FLAGS, "-Wno-unknown-pragmas")):
-            command = [compiler, *options, *_LIBRARY, str(code), "-o", str(made)]
+        # The first is GCC's; without OpenMP, which clang may lack, loops run in one thread.
+        for options in (("-fvect-cost-model=dynamic", "-fopenmp"), ("-fopenmp",), ("-Wno-unknown-pragmas",)):
+            command = [compiler, *_FLAGS, *options, *_LIBRARY, str(code), "-o", str(made)]
             result = subprocess.run(command, capture_output=True, text=True, check=False)
             if result.returncode == 0:
                 os.replace(made, library)

@@ -101,9 +101,9 @@ def _columns(outlines: Sequence[Value], row: Sequence[Value], size: Sequence[Val
     At height y above its centre, the ellipse A x² + 2 B x y + C y² = 1 spans
     x = -B/A y ± sqrt((1 - y² / reach_y²) / A), and it is widest where y = ∓B/C reach_x.
     """
-    spans, (row,), (width, _) = [], row, size
+    spans, (tile_row,), (width, _) = [], row, size
     for u, v, A, B, C, reach_x, reach_y in _ellipses(outlines):
-        top = row * TILE + 0.5 - v
+        top = tile_row * TILE + 0.5 - v
         above, below = torch.maximum(top, -reach_y), torch.minimum(top + (TILE - 1), reach_y)
         widest = -B / C * reach_x
         y_right = torch.minimum(torch.maximum(widest, above), below)
@@ -115,7 +115,7 @@ def _columns(outlines: Sequence[Value], row: Sequence[Value], size: Sequence[Val
         right = torch.where(meets, right + half_widths[1], -math.inf)
         spans.append((left, right))
     first, n_tiles = _tiles_between(*_around(spans), width)
-    return [[row * torch.floor((width + (TILE - 1)) / TILE) + first, n_tiles]]
+    return [[tile_row * torch.floor((width + (TILE - 1)) / TILE) + first, n_tiles]]
 
 
 def _ellipses(outlines: Sequence[Value]) -> list[Sequence[Value]]:

@@ -114,11 +114,11 @@ def step_back(
     transmittance. Its update needs no division, behind += alpha_i (g_i - behind), and the gradient of the loss w.r.t.
     alpha_i is T_i (g_i - behind). The channels may be in groups, whose parts are told apart.
     """
-    values, new, grad_z = iter(values), [], []
+    remaining, new, grad_z = iter(values), [], []
     for behind, gradients in zip(behinds, groups, strict=True):
         excess = -behind
         for gradient in gradients:
-            excess = excess + gradient * next(values)
+            excess = excess + gradient * next(remaining)
         new.append(behind + alpha * excess)
         # d alpha / dz = -ln 2 alpha, and 0 where alpha is at its maximum
         grad_z.append(torch.where(z > 0, (-math.log(2)) * (alpha * before) * excess, 0.0))

@@ -120,9 +120,11 @@ class Loops:
             alpha, before = attenuate(at.z, before, TRANSMITTANCE_MIN)
             alphas.append(alpha)
         groups, new = self.groups(gradients), behinds
-        for splat, at, *state in zip(params[::-1], evaluated[::-1], befores[::-1], alphas[::-1], strict=True):
+        for splat, at, transmittance, alpha in zip(
+            *(e[::-1] for e in (params, evaluated, befores, alphas)), strict=True
+        ):
             values = [*splat[kernels.n_shape :], *at.maps]
-            new, of_z = step_back(values, at.z, *state, new, groups)
+            new, of_z = step_back(values, at.z, transmittance, alpha, new, groups)
             grad_z.insert(0, of_z)
         for behind, each in zip(behinds, new, strict=True):
             behind.copy_(each)
