@@ -48,6 +48,7 @@ class Observations:
         views: the camera of each observation.
         points: its point.
         pixels: where the point is seen.
+        weights: how much each observation counts.
         lens_of: lens of each camera.
         fisheye: whether each lens is a fisheye lens.
         free: the parameters that are adjusted of each lens, as the columns of a matrix.
@@ -57,6 +58,7 @@ class Observations:
     views: Int64[np.ndarray, " M"]
     points: Int64[np.ndarray, " M"]
     pixels: Float64[np.ndarray, "M 2"]
+    weights: Float64[np.ndarray, " M"]
     lens_of: Int64[np.ndarray, " V"]
     fisheye: Bool[np.ndarray, " L"]
     free: Float64[np.ndarray, "L 10 P"]
@@ -65,7 +67,8 @@ class Observations:
     def of_points(self, chosen: Bool[np.ndarray, " N"]) -> Observations:
         """The observations of some of the points, which keep their numbers."""
         kept = chosen[self.points]
-        return replace(self, views=self.views[kept], points=self.points[kept], pixels=self.pixels[kept])
+        chosen_of = {name: getattr(self, name)[kept] for name in ("views", "points", "pixels", "weights")}
+        return replace(self, **chosen_of)
 
 
 @dataclass(frozen=True)
@@ -169,11 +172,11 @@ def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) 
     error = error / objective.pixel
     scale = objective.cauchy**2
     squared = (error**2).sum(axis=1)
-    weight = np.where(front, 1 / (1 + squared / scale), 0.0)
+    weight = np.where(front, seen.weights / (1 + squared / scale), 0.0)
     distance = np.einsum("kj,kj->k", planes.normals, bundle.points[planes.points] - planes.feet)
     inlying = np.clip(1 - (distance / planes.gate) ** 2, 0, None)
     away = bundle.centres[known.views] - known.centres
-    cost = 0.5 * scale * np.log1p(squared / scale).sum()
+    cost = 0.5 * scale * (seen.weights * np.log1p(squared / scale)).sum()
     cost += (planes.gate / planes.sigma) ** 2 / 6 * (1 - inlying**3).sum()
     cost += 0.5 * ((away / known.sigma[:, None]) ** 2).sum()
     if not derivatives:
@@ -187,23 +190,30 @@ def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) 
     by_turn = np.cross(inside[:, None], by_inside)
     lens = seen.lens_of[seen.views]
     by_lens = np.einsum("mij,mjp->mip", by_lens * (root / objective.pixel)[:, None, None], seen.free[lens])
+    by_pose = np.concatenate([by_turn, -by_point], axis=2)
     error = error * root[:, None]
 
-    count, cameras, lenses = len(error), len(bundle.centres), len(bundle.lenses)
+    cameras, count = len(bundle.centres), len(bundle.points)
     width = seen.free.shape[2]
-    size = 6 * cameras + width * lenses
-    columns = np.concatenate(
-        [6 * seen.views[:, None] + np.arange(6), 6 * cameras + width * lens[:, None] + np.arange(width)], axis=1
+    of_view, of_lens, of_point = (
+        _sum_by(index, size)
+        for index, size in ((seen.views, cameras), (lens, len(bundle.lenses)), (seen.points, count))
     )
-    Jc = _rows(np.concatenate([by_turn, -by_point, by_lens], axis=2), columns, size)
-    Jx = _rows(by_point, 3 * seen.points[:, None] + np.arange(3), 3 * len(bundle.points))
-    flat = error.reshape(-1)
-    Hcc = (Jc.T @ Jc).toarray()
-    gc = Jc.T @ flat
-    gx = (Jx.T @ flat).reshape(-1, 3)
-    blocks = np.einsum("mki,mkj->mij", by_point, by_point).reshape(count, 9)
-    summed = sparse.csr_matrix((np.ones(count), (seen.points, np.arange(count))), (len(bundle.points), count))
-    Hxx = (summed @ blocks).reshape(-1, 3, 3)
+    split = 6 * cameras
+    Hcc = np.zeros((split + width * len(bundle.lenses),) * 2)
+    pose = np.arange(split).reshape(-1, 6)
+    focal = split + np.arange(width * len(bundle.lenses)).reshape(-1, width)
+    Hcc[pose[:, :, None], pose[:, None]] = _blocks(of_view, by_pose, by_pose)
+    Hcc[focal[:, :, None], focal[:, None]] = _blocks(of_lens, by_lens, by_lens)
+    mixed = _blocks(of_view, by_pose, by_lens)
+    Hcc[pose[:, :, None], focal[seen.lens_of][:, None]] = mixed
+    Hcc[focal[seen.lens_of][:, :, None], pose[:, None]] = mixed.transpose(0, 2, 1)
+    gc = np.concatenate([_blocks(of_view, by_pose, error[..., None]).ravel(), _blocks(of_lens, by_lens, error[..., None]).ravel()])
+    gx = _blocks(of_point, by_point, error[..., None])[..., 0]
+    Hxx = _blocks(of_point, by_point, by_point)
+    Hcx = sparse.vstack(
+        [_mixed(by_pose, by_point, seen.views, cameras, seen.points, count), _mixed(by_lens, by_point, lens, len(bundle.lenses), seen.points, count)], format="csr"
+    )
 
     stiffness = inlying**2 / planes.sigma**2
     np.add.at(Hxx, planes.points, stiffness[:, None, None] * planes.normals[:, :, None] * planes.normals[:, None])
@@ -211,31 +221,39 @@ def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) 
     diagonal = 6 * known.views[:, None] + np.arange(3, 6)
     np.add.at(Hcc, (diagonal, diagonal), 1 / known.sigma[:, None] ** 2)
     np.add.at(gc, diagonal, away / known.sigma[:, None] ** 2)
-    return _Linearised(float(cost), Hcc, (Jc.T @ Jx).tocsr(), Hxx, gc, gx)
+    return _Linearised(float(cost), Hcc, Hcx, Hxx, gc, gx)
 
 
-def _rows(derivatives: np.ndarray, columns: np.ndarray, size: int) -> sparse.csr_matrix:
-    """A sparse Jacobian of two rows for each observation, with derivatives by the same columns."""
-    count, rows, width = derivatives.shape
-    indices = np.repeat(columns[:, None], rows, axis=1).reshape(-1)
-    starts = np.arange(0, count * rows * width + 1, width)
-    return sparse.csr_matrix((derivatives.reshape(-1), indices, starts), (count * rows, size))
+def _blocks(summed: sparse.csr_matrix, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Sums of the products of derivatives (observation, pixel coordinate, unknown), over observations of the same."""
+    products = np.matmul(one.transpose(0, 2, 1), other)
+    return (summed @ products.reshape(len(products), -1)).reshape(-1, *products.shape[1:])
 
 
-def _reduced(system: _Linearised, damping: float, held: np.ndarray) -> tuple[np.ndarray, np.ndarray, sparse.bsr_matrix]:
-    """Schur complement of the points, its right side, and the inverse of the points' blocks."""
-    Hxx = system.Hxx + damping * system.Hxx * np.eye(3)
-    traces = np.einsum("nii->n", Hxx)
-    Hxx += (1e-12 * traces + (traces == 0))[:, None, None] * np.eye(3)
-    inverse = np.linalg.inv(Hxx)
-    count = len(inverse)
-    blocks = sparse.bsr_matrix((inverse, np.arange(count), np.arange(count + 1)), (3 * count, 3 * count))
-    carried = system.Hcx @ blocks
-    S = system.Hcc + np.diag(damping * system.Hcc.diagonal()) - (carried @ system.Hcx.T).toarray()
-    right = -(system.gc - carried @ system.gx.reshape(-1))
+def _mixed(
+    one: np.ndarray, other: np.ndarray, rows: np.ndarray, height: int, columns: np.ndarray, width: int
+) -> sparse.csr_matrix:
+    """The products of derivatives as blocks of a matrix, those of the same row and column summed."""
+    order = np.argsort(rows, kind="stable")
+    products = np.matmul(one.transpose(0, 2, 1), other)[order]
+    starts = np.searchsorted(rows[order], np.arange(height + 1))
+    shape = (height * products.shape[1], width * products.shape[2])
+    blocks = sparse.bsr_matrix((products, columns[order], starts), shape).tocsr()
+    blocks.sum_duplicates()
+    return blocks
+
+
+def _reduced(system: _Linearised, damping: float, held: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Schur complement of the points, its right side, and the inverses of the points' blocks."""
+    inverses = np.linalg.inv(_damped(system.Hxx, damping))
+    Hcx = system.Hcx
+    triples = np.matmul(Hcx.data.reshape(-1, 1, 3), inverses[Hcx.indices[::3] // 3])  # a row has all three of a point
+    carried = sparse.csr_matrix((triples.reshape(-1), Hcx.indices, Hcx.indptr), Hcx.shape)
+    S = system.Hcc + np.diag(damping * system.Hcc.diagonal()) - (carried @ Hcx.T).toarray()
+    right = carried @ system.gx.reshape(-1) - system.gc
     S[held], S[:, held], right[held] = 0.0, 0.0, 0.0
     S[held, held] = 1.0
-    return S, right, blocks
+    return S, right, inverses
 
 
 def _moved(bundle: Bundle, step: np.ndarray, points: np.ndarray, seen: Observations) -> Bundle:
@@ -257,7 +275,7 @@ def _held(system: _Linearised, bundle: Bundle, seen: Observations) -> np.ndarray
     return held
 
 
-def adjust(objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4) -> tuple[Bundle, float]:
+def adjust(objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4, converged: float = 1e-8) -> tuple[Bundle, float]:
     """Minimise an objective from a start; return the minimum and the damping to go on with.
 
     Along directions that nothing determines, such as the seven of the frame where only photographs speak, the bundle
@@ -267,13 +285,14 @@ def adjust(objective: Objective, bundle: Bundle, steps: int = 50, damping: float
     for _ in range(steps):
         held = _held(system, bundle, objective.observations)
         while damping < _MOST_DAMPING:
-            S, right, blocks = _reduced(system, damping, held)
+            S, right, inverses = _reduced(system, damping, held)
             try:
                 step = cho_solve(cho_factor(S), right)
             except np.linalg.LinAlgError:
                 damping *= 10
                 continue
-            points = -(blocks @ (system.gx.reshape(-1) + system.Hcx.T @ step)).reshape(-1, 3)
+            gradient = system.gx + (system.Hcx.T @ step).reshape(-1, 3)
+            points = -np.matmul(inverses, gradient[..., None])[..., 0]
             trial = _moved(bundle, step, points, objective.observations)
             cost = objective.cost(trial)
             if cost < system.cost:
@@ -283,38 +302,65 @@ def adjust(objective: Objective, bundle: Bundle, steps: int = 50, damping: float
             break
         bundle, before = trial, system.cost
         damping = max(damping / 10, _LEAST_DAMPING)
-        if before - cost <= _CONVERGED * before:
+        if before - cost <= converged * before:
             break
         system = _linearised(objective, bundle)
     return bundle, min(damping, 1e-2)
 
 
 def intersected(objective: Objective, bundle: Bundle, steps: int = 20) -> Bundle:
-    """Minimise an objective over the points alone: triangulate them from the cameras as they are."""
-    damping = np.full(len(bundle.points), 1e-3)
-    system = _linearised(objective, bundle)
-    cost = _point_costs(objective, bundle)
+    """Minimise the reprojection errors over the points alone: triangulate them from the cameras as they are."""
+    damping, cost = np.full(len(bundle.points), 1e-3), _point_costs(objective, bundle)
     for _ in range(steps):
-        Hxx = system.Hxx + damping[:, None, None] * system.Hxx * np.eye(3)
-        traces = np.einsum("nii->n", Hxx)
-        Hxx += (1e-12 * traces + (traces == 0))[:, None, None] * np.eye(3)
-        trial = replace(bundle, points=bundle.points - np.linalg.solve(Hxx, system.gx[..., None])[..., 0])
+        Hxx, gx = _of_points(objective, bundle)
+        step = np.linalg.solve(_damped(Hxx, damping[:, None, None]), gx[..., None])[..., 0]
+        trial = replace(bundle, points=bundle.points - step)
         costs = _point_costs(objective, trial)
         better = costs < cost
         bundle = replace(bundle, points=np.where(better[:, None], trial.points, bundle.points))
-        if (cost - np.minimum(cost, costs)).sum() <= _CONVERGED * cost.sum():
+        decrease = np.where(better, cost - costs, 0.0).sum()
+        if decrease <= _CONVERGED * cost.sum():
             break
-        cost = np.minimum(cost, costs)
+        cost = np.where(better, costs, cost)
         damping = np.clip(np.where(better, damping / 10, damping * 10), _LEAST_DAMPING, _MOST_DAMPING)
-        system = _linearised(objective, bundle)
     return bundle
+
+
+def _of_points(objective: Objective, bundle: Bundle) -> tuple[np.ndarray, np.ndarray]:
+    """Hessian and gradient of the reprojection errors by each point."""
+    seen = objective.observations
+    error, front, _, by_inside, _ = _project(bundle, seen)
+    squared = (error**2).sum(axis=1) / objective.pixel**2
+    weight = np.where(front, seen.weights / (1 + squared / objective.cauchy**2), 0.0) / objective.pixel**2
+    by_point = by_inside @ bundle.rotations[seen.views]
+    summed = _sum_by(seen.points, len(bundle.points))
+    weighed = weight[:, None, None] * by_point
+    return _blocks(summed, weighed, by_point), _blocks(summed, weighed, error[..., None])[..., 0]
+
+
+def scatter(objective: Objective, bundle: Bundle, normals: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    """Standard deviation of each triangulated point along a direction, the cameras being exact."""
+    Hxx, _ = _of_points(objective, bundle)
+    return np.sqrt(np.einsum("ni,nij,nj->n", normals, np.linalg.inv(_damped(Hxx, 0.0)), normals))
+
+
+def _sum_by(index: np.ndarray, count: int) -> sparse.csr_matrix:
+    """The matrix that sums rows with the same index."""
+    return sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), (count, len(index)))
+
+
+def _damped(blocks: np.ndarray, damping: float | np.ndarray) -> np.ndarray:
+    """Blocks of points with a larger diagonal; that of a point without observations is 1."""
+    blocks = blocks * (1 + damping * np.eye(3))
+    traces = np.einsum("nii->n", blocks)
+    return blocks + (1e-12 * traces + (traces == 0))[:, None, None] * np.eye(3)
 
 
 def _point_costs(objective: Objective, bundle: Bundle) -> np.ndarray:
     """Costs of the reprojection errors of each point."""
     error, _ = reprojection_errors(bundle, objective.observations)
     scale = (objective.cauchy * objective.pixel) ** 2
-    costs = np.log1p((error**2).sum(axis=1) / scale)
+    costs = objective.observations.weights * np.log1p((error**2).sum(axis=1) / scale)
     return np.bincount(objective.observations.points, costs, len(bundle.points))
 
 
