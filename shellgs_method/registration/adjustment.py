@@ -1,12 +1,13 @@
 """Unbend the cameras of a scene by its shell: bundle adjustment with the SfM points that lie on the shell.
 
-A similarity cannot absorb the drift of structure from motion. Its weak directions, along which cameras bend at hardly any
-reprojection error, are those that the shell determines: its walls are straight.
+A similarity cannot absorb the drift of structure from motion: cameras bend at hardly any reprojection error, by wrong
+observations and a wrong distortion. The shell's walls are where they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,20 +31,28 @@ from shellgs_method.registration.bundle import (
     reprojection_errors,
     scatter,
 )
-from shellgs_method.registration.refinement import FINAL_GATE
 from shellgs_method.shell.surface import ShellSurface
 
 REACH = 0.3
-"""Metres from the shell within which points are on it before the adjustment: the drift of a walk past a house."""
+"""Metres from the shell within which points may be on it before the adjustment: the drift of a walk past a house."""
+GATE = 0.03
+"""The same in the last rounds: frames, sills and railings, which a scan lacks, are farther from its planes."""
 HELD_OUT = 0.1
 """Share of the tracks that are left out of the adjustment, and checked."""
+STRAIGHT = 0.95
+"""Distance of the points held out from the shell, relative to the one before, above which cameras were not bent."""
 _FINEST = 0.005
-"""Metres: smallest noise of a shell. No scan of a building is better, and an exact model is not what was built."""
+"""Metres: smallest noise of a shell. No scan of a building is better, and no building is its model."""
 _RANGE = 0.05
 """Largest change of focal lengths, relative, and of distortion coefficients."""
-_GATES, _ROUNDS, _STEPS = 6, 15, 3
-_STILL = 2e-4  # metres that cameras move by in a round, from which they stand still
+_OUTLYING = 4.0
+"""Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of those of a video are: of
+edges that slide along others, and of repeated windows. Structure from motion without a robust loss is bent by them."""
+_VIEWS = 3  # observations that are not wrong, which a track needs: nothing checks two
+_ROBUST, _GATES, _ROUNDS, _STEPS = 4, 7, 18, 3
+_STILL = 5e-4  # metres that cameras move by in a round, from which they stand still
 _FEW = 50  # points on the shell that determine nothing
+_SHARED = 10  # photographs of a lens from which on its distortion is found
 
 
 @dataclass(frozen=True)
@@ -51,7 +60,7 @@ class HeldOut:
     """What the tracks that were left out of the adjustment say of it; their points are triangulated.
 
     Attributes:
-        points: how many are on the shell.
+        points: how many are near the shell.
         pixels: median reprojection error, before and after.
         metres: median distance from the shell, before and after.
     """
@@ -59,6 +68,11 @@ class HeldOut:
     points: int
     pixels: tuple[float, float]
     metres: tuple[float, float]
+
+    @property
+    def were_straight(self) -> bool:
+        """Whether the points are no closer to the shell than before."""
+        return not self.metres[1] < STRAIGHT * self.metres[0]
 
 
 @dataclass(frozen=True)
@@ -92,18 +106,17 @@ def adjusted(
     surface: ShellSurface,
     model: Model,
     survey_from_scene: Float64[np.ndarray, "4 4"],
-    known: dict[str, Float64[np.ndarray, " 3"]] | None = None,
+    known: Mapping[str, Float64[np.ndarray, " 3"]] | None = None,
     sigma: float = 0.03,
 ) -> Adjustment:
     """Adjust cameras, lenses and points of a model to the shell.
 
-    What photographs say of the cameras is taken from the model: the reprojection errors that are minimised are changes of
-    those that it has. Else cameras that were surveyed, or found with more than these tracks, would be moved by the noise
-    of the tracks.
+    First without the shell, leaving out observations that are outliers by Tukey's biweight. Then points within a gate of
+    the shell are drawn onto the planes of their closest triangles, with Tukey's loss and the noise of the shell, which is
+    estimated from the data. The gate shrinks from :data:`REACH` to :data:`GATE`.
 
-    The points within a gate of the shell are drawn onto the planes of their closest triangles, with Tukey's loss and the
-    noise of the shell, which is estimated from the data. The gate shrinks from :data:`REACH` to
-    :data:`~shellgs_method.registration.refinement.FINAL_GATE`, as in the refinement.
+    The pinhole lens of undistorted photographs becomes one that distorts (OPENCV), since a distortion that was found
+    wrong has left a rest in them, which bends cameras.
 
     Args:
         surface: the shell.
@@ -115,9 +128,9 @@ def adjusted(
     Raises:
         SceneError: the model has no tracks, its cameras cannot be adjusted, or too few points are on the shell.
     """
+    model = _with_distortion(model)
     start, seen = bundle_of(model, survey_from_scene)
-    pixel = _noise_of_pixels(start, seen)
-    start = intersected(Objective(seen, pixel), start)
+    start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
     fitted = np.random.default_rng(0).random(len(start.points)) >= HELD_OUT
     names = [image.name for image in model.images.values()]
     there = [k for k, name in enumerate(names) if known and name in known]
@@ -126,56 +139,72 @@ def adjusted(
         np.array([(known or {})[names[k]] for k in there]).reshape(-1, 3),
         np.full(len(there), sigma),
     )
-    objective = Objective(_as_predicted(start, seen.of_points(fitted), pixel), pixel, positions=positions)
-    bundle, objective = _drawn_to(surface, objective, start)
+    bundle, objective = _drawn_to(surface, seen.of_points(fitted), positions, start)
     spread = deviations(objective, bundle)
-
-    final = intersected(Objective(seen, pixel), bundle)
-    steady = np.flatnonzero(_near(surface, final.points, FINAL_GATE))
-    one, other = (np.concatenate([each.points[steady], each.centres]) for each in (final, start))
+    whole = Objective(seen, objective.pixel)
+    final = intersected(whole, bundle)
+    on = surface.distance(final.points) < GATE
+    one, other = (np.concatenate([each.points[on], each.centres]) for each in (final, start))
     back = fit_similarity(one, other)
-    shifted = transformed(final.points[steady], back) - final.points[steady]
+    shifted = transformed(final.points[on], back) - final.points[on]
     moved = np.linalg.norm(transformed(bundle.centres, back) - start.centres, axis=1)
     placed = np.linalg.inv(back) @ survey_from_scene
-    errors, _ = reprojection_errors(final, seen)
-    lengths = np.linalg.norm(errors, axis=1)
-    counts = np.maximum(np.bincount(seen.points, minlength=len(final.points)), 1)
+    lengths = np.linalg.norm(reprojection_errors(final, seen)[0], axis=1)
+    counts = np.bincount(seen.points, minlength=len(final.points))
     return Adjustment(
         adjusted_model(model, final, placed),
-        np.bincount(seen.points, lengths, len(final.points)) / counts,
+        np.bincount(seen.points, lengths, len(final.points)) / np.maximum(counts, 1),
         placed,
         float(np.sqrt((shifted**2).sum(axis=1).mean())),
         dict(zip(names, moved.tolist(), strict=True)),
         dict(zip(names, spread.tolist(), strict=True)),
-        pixel,
+        objective.pixel,
         objective.planes.sigma,
-        _held_out(surface, start, final, seen, ~fitted),
+        _held_out(surface, start, final, seen, ~fitted & (counts >= _VIEWS)),
     )
 
 
-def _drawn_to(surface: ShellSurface, objective: Objective, bundle: Bundle) -> tuple[Bundle, Objective]:
-    """Rounds of looking for the closest planes and adjusting to them."""
-    gates = np.append(np.geomspace(REACH, FINAL_GATE, _GATES), np.full(_ROUNDS - _GATES, FINAL_GATE))
+def _drawn_to(
+    surface: ShellSurface, seen: Observations, positions: Positions, bundle: Bundle
+) -> tuple[Bundle, Objective]:
+    """Rounds of leaving out wrong observations, looking for the closest planes and adjusting to them."""
+    seen = seen.of_points(np.bincount(seen.points, minlength=len(bundle.points)) >= _VIEWS)
+    objective = Objective(seen, _noise_of_pixels(bundle, seen), positions=positions)
+    gates = [*np.full(_ROBUST, np.inf), *np.geomspace(REACH, GATE, _GATES)]
+    gates += [GATE] * (_ROUNDS - len(gates))
     damping = 1e-4
     for gate in track(gates, "bundle adjustment", transient=True):
-        # Points that were drawn to the shell say nothing of its noise, nor where they belong.
+        # Points are triangulated again: those drawn to the shell say nothing of its noise, nor where they belong.
         free = intersected(objective, bundle, steps=5)
-        planes = _planes(surface, objective, free, float(gate))
-        objective, before = replace(objective, planes=planes), bundle.centres
-        bundle, damping = adjust(objective, bundle, _STEPS, damping, 1e-5)
-        if gate == FINAL_GATE and np.linalg.norm(bundle.centres - before, axis=1).max() < _STILL:
+        pixel = _noise_of_pixels(free, seen)
+        objective = replace(objective, observations=_trusted(free, seen, pixel), pixel=pixel)
+        if gate < np.inf:
+            objective = replace(objective, planes=_planes(surface, objective, free, gate))
+        before = bundle.centres
+        bundle, damping = adjust(objective, replace(bundle, points=free.points), _STEPS, damping, 1e-6)
+        if gate == GATE and np.linalg.norm(bundle.centres - before, axis=1).max() < _STILL:
             break
     return bundle, objective
 
 
+def _trusted(bundle: Bundle, seen: Observations, pixel: float) -> Observations:
+    """The observations with weights: 0 for wrong ones, and where fewer than three of a track are left."""
+    error, front = reprojection_errors(bundle, seen)
+    distance = np.linalg.norm(error, axis=1) / (_OUTLYING * pixel)
+    weights = np.where(front, np.clip(1 - distance**2, 0, None) ** 2, 0.0)
+    sound = np.bincount(seen.points, weights > 0.1, len(bundle.points)) >= _VIEWS
+    return replace(seen, weights=weights * sound[seen.points])
+
+
 def _planes(surface: ShellSurface, objective: Objective, bundle: Bundle, gate: float) -> Planes:
+    """The planes of the points within a gate of the shell."""
     closest = surface.closest(bundle.points)
     offset = bundle.points - closest.point
-    seen = np.bincount(objective.observations.points, minlength=len(offset)) > 1
+    seen = np.bincount(objective.observations.points, objective.observations.weights, len(offset)) > 0
     near = np.flatnonzero(seen & (np.linalg.norm(offset, axis=1) < gate))
     if len(near) < _FEW:
         raise SceneError(
-            f"only {len(near)} points with tracks are within {gate:.2g} m of the shell: these cannot tell how cameras are bent"
+            f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to tell how cameras are bent"
         )
     normals = surface.normals[closest.triangle]
     distance = np.einsum("nd,nd->n", normals, offset)[near]
@@ -186,22 +215,11 @@ def _planes(surface: ShellSurface, objective: Objective, bundle: Bundle, gate: f
     return Planes(near, normals[near], closest.point[near].astype(np.float64), sigma, gate)
 
 
-def _near(surface: ShellSurface, points: np.ndarray, gate: float) -> np.ndarray:
-    return surface.distance(points) < gate
-
-
 def _noise_of_pixels(bundle: Bundle, seen: Observations) -> float:
     """Standard deviation of a keypoint's coordinate, from the median residual and the number of unknowns."""
     error, front = reprojection_errors(bundle, seen)
     freedom = 2 * len(error) - 3 * len(np.unique(seen.points)) - 6 * len(bundle.centres)
     return 1.4826 * float(np.median(np.abs(error[front]))) * np.sqrt(2 * len(error) / max(freedom, 1))
-
-
-def _as_predicted(bundle: Bundle, seen: Observations, pixel: float) -> Observations:
-    """The observations without their errors, which only weigh them."""
-    error, front = reprojection_errors(bundle, seen)
-    weights = 1 / (1 + (error**2).sum(axis=1) / (Objective.cauchy * pixel) ** 2)
-    return replace(seen, pixels=seen.pixels + error, weights=np.where(front, weights, 0.0))
 
 
 def _held_out(surface: ShellSurface, start: Bundle, final: Bundle, seen: Observations, chosen: np.ndarray) -> HeldOut:
@@ -214,6 +232,18 @@ def _held_out(surface: ShellSurface, start: Bundle, final: Bundle, seen: Observa
         pixels.append(float(np.median(np.linalg.norm(error[of], axis=1))) if of.any() else float("nan"))
         metres.append(float(np.median(distance[chosen])) if chosen.any() else float("nan"))
     return HeldOut(int(chosen.sum()), (pixels[0], pixels[1]), (metres[0], metres[1]))
+
+
+def _with_distortion(model: Model) -> Model:
+    """The model with lenses of many photographs that may distort."""
+    shared = Counter(image.camera for image in model.images.values())
+    cameras = {}
+    for number, camera in model.cameras.items():
+        if camera.model in ("SIMPLE_PINHOLE", "PINHOLE") and shared[number] >= _SHARED:
+            fx, fy, cx, cy = (_columns(camera) @ np.array(camera.params))[:4].tolist()
+            camera = camera._replace(model="OPENCV", params=(fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0))
+        cameras[number] = camera
+    return replace(model, cameras=cameras)
 
 
 def bundle_of(model: Model, placed: Float64[np.ndarray, "4 4"]) -> tuple[Bundle, Observations]:
@@ -311,8 +341,3 @@ def adjusted_model(model: Model, bundle: Bundle, placed: Float64[np.ndarray, "4 
         for (number, camera), lens in zip(model.cameras.items(), bundle.lenses, strict=True)
     }
     return Model(cameras, images, replace(model.points, positions=transformed(bundle.points, back)))
-
-
-def worst(values: dict[str, float], count: int) -> Sequence[str]:
-    """The names with the largest values."""
-    return sorted(values, key=lambda name: -values[name])[:count]
