@@ -39,7 +39,12 @@ def _brown(rays: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.n
     )
     across = x * y * slope + 2 * p1 * x + 2 * p2 * y
     by_ray = np.stack(
-        [radial + x**2 * slope + 2 * p1 * y + 6 * p2 * x, across, across, radial + y**2 * slope + 2 * p2 * x + 6 * p1 * y],
+        [
+            radial + x**2 * slope + 2 * p1 * y + 6 * p2 * x,
+            across,
+            across,
+            radial + y**2 * slope + 2 * p2 * x + 6 * p1 * y,
+        ],
         axis=1,
     ).reshape(-1, 2, 2)
     by_coefficient = np.zeros((len(rays), 2, 6))

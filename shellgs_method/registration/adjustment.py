@@ -84,7 +84,7 @@ class Adjustment:
         errors: mean reprojection error of each point, in pixels.
         survey_from_scene: the similarity that fits the shell to this model.
         shifted: how far that similarity moved the points on the shell, in metres (root mean square).
-        moved: how far each camera moved besides, in metres, by the image's name.
+        moved: how far each camera moved besides, in metres, by the image's number (or the view's name).
         deviations: standard deviation of its centre.
         pixel: noise of a keypoint's coordinate, in pixels.
         noise: noise of the shell, in metres.
@@ -95,8 +95,8 @@ class Adjustment:
     errors: Float64[np.ndarray, " N"]
     survey_from_scene: Float64[np.ndarray, "4 4"]
     shifted: float
-    moved: dict[str, float]
-    deviations: dict[str, float]
+    moved: Mapping[int | str, float]
+    deviations: Mapping[int | str, float]
     pixel: float
     noise: float
     held_out: HeldOut
@@ -106,7 +106,7 @@ def adjusted(
     surface: ShellSurface,
     model: Model,
     survey_from_scene: Float64[np.ndarray, "4 4"],
-    known: Mapping[str, Float64[np.ndarray, " 3"]] | None = None,
+    known: Mapping[int, Float64[np.ndarray, " 3"]] | None = None,
     sigma: float = 0.03,
 ) -> Adjustment:
     """Adjust cameras, lenses and points of a model to the shell.
@@ -122,7 +122,7 @@ def adjusted(
         surface: the shell.
         model: the model.
         survey_from_scene: the shell's place.
-        known: known camera centres in the survey frame, by the image's name.
+        known: known camera centres in the survey frame, by the image's number.
         sigma: standard deviation of these along each axis, in metres.
 
     Raises:
@@ -132,11 +132,11 @@ def adjusted(
     start, seen = bundle_of(model, survey_from_scene)
     start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
     fitted = np.random.default_rng(0).random(len(start.points)) >= HELD_OUT
-    names = [image.name for image in model.images.values()]
-    there = [k for k, name in enumerate(names) if known and name in known]
+    numbers = list(model.images)
+    there = [k for k, number in enumerate(numbers) if known and number in known]
     positions = Positions(
         np.array(there, dtype=np.int64),
-        np.array([(known or {})[names[k]] for k in there]).reshape(-1, 3),
+        np.array([(known or {})[numbers[k]] for k in there]).reshape(-1, 3),
         np.full(len(there), sigma),
     )
     bundle, objective = _drawn_to(surface, seen.of_points(fitted), positions, start)
@@ -156,8 +156,8 @@ def adjusted(
         np.bincount(seen.points, lengths, len(final.points)) / np.maximum(counts, 1),
         placed,
         float(np.sqrt((shifted**2).sum(axis=1).mean())),
-        dict(zip(names, moved.tolist(), strict=True)),
-        dict(zip(names, spread.tolist(), strict=True)),
+        dict(zip(numbers, moved.tolist(), strict=True)),
+        dict(zip(numbers, spread.tolist(), strict=True)),
         objective.pixel,
         objective.planes.sigma,
         _held_out(surface, start, final, seen, ~fitted & (counts >= _VIEWS)),
@@ -224,7 +224,7 @@ def _noise_of_pixels(bundle: Bundle, seen: Observations) -> float:
 
 def _held_out(surface: ShellSurface, start: Bundle, final: Bundle, seen: Observations, chosen: np.ndarray) -> HeldOut:
     distances = [surface.distance(bundle.points) for bundle in (start, final)]
-    chosen = chosen & (np.minimum(*distances) < REACH / 2)
+    chosen = chosen & (np.minimum(*distances) < 2 * GATE)
     pixels, metres = [], []
     for bundle, distance in zip((start, final), distances, strict=True):
         error, front = reprojection_errors(bundle, seen)

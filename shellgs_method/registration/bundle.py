@@ -208,11 +208,17 @@ def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) 
     mixed = _blocks(of_view, by_pose, by_lens)
     Hcc[pose[:, :, None], focal[seen.lens_of][:, None]] = mixed
     Hcc[focal[seen.lens_of][:, :, None], pose[:, None]] = mixed.transpose(0, 2, 1)
-    gc = np.concatenate([_blocks(of_view, by_pose, error[..., None]).ravel(), _blocks(of_lens, by_lens, error[..., None]).ravel()])
+    gc = np.concatenate(
+        [_blocks(of_view, by_pose, error[..., None]).ravel(), _blocks(of_lens, by_lens, error[..., None]).ravel()]
+    )
     gx = _blocks(of_point, by_point, error[..., None])[..., 0]
     Hxx = _blocks(of_point, by_point, by_point)
     Hcx = sparse.vstack(
-        [_mixed(by_pose, by_point, seen.views, cameras, seen.points, count), _mixed(by_lens, by_point, lens, len(bundle.lenses), seen.points, count)], format="csr"
+        [
+            _mixed(by_pose, by_point, seen.views, cameras, seen.points, count),
+            _mixed(by_lens, by_point, lens, len(bundle.lenses), seen.points, count),
+        ],
+        format="csr",
     )
 
     stiffness = inlying**2 / planes.sigma**2
@@ -275,7 +281,9 @@ def _held(system: _Linearised, bundle: Bundle, seen: Observations) -> np.ndarray
     return held
 
 
-def adjust(objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4, converged: float = 1e-8) -> tuple[Bundle, float]:
+def adjust(
+    objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4, converged: float = 1e-8
+) -> tuple[Bundle, float]:
     """Minimise an objective from a start; return the minimum and the damping to go on with.
 
     Along directions that nothing determines, such as the seven of the frame where only photographs speak, the bundle

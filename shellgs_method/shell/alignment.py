@@ -23,6 +23,7 @@ from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
 from shellgs_method.shell.mesh import ShellMesh, load_shell
 
+
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """A similarity from the shell's frame to the scene's, and how it was found.

@@ -88,7 +88,10 @@ def test_the_derivatives_of_a_lens_are_those_of_finite_differences(fisheye: bool
         for k in range(analytic.shape[2]):
             step = np.zeros(analytic.shape[2])
             step[k] = 1e-5
-            ends = [to_pixels(*((rays + s * step, lenses) if at == 0 else (rays, lenses + s * step)), fisheye)[0] for s in (1, -1)]
+            ends = [
+                to_pixels(*((rays + s * step, lenses) if at == 0 else (rays, lenses + s * step)), fisheye)[0]
+                for s in (1, -1)
+            ]
             np.testing.assert_allclose(analytic[:, :, k], (ends[0] - ends[1]) / 2e-5, rtol=1e-6, atol=1e-5)
 
 
@@ -236,5 +239,3 @@ def test_lenses_stay_within_their_limits():
     known = Positions(np.arange(5), bundle.centres, np.full(5, 1e-3))
     found, _ = adjust(Objective(replace(seen, limits=limits), 0.5, positions=known), wrong)
     np.testing.assert_allclose(found.lenses[:, 0], limits[1][:, 0])
-
-
