@@ -44,7 +44,8 @@ _MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, o
     "EQUIRECTANGULAR": 2,
 }
 _PARAMETERS = {name: known if isinstance(known, int) else len(known.split()) for name, known in _MODELS.items()}
-_KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+"""A keypoint of a photograph, and the id of its point or -1."""
 _PANORAMAS = {"EQUIRECTANGULAR", "SPHERICAL"}  # the same by the name of other programs
 
 T = TypeVar("T")
@@ -78,7 +79,7 @@ class ColmapImage(NamedTuple):
         if isinstance(self.keypoints, np.ndarray):
             return self.keypoints
         words = np.array(self.keypoints.split(), dtype=np.float64).reshape(-1, 3)
-        features = np.empty(len(words), _KEYPOINT)
+        features = np.empty(len(words), KEYPOINT)
         features["xy"], features["point"] = words[:, :2], words[:, 2]
         return features
 
@@ -370,7 +371,7 @@ def _binary_images(file: _Bytes) -> dict[int, ColmapImage]:
         number, *pose, camera = file.take("<i7di")
         name = file.text()
         (count,) = file.take("<Q")
-        images[number] = ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera, name, file.array(_KEYPOINT, count))
+        images[number] = ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera, name, file.array(KEYPOINT, count))
     return images
 
 

@@ -116,8 +116,8 @@ class SceneLayout(ScenePaths):
             return self.unadjusted_folder()
         if not (self.data / ADJUSTED).is_dir():
             raise SceneError(
-                f"{self.data / ALIGNMENT} was found with the cameras of {self.data / ADJUSTED}, which is missing: align "
-                "the shell again"
+                f"{self.data / ALIGNMENT} was found with the cameras of {self.data / ADJUSTED}, which is missing: "
+                "align the shell again"
             )
         return ADJUSTED
 

@@ -46,10 +46,11 @@ _FINEST = 0.005
 _RANGE = 0.05
 """Largest change of focal lengths, relative, and of distortion coefficients."""
 _OUTLYING = 4.0
-"""Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of those of a video are: of
-edges that slide along others, and of repeated windows. Structure from motion without a robust loss is bent by them."""
+"""Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of a video's are: of edges
+that slide along others, and of repeated windows. Structure from motion without a robust loss is bent by them."""
 _VIEWS = 3  # observations that are not wrong, which a track needs: nothing checks two
 _ROBUST, _GATES, _ROUNDS, _STEPS = 4, 7, 18, 3
+_LOOSE = 1.0  # metres: a prior that keeps what nothing determines, such as where cameras are along a bare wall
 _STILL = 5e-4  # metres that cameras move by in a round, from which they stand still
 _FEW = 50  # points on the shell that determine nothing
 _SHARED = 10  # photographs of a lens from which on its distortion is found
@@ -80,7 +81,7 @@ class Adjustment:
     """Adjusted cameras and points.
 
     Attributes:
-        model: the model, in the scene's frame, which it keeps on average; its points are triangulated, without the shell.
+        model: the model, in the scene's frame, kept on average; its points are triangulated without the shell.
         errors: mean reprojection error of each point, in pixels.
         survey_from_scene: the similarity that fits the shell to this model.
         shifted: how far that similarity moved the points on the shell, in metres (root mean square).
@@ -111,9 +112,9 @@ def adjusted(
 ) -> Adjustment:
     """Adjust cameras, lenses and points of a model to the shell.
 
-    First without the shell, leaving out observations that are outliers by Tukey's biweight. Then points within a gate of
-    the shell are drawn onto the planes of their closest triangles, with Tukey's loss and the noise of the shell, which is
-    estimated from the data. The gate shrinks from :data:`REACH` to :data:`GATE`.
+    First without the shell, leaving out observations that are outliers by Tukey's biweight. Then points within a gate
+    of the shell are drawn onto the planes of their closest triangles, with Tukey's loss and the noise of the shell,
+    which is estimated from the data. The gate shrinks from :data:`REACH` to :data:`GATE`.
 
     The pinhole lens of undistorted photographs becomes one that distorts (OPENCV), since a distortion that was found
     wrong has left a rest in them, which bends cameras.
@@ -133,17 +134,19 @@ def adjusted(
     start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
     fitted = np.random.default_rng(0).random(len(start.points)) >= HELD_OUT
     numbers = list(model.images)
-    there = [k for k, number in enumerate(numbers) if known and number in known]
+    known = known or {}
     positions = Positions(
-        np.array(there, dtype=np.int64),
-        np.array([(known or {})[numbers[k]] for k in there]).reshape(-1, 3),
-        np.full(len(there), sigma),
+        np.arange(len(numbers)),
+        np.stack([known.get(number, centre) for number, centre in zip(numbers, start.centres, strict=True)]),
+        np.array([sigma if number in known else _LOOSE for number in numbers]),
     )
     bundle, objective = _drawn_to(surface, seen.of_points(fitted), positions, start)
     spread = deviations(objective, bundle)
     whole = Objective(seen, objective.pixel)
     final = intersected(whole, bundle)
+    jump = np.linalg.norm(final.points - start.points, axis=1)
     on = surface.distance(final.points) < GATE
+    on &= jump < 3 * np.median(jump[on])  # wrong observations throw points far off before they are left out
     one, other = (np.concatenate([each.points[on], each.centres]) for each in (final, start))
     back = fit_similarity(one, other)
     shifted = transformed(final.points[on], back) - final.points[on]
@@ -204,7 +207,8 @@ def _planes(surface: ShellSurface, objective: Objective, bundle: Bundle, gate: f
     near = np.flatnonzero(seen & (np.linalg.norm(offset, axis=1) < gate))
     if len(near) < _FEW:
         raise SceneError(
-            f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to tell how cameras are bent"
+            f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to tell how "
+            "cameras are bent"
         )
     normals = surface.normals[closest.triangle]
     distance = np.einsum("nd,nd->n", normals, offset)[near]

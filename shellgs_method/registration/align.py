@@ -132,7 +132,7 @@ def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
 
 
 def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[Placement, Adjustment | None]:
-    """Adjust the cameras of a scene to the shell; return the placement in these, and no adjustment if none was needed.
+    """Adjust the cameras of a scene to the shell; return the placement, and None if they are left as is.
 
     Surveyed camera positions that the placement was found by are priors.
 
@@ -147,7 +147,7 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     folder = layout.colmap_folder()
     if folder is None:
         raise SceneError(
-            f"the cameras of {layout.data} cannot be adjusted: transforms.json has no tracks, only a COLMAP model has them"
+            f"the cameras of {layout.data} cannot be adjusted: transforms.json has no tracks, which a COLMAP model has"
         )
     alignment = placement.alignment
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
@@ -172,12 +172,12 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
         )
         return replace(placement, history=[*placement.history, sentence]), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
-    moved = list(adjustment.moved.values())
+    moved, deviation = (100 * np.array([*by.values()]) for by in (adjustment.moved, adjustment.deviations))
     sentence = (
-        f"Cameras adjusted to the shell: they moved by {100 * np.mean(moved):.1f} cm in the mean, {100 * np.max(moved):.1f} cm "
-        f"at most (standard deviation {100 * np.median(list(adjustment.deviations.values())):.1f} cm). {held.points} points "
-        f"held out of the adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their "
-        f"keypoints, {held.pixels[0]:.2f} px before (medians)."
+        f"The cameras were adjusted to the shell. They moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm at "
+        f"most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of the "
+        f"adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their keypoints, "
+        f"{held.pixels[0]:.2f} px before (medians)."
     )
     by_name = replace(
         adjustment,

@@ -225,9 +225,9 @@ def _unbending(validation: Validation) -> Iterator[str]:
     assert validation.unbending is not None
     adjustment = validation.unbending.adjustment
     earlier = {support.view.name: support.error for support in validation.unbending.before.views}
-    yield "<h2>Cameras adjusted to the shell</h2><p>Photograph by photograph: how far its camera moved, with the standard "
-    yield "deviation of its place; how far that moved the shell in the image; and how far the SfM points of the photograph "
-    yield f"are from the shell in depth, in the median. Noise of the keypoints {adjustment.pixel:.2f} px, of the shell "
+    yield "<h2>Cameras adjusted to the shell</h2><p>How far each camera moved, with the standard deviation of "
+    yield "its place; how far that moved the shell in the image; and how far the SfM points of the photograph are from "
+    yield f"the shell in depth, in the median. Noise of the keypoints {adjustment.pixel:.2f} px, of the shell "
     yield f"{100 * adjustment.noise:.1f} cm.</p>"
     rows = sorted(_moved(validation), key=lambda row: -row[1][0])
     yield table(
