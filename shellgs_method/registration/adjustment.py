@@ -85,7 +85,7 @@ class Adjustment:
         errors: mean reprojection error of each point, in pixels.
         survey_from_scene: the similarity that fits the shell to this model.
         shifted: how far that similarity moved the points on the shell, in metres (root mean square).
-        moved: how far each camera moved besides, in metres, by the image's number (or the view's name).
+        moved: how far each camera moved besides, in metres, by the photograph's name.
         deviations: standard deviation of its centre.
         pixel: noise of a keypoint's coordinate, in pixels.
         noise: noise of the shell, in metres.
@@ -96,8 +96,8 @@ class Adjustment:
     errors: Float64[np.ndarray, " N"]
     survey_from_scene: Float64[np.ndarray, "4 4"]
     shifted: float
-    moved: Mapping[int | str, float]
-    deviations: Mapping[int | str, float]
+    moved: Mapping[str, float]
+    deviations: Mapping[str, float]
     pixel: float
     noise: float
     held_out: HeldOut
@@ -107,7 +107,8 @@ def adjusted(
     surface: ShellSurface,
     model: Model,
     survey_from_scene: Float64[np.ndarray, "4 4"],
-    known: Mapping[int, Float64[np.ndarray, " 3"]] | None = None,
+    names: Mapping[int, str],
+    known: Mapping[str, Float64[np.ndarray, " 3"]] | None = None,
     sigma: float = 0.03,
 ) -> Adjustment:
     """Adjust cameras, lenses and points of a model to the shell.
@@ -123,7 +124,8 @@ def adjusted(
         surface: the shell.
         model: the model.
         survey_from_scene: the shell's place.
-        known: known camera centres in the survey frame, by the image's number.
+        names: name of each photograph, by its number in the model.
+        known: known camera centres in the survey frame, by the photograph's name.
         sigma: standard deviation of these along each axis, in metres.
 
     Raises:
@@ -133,12 +135,12 @@ def adjusted(
     start, seen = bundle_of(model, survey_from_scene)
     start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
     fitted = np.random.default_rng(0).random(len(start.points)) >= HELD_OUT
-    numbers = list(model.images)
-    known = known or {}
+    called = [names[number] for number in model.images]
+    priors = dict(zip(called, start.centres, strict=True)) | dict(known or {})
     positions = Positions(
-        np.arange(len(numbers)),
-        np.stack([known.get(number, centre) for number, centre in zip(numbers, start.centres, strict=True)]),
-        np.array([sigma if number in known else _LOOSE for number in numbers]),
+        np.arange(len(called)),
+        np.stack([priors[name] for name in called]),
+        np.array([sigma if name in (known or {}) else _LOOSE for name in called]),
     )
     bundle, objective = _drawn_to(surface, seen.of_points(fitted), positions, start)
     spread = deviations(objective, bundle)
@@ -159,8 +161,8 @@ def adjusted(
         np.bincount(seen.points, lengths, len(final.points)) / np.maximum(counts, 1),
         placed,
         float(np.sqrt((shifted**2).sum(axis=1).mean())),
-        dict(zip(numbers, moved.tolist(), strict=True)),
-        dict(zip(numbers, spread.tolist(), strict=True)),
+        dict(zip(called, moved.tolist(), strict=True)),
+        dict(zip(called, spread.tolist(), strict=True)),
         objective.pixel,
         objective.planes.sigma,
         _held_out(surface, start, final, seen, ~fitted & (counts >= _VIEWS)),

@@ -154,14 +154,13 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
     surveyed = [point for point in placement.correspondences if point.is_used and not isinstance(point, PickedPoint)]
     _, names = read_points(layout.data, folder, layout.images_path)
-    numbers = {name: number for number, name in names.items()}
-    known = {numbers[point.name]: transformed(point.shell, surface.survey_from_shell) for point in surveyed}
+    known = {point.name: transformed(point.shell, surface.survey_from_shell) for point in surveyed}
     scatter = max(_RTK, float(np.median([point.residual for point in surveyed]))) if surveyed else _RTK
-    adjustment = adjusted(surface, read_model(layout.data / folder), start, known, scatter)
+    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter)
     if adjustment.shifted > _ELSEWHERE:
         raise SceneError(
-            f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which is no "
-            "bend of cameras; align it better first, with --picks and --refine"
+            f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which is "
+            "no bend of cameras; align it better first, with --picks and --refine"
         )
     held = adjustment.held_out
     before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
@@ -174,20 +173,15 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
     moved, deviation = (100 * np.array([*by.values()]) for by in (adjustment.moved, adjustment.deviations))
     sentence = (
-        f"The cameras were adjusted to the shell. They moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm at "
-        f"most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of the "
+        f"Cameras adjusted to the shell: they moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm "
+        f"at most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of the "
         f"adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their keypoints, "
         f"{held.pixels[0]:.2f} px before (medians)."
-    )
-    by_name = replace(
-        adjustment,
-        moved={names[number]: metres for number, metres in adjustment.moved.items()},
-        deviations={names[number]: metres for number, metres in adjustment.deviations.items()},
     )
     found = replace(
         alignment, shell_to_scene=matrix, source=f"{alignment.source}, cameras adjusted", model=ADJUSTED.as_posix()
     )
-    return replace(placement, alignment=found, history=[*placement.history, sentence]), by_name
+    return replace(placement, alignment=found, history=[*placement.history, sentence]), adjustment
 
 
 def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) -> Placement:

@@ -213,12 +213,13 @@ def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) 
     )
     gx = _blocks(of_point, by_point, error[..., None])[..., 0]
     Hxx = _blocks(of_point, by_point, by_point)
-    Hcx = sparse.vstack(
-        [
-            _mixed(by_pose, by_point, seen.views, cameras, seen.points, count),
-            _mixed(by_lens, by_point, lens, len(bundle.lenses), seen.points, count),
-        ],
-        format="csr",
+    Hcx = sparse.csr_matrix(
+        sparse.vstack(
+            [
+                _mixed(by_pose, by_point, seen.views, cameras, seen.points, count),
+                _mixed(by_lens, by_point, lens, len(bundle.lenses), seen.points, count),
+            ]
+        )
     )
 
     stiffness = inlying**2 / planes.sigma**2
@@ -244,7 +245,7 @@ def _mixed(
     products = np.matmul(one.transpose(0, 2, 1), other)[order]
     starts = np.searchsorted(rows[order], np.arange(height + 1))
     shape = (height * products.shape[1], width * products.shape[2])
-    blocks = sparse.bsr_matrix((products, columns[order], starts), shape).tocsr()
+    blocks = sparse.csr_matrix(sparse.bsr_matrix((products, columns[order], starts), shape))
     blocks.sum_duplicates()
     return blocks
 

@@ -37,6 +37,7 @@ from shellgs_method.synthetic.path import walk
 VIEWS, WIDTH, HEIGHT, NOISE = 24, 640, 480, 0.3
 CAMERAS = walk(15.0, VIEWS, WIDTH, HEIGHT, np.random.default_rng(0))
 CENTRES = np.stack([camera.position.numpy() for camera in CAMERAS])
+NAMES = {number: f"{number:02d}.png" for number in range(1, VIEWS + 1)}
 ORIGINAL = ScenePaths(colmap_path=Path("colmap/sparse/0"))
 
 
@@ -133,7 +134,7 @@ def write(scene: Path, model: Model, mesh: ShellMesh, alignment: np.ndarray | No
     solid = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
     )
-    o3d.io.write_triangle_mesh(str(scene / "shell.ply"), solid)
+    o3d.io.write_triangle_mesh(scene / "shell.ply", solid)
     matrix = scene / "matrix.txt"
     np.savetxt(matrix, np.eye(4) if alignment is None else alignment)
     return matrix
@@ -155,7 +156,7 @@ def test_a_model_is_read_as_it_was_written(tmp_path: Path, model: Model):
 
 def test_bent_cameras_are_straightened(surface: ShellSurface, model: Model, bent: Model):
     before = np.linalg.norm(centres(bent) - CENTRES, axis=1)
-    found = adjusted(surface, bent, surface.survey_from_shell)
+    found = adjusted(surface, bent, surface.survey_from_shell, NAMES)
     after = error(surface, found)
     assert before.mean() > 0.03
     assert after.mean() < 0.015
@@ -165,21 +166,21 @@ def test_bent_cameras_are_straightened(surface: ShellSurface, model: Model, bent
 
 
 def test_the_scene_keeps_its_frame(surface: ShellSurface, bent: Model):
-    found = adjusted(surface, bent, surface.survey_from_shell)
+    found = adjusted(surface, bent, surface.survey_from_shell, NAMES)
     common = fit_similarity(found.model.points.positions, bent.points.positions)
     np.testing.assert_allclose(common, np.eye(4), atol=0.02)
 
 
 def test_cameras_that_are_straight_move_by_less_than_their_deviation(surface: ShellSurface, model: Model):
-    found = adjusted(surface, model, surface.survey_from_shell)
+    found = adjusted(surface, model, surface.survey_from_shell, NAMES)
     moved, deviations = (np.array(list(by.values())) for by in (found.moved, found.deviations))
     assert np.median(moved) < np.median(deviations)
     assert found.held_out.were_straight
 
 
 def test_surveyed_positions_draw_cameras_to_them(surface: ShellSurface, bent: Model):
-    known = dict(enumerate(transformed(CENTRES, surface.survey_from_shell), start=1))
-    found = adjusted(surface, bent, surface.survey_from_shell, known, 0.001)
+    known = dict(zip(NAMES.values(), transformed(CENTRES, surface.survey_from_shell), strict=True))
+    found = adjusted(surface, bent, surface.survey_from_shell, NAMES, known, 0.001)
     assert error(surface, found).max() < 0.003
 
 
@@ -190,6 +191,7 @@ def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
             surface,
             replace(model, points=replace(model.points, observers=none, keypoints=none)),
             surface.survey_from_shell,
+            NAMES,
         )
 
 
