@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -24,6 +25,7 @@ def align(
     picks: Optional[Path] = None,
     positions: Optional[Path] = None,
     refine: Optional[float] = None,
+    bundle_adjust: bool = False,
     accept: bool = False,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
@@ -43,6 +45,8 @@ def align(
         picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
         positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
         refine: Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres.
+        bundle_adjust: Then adjust the cameras to the shell, which unbends them, if the alignment is not refused: into
+            colmap/adjusted, which is used from then on. Without it, or with --colmap-path, the cameras are as before.
         accept: Accept the earlier proposal.
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres.
@@ -52,7 +56,10 @@ def align(
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import read_views
+    from shellgs_method.files.atomic import replace_folder, unfinished
+    from shellgs_method.files.colmap import write_model
     from shellgs_method.files.cue_maps import relative_path
+    from shellgs_method.files.scene import ADJUSTED
     from shellgs_method.files.sparse_points import read_sparse_points
     from shellgs_method.registration.align import (
         PROPOSAL,
@@ -65,6 +72,8 @@ def align(
         place_by_picks,
         place_by_positions,
         refined,
+        seen_again,
+        unbent,
     )
     from shellgs_method.registration.frames import ShellPlace
     from shellgs_method.registration.report import write_report
@@ -83,6 +92,8 @@ def align(
     if metres_per_shell_unit != 1 and shell is None:
         raise SceneError("--metres-per-shell-unit belongs to a shell: give the shell and a start, to align it again")
     layout = paths.of(scene)
+    if shell or accept or bundle_adjust:
+        layout = layout.unadjusted()
     views, points = read_views(layout), read_sparse_points(layout)
     check_points(points, views)
     name = relative_path(shell, scene) if shell else ""
@@ -108,12 +119,35 @@ def align(
         raise SceneError(f"the alignment cannot be refined: {misplacement}")
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
+    is_adjusted = layout.colmap_folder() == ADJUSTED
+    placement = replace(
+        placement, alignment=replace(placement.alignment, model=ADJUSTED.as_posix() if is_adjusted else "")
+    )
+    if placement.proposed and bundle_adjust:
+        raise SceneError(
+            "cameras are not adjusted to a proposal: look at it first, then --accept it with --bundle-adjust"
+        )
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
-    write_report(scene / REPORT, mesh, validation, placement.history)
-    if validation.verdict != "refused":
-        validation.validated(views).save(target)
-        renew_error(scene)
+    candidate = unfinished(scene / ADJUSTED)
+    try:
+        if bundle_adjust and validation.verdict != "refused":
+            placement, adjustment = unbent(placement, mesh, layout)
+            if adjustment:
+                write_model(candidate, adjustment.model, adjustment.errors)
+                layout = replace(layout, colmap_path=candidate.relative_to(scene))
+                views, points = read_views(layout), read_sparse_points(layout)
+                placement = seen_again(placement, views, picks)
+                after = validate(mesh, placement.alignment, views, points, placement.correspondences)
+                validation = after.after(adjustment, validation)
+        write_report(scene / REPORT, mesh, validation, placement.history)
+        if validation.verdict != "refused":
+            if candidate.is_dir():
+                replace_folder(scene / ADJUSTED, candidate)
+            validation.validated(views).save(target)
+            renew_error(scene)
+    finally:
+        shutil.rmtree(candidate, ignore_errors=True)
     _show_alignment(scene, target, placement, validation)
     if validation.verdict == "refused":
         why = f"{misplacement}; " if misplacement else ""

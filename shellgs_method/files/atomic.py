@@ -48,6 +48,13 @@ def unfinished(path: Path, suffix: str = "") -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp{suffix}")
 
 
+def replace_folder(folder: Path, complete: Path) -> None:
+    """Put a complete folder, made at the path :func:`unfinished`, in the place of another, if that is there."""
+    if folder.is_dir():
+        shutil.rmtree(folder)
+    os.replace(complete, folder)
+
+
 def remove_leftovers(folder: Path) -> None:
     """Delete what killed processes left :func:`unfinished` in a folder and below."""
     for path in folder.rglob(".*.tmp*"):

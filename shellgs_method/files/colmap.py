@@ -1,4 +1,7 @@
-"""Read COLMAP models, binary or text: cameras, images and points. What a file claims is checked against its size."""
+"""Read COLMAP models, binary or text, and write them: cameras, images and points.
+
+What a file claims is checked against its size.
+"""
 
 from __future__ import annotations
 
@@ -41,23 +44,44 @@ _MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, o
     "EQUIRECTANGULAR": 2,
 }
 _PARAMETERS = {name: known if isinstance(known, int) else len(known.split()) for name, known in _MODELS.items()}
+KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+"""A keypoint of a photograph, and the id of its point or -1."""
 _PANORAMAS = {"EQUIRECTANGULAR", "SPHERICAL"}  # the same by the name of other programs
 
 T = TypeVar("T")
 
 
-class _Camera(NamedTuple):
+class ColmapCamera(NamedTuple):
+    """A lens, as COLMAP describes it."""
+
     model: str
     width: int
     height: int
     params: tuple[float, ...]
 
 
-class _Image(NamedTuple):
+class ColmapImage(NamedTuple):
+    """A photograph of a model; its keypoints stay as the file has them until they are asked for."""
+
     quaternion: tuple[float, ...]  # w x y z
     translation: tuple[float, ...]
     camera: int
     name: str
+    keypoints: np.ndarray | str
+
+    @property
+    def features(self) -> np.ndarray:
+        """Pixel ``xy`` and id of the ``point``, or -1, of each keypoint.
+
+        Raises:
+            ValueError: they are damaged.
+        """
+        if isinstance(self.keypoints, np.ndarray):
+            return self.keypoints
+        words = np.array(self.keypoints.split(), dtype=np.float64).reshape(-1, 3)
+        features = np.empty(len(words), KEYPOINT)
+        features["xy"], features["point"] = words[:, :2], words[:, 2]
+        return features
 
 
 @dataclass(frozen=True)
@@ -68,11 +92,24 @@ class Points:
         positions: in the model's frame.
         colours: RGB.
         observers: ids of the images that observe each point.
+        keypoints: index of each observation among the keypoints of its image.
+        ids: COLMAP's number of each point.
     """
 
     positions: Float64[np.ndarray, "N 3"]
     colours: UInt8[np.ndarray, "N 3"]
     observers: list[Int64[np.ndarray, " M"]]
+    keypoints: list[Int64[np.ndarray, " M"]]
+    ids: Int64[np.ndarray, " N"]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A whole model: cameras and images by their ids, and points."""
+
+    cameras: Mapping[int, ColmapCamera]
+    images: Mapping[int, ColmapImage]
+    points: Points
 
 
 def find_folder(scene: Path, chosen: Path | None) -> Path | None:
@@ -127,8 +164,61 @@ def read_points(scene: Path, folder: Path, images_path: Path) -> tuple[Points, M
     files = _files(scene, folder, images_path)
     names = {number: _path(image.name, files) for number, image in _images(scene / folder).items()}
     if not any((scene / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
-        return Points(np.empty((0, 3)), np.empty((0, 3), np.uint8), []), names
+        return _points([], [], [], []), names
     return _read(scene / folder, "points3D", _binary_points, _text_points), names
+
+
+def read_model(folder: Path) -> Model:
+    """Read a model with the tracks of its points.
+
+    Raises:
+        FileNotFoundError: a file of the model is missing.
+        SceneError: a file is damaged.
+    """
+    cameras = _read(folder, "cameras", _binary_cameras, _text_cameras)
+    return Model(cameras, _images(folder), _read(folder, "points3D", _binary_points, _text_points))
+
+
+def write_model(folder: Path, model: Model, errors: Float64[np.ndarray, " N"]) -> None:
+    """Write a model, binary, into a new folder.
+
+    Args:
+        folder: the folder.
+        model: the model.
+        errors: mean reprojection error of each point in pixels.
+    """
+    folder.mkdir(parents=True)
+    kinds = list(_MODELS)
+    with (folder / "cameras.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(model.cameras)))
+        for number, camera in model.cameras.items():
+            file.write(struct.pack("<iiQQ", number, kinds.index(camera.model), camera.width, camera.height))
+            file.write(struct.pack(f"<{len(camera.params)}d", *camera.params))
+    with (folder / "images.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(model.images)))
+        for number, image in model.images.items():
+            file.write(struct.pack("<i7di", number, *image.quaternion, *image.translation, image.camera))
+            features = image.features
+            file.write(image.name.encode() + b"\0" + struct.pack("<Q", len(features)) + features.tobytes())
+    points = model.points
+    with (folder / "points3D.bin").open("wb") as file:
+        file.write(struct.pack("<Q", len(points.ids)))
+        for k, number in enumerate(points.ids):
+            track = np.stack([points.observers[k], points.keypoints[k]], axis=1).astype("<i4")
+            file.write(struct.pack("<Q3d3Bd", number, *points.positions[k], *points.colours[k], errors[k]))
+            file.write(struct.pack("<Q", len(track)) + track.tobytes())
+
+
+def parameters_of(camera: ColmapCamera) -> list[str]:
+    """Names of the parameters of a lens whose model is not only named.
+
+    Raises:
+        SceneError: it is one of the others, which cannot be undistorted.
+    """
+    parameters = _MODELS.get(camera.model)
+    if not isinstance(parameters, str):
+        raise SceneError(f"the camera model {camera.model} cannot be adjusted; {UNDISTORT}")
+    return parameters.split()
 
 
 def _numbered(scene: Path, place: Path) -> list[Path]:
@@ -140,7 +230,7 @@ def _is_model(folder: Path) -> bool:
     return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
 
 
-def _images(folder: Path) -> dict[int, _Image]:
+def _images(folder: Path) -> dict[int, ColmapImage]:
     return _read(folder, "images", _binary_images, _text_images)
 
 
@@ -154,7 +244,7 @@ def _path(name: str, files: NamedFiles) -> str:
     return path.relative_to(files.scene).as_posix()
 
 
-def _frame(scene: Path, path: str, image: _Image, cameras: Mapping[int, _Camera], folder: Path) -> Frame:
+def _frame(scene: Path, path: str, image: ColmapImage, cameras: Mapping[int, ColmapCamera], folder: Path) -> Frame:
     where = str(scene / folder)
     camera = cameras.get(image.camera)
     if camera is None:
@@ -170,7 +260,7 @@ def _frame(scene: Path, path: str, image: _Image, cameras: Mapping[int, _Camera]
     return frame(scene, path, pose, _lens(camera, scene), where)
 
 
-def _lens(camera: _Camera, scene: Path) -> dict[str, Any]:
+def _lens(camera: ColmapCamera, scene: Path) -> dict[str, Any]:
     """Intrinsics and distortion by the names of transforms.json."""
     parameters = _MODELS.get(camera.model)
     if not isinstance(parameters, str):
@@ -237,7 +327,7 @@ class _Bytes:
         self.at = end + 1
         return text
 
-    def array(self, dtype: str, count: int) -> np.ndarray:
+    def array(self, dtype: str | np.dtype, count: int) -> np.ndarray:
         array = np.frombuffer(self.data, dtype, count, self.at) if count else np.empty(0, dtype)
         self.at += array.nbytes
         return array
@@ -250,7 +340,7 @@ class _Bytes:
         return range(count)
 
 
-def _binary_cameras(file: _Bytes) -> dict[int, _Camera]:
+def _binary_cameras(file: _Bytes) -> dict[int, ColmapCamera]:
     cameras = {}
     for _ in file.records():
         number, model, width, height = file.take("<iiQQ")
@@ -261,50 +351,50 @@ def _binary_cameras(file: _Bytes) -> dict[int, _Camera]:
             )
         name = list(_MODELS)[model]
         count = _PARAMETERS[name]
-        cameras[number] = _Camera(name, width, height, file.take(f"<{count}d"))
+        cameras[number] = ColmapCamera(name, width, height, file.take(f"<{count}d"))
     return cameras
 
 
-def _text_cameras(lines: Iterator[str]) -> dict[int, _Camera]:
+def _text_cameras(lines: Iterator[str]) -> dict[int, ColmapCamera]:
     cameras = {}
     for words in map(str.split, lines):
         params = tuple(map(float, words[4:]))
         if len(params) != _PARAMETERS.get(words[1], len(params)):
             raise ValueError(f"{words[1]} has {_PARAMETERS[words[1]]} parameters, not {len(params)}")
-        cameras[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), params)
+        cameras[int(words[0])] = ColmapCamera(words[1], int(words[2]), int(words[3]), params)
     return cameras
 
 
-def _binary_images(file: _Bytes) -> dict[int, _Image]:
+def _binary_images(file: _Bytes) -> dict[int, ColmapImage]:
     images = {}
     for _ in file.records():
         number, *pose, camera = file.take("<i7di")
         name = file.text()
         (count,) = file.take("<Q")
-        file.array("V24", count)  # keypoints: x, y and point id
-        images[number] = _Image(tuple(pose[:4]), tuple(pose[4:]), camera, name)
+        images[number] = ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera, name, file.array(KEYPOINT, count))
     return images
 
 
-def _text_images(lines: Iterator[str]) -> dict[int, _Image]:
+def _text_images(lines: Iterator[str]) -> dict[int, ColmapImage]:
     """Images in lines that are not empty: the second line of an image, its keypoints, may be missing.
 
     It is empty for an image without keypoints, and programs drop or add empty lines.
     """
     images = {}
-    may_be_keypoints = False  # they follow their image
+    last: int | None = None  # the image whose keypoints may follow
     for line in lines:
         words = line.split(maxsplit=9)  # a name may have blanks
-        if may_be_keypoints and _are_keypoints(line):
-            may_be_keypoints = False
+        if last is not None and _are_keypoints(line):
+            images[last] = images[last]._replace(keypoints=line)
+            last = None
             continue
         pose = tuple(map(float, words[1:8]))
         if len(words) < 10:
             raise ValueError(f"a line of images is ID, 7 pose values, CAMERA, NAME, not {line[:40]!r}")
         if int(words[0]) in images:
             raise ValueError(f"two images have the number {words[0]}")
-        images[int(words[0])] = _Image(pose[:4], pose[4:], int(words[8]), words[9])
-        may_be_keypoints = True
+        last = int(words[0])
+        images[last] = ColmapImage(pose[:4], pose[4:], int(words[8]), words[9], "")
     return images
 
 
@@ -319,31 +409,35 @@ def _are_keypoints(line: str) -> bool:
 
 
 def _binary_points(file: _Bytes) -> Points:
-    positions, colours, observers = [], [], []
+    positions, colours, tracks, ids = [], [], [], []
     for _ in file.records():
-        _, *known, _, count = file.take("<Q3d3BdQ")
+        number, *known, _, count = file.take("<Q3d3BdQ")
+        ids.append(number)
         positions.append(known[:3])
         colours.append(known[3:])
-        observers.append(file.array("<i4", 2 * count)[::2].astype(np.int64))
-    return _points(positions, colours, observers)
+        tracks.append(file.array("<i4", 2 * count).astype(np.int64))
+    return _points(positions, colours, tracks, ids)
 
 
 def _text_points(lines: Iterator[str]) -> Points:
-    positions, colours, observers = [], [], []
+    positions, colours, tracks, ids = [], [], [], []
     for words in map(str.split, lines):
         position = [float(word) for word in words[1:4]]
         colour = [int(word) for word in words[4:7]]
         if len(position) != 3 or len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
             raise ValueError(f"a line of points is ID X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
+        ids.append(int(words[0]))
         positions.append(position)
         colours.append(colour)
-        observers.append(np.array(words[8::2], dtype=np.int64))
-    return _points(positions, colours, observers)
+        tracks.append(np.array(words[8:], dtype=np.int64))
+    return _points(positions, colours, tracks, ids)
 
 
-def _points(positions: list, colours: list, observers: list) -> Points:
+def _points(positions: list, colours: list, tracks: list, ids: list) -> Points:
     return Points(
         np.array(positions, dtype=np.float64).reshape(-1, 3),
         np.array(colours, dtype=np.uint8).reshape(-1, 3),
-        observers,
+        [track[::2] for track in tracks],
+        [track[1::2] for track in tracks],
+        np.array(ids, dtype=np.uint64).astype(np.int64),
     )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Optional
 
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.atomic import read_json
 from shellgs_method.files.paths import mask_names, photographs_in, tell_of_masks
 
 if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line needs only the paths
@@ -16,6 +18,10 @@ if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line ne
 
 MASKS = Path("masks")
 """Default folder of masks, in the scene."""
+ALIGNMENT = Path("shell/alignment.json")
+"""File of the shell's alignment, in the scene."""
+ADJUSTED = Path("colmap/adjusted")
+"""Folder of the model whose cameras were adjusted to the shell, in the scene."""
 
 
 @dataclass(unsafe_hash=True)
@@ -25,8 +31,8 @@ class ScenePaths:
     images_path: Path = Path("images")
     """Folder of the photographs in a COLMAP scene, relative to the scene folder."""
     colmap_path: Optional[Path] = None
-    """COLMAP model, relative to the scene folder. If not set: the largest of those numbered in colmap/sparse or sparse,
-    else the one there."""
+    """COLMAP model, relative to the scene folder. If not set: the one that the shell was aligned to with
+    --bundle-adjust, else the largest of those numbered in colmap/sparse or sparse, else the one there."""
     masks_path: Optional[Path] = None
     """Folder of masks (white is kept, black is ignored), relative to the scene folder. If not set: masks, if there."""
 
@@ -102,6 +108,36 @@ class SceneLayout(ScenePaths):
 
         Raises:
             FileNotFoundError: the scene has neither.
+            SceneError: the shell was aligned to adjusted cameras, which are missing.
+        """
+        if not self.data.is_dir():
+            raise FileNotFoundError(f"{self.data} is not a folder; --data takes a scene folder.")
+        if self.colmap_path is not None or not self._is_adjusted():
+            return self.unadjusted_folder()
+        if not (self.data / ADJUSTED).is_dir():
+            raise SceneError(
+                f"{self.data / ALIGNMENT} was found with the cameras of {self.data / ADJUSTED}, which is missing: "
+                "align the shell again"
+            )
+        return ADJUSTED
+
+    def _is_adjusted(self) -> bool:
+        """Whether the scene's alignment was found with adjusted cameras; a damaged one is reported where it is used."""
+        path = self.data / ALIGNMENT
+        with suppress(SceneError):
+            return path.is_file() and read_json(path).get("model") == ADJUSTED.as_posix()
+        return False
+
+    def unadjusted(self) -> SceneLayout:
+        """The same scene with its cameras as structure from motion has them, unless others are chosen."""
+        folder = self.unadjusted_folder()
+        return self if folder is None else replace(self, colmap_path=folder)
+
+    def unadjusted_folder(self) -> Path | None:
+        """As :meth:`colmap_folder`, whatever the alignment says.
+
+        Raises:
+            FileNotFoundError: the scene has no cameras.
         """
         from shellgs_method.files import colmap, transforms
 

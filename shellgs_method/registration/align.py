@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.colmap import read_model, read_points
 from shellgs_method.files.photographs import View
+from shellgs_method.files.scene import ADJUSTED, SceneLayout
 from shellgs_method.files.surfaces import up_axis
 from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import positions, upwards
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.registration.adjustment import Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again
 from shellgs_method.registration.frames import ShellPlace, apart
-from shellgs_method.registration.picks import align_picks, read_picks
+from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import propose
 from shellgs_method.registration.refinement import refine
@@ -35,6 +38,8 @@ if TYPE_CHECKING:
 PROPOSAL = Path("shell/proposal.json")
 REPORT = Path("shell/report")
 
+_RTK = 0.02  # metres: smallest scatter of surveyed positions along an axis
+_ELSEWHERE = 0.15  # metres by which a shell that is moved as a whole is misaligned
 _MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
 
 
@@ -124,6 +129,72 @@ def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
     used = [point.residual for point in points if point.is_used]
     mean = np.sqrt(np.mean(np.square(used)))
     return f"{len(used)} of {len(points)} {called} are used; their residual is {mean:.3f} m (root mean square)."
+
+
+def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[Placement, Adjustment | None]:
+    """Adjust the cameras of a scene to the shell; return the placement, and None if they are left as is.
+
+    Surveyed camera positions that the placement was found by are priors.
+
+    Args:
+        placement: the shell's place, found with the cameras as they are.
+        mesh: the shell in its own frame.
+        layout: the scene, with these cameras.
+
+    Raises:
+        SceneError: the scene has no tracks, the shell stands elsewhere, or too few points are on it.
+    """
+    folder = layout.colmap_folder()
+    if folder is None:
+        raise SceneError(
+            f"the cameras of {layout.data} cannot be adjusted: transforms.json has no tracks, which a COLMAP model has"
+        )
+    alignment = placement.alignment
+    surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
+    start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
+    surveyed = [point for point in placement.correspondences if point.is_used and not isinstance(point, PickedPoint)]
+    _, names = read_points(layout.data, folder, layout.images_path)
+    known = {point.name: transformed(point.shell, surface.survey_from_shell) for point in surveyed}
+    scatter = max(_RTK, float(np.median([point.residual for point in surveyed]))) if surveyed else _RTK
+    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter)
+    if adjustment.shifted > _ELSEWHERE:
+        raise SceneError(
+            f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which is "
+            "no bend of cameras; align it better first, with --picks and --refine"
+        )
+    held = adjustment.held_out
+    before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
+    if held.were_straight:
+        sentence = (
+            f"The cameras are left as they are: {held.points} points held out of their adjustment are {after} from the "
+            f"shell with it, {before} without."
+        )
+        return replace(placement, history=[*placement.history, sentence]), None
+    matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
+    moved, deviation = (100 * np.array([*by.values()]) for by in (adjustment.moved, adjustment.deviations))
+    sentence = (
+        f"Cameras adjusted to the shell: they moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm "
+        f"at most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of the "
+        f"adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their keypoints, "
+        f"{held.pixels[0]:.2f} px before (medians)."
+    )
+    found = replace(
+        alignment, shell_to_scene=matrix, source=f"{alignment.source}, cameras adjusted", model=ADJUSTED.as_posix()
+    )
+    return replace(placement, alignment=found, history=[*placement.history, sentence]), adjustment
+
+
+def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) -> Placement:
+    """The placement with the residuals that its correspondences have in other cameras."""
+    known = placement.correspondences
+    if picks is not None:
+        of_picks = [point for point in known if isinstance(point, PickedPoint)]
+        return replace(
+            placement, correspondences=picked_again(of_picks, read_picks(picks, views), views, placement.alignment)
+        )
+    centres = {view.name: view.camera.position.double().numpy() for view in views}
+    moved = [replace(point, scene=centres[point.name]) for point in known]
+    return replace(placement, correspondences=measured_again(moved, placement.alignment))
 
 
 def place_by_guess(

@@ -10,7 +10,7 @@ names with spaces. Points whose name begins with "check" are not fitted, only me
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +22,12 @@ from shellgs_method.registration.correspondences import (
     Correspondence,
     are_numbers,
     fit_robustly,
+    measured_again,
     read_lines,
     view_named,
     worst_first,
 )
+from shellgs_method.shell.alignment import Alignment
 
 MAX_REPROJECTION = 4.0
 """Largest distance of a picked pixel from the triangulated point, in pixels of a photograph 1000 pixels wide."""
@@ -163,6 +165,23 @@ def align_picks(
         for k, pick in enumerate(picks)
     ]
     return fit.shell_to_scene, worst_first(points)
+
+
+def picked_again(
+    points: Sequence[PickedPoint], picks: Sequence[Pick], views: Sequence[View], alignment: Alignment
+) -> list[PickedPoint]:
+    """Residuals of picks in other cameras and under another alignment, worst first.
+
+    Raises:
+        SceneError: a pick cannot be triangulated.
+    """
+    scene, reprojection, worst_view, _ = _triangulate_all(picks, views)
+    found = {pick.name: k for k, pick in enumerate(picks)}
+    moved = []
+    for point in points:
+        k = found[point.name]
+        moved.append(replace(point, scene=scene[k], reprojection=reprojection[k], worst_view=worst_view[k]))
+    return measured_again(moved, alignment)
 
 
 def _triangulate_all(

@@ -10,6 +10,7 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool
 from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
@@ -17,17 +18,22 @@ from scipy.ndimage import gaussian_filter
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import CueMap
 from shellgs_method.files.html import captioned, encoded, img, table, write_page
-from shellgs_method.files.photographs import load_photograph
+from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.geometry.camera import project
+from shellgs_method.geometry.distortion import to_pixels
+from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.correspondences import Correspondence
 from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.registration.repetition import RIVALRY
-from shellgs_method.registration.support import representative
+from shellgs_method.registration.support import ViewSupport, representative
 from shellgs_method.registration.validation import Validation, Verdict
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
 
 COLOURS = {"good": "#1a7f37", "doubtful": "#9a6700", "refused": "#cf222e"}
 _EDGE = (255, 0, 140)
+_EDGE_BEFORE = (0, 200, 255)
+_MOVED = 6  # photographs shown for having moved most
 _OVERLAY = 1280  # pixels of the longer side
 _BLUR = 2  # pixels
 
@@ -96,19 +102,70 @@ def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history:
 def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator[str]:
     """Yield the HTML of each representative view, and write its overlay as PNG."""
     caster = ShellCaster(mesh, validation.alignment.shell_to_scene)
-    for number, support in enumerate(representative(validation.views, validation.axes[0]), start=1):
+    before = {}
+    if validation.unbending is not None:
+        earlier = validation.unbending.before
+        before = {support.view.name: support.view.camera for support in earlier.views}
+        caster_before = ShellCaster(mesh, earlier.alignment.shell_to_scene)
+    for number, support in enumerate(_shown(validation), start=1):
         view = replace(support.view, camera=support.view.camera.shrunk(_OVERLAY))
         photograph = np.ascontiguousarray(load_photograph(view))
         edges = shell_edges(caster.cast(view.camera), validation.alignment.metres_per_unit)
         composite = photograph.copy()
-        composite[edges] = _EDGE
+        lines = np.zeros((*edges.shape, 4), np.uint8)
+        if view.name in before:
+            K = view.camera.K.clone()  # undistorted anew, the photograph has another centre
+            was = before[view.name]
+            K[0, 0], K[1, 1] = torch.diagonal(was.K)[:2] * (K[0, 2] / was.K[0, 2])
+            camera = replace(view.camera, viewmat=was.viewmat, K=K)
+            old = shell_edges(caster_before.cast(camera), validation.alignment.metres_per_unit)
+            composite[old], lines[old] = _EDGE_BEFORE, (*_EDGE_BEFORE, 255)
+        composite[edges], lines[edges] = _EDGE, (*_EDGE, 255)
         name = f"view_{number}_{Path(view.name).stem}.png"
         _write(folder / name, encoded(composite))
-        lines = np.zeros((*edges.shape, 4), np.uint8)
-        lines[edges] = (*_EDGE, 255)
         layers = img(encoded(photograph, "JPEG"), view.name) + img(encoded(lines), "the shell's edges")
         caption = f"{escape(view.name)}, {support.supported:.0%} on the shell"
         yield captioned(f'<div class="layers">{layers}</div>', caption)
+
+
+def _shown(validation: Validation) -> list[ViewSupport]:
+    """Views spread over the facade, then those of the cameras that were moved most."""
+    shown = representative(validation.views, validation.axes[0])
+    if validation.unbending is None:
+        return shown
+    moved = {support.view.name: row[0] for support, row in _moved(validation)}
+    most = sorted((s for s in validation.views if s not in shown), key=lambda s: -moved[s.view.name])
+    return [*shown, *most[:_MOVED]]
+
+
+def _moved(validation: Validation) -> Iterator[tuple[ViewSupport, tuple[float, float, float]]]:
+    """For each view of adjusted cameras: metres that it moved, its standard deviation, and pixels its edges moved."""
+    assert validation.unbending is not None
+    adjustment, before = validation.unbending.adjustment, validation.unbending.before
+    earlier = {support.view.name: support for support in before.views}
+    for support in validation.views:
+        name = support.view.name
+        pixels = [
+            _in_photograph(view, transformed(support.hits, np.linalg.inv(of.survey_from_scene)))
+            for view, of in ((support.view, validation), (earlier[name].view, before))
+        ]
+        shift = np.linalg.norm(pixels[0] - pixels[1], axis=1)
+        yield (
+            support,
+            (adjustment.moved[name], adjustment.deviations[name], float(shift.mean()) if len(shift) else np.nan),
+        )
+
+
+def _in_photograph(view: View, points: np.ndarray) -> np.ndarray:
+    """Pixels of points of the scene in the photograph as it is stored, with its distortion."""
+    pixels, _ = project(view.camera, points)
+    if view.lens is None:
+        return pixels
+    pinhole, K = view.camera.K.double().numpy(), view.lens.K.double().numpy()
+    rays = (pixels - pinhole[:2, 2]) / pinhole[[0, 1], [0, 1]]
+    k1, k2, k3, k4, p1, p2 = view.lens.distortion
+    lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, p1, p2, k3, k4])
+    return to_pixels(rays, np.tile(lens, (len(rays), 1)), view.lens.fisheye)[0]
 
 
 def _body(
@@ -128,7 +185,11 @@ def _body(
     if overlays:
         yield "<h2>The shell's edges on the photographs</h2><p>They must lie on the photographed edges, also at both "
         yield "ends of the building. Hover over an image to hide them.</p>"
+        if validation.unbending is not None:
+            yield "<p>Blue: before the cameras were adjusted.</p>"
         yield f'<div class="row">{"".join(overlays)}</div>'
+    if validation.unbending is not None:
+        yield from _unbending(validation)
     if "distances" in plots:
         shares = ", ".join(f"{validation.share_within(d):.0%} within {100 * d:.0f} cm" for d in (0.05, 0.10, 0.20))
         yield f"<h2>Distance of the SfM points from the shell</h2><p>Of those within 1 m: {shares}; median "
@@ -157,6 +218,32 @@ def _body(
         for s in validation.views
     )
     yield table(("view", "on the shell", "SfM points there", "median depth error", "occluded"), rows)
+
+
+def _unbending(validation: Validation) -> Iterator[str]:
+    """How each camera was adjusted, the one that moved most first."""
+    assert validation.unbending is not None
+    adjustment = validation.unbending.adjustment
+    earlier = {support.view.name: support.error for support in validation.unbending.before.views}
+    yield "<h2>Cameras adjusted to the shell</h2><p>How far each camera moved, with the standard deviation of "
+    yield "its place; how far that moved the shell in the image; and how far the SfM points of the photograph are from "
+    yield f"the shell in depth, in the median. Noise of the keypoints {adjustment.pixel:.2f} px, of the shell "
+    yield f"{100 * adjustment.noise:.1f} cm.</p>"
+    rows = sorted(_moved(validation), key=lambda row: -row[1][0])
+    yield table(
+        ("photograph", "moved", "deviation", "shell in the image", "depth error before", "after"),
+        (
+            (
+                escape(support.view.name),
+                f"{100 * metres:.1f} cm",
+                f"{100 * deviation:.1f} cm",
+                f"{pixels:.1f} px",
+                f"{100 * earlier[support.view.name]:.1f} cm",
+                f"{100 * support.error:.1f} cm",
+            )
+            for support, (metres, deviation, pixels) in rows
+        ),
+    )
 
 
 def _coloured(verdict: Verdict) -> str:

@@ -20,6 +20,7 @@ from shellgs_method.geometry.camera import positions, upwards
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.precision import COARSEST, FINE, REMEDY, Step, camera_step
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.registration.adjustment import Adjustment
 from shellgs_method.registration.correspondences import Correspondence
 from shellgs_method.registration.refinement import Refinement, refine
 from shellgs_method.registration.repetition import BETTER, RIVALRY, ShiftScan, scan_shifts
@@ -70,6 +71,8 @@ LIMITS = {
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
     "step": Limit(FINE, COARSEST, f"an error of half a step does not average out; {REMEDY}"),
     "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
+    "bent_pixels": Limit(1.05, 1.2, "points that were not adjusted to fit worse if cameras are bent"),
+    "bent_check": Limit(0.02, 0.05, "check points that are farther off than before show that cameras are bent"),
 }
 """All thresholds of the verdict, with their reasons."""
 
@@ -104,6 +107,8 @@ class Validation:
         test: test refinement of the alignment; None if too few points are near the shell.
         correspondences: picks or camera positions and their residuals, if any.
         steps: steps of the coordinates in metres, by what they are of.
+        unbending: how the cameras were adjusted to the shell, if they were.
+        survey_from_scene: the place of the scene in the survey frame.
     """
 
     alignment: Alignment
@@ -116,6 +121,8 @@ class Validation:
     test: Refinement | None = None
     correspondences: Sequence[Correspondence] = ()
     steps: Mapping[str, Step] = field(default_factory=dict)
+    unbending: Unbending | None = None
+    survey_from_scene: Float64[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
 
     @property
     def verdict(self) -> Verdict:
@@ -132,6 +139,11 @@ class Validation:
         """The alignment with its verdict and metrics, bound to the cameras of the views that it was validated with."""
         cameras = BoundCameras.of(views)
         return replace(self.alignment, verdict=self.verdict, metrics=self.metrics(), cameras=cameras)
+
+    def after(self, adjustment: Adjustment, before: Validation) -> Validation:
+        """This validation, of adjusted cameras, with what was held out of the adjustment."""
+        unbending = Unbending(adjustment, before)
+        return replace(self, checks=[*self.checks, *unbending.checks(self)], unbending=unbending)
 
     def share_within(self, metres: float) -> float:
         """Share of the points near the shell that are less than ``metres`` from it."""
@@ -154,6 +166,34 @@ class Validation:
         if held := [p.residual for p in self.correspondences if p.held_out]:
             values["check_points_m"] = float(np.median(held))
         return {name: None if np.isnan(value) else float(f"{value:.4g}") for name, value in values.items()}
+
+
+@dataclass(frozen=True)
+class Unbending:
+    """Cameras that were adjusted to the shell.
+
+    Attributes:
+        adjustment: how.
+        before: the validation of the cameras as they were.
+    """
+
+    adjustment: Adjustment
+    before: Validation
+
+    def checks(self, after: Validation) -> Iterator[Check]:
+        """What was held out of the adjustment: it must not be worse than before."""
+        before, now = self.adjustment.held_out.pixels
+        name = "Bent: reprojection error of tracks held out, relative to the one before"
+        yield _check("bent_pixels", now / before if before else 1.0, name, "{:.2f}")
+        held = [_check_points(validation) for validation in (self.before, after)]
+        if not np.isnan(held).any():
+            name = "Bent: check points, median residual, less the one before"
+            yield _check("bent_check", held[1] - held[0], name, "{:+.3f} m")
+
+
+def _check_points(validation: Validation) -> float:
+    residuals = [point.residual for point in validation.correspondences if point.held_out]
+    return float(np.median(residuals)) if residuals else float("nan")
 
 
 def validate(
@@ -207,6 +247,7 @@ def validate(
         test=test,
         correspondences=correspondences,
         steps=steps,
+        survey_from_scene=survey_from_scene,
     )
     return replace(measured, checks=[sight, size, *_checks(measured)])
 

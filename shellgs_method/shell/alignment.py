@@ -17,13 +17,11 @@ from shellgs_method.files.atomic import atomic_write, read_json, remove_leftover
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.contents import Geometry
+from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
 from shellgs_method.shell.mesh import ShellMesh, load_shell
-
-ALIGNMENT = Path("shell/alignment.json")
-"""Alignment file, in the scene's folder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +37,7 @@ class Alignment:
         metrics: main metrics behind the verdict.
         mesher: method that meshes a point cloud.
         cameras: cameras it was found for, in whose frame alone it is valid; none in files of older versions.
+        model: COLMAP model of these, relative to the scene's folder, if they were adjusted to the shell; else empty.
 
     Raises:
         SceneError: the matrix is not a similarity, or mirrors, or the mesher is unknown.
@@ -52,6 +51,7 @@ class Alignment:
     metrics: Mapping[str, float | None] = field(default_factory=dict)
     mesher: Mesher = "planes"
     cameras: BoundCameras = field(default_factory=BoundCameras)
+    model: str = ""
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -161,8 +161,10 @@ class Alignment:
         """Write a scene's alignment, bound to the cameras of its views; a file that says the same keeps its verdict."""
         path = scene / ALIGNMENT
         known = Alignment.load(path) if path.is_file() else None
-        if known is None or not known.places_like(self) or known.cameras.changed(views):
-            replace(self, cameras=BoundCameras.of(views)).save(path)
+        same = known is not None and not known.cameras.changed(views)
+        if known is None or not same or not known.places_like(self):
+            model = known.model if known and same else self.model
+            replace(self, cameras=BoundCameras.of(views), model=model).save(path)
 
     @classmethod
     def load(cls, path: Path) -> Alignment:
@@ -184,7 +186,8 @@ class Alignment:
             known = dict(fields.get("metrics", fields.get("figures", {})))  # older files say figures
             metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
             cameras = BoundCameras.from_json(fields.get("cameras", {}))
-            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, metrics, mesher, cameras)
+            model = str(fields.get("model", ""))
+            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, metrics, mesher, cameras, model)
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
         except SceneError as error:

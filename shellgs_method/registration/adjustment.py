@@ -1,0 +1,349 @@
+"""Unbend the cameras of a scene by its shell: bundle adjustment with the SfM points that lie on the shell.
+
+A similarity cannot absorb the drift of structure from motion: cameras bend at hardly any reprojection error, by wrong
+observations and a wrong distortion. The shell's walls are where they are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+from rich.progress import track
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.colmap import ColmapCamera, ColmapImage, Model, parameters_of
+from shellgs_method.geometry.distortion import PARAMETERS
+from shellgs_method.geometry.similarity import fit_similarity, scale_of, transformed
+from shellgs_method.registration.bundle import (
+    Bundle,
+    Objective,
+    Observations,
+    Planes,
+    Positions,
+    adjust,
+    deviations,
+    intersected,
+    reprojection_errors,
+    scatter,
+)
+from shellgs_method.shell.surface import ShellSurface
+
+REACH = 0.3
+"""Metres from the shell within which points may be on it before the adjustment: the drift of a walk past a house."""
+GATE = 0.03
+"""The same in the last rounds: frames, sills and railings, which a scan lacks, are farther from its planes."""
+HELD_OUT = 0.1
+"""Share of the tracks that are left out of the adjustment, and checked."""
+STRAIGHT = 0.95
+"""Distance of the points held out from the shell, relative to the one before, above which cameras were not bent."""
+_FINEST = 0.005
+"""Metres: smallest noise of a shell. No scan of a building is better, and no building is its model."""
+_RANGE = 0.05
+"""Largest change of focal lengths, relative, and of distortion coefficients."""
+_OUTLYING = 4.0
+"""Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of a video's are: of edges
+that slide along others, and of repeated windows. Structure from motion without a robust loss is bent by them."""
+_VIEWS = 3  # observations that are not wrong, which a track needs: nothing checks two
+_ROBUST, _GATES, _ROUNDS, _STEPS = 4, 7, 18, 3
+_LOOSE = 1.0  # metres: a prior that keeps what nothing determines, such as where cameras are along a bare wall
+_STILL = 5e-4  # metres that cameras move by in a round, from which they stand still
+_FEW = 50  # points on the shell that determine nothing
+_SHARED = 10  # photographs of a lens from which on its distortion is found
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """What the tracks that were left out of the adjustment say of it; their points are triangulated.
+
+    Attributes:
+        points: how many are near the shell.
+        pixels: median reprojection error, before and after.
+        metres: median distance from the shell, before and after.
+    """
+
+    points: int
+    pixels: tuple[float, float]
+    metres: tuple[float, float]
+
+    @property
+    def were_straight(self) -> bool:
+        """Whether the points are no closer to the shell than before."""
+        return not self.metres[1] < STRAIGHT * self.metres[0]
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Adjusted cameras and points.
+
+    Attributes:
+        model: the model, in the scene's frame, kept on average; its points are triangulated without the shell.
+        errors: mean reprojection error of each point, in pixels.
+        survey_from_scene: the similarity that fits the shell to this model.
+        shifted: how far that similarity moved the points on the shell, in metres (root mean square).
+        moved: how far each camera moved besides, in metres, by the photograph's name.
+        deviations: standard deviation of its centre.
+        pixel: noise of a keypoint's coordinate, in pixels.
+        noise: noise of the shell, in metres.
+        held_out: what the tracks that were left out say.
+    """
+
+    model: Model
+    errors: Float64[np.ndarray, " N"]
+    survey_from_scene: Float64[np.ndarray, "4 4"]
+    shifted: float
+    moved: Mapping[str, float]
+    deviations: Mapping[str, float]
+    pixel: float
+    noise: float
+    held_out: HeldOut
+
+
+def adjusted(
+    surface: ShellSurface,
+    model: Model,
+    survey_from_scene: Float64[np.ndarray, "4 4"],
+    names: Mapping[int, str],
+    known: Mapping[str, Float64[np.ndarray, " 3"]] | None = None,
+    sigma: float = 0.03,
+) -> Adjustment:
+    """Adjust cameras, lenses and points of a model to the shell.
+
+    First without the shell, leaving out observations that are outliers by Tukey's biweight. Then points within a gate
+    of the shell are drawn onto the planes of their closest triangles, with Tukey's loss and the noise of the shell,
+    which is estimated from the data. The gate shrinks from :data:`REACH` to :data:`GATE`.
+
+    The pinhole lens of undistorted photographs becomes one that distorts (OPENCV), since a distortion that was found
+    wrong has left a rest in them, which bends cameras.
+
+    Args:
+        surface: the shell.
+        model: the model.
+        survey_from_scene: the shell's place.
+        names: name of each photograph, by its number in the model.
+        known: known camera centres in the survey frame, by the photograph's name.
+        sigma: standard deviation of these along each axis, in metres.
+
+    Raises:
+        SceneError: the model has no tracks, its cameras cannot be adjusted, or too few points are on the shell.
+    """
+    model = _with_distortion(model)
+    start, seen = bundle_of(model, survey_from_scene)
+    start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
+    fitted = np.random.default_rng(0).random(len(start.points)) >= HELD_OUT
+    called = [names[number] for number in model.images]
+    priors = dict(zip(called, start.centres, strict=True)) | dict(known or {})
+    positions = Positions(
+        np.arange(len(called)),
+        np.stack([priors[name] for name in called]),
+        np.array([sigma if name in (known or {}) else _LOOSE for name in called]),
+    )
+    bundle, objective = _drawn_to(surface, seen.of_points(fitted), positions, start)
+    spread = deviations(objective, bundle)
+    whole = Objective(seen, objective.pixel)
+    final = intersected(whole, bundle)
+    jump = np.linalg.norm(final.points - start.points, axis=1)
+    on = surface.distance(final.points) < GATE
+    on &= jump < 3 * np.median(jump[on])  # wrong observations throw points far off before they are left out
+    one, other = (np.concatenate([each.points[on], each.centres]) for each in (final, start))
+    back = fit_similarity(one, other)
+    shifted = transformed(final.points[on], back) - final.points[on]
+    moved = np.linalg.norm(transformed(bundle.centres, back) - start.centres, axis=1)
+    placed = np.linalg.inv(back) @ survey_from_scene
+    lengths = np.linalg.norm(reprojection_errors(final, seen)[0], axis=1)
+    counts = np.bincount(seen.points, minlength=len(final.points))
+    return Adjustment(
+        adjusted_model(model, final, placed),
+        np.bincount(seen.points, lengths, len(final.points)) / np.maximum(counts, 1),
+        placed,
+        float(np.sqrt((shifted**2).sum(axis=1).mean())),
+        dict(zip(called, moved.tolist(), strict=True)),
+        dict(zip(called, spread.tolist(), strict=True)),
+        objective.pixel,
+        objective.planes.sigma,
+        _held_out(surface, start, final, seen, ~fitted & (counts >= _VIEWS)),
+    )
+
+
+def _drawn_to(
+    surface: ShellSurface, seen: Observations, positions: Positions, bundle: Bundle
+) -> tuple[Bundle, Objective]:
+    """Rounds of leaving out wrong observations, looking for the closest planes and adjusting to them."""
+    seen = seen.of_points(np.bincount(seen.points, minlength=len(bundle.points)) >= _VIEWS)
+    objective = Objective(seen, _noise_of_pixels(bundle, seen), positions=positions)
+    gates = [*np.full(_ROBUST, np.inf), *np.geomspace(REACH, GATE, _GATES)]
+    gates += [GATE] * (_ROUNDS - len(gates))
+    damping = 1e-4
+    for gate in track(gates, "bundle adjustment", transient=True):
+        # Points are triangulated again: those drawn to the shell say nothing of its noise, nor where they belong.
+        free = intersected(objective, bundle, steps=5)
+        pixel = _noise_of_pixels(free, seen)
+        objective = replace(objective, observations=_trusted(free, seen, pixel), pixel=pixel)
+        if gate < np.inf:
+            objective = replace(objective, planes=_planes(surface, objective, free, gate))
+        before = bundle.centres
+        bundle, damping = adjust(objective, replace(bundle, points=free.points), _STEPS, damping, 1e-6)
+        if gate == GATE and np.linalg.norm(bundle.centres - before, axis=1).max() < _STILL:
+            break
+    return bundle, objective
+
+
+def _trusted(bundle: Bundle, seen: Observations, pixel: float) -> Observations:
+    """The observations with weights: 0 for wrong ones, and where fewer than three of a track are left."""
+    error, front = reprojection_errors(bundle, seen)
+    distance = np.linalg.norm(error, axis=1) / (_OUTLYING * pixel)
+    weights = np.where(front, np.clip(1 - distance**2, 0, None) ** 2, 0.0)
+    sound = np.bincount(seen.points, weights > 0.1, len(bundle.points)) >= _VIEWS
+    return replace(seen, weights=weights * sound[seen.points])
+
+
+def _planes(surface: ShellSurface, objective: Objective, bundle: Bundle, gate: float) -> Planes:
+    """The planes of the points within a gate of the shell."""
+    closest = surface.closest(bundle.points)
+    offset = bundle.points - closest.point
+    seen = np.bincount(objective.observations.points, objective.observations.weights, len(offset)) > 0
+    near = np.flatnonzero(seen & (np.linalg.norm(offset, axis=1) < gate))
+    if len(near) < _FEW:
+        raise SceneError(
+            f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to tell how "
+            "cameras are bent"
+        )
+    normals = surface.normals[closest.triangle]
+    distance = np.einsum("nd,nd->n", normals, offset)[near]
+    deviation = scatter(objective, bundle, normals)[near]
+    sharp = deviation <= np.median(deviation)
+    variance = (1.4826 * np.median(np.abs(distance[sharp]))) ** 2 - np.median(deviation[sharp]) ** 2
+    sigma = float(np.sqrt(max(variance, _FINEST**2)))
+    return Planes(near, normals[near], closest.point[near].astype(np.float64), sigma, gate)
+
+
+def _noise_of_pixels(bundle: Bundle, seen: Observations) -> float:
+    """Standard deviation of a keypoint's coordinate, from the median residual and the number of unknowns."""
+    error, front = reprojection_errors(bundle, seen)
+    freedom = 2 * len(error) - 3 * len(np.unique(seen.points)) - 6 * len(bundle.centres)
+    return 1.4826 * float(np.median(np.abs(error[front]))) * np.sqrt(2 * len(error) / max(freedom, 1))
+
+
+def _held_out(surface: ShellSurface, start: Bundle, final: Bundle, seen: Observations, chosen: np.ndarray) -> HeldOut:
+    distances = [surface.distance(bundle.points) for bundle in (start, final)]
+    chosen = chosen & (np.minimum(*distances) < 2 * GATE)
+    pixels, metres = [], []
+    for bundle, distance in zip((start, final), distances, strict=True):
+        error, front = reprojection_errors(bundle, seen)
+        of = chosen[seen.points] & front
+        pixels.append(float(np.median(np.linalg.norm(error[of], axis=1))) if of.any() else float("nan"))
+        metres.append(float(np.median(distance[chosen])) if chosen.any() else float("nan"))
+    return HeldOut(int(chosen.sum()), (pixels[0], pixels[1]), (metres[0], metres[1]))
+
+
+def _with_distortion(model: Model) -> Model:
+    """The model with lenses of many photographs that may distort."""
+    shared = Counter(image.camera for image in model.images.values())
+    cameras = {}
+    for number, camera in model.cameras.items():
+        if camera.model in ("SIMPLE_PINHOLE", "PINHOLE") and shared[number] >= _SHARED:
+            fx, fy, cx, cy = (_columns(camera) @ np.array(camera.params))[:4].tolist()
+            camera = camera._replace(model="OPENCV", params=(fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0))
+        cameras[number] = camera
+    return replace(model, cameras=cameras)
+
+
+def bundle_of(model: Model, placed: Float64[np.ndarray, "4 4"]) -> tuple[Bundle, Observations]:
+    """Cameras, lenses, points and tracks of a model, moved by a similarity.
+
+    Focal lengths and distortion are free within a range, principal points stay, as in COLMAP.
+
+    Raises:
+        SceneError: the model has no tracks, or a lens of a model that cannot be adjusted.
+    """
+    numbers = {number: k for k, number in enumerate(model.images)}
+    scale = scale_of(placed)
+    poses = [_pose(image) for image in model.images.values()]
+    rotations = np.stack([rotation for rotation, _ in poses])
+    centres = np.stack([-rotation.T @ translation for rotation, translation in poses])
+    lenses, free, margins = zip(*map(_lens, model.cameras.values()), strict=True)
+    width = max(columns.shape[1] for columns in free)
+    lens, margin = np.stack(lenses), np.stack(margins)
+    views, points, pixels = _tracks(model, numbers)
+    order = {number: k for k, number in enumerate(model.cameras)}
+    bundle = Bundle(
+        rotations @ (placed[:3, :3] / scale).T,
+        transformed(centres, placed),
+        lens,
+        transformed(model.points.positions, placed),
+    )
+    seen = Observations(
+        views,
+        points,
+        pixels,
+        np.ones(len(views)),
+        np.array([order[image.camera] for image in model.images.values()]),
+        np.array(["FISHEYE" in camera.model for camera in model.cameras.values()]),
+        np.stack([np.pad(columns, ((0, 0), (0, width - columns.shape[1]))) for columns in free]),
+        (lens - margin, lens + margin),
+    )
+    return bundle, seen
+
+
+def _tracks(model: Model, numbers: dict[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """View, point and pixel of each observation."""
+    observers, keypoints = model.points.observers, model.points.keypoints
+    counts = [len(track) for track in observers]
+    if sum(counts) == 0:
+        raise SceneError("the SfM points have no tracks, without which cameras cannot be adjusted")
+    images, index = np.concatenate(observers), np.concatenate(keypoints)
+    points = np.repeat(np.arange(len(counts)), counts)
+    views = np.array([numbers.get(number, -1) for number in images.tolist()])
+    pixels = np.full((len(views), 2), np.nan)
+    for number, image in model.images.items():
+        of = np.flatnonzero(views == numbers[number])
+        xy = image.features["xy"]
+        there = index[of] < len(xy)
+        pixels[of[there]] = xy[index[of[there]]]
+    kept = np.isfinite(pixels).all(axis=1)
+    if not kept.any():
+        raise SceneError("the photographs have no keypoints, without which cameras cannot be adjusted")
+    return views[kept], points[kept], pixels[kept]
+
+
+def _pose(image: ColmapImage) -> tuple[np.ndarray, np.ndarray]:
+    quaternion = np.array(image.quaternion)
+    return Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix(), np.array(image.translation)
+
+
+def _lens(camera: ColmapCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All parameters of a lens, the ones that are adjusted as columns, and how far they may move."""
+    columns = _columns(camera)
+    lens = columns @ np.array(camera.params)
+    margins = np.full(len(PARAMETERS), _RANGE)
+    margins[:4] *= lens[[0, 1, 0, 1]]
+    return lens, columns[:, [k for k, name in enumerate(parameters_of(camera)) if name not in ("cx", "cy")]], margins
+
+
+def _columns(camera: ColmapCamera) -> np.ndarray:
+    """The linear map from the parameters of COLMAP's model to :data:`PARAMETERS`."""
+    names = parameters_of(camera)
+    columns = np.zeros((len(PARAMETERS), len(names)))
+    for k, name in enumerate(names):
+        for of in ("fx", "fy") if name == "f" else (name,):
+            columns[PARAMETERS.index(of), k] = 1.0
+    return columns
+
+
+def adjusted_model(model: Model, bundle: Bundle, placed: Float64[np.ndarray, "4 4"]) -> Model:
+    """The model with the cameras, lenses and points of a bundle, moved back by a similarity."""
+    back, turn = np.linalg.inv(placed), placed[:3, :3] / scale_of(placed)
+    centres = transformed(bundle.centres, back)
+    images = {}
+    for (number, image), rotation, centre in zip(model.images.items(), bundle.rotations @ turn, centres, strict=True):
+        x, y, z, w = map(float, Rotation.from_matrix(rotation).as_quat())
+        images[number] = image._replace(quaternion=(w, x, y, z), translation=tuple(map(float, -rotation @ centre)))
+    cameras = {
+        number: camera._replace(params=tuple(map(float, np.linalg.pinv(_columns(camera)) @ lens)))
+        for (number, camera), lens in zip(model.cameras.items(), bundle.lenses, strict=True)
+    }
+    return Model(cameras, images, replace(model.points, positions=transformed(bundle.points, back)))

@@ -1,0 +1,382 @@
+"""Bundle adjustment: cameras, lenses and points by sparse Levenberg-Marquardt, points eliminated (Schur complement).
+
+Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000. Besides reprojection errors there are the distances of
+points from planes and of camera centres from given positions, which COLMAP's bundle adjustment has not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.geometry.distortion import to_pixels
+
+_LEAST_DAMPING, _MOST_DAMPING = 1e-10, 1e8
+_CONVERGED = 1e-8
+"""Relative decrease of the cost below which the adjustment has converged."""
+_BEHIND = 1e-6
+"""Depth below which a point is behind its camera, and has no error there."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """The unknowns.
+
+    Attributes:
+        rotations: from the world to each camera.
+        centres: of the cameras, in the world.
+        lenses: :data:`~shellgs_method.geometry.distortion.PARAMETERS` of each lens, in pixels.
+        points: in the world.
+    """
+
+    rotations: Float64[np.ndarray, "V 3 3"]
+    centres: Float64[np.ndarray, "V 3"]
+    lenses: Float64[np.ndarray, "L 10"]
+    points: Float64[np.ndarray, "N 3"]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What photographs show of the points.
+
+    Attributes:
+        views: the camera of each observation.
+        points: its point.
+        pixels: where the point is seen.
+        weights: how much each observation counts.
+        lens_of: lens of each camera.
+        fisheye: whether each lens is a fisheye lens.
+        free: the parameters that are adjusted of each lens, as the columns of a matrix.
+        limits: smallest and largest value of each lens' parameters.
+    """
+
+    views: Int64[np.ndarray, " M"]
+    points: Int64[np.ndarray, " M"]
+    pixels: Float64[np.ndarray, "M 2"]
+    weights: Float64[np.ndarray, " M"]
+    lens_of: Int64[np.ndarray, " V"]
+    fisheye: Bool[np.ndarray, " L"]
+    free: Float64[np.ndarray, "L 10 P"]
+    limits: tuple[Float64[np.ndarray, "L 10"], Float64[np.ndarray, "L 10"]]
+
+    def of_points(self, chosen: Bool[np.ndarray, " N"]) -> Observations:
+        """The observations of some of the points, which keep their numbers."""
+        kept = chosen[self.points]
+        chosen_of = {name: getattr(self, name)[kept] for name in ("views", "points", "pixels", "weights")}
+        return replace(self, **chosen_of)
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Planes that points lie on.
+
+    Attributes:
+        points: indices of the points.
+        normals: unit normal of the plane of each.
+        feet: a point of the plane of each.
+        sigma: standard deviation of a point's distance from its plane.
+        gate: distance from which a plane says nothing about its point.
+    """
+
+    points: Int64[np.ndarray, " K"] = field(default_factory=lambda: np.empty(0, np.int64))
+    normals: Float64[np.ndarray, "K 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    feet: Float64[np.ndarray, "K 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    sigma: float = 1.0
+    gate: float = 1.0
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Known positions of cameras.
+
+    Attributes:
+        views: the cameras.
+        centres: where they are.
+        sigma: standard deviation of each position, along each axis.
+    """
+
+    views: Int64[np.ndarray, " K"] = field(default_factory=lambda: np.empty(0, np.int64))
+    centres: Float64[np.ndarray, "K 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    sigma: Float64[np.ndarray, " K"] = field(default_factory=lambda: np.empty(0))
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Half the sum of squared errors by their standard deviations, all but those of positions robust.
+
+    Attributes:
+        observations: reprojection errors, with Cauchy's loss.
+        pixel: standard deviation of a pixel's coordinate.
+        cauchy: scale of the loss, in standard deviations.
+        planes: distances of points from planes, with Tukey's loss, which is flat beyond the gate.
+        positions: distances of cameras from known positions.
+    """
+
+    observations: Observations
+    pixel: float = 1.0
+    cauchy: float = 2.0
+    planes: Planes = field(default_factory=Planes)
+    positions: Positions = field(default_factory=Positions)
+
+    def cost(self, bundle: Bundle) -> float:
+        """Value of the objective."""
+        return _linearised(self, bundle, derivatives=False).cost
+
+
+@dataclass
+class _Linearised:
+    """Cost, gradients and Gauss-Newton's Hessian of cameras and lenses (c) and of points (x)."""
+
+    cost: float
+    Hcc: np.ndarray
+    Hcx: sparse.csr_matrix
+    Hxx: np.ndarray
+    gc: np.ndarray
+    gx: np.ndarray
+
+
+def reprojection_errors(
+    bundle: Bundle, observations: Observations
+) -> tuple[Float64[np.ndarray, "M 2"], Bool[np.ndarray, " M"]]:
+    """Projected less observed pixels, and which points are in front of their camera; the error of others is 0."""
+    error, front, *_ = _project(bundle, observations)
+    return error, front
+
+
+def _project(bundle: Bundle, seen: Observations) -> tuple[np.ndarray, ...]:
+    """Errors, which are in front, points in the camera, derivatives of pixels by these and by lenses."""
+    rotations = bundle.rotations[seen.views]
+    inside = np.einsum("mij,mj->mi", rotations, bundle.points[seen.points] - bundle.centres[seen.views])
+    front = inside[:, 2] > _BEHIND
+    depth = np.where(front, inside[:, 2], 1.0)
+    rays = inside[:, :2] / depth[:, None]
+    lens = seen.lens_of[seen.views]
+    pixels, by_ray, by_lens = np.zeros((len(rays), 2)), np.zeros((len(rays), 2, 2)), np.zeros((len(rays), 2, 10))
+    for fisheye in np.unique(seen.fisheye):
+        of = seen.fisheye[lens] == fisheye
+        pixels[of], by_ray[of], by_lens[of] = to_pixels(rays[of], bundle.lenses[lens[of]], bool(fisheye))
+    by_inside = np.concatenate([by_ray, -np.einsum("mij,mj->mi", by_ray, rays)[..., None]], axis=2)
+    by_inside /= depth[:, None, None]
+    error = np.where(front[:, None], pixels - seen.pixels, 0.0)
+    return error, front, inside, by_inside, by_lens
+
+
+def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) -> _Linearised:
+    seen, planes, known = objective.observations, objective.planes, objective.positions
+    error, front, inside, by_inside, by_lens = _project(bundle, seen)
+    error = error / objective.pixel
+    scale = objective.cauchy**2
+    squared = (error**2).sum(axis=1)
+    weight = np.where(front, seen.weights / (1 + squared / scale), 0.0)
+    distance = np.einsum("kj,kj->k", planes.normals, bundle.points[planes.points] - planes.feet)
+    inlying = np.clip(1 - (distance / planes.gate) ** 2, 0, None)
+    away = bundle.centres[known.views] - known.centres
+    cost = 0.5 * scale * (seen.weights * np.log1p(squared / scale)).sum()
+    cost += (planes.gate / planes.sigma) ** 2 / 6 * (1 - inlying**3).sum()
+    cost += 0.5 * ((away / known.sigma[:, None]) ** 2).sum()
+    if not derivatives:
+        empty = np.empty(0)
+        return _Linearised(float(cost), empty, sparse.csr_matrix((0, 0)), empty, empty, empty)
+
+    root = np.sqrt(weight)
+    by_inside = by_inside * (root / objective.pixel)[:, None, None]
+    by_point = by_inside @ bundle.rotations[seen.views]
+    # Turning the camera by the vector w moves a point x in its frame by w x x.
+    by_turn = np.cross(inside[:, None], by_inside)
+    lens = seen.lens_of[seen.views]
+    by_lens = np.einsum("mij,mjp->mip", by_lens * (root / objective.pixel)[:, None, None], seen.free[lens])
+    by_pose = np.concatenate([by_turn, -by_point], axis=2)
+    error = error * root[:, None]
+
+    cameras, count = len(bundle.centres), len(bundle.points)
+    width = seen.free.shape[2]
+    of_view, of_lens, of_point = (
+        _sum_by(index, size)
+        for index, size in ((seen.views, cameras), (lens, len(bundle.lenses)), (seen.points, count))
+    )
+    split = 6 * cameras
+    Hcc = np.zeros((split + width * len(bundle.lenses),) * 2)
+    pose = np.arange(split).reshape(-1, 6)
+    focal = split + np.arange(width * len(bundle.lenses)).reshape(-1, width)
+    Hcc[pose[:, :, None], pose[:, None]] = _blocks(of_view, by_pose, by_pose)
+    Hcc[focal[:, :, None], focal[:, None]] = _blocks(of_lens, by_lens, by_lens)
+    mixed = _blocks(of_view, by_pose, by_lens)
+    Hcc[pose[:, :, None], focal[seen.lens_of][:, None]] = mixed
+    Hcc[focal[seen.lens_of][:, :, None], pose[:, None]] = mixed.transpose(0, 2, 1)
+    gc = np.concatenate(
+        [_blocks(of_view, by_pose, error[..., None]).ravel(), _blocks(of_lens, by_lens, error[..., None]).ravel()]
+    )
+    gx = _blocks(of_point, by_point, error[..., None])[..., 0]
+    Hxx = _blocks(of_point, by_point, by_point)
+    Hcx = sparse.csr_matrix(
+        sparse.vstack(
+            [
+                _mixed(by_pose, by_point, seen.views, cameras, seen.points, count),
+                _mixed(by_lens, by_point, lens, len(bundle.lenses), seen.points, count),
+            ]
+        )
+    )
+
+    stiffness = inlying**2 / planes.sigma**2
+    np.add.at(Hxx, planes.points, stiffness[:, None, None] * planes.normals[:, :, None] * planes.normals[:, None])
+    np.add.at(gx, planes.points, (stiffness * distance)[:, None] * planes.normals)
+    diagonal = 6 * known.views[:, None] + np.arange(3, 6)
+    np.add.at(Hcc, (diagonal, diagonal), 1 / known.sigma[:, None] ** 2)
+    np.add.at(gc, diagonal, away / known.sigma[:, None] ** 2)
+    return _Linearised(float(cost), Hcc, Hcx, Hxx, gc, gx)
+
+
+def _blocks(summed: sparse.csr_matrix, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Sums of the products of derivatives (observation, pixel coordinate, unknown), over observations of the same."""
+    products = np.matmul(one.transpose(0, 2, 1), other)
+    return (summed @ products.reshape(len(products), -1)).reshape(-1, *products.shape[1:])
+
+
+def _mixed(
+    one: np.ndarray, other: np.ndarray, rows: np.ndarray, height: int, columns: np.ndarray, width: int
+) -> sparse.csr_matrix:
+    """The products of derivatives as blocks of a matrix, those of the same row and column summed."""
+    order = np.argsort(rows, kind="stable")
+    products = np.matmul(one.transpose(0, 2, 1), other)[order]
+    starts = np.searchsorted(rows[order], np.arange(height + 1))
+    shape = (height * products.shape[1], width * products.shape[2])
+    blocks = sparse.csr_matrix(sparse.bsr_matrix((products, columns[order], starts), shape))
+    blocks.sum_duplicates()
+    return blocks
+
+
+def _reduced(system: _Linearised, damping: float, held: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Schur complement of the points, its right side, and the inverses of the points' blocks."""
+    inverses = np.linalg.inv(_damped(system.Hxx, damping))
+    Hcx = system.Hcx
+    triples = np.matmul(Hcx.data.reshape(-1, 1, 3), inverses[Hcx.indices[::3] // 3])  # a row has all three of a point
+    carried = sparse.csr_matrix((triples.reshape(-1), Hcx.indices, Hcx.indptr), Hcx.shape)
+    S = system.Hcc + np.diag(damping * system.Hcc.diagonal()) - (carried @ Hcx.T).toarray()
+    right = carried @ system.gx.reshape(-1) - system.gc
+    S[held], S[:, held], right[held] = 0.0, 0.0, 0.0
+    S[held, held] = 1.0
+    return S, right, inverses
+
+
+def _moved(bundle: Bundle, step: np.ndarray, points: np.ndarray, seen: Observations) -> Bundle:
+    cameras = len(bundle.centres)
+    pose, lens = step[: 6 * cameras].reshape(-1, 6), step[6 * cameras :].reshape(len(bundle.lenses), -1)
+    turn = Rotation.from_rotvec(pose[:, :3]).as_matrix()
+    lenses = np.clip(bundle.lenses + np.einsum("ljp,lp->lj", seen.free, lens), *seen.limits)
+    return Bundle(turn @ bundle.rotations, bundle.centres + pose[:, 3:], lenses, bundle.points + points)
+
+
+def _held(system: _Linearised, bundle: Bundle, seen: Observations) -> np.ndarray:
+    """Unknowns that stay: those without influence, and those of a lens that are pulled beyond their limits."""
+    cameras = len(bundle.centres)
+    pull = -system.gc[6 * cameras :].reshape(len(bundle.lenses), -1)
+    low, high = seen.limits
+    at = np.where(bundle.lenses <= low, -1.0, np.where(bundle.lenses >= high, 1.0, 0.0))
+    held = system.Hcc.diagonal() == 0
+    held[6 * cameras :] |= (np.einsum("lj,ljp->lp", at, seen.free) * pull > 0).reshape(-1)
+    return held
+
+
+def adjust(
+    objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4, converged: float = 1e-8
+) -> tuple[Bundle, float]:
+    """Minimise an objective from a start; return the minimum and the damping to go on with.
+
+    Along directions that nothing determines, such as the seven of the frame where only photographs speak, the bundle
+    keeps its place: the gradient is 0 there, and damping holds it.
+    """
+    system = _linearised(objective, bundle)
+    for _ in range(steps):
+        held = _held(system, bundle, objective.observations)
+        while damping < _MOST_DAMPING:
+            S, right, inverses = _reduced(system, damping, held)
+            try:
+                step = cho_solve(cho_factor(S), right)
+            except np.linalg.LinAlgError:
+                damping *= 10
+                continue
+            gradient = system.gx + (system.Hcx.T @ step).reshape(-1, 3)
+            points = -np.matmul(inverses, gradient[..., None])[..., 0]
+            trial = _moved(bundle, step, points, objective.observations)
+            cost = objective.cost(trial)
+            if cost < system.cost:
+                break
+            damping *= 10
+        else:
+            break
+        bundle, before = trial, system.cost
+        damping = max(damping / 10, _LEAST_DAMPING)
+        if before - cost <= converged * before:
+            break
+        system = _linearised(objective, bundle)
+    return bundle, min(damping, 1e-2)
+
+
+def intersected(objective: Objective, bundle: Bundle, steps: int = 20) -> Bundle:
+    """Minimise the reprojection errors over the points alone: triangulate them from the cameras as they are."""
+    damping, cost = np.full(len(bundle.points), 1e-3), _point_costs(objective, bundle)
+    for _ in range(steps):
+        Hxx, gx = _of_points(objective, bundle)
+        step = np.linalg.solve(_damped(Hxx, damping[:, None, None]), gx[..., None])[..., 0]
+        trial = replace(bundle, points=bundle.points - step)
+        costs = _point_costs(objective, trial)
+        better = costs < cost
+        bundle = replace(bundle, points=np.where(better[:, None], trial.points, bundle.points))
+        decrease = np.where(better, cost - costs, 0.0).sum()
+        if decrease <= _CONVERGED * cost.sum():
+            break
+        cost = np.where(better, costs, cost)
+        damping = np.clip(np.where(better, damping / 10, damping * 10), _LEAST_DAMPING, _MOST_DAMPING)
+    return bundle
+
+
+def _of_points(objective: Objective, bundle: Bundle) -> tuple[np.ndarray, np.ndarray]:
+    """Hessian and gradient of the reprojection errors by each point."""
+    seen = objective.observations
+    error, front, _, by_inside, _ = _project(bundle, seen)
+    squared = (error**2).sum(axis=1) / objective.pixel**2
+    weight = np.where(front, seen.weights / (1 + squared / objective.cauchy**2), 0.0) / objective.pixel**2
+    by_point = by_inside @ bundle.rotations[seen.views]
+    summed = _sum_by(seen.points, len(bundle.points))
+    weighed = weight[:, None, None] * by_point
+    return _blocks(summed, weighed, by_point), _blocks(summed, weighed, error[..., None])[..., 0]
+
+
+def scatter(objective: Objective, bundle: Bundle, normals: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    """Standard deviation of each triangulated point along a direction, the cameras being exact."""
+    Hxx, _ = _of_points(objective, bundle)
+    return np.sqrt(np.einsum("ni,nij,nj->n", normals, np.linalg.inv(_damped(Hxx, 0.0)), normals))
+
+
+def _sum_by(index: np.ndarray, count: int) -> sparse.csr_matrix:
+    """The matrix that sums rows with the same index."""
+    return sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), (count, len(index)))
+
+
+def _damped(blocks: np.ndarray, damping: float | np.ndarray) -> np.ndarray:
+    """Blocks of points with a larger diagonal; that of a point without observations is 1."""
+    blocks = blocks * (1 + damping * np.eye(3))
+    traces = np.einsum("nii->n", blocks)
+    return blocks + (1e-12 * traces + (traces == 0))[:, None, None] * np.eye(3)
+
+
+def _point_costs(objective: Objective, bundle: Bundle) -> np.ndarray:
+    """Costs of the reprojection errors of each point."""
+    error, _ = reprojection_errors(bundle, objective.observations)
+    scale = (objective.cauchy * objective.pixel) ** 2
+    costs = objective.observations.weights * np.log1p((error**2).sum(axis=1) / scale)
+    return np.bincount(objective.observations.points, costs, len(bundle.points))
+
+
+def deviations(objective: Objective, bundle: Bundle) -> Float64[np.ndarray, " V"]:
+    """Standard deviation of each camera's centre (root of the trace of its covariance) at the minimum."""
+    system = _linearised(objective, bundle)
+    held = _held(system, bundle, objective.observations)
+    S, _, _ = _reduced(system, 1e-9, held)
+    variances = np.linalg.inv(S).diagonal()[: 6 * len(bundle.centres)].reshape(-1, 6)[:, 3:]
+    return np.sqrt(variances.sum(axis=1))

@@ -1,0 +1,245 @@
+"""Cameras that are bent are straightened by the shell, others and wrong shells are left alone."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import cast
+from scipy.spatial.transform import Rotation
+
+from dataparsers.facade import read_views
+from shellgs_method.commands.align import align
+from shellgs_method.errors import SceneError
+from shellgs_method.files.colmap import (
+    KEYPOINT,
+    ColmapCamera,
+    ColmapImage,
+    Model,
+    Points,
+    read_model,
+    write_model,
+)
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.scene import ADJUSTED, ScenePaths
+from shellgs_method.geometry.camera import in_view
+from shellgs_method.geometry.similarity import fit_similarity, transformed
+from shellgs_method.registration.adjustment import Adjustment, adjusted
+from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh
+from shellgs_method.shell.surface import ShellSurface
+from shellgs_method.synthetic.building import Layout, shell
+from shellgs_method.synthetic.path import walk
+
+VIEWS, WIDTH, HEIGHT, NOISE = 24, 640, 480, 0.3
+CAMERAS = walk(15.0, VIEWS, WIDTH, HEIGHT, np.random.default_rng(0))
+CENTRES = np.stack([camera.position.numpy() for camera in CAMERAS])
+NAMES = {number: f"{number:02d}.png" for number in range(1, VIEWS + 1)}
+ORIGINAL = ScenePaths(colmap_path=Path("colmap/sparse/0"))
+
+
+def building(layout: Layout) -> ShellMesh:
+    """The shell in the building's own frame, in metres: x along the front, y into it, z up."""
+    mesh = shell(layout)
+    return ShellMesh(mesh.vertices, mesh.triangles)
+
+
+@pytest.fixture(scope="module")
+def surface() -> ShellSurface:
+    return ShellSurface(building(Layout(5, 3)))
+
+
+@pytest.fixture(scope="module")
+def model(surface: ShellSurface) -> Model:
+    """The true cameras, and tracks of points of the front over a few neighbours, some of them wrong."""
+    random = np.random.default_rng(1)
+    points, _ = surface.samples(9000)
+    points = transformed(points, np.linalg.inv(surface.survey_from_shell))
+    points = points[points[:, 1] < 0.3][:2500]
+    first = random.integers(0, VIEWS, len(points))
+    observed = []
+    for number, camera in enumerate(CAMERAS):
+        inside, pixels, _ = in_view(camera, points)
+        everything = np.zeros((len(points), 2))
+        everything[inside] = pixels + random.normal(0, NOISE, pixels.shape)
+        wrong = random.random(len(points)) < 0.03
+        everything[wrong] += random.normal(0, 4, (wrong.sum(), 2))
+        observed.append((inside & (np.abs(first - number) <= 3), everything))
+    seen = np.stack([which for which, _ in observed])
+    kept = np.flatnonzero(seen.sum(axis=0) >= 3)
+    images, camera = {}, CAMERAS[0].K.numpy()
+    for number, (_, pixels) in enumerate(observed, start=1):
+        features = np.empty(len(kept), KEYPOINT)
+        features["xy"], features["point"] = (
+            pixels[kept],
+            np.where(seen[number - 1, kept], np.arange(1, len(kept) + 1), -1),
+        )
+        x, y, z, w = Rotation.from_matrix(CAMERAS[number - 1].viewmat[:3, :3].numpy()).as_quat()
+        translation = tuple(CAMERAS[number - 1].viewmat[:3, 3].tolist())
+        images[number] = ColmapImage((w, x, y, z), translation, 1, f"{number:02d}.png", features)
+    observers = [np.flatnonzero(seen[:, k]) + 1 for k in kept]
+    keypoints = [np.full(len(track), k) for k, track in enumerate(observers)]
+    colours = np.full((len(kept), 3), 128, np.uint8)
+    known = Points(points[kept], colours, observers, keypoints, np.arange(1, len(kept) + 1))
+    K = (camera[0, 0], camera[1, 1], camera[0, 2], camera[1, 2])
+    return Model({1: ColmapCamera("PINHOLE", WIDTH, HEIGHT, K)}, images, known)
+
+
+@pytest.fixture(scope="module")
+def bent(model: Model) -> Model:
+    """The model bent like a banana about the middle of the front, by 10 cm at the ends, cameras turned with it."""
+    strength = 0.1 / 7.5**2
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        along, out = points[:, 0] - 7.5, points[:, 1]
+        return points + np.stack([-2 * strength * along * out, strength * along**2, 0 * out], axis=1)
+
+    images = {}
+    for (number, image), camera in zip(model.images.items(), CAMERAS, strict=True):
+        centre = camera.position.numpy()
+        turn = Rotation.from_rotvec([0, 0, 2 * strength * (centre[0] - 7.5)]).as_matrix()
+        rotation = camera.viewmat[:3, :3].numpy() @ turn.T
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+        translation = tuple((-rotation @ moved(centre[None])[0]).tolist())
+        images[number] = image._replace(quaternion=(w, x, y, z), translation=translation)
+    return replace(model, images=images, points=replace(model.points, positions=moved(model.points.positions)))
+
+
+def centres(model: Model) -> np.ndarray:
+    found = []
+    for image in model.images.values():
+        rotation = Rotation.from_quat(np.array(image.quaternion)[[1, 2, 3, 0]]).as_matrix()
+        found.append(-rotation.T @ np.array(image.translation))
+    return np.stack(found)
+
+
+def error(surface: ShellSurface, found: Adjustment) -> np.ndarray:
+    """Distance of each camera's centre from the true one, in the frame of the shell, in metres."""
+    in_survey = transformed(centres(found.model), found.survey_from_scene)
+    return np.linalg.norm(in_survey - transformed(CENTRES, surface.survey_from_shell), axis=1)
+
+
+def write(scene: Path, model: Model, mesh: ShellMesh, alignment: np.ndarray | None = None) -> Path:
+    """A scene of a model, its shell and a file of the matrix; return that."""
+    import open3d as o3d
+
+    (scene / "colmap/sparse").mkdir(parents=True)
+    (scene / "images").mkdir()
+    write_model(scene / "colmap/sparse/0", model, np.zeros(len(model.points.ids)))
+    picture = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    for image in model.images.values():
+        Image.fromarray(picture).save(scene / "images" / image.name)
+    solid = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
+    )
+    o3d.io.write_triangle_mesh(scene / "shell.ply", solid)
+    matrix = scene / "matrix.txt"
+    np.savetxt(matrix, np.eye(4) if alignment is None else alignment)
+    return matrix
+
+
+def test_a_model_is_read_as_it_was_written(tmp_path: Path, model: Model):
+    write_model(tmp_path / "model", model, np.zeros(len(model.points.ids)))
+    again = read_model(tmp_path / "model")
+    assert again.cameras == model.cameras
+    for number, image in model.images.items():
+        assert again.images[number][:4] == image[:4]
+        np.testing.assert_array_equal(again.images[number].features, image.features)
+    np.testing.assert_array_equal(again.points.positions, model.points.positions)
+    for name in ("observers", "keypoints"):
+        np.testing.assert_array_equal(
+            np.concatenate(getattr(again.points, name)), np.concatenate(getattr(model.points, name))
+        )
+
+
+def test_bent_cameras_are_straightened(surface: ShellSurface, model: Model, bent: Model):
+    before = np.linalg.norm(centres(bent) - CENTRES, axis=1)
+    found = adjusted(surface, bent, surface.survey_from_shell, NAMES)
+    after = error(surface, found)
+    assert before.mean() > 0.03
+    assert after.mean() < 0.015
+    assert after.mean() < 3 * np.median(list(found.deviations.values()))
+    assert not found.held_out.were_straight
+    assert found.held_out.pixels[1] < 1.05 * found.held_out.pixels[0]
+
+
+def test_the_scene_keeps_its_frame(surface: ShellSurface, bent: Model):
+    found = adjusted(surface, bent, surface.survey_from_shell, NAMES)
+    common = fit_similarity(found.model.points.positions, bent.points.positions)
+    np.testing.assert_allclose(common[:3, :3], np.eye(3), atol=0.005)
+    assert np.linalg.norm(common[:3, 3]) < 0.1
+
+
+def test_cameras_that_are_straight_move_by_less_than_their_deviation(surface: ShellSurface, model: Model):
+    found = adjusted(surface, model, surface.survey_from_shell, NAMES)
+    moved, deviations = (np.array(list(by.values())) for by in (found.moved, found.deviations))
+    assert np.median(moved) < np.median(deviations)
+    assert found.held_out.were_straight
+
+
+def test_surveyed_positions_draw_cameras_to_them(surface: ShellSurface, bent: Model):
+    known = dict(zip(NAMES.values(), transformed(CENTRES, surface.survey_from_shell), strict=True))
+    found = adjusted(surface, bent, surface.survey_from_shell, NAMES, known, 0.001)
+    assert error(surface, found).max() < 0.003
+
+
+def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
+    none = [np.empty(0, np.int64)] * len(model.points.ids)
+    with pytest.raises(SceneError, match="have no tracks"):
+        adjusted(
+            surface,
+            replace(model, points=replace(model.points, observers=none, keypoints=none)),
+            surface.survey_from_shell,
+            NAMES,
+        )
+
+
+def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: ShellSurface, bent: Model):
+    matrix = write(tmp_path, bent, building(Layout(5, 3)))
+    files = {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()}
+    align(tmp_path, tmp_path / "shell.ply", matrix=matrix, refine=0.3, bundle_adjust=True)
+    assert Alignment.load(tmp_path / ALIGNMENT).model == ADJUSTED.as_posix()
+    layout = ScenePaths().of(tmp_path)
+    assert layout.colmap_folder() == ADJUSTED
+    views = read_views(layout)
+    scale = np.linalg.inv(Alignment.load(tmp_path / ALIGNMENT).shell_to_scene)
+    straight = transformed(np.stack([view.camera.position.numpy() for view in views]), scale)
+    assert np.linalg.norm(straight - CENTRES, axis=1).mean() < 0.015
+    report = (tmp_path / "shell/report/index.html").read_text()
+    assert "Cameras adjusted to the shell" in report
+    assert all(view.name in report for view in views)
+    assert {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()} == files
+
+    alignment = Alignment.load(tmp_path / ALIGNMENT)
+    cast(tmp_path, views[:1], alignment, max_image_size=64)
+    align(tmp_path, paths=ORIGINAL)
+    assert Alignment.load(tmp_path / ALIGNMENT).model == ""
+    assert layout.colmap_folder() == Path("colmap/sparse/0")
+    view = read_views(layout)[0]
+    with pytest.raises(SceneError, match="map"):
+        CueMaps.open(tmp_path, "shell").require(view.name, view.camera.shrunk(64))
+
+
+@pytest.mark.parametrize("wrong", ["30 cm", "2 degrees", "another building"])
+def test_a_wrong_shell_does_not_bend_good_cameras(tmp_path: Path, model: Model, wrong: str):
+    shift = np.eye(4)
+    if wrong == "30 cm":
+        shift[1, 3] = -0.3
+    if wrong == "2 degrees":
+        shift[:3, :3] = Rotation.from_euler("z", 2, degrees=True).as_matrix()
+    mesh = building(Layout(3, 5) if wrong == "another building" else Layout(5, 3))
+    matrix = write(tmp_path, model, mesh, shift)
+    with suppress(SceneError):  # or says that the cameras are left as they are
+        align(tmp_path, tmp_path / "shell.ply", matrix=matrix, bundle_adjust=True)
+    assert not (tmp_path / ADJUSTED).exists()
+    assert ScenePaths().of(tmp_path).colmap_folder() == Path("colmap/sparse/0")
+
+
+def test_adjusted_cameras_that_are_missing_are_named(tmp_path: Path, model: Model):
+    write(tmp_path, model, building(Layout(5, 3)))
+    Alignment(np.eye(4), "shell.ply", model=ADJUSTED.as_posix()).save(tmp_path / ALIGNMENT)
+    with pytest.raises(SceneError, match=r"colmap/adjusted, which is missing: align the shell again"):
+        ScenePaths().of(tmp_path).colmap_folder()
