@@ -14,7 +14,7 @@ import pytest
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import notice
-from shellgs_method.machine import cpp
+from shellgs_method.machine import system
 from shellgs_method.machine.open3d import load_libusb
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
@@ -71,7 +71,7 @@ def shellgs(in_process) -> Callable[..., str]:
 @pytest.fixture
 def compiler(monkeypatch) -> None:
     """Run kernels in C++; skip where there is no compiler."""
-    if cpp.cpp_compiler() is None:
+    if system.compiler() is None:
         pytest.skip("no C++ compiler")
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
 

@@ -12,7 +12,6 @@ import hashlib
 import itertools
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from pathlib import Path
 from filelock import FileLock
 
 from shellgs_method.errors import notice
+from shellgs_method.machine import system
 from shellgs_method.machine.progress import tell
 
 # The vectors are written out in the sources: -O3 compiles four times as long for a twentieth of the speed.
@@ -41,12 +41,6 @@ def compiles() -> bool:
     return os.environ.get("SHELLGS_COMPILE") != "0" and compiler_works()
 
 
-def cpp_compiler() -> str | None:
-    """Path of a C++ compiler with GCC's options and vectors: $CXX, g++ or clang++."""
-    named = os.environ.get("CXX")
-    return shutil.which(named) if named else next(filter(None, map(shutil.which, ("g++", "clang++"))), None)
-
-
 @functools.cache
 def load_library(source: str) -> ctypes.CDLL | None:
     """Compile C++, unless that was done on this machine before, and load it; None, said once, where that fails.
@@ -54,7 +48,7 @@ def load_library(source: str) -> ctypes.CDLL | None:
     Of several processes that need the same library, one compiles it, and the others wait.
     """
     try:
-        if (compiler := cpp_compiler()) is None:
+        if (compiler := system.compiler()) is None:
             raise FileNotFoundError("there is no C++ compiler (g++ or clang++)")
         key = hashlib.sha256("\n".join([source, compiler, *_FLAGS, *_LIBRARY, _processor()]).encode()).hexdigest()[:24]
         library = _folder() / f"{key}.so"

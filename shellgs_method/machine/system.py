@@ -10,10 +10,8 @@ import os
 import shutil
 import subprocess
 import sys
-import sysconfig
 from collections.abc import Iterable
 from importlib.util import find_spec
-from pathlib import Path
 
 LIBRARIES = {
     "libGL.so.1": "libgl1",
@@ -25,7 +23,7 @@ LIBRARIES = {
 }
 """What Open3D's wheels for Linux link and do not bring, and Debian's packages of it; libusb is in `open3d.py`."""
 USB = "libusb-1.0.so.0"
-_COST = "Without a compiler and Python.h training is several times slower; without libusb ns-export does not start"
+_COST = "Without a compiler training is several times slower; without libusb ns-export does not start"
 
 
 def loads(library: str) -> bool:
@@ -38,17 +36,9 @@ def loads(library: str) -> bool:
 
 
 def compiler() -> str | None:
-    """Path of a C++ compiler."""
-    return shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-
-
-def missing_to_compile() -> dict[str, str]:
-    """What is not here of what kernels are compiled with, and Debian's packages of it."""
-    headers = Path(sysconfig.get_paths()["include"], "Python.h").exists()  # every kernel includes it
-    return {
-        **({} if compiler() else {"a C++ compiler": "g++"}),
-        **({} if headers else {"Python.h": f"{_python()}-dev"}),
-    }
+    """Path of a C++ compiler with GCC's options and vectors: $CXX, g++ or clang++."""
+    named = os.environ.get("CXX")
+    return shutil.which(named) if named else shutil.which("g++") or shutil.which("clang++")
 
 
 def missing_libraries() -> dict[str, str]:
@@ -71,7 +61,7 @@ def _missing_to_install() -> dict[str, str]:
 def _missing_besides() -> dict[str, str]:
     """What is not here of what training is slow or ns-export does not start without, and Debian's packages of it."""
     usb = {} if sys.platform != "linux" or loads(USB) else {USB: "libusb-1.0-0"}
-    return {**missing_to_compile(), **usb}
+    return {**({} if compiler() else {"a C++ compiler": "g++"}), **usb}
 
 
 def _python() -> str:

@@ -33,7 +33,7 @@ def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setenv("PATH", str(apt_get.parent), prepend=os.pathsep)
     table = {**system.LIBRARIES, system.USB: "libusb-1.0-0"}
     monkeypatch.setattr(system, "loads", lambda name: table[name] in packages.read_text().split())
-    monkeypatch.setattr(system, "missing_to_compile", dict)
+    monkeypatch.setattr(system, "compiler", lambda: "/usr/bin/g++")
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     return packages
@@ -67,7 +67,7 @@ def test_what_apt_get_could_not_install_stops_too(installed):
 
 def test_libusb_and_a_compiler_are_not_needed(installed, capsys, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    monkeypatch.setattr(system, "missing_to_compile", lambda: {"a C++ compiler": "g++"})
+    monkeypatch.setattr(system, "compiler", lambda: None)
     installed.write_text(" ".join(system.LIBRARIES.values()))
     system.main()
     said = capsys.readouterr().out
