@@ -58,7 +58,8 @@ def test_a_third_of_wrong_colours_does_not_change_the_gains():
 def test_residuals_are_least_in_absolute_value():
     """Against a linear programme over all gains and points."""
     views, points = 4, 12
-    seen = Sightings(*np.indices((views, points)).reshape(2, -1), RNG.uniform(0.2, 0.9, (views * points, 3)))
+    view, point = np.indices((views, points)).reshape(2, -1)
+    seen = Sightings(view, point, RNG.uniform(0.2, 0.9, (views * points, 3)))
     found = log_gains(seen, np.zeros(views))[:, 0]
     log = 2.4 * np.log((seen.colour[:, 0] + 0.055) / 1.055)
     count = len(log)
@@ -93,7 +94,7 @@ def wall(x: float, gain: np.ndarray) -> Exposed:
     viewmat[0, 3] = -x
     camera = Camera(viewmat, torch.tensor([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), 80, 60)
     depth = torch.full((60, 80), 4.0)
-    points = [*(depth[..., None] * camera.rays()).numpy(), x, 0, 0]
+    points = (depth[..., None] * camera.rays()).numpy() + np.array([x, 0, 0])
     linear = 0.35 + 0.2 * np.sin(np.stack([points[..., 0], points[..., 1], points[..., 0] + points[..., 1]], axis=-1))
     return Exposed.of(camera, torch.from_numpy(srgb(linear * np.exp(gain))).float(), depth)
 
