@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -506,8 +507,12 @@ def without_colmap(monkeypatch) -> list[str]:
 def exposure_of(seconds: float, iso: int = 200) -> Image.Exif:
     exif = Image.Exif()
     exif[ExifTags.Base.Make] = "a phone"  # without any tag here, Pillow writes none into a PNG
-    tags = {ExifTags.Base.ExposureTime: seconds, ExifTags.Base.FNumber: 1.8, ExifTags.Base.ISOSpeedRatings: iso}
-    exif.get_ifd(ExifTags.IFD.Exif).update(tags)
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    tags[ExifTags.Base.ExposureTime], tags[ExifTags.Base.FNumber], tags[ExifTags.Base.ISOSpeedRatings] = (
+        seconds,
+        1.8,
+        iso,
+    )
     return exif
 
 
@@ -532,7 +537,7 @@ def test_exposures_survive_capture(tmp_path, without_colmap, monkeypatch):
     (tmp_path / "photographs").mkdir()
     for k, seconds in enumerate((1 / 100, 1 / 200, 1 / 400)):
         photograph(seed=k).save(tmp_path / "photographs" / f"IMG {k}.jpg", exif=exposure_of(seconds))
-    fake = stages.run_step
+    fake: Any = stages.run_step
 
     def run_step(step: str, arguments: dict, **_):
         found = fake(step, arguments)

@@ -127,6 +127,14 @@ def test_renders_are_as_bright_as_the_photographs_at_their_mean_exposure(trained
     assert max(abs(difference) for difference in apart) < 0.04
 
 
+def test_photographs_of_a_texture_are_brought_to_the_mean_exposure(trained):
+    """Those of training views by their learned exposures, held-out ones by their renders."""
+    found = TrainedRun(model_of(trained), data_of(trained)).log_gains()
+    np.testing.assert_allclose(found[:8], log_gains(trained), atol=1e-6)
+    mean = GAINS[[k for k in range(10) if k % 8]].mean(axis=0)
+    np.testing.assert_allclose(found[8:], GAINS[[0, 8]] - mean, atol=0.5 * STOPS)
+
+
 def test_a_resumed_run_has_the_same_exposures(changing, tmp_path, trained):
     half = trainer_of(changing, tmp_path / "half", "shellgs_metric", 60)
     half.config.steps_per_save = 30
