@@ -300,8 +300,9 @@ class FacadeModel(SplatfactoModel):
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
-        if self.training and self.exposures is not None:
-            rgb = exposed(rgb, self.exposures.log_gains[(camera.metadata or {})["cam_idx"]])
+        photograph = (camera.metadata or {}).get("cam_idx") if self.training else None
+        if self.exposures is not None and photograph is not None:
+            rgb = exposed(rgb, self.exposures.log_gains[photograph])
         outputs = {"rgb": rgb.clamp(0, 1), "accumulation": alpha, "background": background}
         if not self.training:
             outputs["background"] = background.expand(pinhole.height, pinhole.width, 3)
