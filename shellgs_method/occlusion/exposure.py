@@ -2,7 +2,7 @@
 
 A gain in linear light acts on colours as they are stored, by sRGB's curve, as a scale about :data:`BLACK`, exactly so
 but for the darkest. Fitted to photographs at ±0.7 stops this leaves 55 dB, with a camera's gamma of 2.2 46 dB, with an
-S-curve 34 to 43 dB; a plain scale is 1 to 10 dB worse on all but the gamma.
+S-curve 35 to 43 dB; a plain scale is 1 to 10 dB worse on all but the gamma.
 """
 
 from __future__ import annotations
