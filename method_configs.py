@@ -40,6 +40,7 @@ def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpec
             "opacities": _adam(0.05),
             "scales": _adam(0.005),
             "quats": _adam(0.001),
+            "exposures": _adam(0.005, lr_final=0.0005),
         },
         viewer=ViewerConfig(quit_on_train_completion=True, websocket_host="127.0.0.1"),
         vis="viewer",
@@ -65,6 +66,7 @@ shellgs_metric = _method(
         cues="shell",
         init="shell",
         trust="photographs",
+        exposure="learned",
         depth="mode",
         densify_grad_thresh=THRESHOLD_METRIC,
         extra=ExtraLossConfig(

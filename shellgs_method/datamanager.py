@@ -27,13 +27,16 @@ from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
 from shellgs_method.evaluation.regions import REFERENCES
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
-from shellgs_method.files.photographs import View, has_alpha, load_mask, load_photograph
+from shellgs_method.files.photographs import View, exif_log_gains, has_alpha, load_mask, load_photograph
+from shellgs_method.gaussians.seeds import SeededView, photograph_of, view_of_surface
+from shellgs_method.gaussians.skybox import SkyView
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory
 from shellgs_method.machine.progress import track
+from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sightings_of_points, sightings_on_surface
 from shellgs_method.runs.host import NoPixelSampler
 
-ViewT = TypeVar("ViewT")
+ViewT = TypeVar("ViewT", SeededView, SkyView)
 logger = logging.getLogger(__name__)
 # Nerfstudio's own says nothing in a log.
 full_images_datamanager.track = track  # pyright: ignore[reportPrivateImportUsage]
@@ -290,21 +293,52 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             raise SceneError("a holdout needs the shell maps of the scene: run `shellgs cast SCENE` first")
         return facade_holdout(metadata["cues"]["shell"], metadata["views"], self.config.band_width, self.config.holdout)
 
+    def log_gains(self) -> tuple[Float64[np.ndarray, "V 3"], Float64[np.ndarray, "N 3"]]:
+        """Exposures of the training photographs, by their colours of the same points, or else by their EXIF data.
+
+        Returns:
+            Logarithms of their gains in linear light, with a mean of 0, and of each SfM point those of the photographs
+            that show it, in the mean.
+        """
+        dataset, exposures = self.train_dataset, []
+        for index, batch in enumerate(self.cached_train):
+            camera, batch = dataset.camera(index), self._with_maps(batch)
+            seen = view_of_surface(camera, batch) if "shell_depth" in batch else None
+            surface = None if seen is None else seen.shell.depth.where(seen.shell.mask, 0.0)[..., 0]
+            exposures.append(Exposed.of(camera, photograph_of(batch), surface))
+        points, observed = self.sfm_points.float(), self.train_dataparser_outputs.metadata["observed"]
+        of_points = sightings_of_points(exposures, points, observed)
+        known = exif_log_gains([view.image for view in dataset.views])
+        gains = log_gains(of_points.with_others(sightings_on_surface(exposures)), known)
+        return gains, of_points.mean_of_views(gains, len(points))
+
     def seed_views(
-        self, view_of: Callable[[Camera, dict], ViewT], kind: str | None = None
+        self,
+        view_of: Callable[[Camera, dict], ViewT],
+        kind: str | None = None,
+        log_gains: Float64[np.ndarray, "V 3"] | None = None,
     ) -> tuple[Iterator[ViewT], int]:
         """Training views to make seeds from, one at a time, and the number of pixels of all.
 
         Args:
             view_of: makes one from the camera, in nerfstudio's rescaled world, and the batch with its maps.
             kind: only views with a map of this kind; all if None.
+            log_gains: exposures of the training photographs, which are brought to their mean.
         """
         dataset = self.train_dataset
         maps = dataset.cues[kind] if kind else None
         chosen = [k for k, view in enumerate(dataset.views) if maps is None or maps.record(view.name)]
         cameras, cached = [dataset.camera(k) for k in chosen], self.cached_train
+
+        def made(index: int, camera: Camera) -> ViewT:
+            view = view_of(camera, self._with_maps(cached[index]))
+            if log_gains is None:
+                return view
+            gain = torch.from_numpy(log_gains[index]).float()
+            return view._replace(image=exposed(view.image, -gain).clamp(0, 1))
+
         shown = track(zip(chosen, cameras, strict=True), "Placing the first Gaussians", len(chosen))
-        views = (view_of(camera, self._with_maps(cached[k])) for k, camera in shown)
+        views = (made(k, camera) for k, camera in shown)
         return views, sum(camera.width * camera.height for camera in cameras)
 
     @property

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, NoReturn, Optional
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
@@ -23,7 +24,8 @@ from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_im
 from shellgs_method.evaluation.pixels import kept_pixels
 from shellgs_method.evaluation.regions import masked_image_errors, reference_errors, references
 from shellgs_method.gaussians.densification import GradientStrategy, SkyboxStrategy
-from shellgs_method.gaussians.initial import OPACITY, Init, InitialGaussians, sfm_points
+from shellgs_method.gaussians.exposures import Exposures
+from shellgs_method.gaussians.initial import OPACITY, Init, InitialGaussians, harmonics, sfm_points
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.geometry.camera import Camera
@@ -31,6 +33,7 @@ from shellgs_method.losses import PAPER_ITERATIONS
 from shellgs_method.losses.objective import Cues, ExtraLossConfig, GeometryLossConfig, Objective, Trust, ViewLosses
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.machine.threads import ThreadsByLoad
+from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.render.maps import DepthKind, Geometry, Primitive
 from shellgs_method.render.panorama import is_pinhole, render_around
 from shellgs_method.render.view import ViewRenderer
@@ -59,6 +62,9 @@ class FacadeModelConfig(SplatfactoModelConfig):
     """What counts where photographs contradict the shell. With photographs, it neither supervises nor is seeded where
     they show something in front of it or the background; what they show behind it, in windows, is no part of depth and
     normals; and what only one of them shows in front of it, which has moved, is left out of the photometric loss."""
+    exposure: Literal["fixed", "learned"] = "fixed"
+    """Whether each training photograph has an exposure and a white balance of its own, learned with the run. What is
+    rendered outside training, and exported, has their mean."""
     depth: DepthKind = "expected"
     """Depth that is rendered and supervised: expected, median (discs only), plane (of the composited plane), or mode
     (of the heavier of two layers; expected in training)."""
@@ -136,6 +142,7 @@ class FacadeModel(SplatfactoModel):
         self.background_color = get_color("black" if config.background_color == "random" else config.background_color)
         self.crop_box = None
         self.metres_per_unit: float | None = metadata.get("metres_per_unit")
+        self.exposures = Exposures(self.num_train_data) if config.exposure == "learned" else None
         self.objective = Objective(
             config.cues, config.trust, config.geometry, config.extra, self.metres_per_unit, metadata.get("shell_error")
         )
@@ -170,11 +177,28 @@ class FacadeModel(SplatfactoModel):
                 f"run `shellgs {command} SCENE` first, or train photo-gs"
             )
 
+    def start_exposures(self, log_gains: Float64[np.ndarray, "V 3"], of_points: Float64[np.ndarray, "N 3"]) -> None:
+        """Start from exposures of the training photographs, and bring the SfM points' colours to the mean exposure.
+
+        Args:
+            log_gains: logarithms of the photographs' gains in linear light.
+            of_points: their mean over the photographs that show each SfM point.
+        """
+        assert self.exposures is not None
+        self.exposures.start(log_gains)
+        colours = exposed(sfm_points(self.seed_points)[1], -torch.from_numpy(of_points).float())
+        self.gauss_params["features_dc"].data = harmonics(colours.clamp(0, 1)).to(self.device)
+
     def add_seeds(self, seeds: Seeds) -> None:
         """Add flat initial Gaussians at seeds."""
         for name, new in self._initial.at_seeds(seeds).items():
             old = self.gauss_params[name].data
             self.gauss_params[name] = nn.Parameter(torch.cat([old, new.to(old)]))
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters of each optimizer: the Gaussians', and where they are learned the photographs' exposures."""
+        exposures = {} if self.exposures is None else {"exposures": [*self.exposures.parameters()]}
+        return super().get_param_groups() | exposures
 
     def plan(self, num_iterations: int) -> None:
         """Scale every schedule to a run of ``num_iterations``."""
@@ -205,6 +229,8 @@ class FacadeModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             stored = dict[f"gauss_params.{name}"]
             parameter.data = parameter.data.new_zeros(stored.shape)
+        if self.exposures is not None:
+            self.exposures.parameter.data = torch.zeros_like(dict["exposures.parameter"], device=self.device)
         self.surface = torch.empty_like(dict["surface"], device=self.device) if "surface" in dict else None
         self.step = self.num_iterations
         return nn.Module.load_state_dict(self, dict, **kwargs)
@@ -274,7 +300,10 @@ class FacadeModel(SplatfactoModel):
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
-        outputs = {"rgb": rgb, "accumulation": alpha, "background": background}
+        photograph = (camera.metadata or {}).get("cam_idx") if self.training else None
+        if self.exposures is not None and photograph is not None:
+            rgb = exposed(rgb, self.exposures.log_gains[photograph])
+        outputs = {"rgb": rgb.clamp(0, 1), "accumulation": alpha, "background": background}
         if not self.training:
             outputs["background"] = background.expand(pinhole.height, pinhole.width, 3)
         if self.geometry is not None:
@@ -318,7 +347,8 @@ class FacadeModel(SplatfactoModel):
         target = self._view(batch, outputs["background"]).photometric.target
         error = (outputs["rgb"].detach() - target).square()
         psnr = -10 * weighted_mean(error, kept_pixels(batch, target)).log10()
-        return {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
+        metrics = {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
+        return metrics if self.exposures is None else metrics | {"exposure_stops": self.exposures.spread}
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """The objective's terms of the view that was rendered last."""

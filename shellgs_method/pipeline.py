@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from types import MappingProxyType
@@ -65,27 +66,36 @@ class FacadePipeline(VanillaPipeline):
             self.contradicted_shell = ContradictedShell(scene, datamanager.scene_to_world)
             if self.test_mode == "val":  # a trained run loads all its Gaussians
                 datamanager.train_on(model.training_cues)
-                self._add_seeds()
+                self._start()
 
-    def _add_seeds(self) -> None:
+    def _start(self) -> None:
+        """Start from what the photographs say of their exposures, and from seeds at the mean exposure."""
+        data, gains = self.datamanager, None
+        if self.model.exposures is not None:
+            gains, of_points = data.log_gains()
+            self.model.start_exposures(gains, of_points)
+        self._add_seeds(partial(data.seed_views, log_gains=gains))
+
+    def _add_seeds(self, seed_views: Callable[..., tuple[Iterator, int]]) -> None:
         model, data = self.model, self.datamanager
         config = model.config
         if config.init == "shell":
             view_of = view_of_shell if config.trust == "shell" else view_of_surface
-            model.add_seeds(shell_seeds(*data.seed_views(view_of, "shell"), SEED_SPACING, MAX_SEEDS))
+            model.add_seeds(shell_seeds(*seed_views(view_of, "shell"), SEED_SPACING, MAX_SEEDS))
         if config.trust == "photographs" and config.primitive == "3d":
-            shell = shell_seeds(*data.seed_views(view_of_shell, "shell"), SEED_SPACING, MAX_SEEDS)
+            shell = shell_seeds(*seed_views(view_of_shell, "shell"), SEED_SPACING, MAX_SEEDS)
             model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
-            behind = data.seed_views(view_behind_shell, "shell")
+            behind = seed_views(view_behind_shell, "shell")
             model.add_seeds(shell_seeds(*behind, SEED_SPACING, MAX_SEEDS))
         if config.init == "shell":
             points = data.sfm_points.double().numpy()
-            model.add_seeds(skybox_seeds(*data.seed_views(view_of_sky), points, SKYBOX_SEEDS))
+            model.add_seeds(skybox_seeds(*seed_views(view_of_sky), points, SKYBOX_SEEDS))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint's Gaussians.
+        """Load a checkpoint's Gaussians and exposures.
 
-        Damaged ones, and those of another ``sh_degree`` than the settings', end the program with a message.
+        Damaged ones, and those of another ``sh_degree`` or ``exposure`` than the settings', end the program with a
+        message.
         """
         with refusals_end_the_program():
             try:
@@ -99,7 +109,22 @@ class FacadePipeline(VanillaPipeline):
                         f"the checkpoint's {name} are of shape {list(stored.shape)}, where these settings (sh_degree) "
                         f"give {list(parameter.shape)}: load it with the settings that it was trained with"
                     )
+            self._check_exposures(loaded_state.get("_model.exposures.parameter"))
         super().load_pipeline(loaded_state, step)
+
+    def _check_exposures(self, stored: Tensor | None) -> None:
+        ours = self.model.exposures
+        if (stored is None) != (ours is None):
+            has, setting = ("no", "fixed") if stored is None else ("the", "learned")
+            raise SceneError(
+                f"the checkpoint has {has} exposures of its photographs: load it with "
+                f"--pipeline.model.exposure {setting}"
+            )
+        if stored is not None and self.test_mode == "val" and len(stored) != self.model.num_train_data:
+            raise SceneError(
+                f"the checkpoint has exposures of {len(stored)} photographs, and the scene has "
+                f"{self.model.num_train_data} to train on: train on the same photographs, or anew"
+            )
 
     def get_train_loss_dict(self, step: int):
         """One step on the next view."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from shellgs_method.capture.config import Cameras
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.paths import DEVELOP, PHOTOGRAPHS, RAW, mask_names, photographs_in, tell_of_masks
 
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv"}
@@ -27,6 +29,8 @@ _LENS_TAGS = (
     ExifTags.Base.FocalLength,
     ExifTags.Base.FocalLengthIn35mmFilm,
 )
+
+_EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
 
 
 def find_photographs(folder: Path) -> dict[str, Path]:
@@ -88,6 +92,48 @@ def add_photograph(source: Path, target: Path) -> None:
         os.link(source.resolve(), target)
     except OSError:  # another file system
         shutil.copyfile(source, target)
+
+
+def keep_exposure(source: Path, undistorted: Path) -> None:
+    """Put a photograph's exposure time, aperture and ISO into its undistorted JPEG or PNG, which is not encoded again.
+
+    COLMAP's undistortion keeps the last one alone.
+    """
+    with Image.open(source) as stored:
+        known = stored.getexif().get_ifd(ExifTags.IFD.Exif)
+    exposure = {tag: known[tag] for tag in _EXPOSURE_TAGS if tag in known}
+    if not exposure:
+        return
+    with Image.open(undistorted) as image:
+        exif, is_jpeg = image.getexif(), image.format == "JPEG"
+    exif.get_ifd(ExifTags.IFD.Exif).update(exposure)
+    content, segment = undistorted.read_bytes(), exif.tobytes()
+    with atomic_write(undistorted) as file:
+        file.write(_jpeg_with_exif(content, segment) if is_jpeg else _png_with_exif(content, segment))
+
+
+def _jpeg_with_exif(content: bytes, exif: bytes) -> bytes:
+    """A JPEG whose EXIF segment is replaced, before the first that is no application segment."""
+    kept, at = b"", 2
+    while content[at] == 0xFF and 0xE0 <= content[at + 1] <= 0xEF:
+        end = at + 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+        if content[at + 4 : at + 10] != b"Exif\0\0":
+            kept += content[at:end]
+        at = end
+    return content[:2] + kept + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + content[at:]
+
+
+def _png_with_exif(content: bytes, exif: bytes) -> bytes:
+    """A PNG whose EXIF chunk is replaced, behind its header."""
+    chunks, at = [], 8
+    while at < len(content):
+        end = at + 12 + int.from_bytes(content[at : at + 4], "big")
+        if content[at + 4 : at + 8] != b"eXIf":
+            chunks.append(content[at:end])
+        at = end
+    named = b"eXIf" + exif.removeprefix(b"Exif\0\0")
+    chunk = (len(named) - 4).to_bytes(4, "big") + named + zlib.crc32(named).to_bytes(4, "big")
+    return content[:8] + b"".join([chunks[0], chunk, *chunks[1:]])
 
 
 def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) -> None:

@@ -24,6 +24,7 @@ from shellgs_method.capture.photographs import (
     find_masks,
     find_photographs,
     group_by_lens,
+    keep_exposure,
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work, listing
@@ -249,6 +250,8 @@ class _Capture:
                 masks=str(self.work.folder / "masks") if self.masked else None,
                 output=str(folder),
             )
+            for image in (folder / "images").rglob("*.*"):
+                keep_exposure(self.folder / image.relative_to(folder / "images"), image)
             (folder / "colmap" / "sparse").mkdir(parents=True)
             os.replace(folder / "sparse", folder / "colmap" / "sparse" / "0")
 

@@ -24,6 +24,7 @@ from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import upwards
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.voxels import voxel_means
+from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
 
 CURVES = tuple(
     c for c in (*MAIN_COLUMNS, *SURFACE_COLUMNS) if c.key in ("psnr", "normal_deg", "depth_mae_m", "chamfer_m")
@@ -75,6 +76,29 @@ def curves(runs: Sequence[Run], path: Path) -> bool:
         axis.set(title=column.heading, xlabel="iteration")
         axis.grid(alpha=0.3)
     figure.axes[0].legend(fontsize=8)
+    save_figure(path, figure, dpi=130)
+    return True
+
+
+def exposures(runs: Sequence[Run], path: Path) -> bool:
+    """Plot the exposures that the training photographs were found to have, in stops, in the order of their names.
+
+    One line per variant, of its first seed; False if no run learned any.
+    """
+    found: dict[str, Float[np.ndarray, "V 3"]] = {}
+    for run in runs:
+        if run.variant.ours and run.trained and run.variant.name not in found:
+            state = load_checkpoint(find_checkpoint(run.checkpoints))["pipeline"]
+            if (stored := state.get("_model.exposures.parameter")) is not None:
+                found[run.variant.name] = ((stored - stored.mean(dim=0)) / np.log(2)).numpy()
+    if not found:
+        return False
+    figure = Figure(figsize=(4 * len(found), 3), layout="constrained")
+    for axis, (name, stops) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items(), strict=True):
+        for channel, colour in zip(stops.T, ("tab:red", "tab:green", "tab:blue"), strict=True):
+            axis.plot(channel, ".-", color=colour)
+        axis.set(title=name, xlabel="training photograph", ylabel="exposure (stops)")
+        axis.grid(alpha=0.3)
     save_figure(path, figure, dpi=130)
     return True
 

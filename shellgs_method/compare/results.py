@@ -10,7 +10,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from shellgs_method.compare.measure import Snapshot, measure_shell
-from shellgs_method.compare.plots import common_views, curves, strip, surfaces
+from shellgs_method.compare.plots import common_views, curves, exposures, strip, surfaces
 from shellgs_method.compare.report import write_report
 from shellgs_method.compare.runs import DamagedRunError, Run
 from shellgs_method.compare.tables import MetricsTable, read_metrics, tables
@@ -148,4 +148,7 @@ def _figures(scene: Path, runs: Sequence[Run], output: Path, suffix: str) -> dic
     path = output / f"curves{suffix}.png"
     if curves(runs, path):
         figures[f"{scene.name}: metrics of all held-out views during training."] = path
+    path = output / f"exposures{suffix}.png"
+    if exposures(runs, path):
+        figures[f"{scene.name}: exposure of each training photograph, by channel."] = path
     return figures

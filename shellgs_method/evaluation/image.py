@@ -1,4 +1,4 @@
-"""Appearance metrics: PSNR, SSIM, LPIPS."""
+"""Appearance metrics: PSNR, SSIM, LPIPS, of a render and of one whose colours are fitted to the photograph."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 SMALLEST_LPIPS_IMAGE = 31
 """Smallest side in pixels that AlexNet's strides can process."""
 
+CLIPPED = 0.5 / 255
+"""Distance from black or white within which a colour is clipped."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -36,7 +39,9 @@ def image_errors(
     """PSNR in dB (at most 100, so that an exact image can be averaged), SSIM, and LPIPS if available.
 
     Colours are in [0, 1]. SSIM is as in the loss, with a Gaussian window of 11 pixels and sigma 1.5; LPIPS uses the
-    AlexNet backbone. PSNR and SSIM of each region that is not empty are ``psnr_…`` and ``ssim_…`` with its name.
+    AlexNet backbone. PSNR and SSIM of each region that is not empty are ``psnr_…`` and ``ssim_…`` with its name. The
+    same metrics of the :func:`colour_corrected` render are ``cc_psnr`` and so on; it is corrected over the region
+    ``seen`` if there is one: what training views do not show says nothing of a photograph's exposure.
 
     Pixels outside ``kept`` are ignored: they are set to the target, so that no window differs there, and excluded from
     all means. LPIPS, whose mean is over all pixels, is divided by the share of kept pixels.
@@ -44,10 +49,47 @@ def image_errors(
     kept = torch.ones_like(target[..., :1], dtype=torch.bool) if kept is None else kept
     if not kept.any():
         return {}
-    rgb = rgb.detach().clamp(0, 1).where(kept, target)
+    rgb, regions = rgb.detach().clamp(0, 1), regions or {}
+    corrected = colour_corrected(rgb, target, kept & regions.get("seen", kept))
+    metrics = _errors(rgb, target, regions, kept)
+    return metrics | {f"cc_{name}": value for name, value in _errors(corrected, target, regions, kept).items()}
+
+
+def colour_corrected(
+    rgb: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], where: Bool[Tensor, "H W 1"]
+) -> Float[Tensor, "H W 3"]:
+    """The affine map of a render's colours that is closest to its photograph in least squares, clamped to [0, 1].
+
+    It takes out what exposure, white balance and a camera's colours change: nothing else does these justice where a
+    held-out photograph has an exposure of its own. Nerfstudio's metrics of this name fit a quadratic map, five times in
+    a row, which takes out more; gsplat has both.
+
+    Args:
+        rgb: render, in [0, 1].
+        target: photograph, in [0, 1].
+        where: pixels to fit; those that are clipped in either do not count. If too few are left, the map stays close to
+            the identity.
+    """
+    clipped = ((rgb <= CLIPPED) | (rgb >= 1 - CLIPPED) | (target <= CLIPPED) | (target >= 1 - CLIPPED)).any(dim=-1)
+    plain = where[..., 0] & ~clipped
+    colours = torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=-1).double()
+    x, y = colours[plain], target[plain].double()
+    identity = torch.eye(4, 3, dtype=x.dtype, device=x.device)
+    ridge = 1e-6 * torch.eye(4, dtype=x.dtype, device=x.device)
+    affine = identity + torch.linalg.solve(x.T @ x + ridge, x.T @ (y - x @ identity))
+    return (colours @ affine).to(rgb).clamp(0, 1)
+
+
+def _errors(
+    rgb: Float[Tensor, "H W 3"],
+    target: Float[Tensor, "H W 3"],
+    regions: Mapping[str, Bool[Tensor, "H W 1"]],
+    kept: Bool[Tensor, "H W 1"],
+) -> dict[str, float]:
+    rgb = rgb.where(kept, target)
     rgb, target, kept = rgb.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], kept[..., 0]
     similarity = ssim(rgb, target, window_size=11)[0]
-    parts = {"": kept} | {f"_{name}": mask[..., 0] & kept for name, mask in (regions or {}).items()}
+    parts = {"": kept} | {f"_{name}": mask[..., 0] & kept for name, mask in regions.items()}
     metrics = {}
     for suffix, region in parts.items():
         if region.any():

@@ -54,6 +54,8 @@ MAIN_COLUMNS = (
 REGION_COLUMNS = (
     Column("psnr_seen", "PSNR, seen", max, ".2f"),
     Column("ssim_seen", "SSIM, seen", max),
+    Column("cc_psnr_seen", "PSNR, seen, colours corrected", max, ".2f"),
+    Column("cc_ssim_seen", "SSIM, seen, colours corrected", max),
     Column("psnr_on_shell", "PSNR on the shell", max, ".2f"),
     Column("ssim_on_shell", "SSIM on the shell", max),
     Column("psnr_off_shell", "PSNR off the shell", max, ".2f"),

@@ -27,6 +27,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.tsdf import DepthView, fuse
 from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
+from shellgs_method.occlusion.exposure import Sightings, log_gains
 from shellgs_method.runs.trained import load_run
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, ShellSurface
 
@@ -183,6 +184,28 @@ class TrainedRun:
             if kept is not None:
                 depth = depth.where(torch.from_numpy(kept)[..., None], 0.0)
             yield DepthView(depth, outputs["rgb"].cpu(), self.frame.camera(dataset.views[index].camera))
+
+    @torch.no_grad()
+    def log_gains(self) -> Float64[np.ndarray, "V 3"]:
+        """Exposures of the photographs of all views, in the order of :meth:`views`, against the mean of the training's.
+
+        Those of training views are learned; held-out photographs are compared with their renders.
+
+        Returns:
+            Logarithms of the gains in linear light; 0 in a run whose exposures are fixed.
+        """
+        learned, (training, held_out) = self.model.exposures, self.datasets
+        if learned is None:
+            return np.zeros((len(training) + len(held_out), 3))
+        gains = [*learned.log_gains.cpu().double().numpy()]
+        for index in range(len(held_out)):
+            render = self.model.get_outputs_for_camera(held_out.cameras[index : index + 1].to(self.model.device))["rgb"]
+            photograph = held_out.get_numpy_image(index) / 255
+            colours = np.stack([render.cpu().double().numpy(), photograph]).reshape(-1, 3)
+            view, point = np.indices((2, len(colours) // 2)).reshape(2, -1)
+            of_both = log_gains(Sightings(view, point, colours), np.zeros(2))
+            gains.append(of_both[1] - of_both[0])
+        return np.array(gains)
 
     def splats(self) -> Splats:
         """The Gaussians in the frame."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.frames import MAX_PIXELS
@@ -117,6 +117,30 @@ def read_mask(path: Path) -> Image.Image:
         mask = Image.fromarray(np.where(kept_pixels(image, path), 255, 0).astype(np.uint8))
     mask.info["exif"] = exif.tobytes()
     return mask
+
+
+def exif_log_gains(paths: Sequence[Path]) -> Float64[np.ndarray, " V"]:
+    """Logarithms of how much light photographs were exposed to, by their EXIF data, and of the sensor's gain.
+
+    Exposure time · ISO / aperture², against the mean of those that say it; 0 for others.
+
+    Raises:
+        SceneError: an image cannot be read.
+    """
+    found = np.array([_exif_log_gain(path) for path in paths])
+    return np.nan_to_num(found - np.nanmean(found)) if np.isfinite(found).any() else np.zeros(len(paths))
+
+
+def _exif_log_gain(path: Path) -> float:
+    """NaN where a photograph does not say it."""
+    with opened(path, whole=False) as image:
+        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+    try:
+        seconds, aperture = float(tags[ExifTags.Base.ExposureTime]), float(tags[ExifTags.Base.FNumber])
+        gain = seconds * float(np.ravel(tags[ExifTags.Base.ISOSpeedRatings])[0]) / aperture**2
+    except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError):  # anything may be written there
+        return np.nan
+    return float(np.log(gain)) if 0 < gain < np.inf else np.nan
 
 
 def without_hidden(image: Image.Image) -> Image.Image:

@@ -84,10 +84,15 @@ class InitialGaussians:
             "means": means,
             "scales": scales,
             "quats": quats,
-            "features_dc": (colours - 0.5) / _DEGREE_0,
+            "features_dc": harmonics(colours),
             "features_rest": torch.zeros(len(means), (self.sh_degree + 1) ** 2 - 1, 3),
             "opacities": torch.full((len(means), 1), self.opacity).logit(),
         }
+
+
+def harmonics(colours: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Coefficients of degree 0 of colours in [0, 1]."""
+    return (colours - 0.5) / _DEGREE_0
 
 
 def _random_quats(count: int) -> Float[Tensor, "N 4"]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -34,12 +34,13 @@ from shellgs_method.occlusion.contradiction import (
     sides,
     sweep,
 )
+from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sightings_on_surface
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 8
+VERSION = 9
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -119,9 +120,11 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
 
 @dataclass(frozen=True)
 class _TrainingViews:
-    """The training views, their sweeps, and the colours in front of the shell and on it."""
+    """The training views at their mean exposure, their sweeps, and the colours in front of the shell and on it."""
 
     views: dict[str, ShellView]
+    exposures: list[Exposed]
+    """The views as they were taken."""
     sweeps: dict[str, Sweep]
     colours: ColourModel
 
@@ -129,8 +132,11 @@ class _TrainingViews:
     def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
         """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
         size = shell.manifest.max_image_size
+        taken = {view.name: _shell_view(view, shell.require(view.name, view.camera.shrunk(size))) for view in views}
+        exposures = [_exposed(seen) for seen in taken.values()]
+        gains = _gains(exposures)
         shell_views = {
-            view.name: _shell_view(view, shell.require(view.name, view.camera.shrunk(size))) for view in views
+            name: _at_mean_exposure(seen, gain) for (name, seen), gain in zip(taken.items(), gains, strict=True)
         }
         files = {name: unfinished / f"{index}.npy" for index, name in enumerate(shell_views)}
         missing = [name for name, file in files.items() if not file.is_file()]
@@ -147,7 +153,7 @@ class _TrainingViews:
                 with atomic_write(files[name]) as stream:
                     stream.write(content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
-        return cls(shell_views, sweeps, ColourModel(shell_views.values(), sweeps.values()))
+        return cls(shell_views, exposures, sweeps, ColourModel(shell_views.values(), sweeps.values()))
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -155,6 +161,8 @@ class _TrainingViews:
             seen, found = self.views[view.name], self.sweeps[view.name]
         else:
             seen = _shell_view(view, cue)
+            gains = _gains([*self.exposures, _exposed(seen)])
+            seen = _at_mean_exposure(seen, gains[-1] - gains[:-1].mean(axis=0))
             found = sweep(seen, list(self.views.values()))
         names = self._neighbours(seen)
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
@@ -217,6 +225,20 @@ def _shell_view(view: View, cue: CueMap) -> ShellView:
     # Without the borders of what is ignored, whose gradients and interpolated colours are not of the photograph.
     counts = torch.from_numpy(cv2.erode(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     return ShellView(camera, torch.from_numpy(image), depth.where(counts, 0.0), counts)
+
+
+def _exposed(view: ShellView) -> Exposed:
+    return Exposed.of(view.camera, view.image / 255, view.depth)
+
+
+def _gains(views: Sequence[Exposed]) -> Float64[np.ndarray, "V 3"]:
+    """Logarithms of the views' gains, by the shell that they show."""
+    return log_gains(sightings_on_surface(views), np.zeros(len(views)))
+
+
+def _at_mean_exposure(view: ShellView, log_gain: Float64[np.ndarray, " 3"]) -> ShellView:
+    image = exposed(view.image / 255, -torch.from_numpy(log_gain).float())
+    return replace(view, image=(255 * image).round().clamp(0, 255).byte())
 
 
 def _relative_depth(found: Sweep, size: tuple[int, ...]) -> Float[np.ndarray, "H W"]:

@@ -64,7 +64,7 @@ class ShellView:
 
     Attributes:
         camera: camera at the size at which views are compared.
-        image: photograph at that size.
+        image: photograph at that size, at the mean exposure of all.
         depth: z-depth of the shell in scene units, 0 where there is none, or where the photograph does not count.
         kept: pixels of the photograph that count; None for all.
     """
@@ -286,8 +286,6 @@ class _Neighbour:
 def _alone(pixels: _Pixels, shown: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "h w"]:
     """How much more a view differs from others on the shell than these do from each other; 0 where one or none sees it.
 
-    A view's exposure and white balance may differ: its colours are scaled by the median ratio to the others'.
-
     Args:
         pixels: the view's.
         shown: the others' colours on the shell; NaN where it is hidden from them.
@@ -295,9 +293,7 @@ def _alone(pixels: _Pixels, shown: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "h
     typical = shown.nanmedian(dim=0).values
     spread = (shown - typical).abs().mean(dim=1).nanquantile(0.75, dim=0)
     known = shown[:, 0].isfinite().sum(dim=0) >= 2
-    own = pixels.features[:3]
-    gain = (typical / own.clamp_min(0.01)).where(known, torch.nan).flatten(1).nanmedian(dim=1).values
-    alone = (gain.nan_to_num(1.0)[:, None, None] * own - typical).abs().mean(dim=0) - 2 * spread
+    alone = (pixels.features[:3] - typical).abs().mean(dim=0) - 2 * spread
     alone, weight = _smooth(pixels, torch.stack([alone.where(known, 0.0), known.float()]))
     return alone / weight.clamp_min(0.05)
 

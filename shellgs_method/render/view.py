@@ -31,7 +31,7 @@ class Rendered(NamedTuple):
     """A rendered view."""
 
     rgb: Float[Tensor, "H W 3"]
-    """Colours in [0, 1], over the background."""
+    """Colours over the background; above 1 where they are brighter than white."""
     alpha: Float[Tensor, "H W 1"]
     geometry: Geometry | None
     info: dict[str, Any]
@@ -73,7 +73,7 @@ class ViewRenderer:
             channels, origin = self._channels(gaussians, camera)
             features = torch.cat([features, *channels], dim=-1)
         composited, alpha, info = self._rasterize(gaussians, features, camera, 3 if geometry and densifies else None)
-        rgb, maps = (composited[..., :3] + background).clamp(0, 1), None
+        rgb, maps = composited[..., :3] + background, None
         if geometry:
             surface = composited[..., -1:] if "surface" in gaussians else None
             maps = rendered_geometry(composited[..., 3:], alpha, info, camera, self.depth, origin, surface)

@@ -26,6 +26,8 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "shellgs-normals-of-depth": ("shellgs", "--pipeline.model.extra.depth-normal", "0.1"),
     "shellgs-empty-space": ("shellgs", *_EMPTY_SPACE),
     "shellgs-2d-empty-space": ("shellgs", *_DISCS, *_EMPTY_SPACE),
+    # With exposures of the photographs, which shellgs-metric has.
+    "photo-gs-exposure": ("photo-gs", "--pipeline.model.exposure", "learned"),
     # Supervised in half of the facade's bands, evaluated in the other half.
     "shellgs-without-a": ("shellgs", "--pipeline.datamanager.holdout", "A"),
     "shellgs-without-b": ("shellgs", "--pipeline.datamanager.holdout", "B"),

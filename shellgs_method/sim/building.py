@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation
@@ -21,6 +22,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.tsdf import DepthView, decimate
 from shellgs_method.occlusion import shell_verdicts
+from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.shell import ShellCaster
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo
@@ -46,6 +48,7 @@ class Reconstruction:
         views: training and held-out views.
         hidden: for each view, mask of reconstructed objects well in front of the shell: poles, trees, cars.
         held_out: names of the held-out views.
+        log_gains: exposures of the views' photographs, of which a texture has the mean.
     """
 
     folder: Path
@@ -56,6 +59,7 @@ class Reconstruction:
     views: list[View]
     hidden: list[Bool[np.ndarray, "h w"]]
     held_out: set[str]
+    log_gains: Float64[np.ndarray, "V 3"]
 
     @classmethod
     def of(
@@ -91,6 +95,7 @@ class Reconstruction:
             views,
             hidden,
             {view.name for view in run.datasets[1].views},
+            run.log_gains(),
         )
 
     @property
@@ -114,9 +119,13 @@ class Reconstruction:
         return _Photos(self)
 
     def photo(self, index: int) -> Photo:
-        """Load the photograph of a view."""
+        """Load the photograph of a view, at the mean exposure."""
         view, hidden = self.views[index], self.hidden[index]
-        image, kept = np.ascontiguousarray(load_photograph(view)), load_mask(view)
+        image, kept = torch.from_numpy(load_photograph(view)), load_mask(view)
+        if (gain := self.log_gains[index]).any():
+            at_mean = exposed(image / 255, -torch.from_numpy(gain).float())
+            image = (255 * at_mean).round().clamp(0, 255).byte()
+        image = np.ascontiguousarray(image.numpy())
         rows, columns = (np.arange(n) * m // n for n, m in zip(image.shape[:2], hidden.shape, strict=True))  # nearest
         clear = ~hidden[np.ix_(rows, columns)]
         return Photo(image, self.frame.camera(view.camera), clear if kept is None else clear & kept)

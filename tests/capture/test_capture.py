@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -26,11 +27,12 @@ from shellgs_method.capture.photographs import (
     find_masks,
     find_photographs,
     group_by_lens,
+    keep_exposure,
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
-from shellgs_method.files.photographs import has_alpha, load_mask, load_photograph
+from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 QUIET = Progress(disable=True)
@@ -500,6 +502,64 @@ def without_colmap(monkeypatch) -> list[str]:
 
     monkeypatch.setattr("shellgs_method.capture.stages.run_step", run_step)
     return steps
+
+
+def exposure_of(seconds: float, iso: int = 200) -> Image.Exif:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = "a phone"  # without any tag here, Pillow writes none into a PNG
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    tags[ExifTags.Base.ExposureTime], tags[ExifTags.Base.FNumber], tags[ExifTags.Base.ISOSpeedRatings] = (
+        seconds,
+        1.8,
+        iso,
+    )
+    return exif
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_an_undistorted_photograph_keeps_its_exposure_and_its_pixels(tmp_path, suffix):
+    """COLMAP's undistortion keeps the ISO alone."""
+    source, undistorted = tmp_path / f"a.{suffix}", tmp_path / f"undistorted.{suffix}"
+    photograph().save(source, exif=exposure_of(1 / 250))
+    of_colmap = Image.Exif()
+    of_colmap.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ISOSpeedRatings] = 200
+    photograph(60, 44, seed=1).save(undistorted, exif=of_colmap)
+    pixels = np.asarray(Image.open(undistorted))
+    for _ in range(2):
+        keep_exposure(source, undistorted)
+        np.testing.assert_array_equal(np.asarray(Image.open(undistorted)), pixels)
+        with Image.open(undistorted) as image:
+            assert dict(image.getexif().get_ifd(ExifTags.IFD.Exif)) == dict(exposure_of(1 / 250).get_ifd(0x8769))
+
+
+def test_exposures_survive_capture(tmp_path, without_colmap, monkeypatch):
+    """Renamed, undistorted, one of them turned."""
+    (tmp_path / "photographs").mkdir()
+    for k, seconds in enumerate((1 / 100, 1 / 200, 1 / 400)):
+        photograph(seed=k).save(tmp_path / "photographs" / f"IMG {k}.jpg", exif=exposure_of(seconds))
+    fake: Any = stages.run_step
+
+    def run_step(step: str, arguments: dict, **_):
+        found = fake(step, arguments)
+        if step == "undistort":
+            for name in found[0]["names"]:
+                photograph(60, 44).save(Path(arguments["output"]) / "images" / name)
+        return found
+
+    monkeypatch.setattr(stages, "run_step", run_step)
+    capture(tmp_path / "photographs", tmp_path / "scene")
+    paths = sorted((tmp_path / "scene" / "images").iterdir())
+    assert [path.name for path in paths] == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"]
+    np.testing.assert_allclose(exif_log_gains(paths) / np.log(2), [1, 0, -1], atol=1e-6)
+
+
+def test_the_light_of_a_photograph_is_that_of_its_exif_data(tmp_path):
+    cases = {"a": exposure_of(1 / 100), "b": exposure_of(1 / 100, iso=800), "none": Image.Exif(), "0": exposure_of(0.0)}
+    for name, exif in cases.items():
+        photograph().save(tmp_path / f"{name}.jpg", exif=exif)
+    gains = exif_log_gains([tmp_path / f"{name}.jpg" for name in cases])
+    np.testing.assert_allclose(gains / np.log(2), [-1, 1, 0, 0], atol=1e-6)
+    np.testing.assert_array_equal(exif_log_gains([tmp_path / "none.jpg"]), [0])
 
 
 @pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])

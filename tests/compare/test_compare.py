@@ -18,6 +18,8 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import psutil
@@ -31,7 +33,7 @@ from training_runs import Method, trainer_of
 
 from shellgs_method import cli
 from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_metrics
-from shellgs_method.compare.plots import DOT, dotted, recorded_metrics
+from shellgs_method.compare.plots import DOT, dotted, exposures, recorded_metrics
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
 from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
@@ -782,3 +784,18 @@ def test_ablations_without_their_method_have_a_report(measured, tmp_path):
 
 def test_curves_hold_all_held_out_views(measured):
     assert sorted(recorded_metrics(measured[1])["normal_deg"]) == [2]
+
+
+def test_exposures_are_plotted_of_the_runs_that_learned_them(tmp_path):
+    def run(name: str, state: dict) -> Run:
+        folder = tmp_path / name
+        folder.mkdir()
+        torch.save({"step": 1, "pipeline": state, "optimizers": {}, "scalers": {}}, folder / "step-000000001.ckpt")
+        found = SimpleNamespace(variant=SimpleNamespace(name=name, ours=True), trained=True, checkpoints=folder)
+        return cast(Run, found)
+
+    fixed, learned = run("photo-gs", {}), run("shellgs-metric", {"_model.exposures.parameter": torch.randn(5, 3)})
+    assert not exposures([fixed], tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+    assert exposures([fixed, learned], tmp_path / "stops.png")
+    assert Image.open(tmp_path / "stops.png").size[0] == 4 * 130  # one panel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -104,8 +105,9 @@ def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_shell_and_skybox
     trainer = trainer_of(pristine_scene, tmp_path / "a", "shellgs_metric", change=choose)
     model, data = model_of(trainer), data_of(trainer)
     sfm = model_of(trainer_of(pristine_scene, tmp_path / "b", "shellgs", change=choose))
-    n, on_shell = sfm.num_points, shell_seeds(*data.seed_views(view_of_surface, "shell"), SEED_SPACING, MAX_SEEDS)
-    in_sky = skybox_seeds(*data.seed_views(view_of_sky), data.sfm_points.double().numpy(), SKYBOX_SEEDS)
+    n, views = sfm.num_points, partial(data.seed_views, log_gains=data.log_gains()[0])
+    on_shell = shell_seeds(*views(view_of_surface, "shell"), SEED_SPACING, MAX_SEEDS)
+    in_sky = skybox_seeds(*views(view_of_sky), data.sfm_points.double().numpy(), SKYBOX_SEEDS)
     seeds = Seeds(*map(np.concatenate, zip(on_shell, in_sky, strict=True)))
     assert len(on_shell.points) > 50
     torch.testing.assert_close(model.means[:n], sfm.means)

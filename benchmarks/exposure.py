@@ -1,0 +1,138 @@
+"""What exposure and white balance that change along the walk cost a method: runs with them against runs without.
+
+python -m benchmarks.exposure outputs/exposure --scene scenes/synthetic --method shellgs-metric
+python -m benchmarks.exposure outputs/exposure --scene scenes/herz-jesu-p25 --method photo-gs --exposure fixed
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Float64
+from numpy import ndarray
+from PIL import Image
+from scipy.ndimage import gaussian_filter1d
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.compare.measure import measure
+from shellgs_method.files.atomic import unfinished
+from shellgs_method.files.photographs import read_image
+from shellgs_method.synthetic.appearance import developed, exposed
+from shellgs_method.synthetic.scene import Facade, FacadeConfig, _generators, settings_of
+
+STOPS, BALANCE = 0.7, 0.08
+"""Largest change of exposure in stops, and of red and blue against green."""
+JUMPS = 3
+GOALS = {"cc_psnr_seen": 0.3, "chamfer_m": 0.002, "f_score_5cm": 0.005}
+"""Differences that are wanted at most between a run with changing light and one without."""
+SHOWN = ("psnr_seen", "cc_psnr_seen", "cc_psnr_on_shell", "cc_psnr_before_shell", "chamfer_m", "f_score_5cm")
+
+
+def main(
+    work: Annotated[Path, tyro.conf.Positional],
+    scene: Path,
+    method: str = "shellgs-metric",
+    exposure: Literal["learned", "fixed"] = "learned",
+    iterations: int = 750,
+    seeds: tuple[int, ...] = (0,),
+    only: Literal["both", "constant", "changing"] = "both",
+    more: tuple[str, ...] = (),
+) -> None:
+    """Train a method on a scene and on the same scene in changing light, and print the difference of their metrics.
+
+    Args:
+        work: folder for the scene in changing light and the runs.
+        scene: a prepared scene: `shellgs cast` was run.
+        method: method to train.
+        exposure: whether it learns exposures.
+        iterations: length of the runs.
+        seeds: seeds of the runs.
+        only: train only on one of the two scenes.
+        more: more words for ns-train.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    changing = work / "scenes" / scene.name
+    if not changing.exists():
+        write_in_changing_light(scene, changing)
+        subprocess.run(["shellgs", "cast", str(changing)], check=True)
+    scenes = {"constant": scene, "changing": changing}
+    means = {}
+    for light, data in scenes.items():
+        if only in ("both", light):
+            runs = [_metrics(work, light, data, method, exposure, iterations, seed, more) for seed in seeds]
+            means[light] = {key: np.array([run[key] for run in runs]) for key in SHOWN if key in runs[0]}
+            print(f"{scene.name}, {method}, exposure {exposure}, {light} light, {iterations} iterations", *more)
+            for key, values in means[light].items():
+                print(f"  {key:22} {values.mean():8.4f} ± {values.std(ddof=1) if len(values) > 1 else 0:.4f}")
+    if len(means) == 2:
+        for key, goal in GOALS.items():
+            difference = means["changing"][key].mean() - means["constant"][key].mean()
+            print(f"  {key:22} {difference:+.4f}, goal {goal} at most")
+
+
+def log_gains(count: int, seed: int = 0) -> Float64[ndarray, "V 3"]:
+    """Logarithms of gains in linear light, along a walk: smooth, with jumps."""
+    rng = np.random.default_rng(seed)
+
+    def walk() -> Float64[ndarray, " V"]:
+        smooth = gaussian_filter1d(rng.normal(size=count), count / 10, mode="wrap")
+        jumps = (np.arange(count)[:, None] >= rng.choice(count, JUMPS)) @ rng.choice([-1.0, 1.0], JUMPS)
+        found = smooth / smooth.std() + 0.7 * (jumps - jumps.mean())
+        return found / np.abs(found).max()
+
+    stops, red, blue = walk(), walk(), walk()
+    balance = np.stack([1 + BALANCE * red, np.ones(count), 1 + BALANCE * blue], axis=1)
+    return np.log(2) * STOPS * stops[:, None] + np.log(balance)
+
+
+def write_in_changing_light(scene: Path, target: Path) -> None:
+    """Copy a scene; of its photographs, the synthetic facade's are taken again, others are changed in linear light."""
+    copy = unfinished(target)
+    shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("checked"))
+    views = read_views(FacadeDataParserConfig(data=copy))
+    gains = np.exp(log_gains(len(views)))
+    if (scene / "facade.json").exists():
+        config = FacadeConfig(**settings_of(scene))
+        facade, sensor = Facade.build(config), _generators(config.seed + 1, 3)[0]
+        images = [
+            developed(gain * exposed(facade.daylight, camera, config.supersampling), sensor)
+            for gain, camera in zip(gains, facade.cameras, strict=True)
+        ]
+    else:
+        images = [_changed(np.asarray(read_image(v.image)), gain) for v, gain in zip(views, gains, strict=True)]
+    for view, image in zip(views, images, strict=True):
+        view.image.unlink()  # it may be a link
+        Image.fromarray(image).save(view.image, quality=98, subsampling=0)
+    copy.rename(target)
+
+
+def _changed(image: ndarray, gain: Float64[ndarray, " 3"]) -> ndarray:
+    """A photograph under a gain before its sRGB curve, clipping and 8 bits."""
+    x = image / 255
+    linear = gain * np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    stored = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(0) ** (1 / 2.4) - 0.055)
+    return (255 * stored.clip(0, 1)).round().astype(np.uint8)
+
+
+def _metrics(
+    work: Path, light: str, data: Path, method: str, exposure: str, iterations: int, seed: int, more: tuple[str, ...]
+) -> dict[str, float]:
+    """Metrics of a run, which is trained if it was not yet."""
+    name = "-".join([light, method, exposure, str(iterations), *(word.strip("-") for word in more)])
+    folder = work / data.name / name / method / f"seed-{seed}"
+    if not any(folder.glob("nerfstudio_models/*.ckpt")):
+        words = ["ns-train", method, "--data", data, "--output-dir", work, "--experiment-name", f"{data.name}/{name}"]
+        words += ["--timestamp", f"seed-{seed}", "--max-num-iterations", iterations, "--machine.seed", seed]
+        words += ["--vis", "tensorboard", "--pipeline.model.exposure", exposure, "--steps-per-eval-image", 0, *more]
+        subprocess.run(list(map(str, words)), check=True, stdout=subprocess.DEVNULL)
+    return measure(folder / "config.yml")["results"]
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,37 @@
+"""Exposure and white balance of the training photographs, learned with the run."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class Exposures(nn.Module):
+    """A gain per channel in linear light for each of V photographs.
+
+    Their logarithms have a mean of 0 over the photographs whatever the parameter is, so that the Gaussians, and all
+    that is exported from them, have the mean exposure: no tint can be learned that cancels.
+    """
+
+    def __init__(self, num_views: int):
+        super().__init__()
+        self.parameter = nn.Parameter(torch.zeros(num_views, 3))
+
+    @property
+    def log_gains(self) -> Float[Tensor, "V 3"]:
+        """Logarithms of the gains."""
+        return self.parameter - self.parameter.mean(dim=0)
+
+    def start(self, log_gains: Float[np.ndarray, "V 3"]) -> None:
+        """Start from gains that are known."""
+        self.parameter.data = torch.from_numpy(log_gains).to(self.parameter)
+
+    @property
+    def spread(self) -> Float[Tensor, ""]:
+        """Standard deviation of the exposures in stops."""
+        stops = self.log_gains.detach().mean(dim=1) / math.log(2)
+        return stops.std(correction=0)

@@ -1,0 +1,181 @@
+"""Exposures of photographs, learned with a run: their mean, their start, checkpoints, and what is exported."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from training_runs import data_of, model_of, render, trainer_of
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.export.runs import TrainedRun
+from shellgs_method.gaussians.exposures import Exposures
+from shellgs_method.occlusion.exposure import exposed
+from shellgs_method.trainer import FacadeTrainer
+
+STOPS = np.log(2)
+GAINS = 0.6 * STOPS * np.sin(np.arange(10))[:, None] * [1.0, 0.9, 1.1]
+
+
+def learned(config) -> None:
+    config.pipeline.model.exposure = "learned"
+
+
+@pytest.fixture(scope="module")
+def changing(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene with another exposure and white balance in each photograph."""
+    scene = Path(shutil.copytree(pristine_scene, tmp_path_factory.mktemp("changing") / "scene"))
+    for view, gain in zip(read_views(FacadeDataParserConfig(data=scene)), GAINS, strict=True):
+        image = torch.from_numpy(np.array(Image.open(view.image))) / 255
+        image = exposed(image, torch.from_numpy(gain).float()).clamp(0, 1)
+        Image.fromarray((255 * image).round().byte().numpy()).save(view.image)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def trained(changing: Path, tmp_path_factory: pytest.TempPathFactory) -> FacadeTrainer:
+    """A shellgs-metric run of 60 iterations in changing light."""
+    trainer = trainer_of(changing, tmp_path_factory.mktemp("run"), "shellgs_metric", iterations=60)
+    trainer.train()
+    trainer.pipeline.eval()
+    return trainer
+
+
+def of_training(trainer: FacadeTrainer) -> np.ndarray:
+    gains = GAINS[[k for k in range(10) if k % 8]]
+    return gains - gains.mean(axis=0)
+
+
+def log_gains(trainer: FacadeTrainer) -> np.ndarray:
+    exposures = model_of(trainer).exposures
+    assert exposures is not None
+    return exposures.log_gains.detach().numpy()
+
+
+@pytest.mark.parametrize("method", ["shellgs_metric", "photo_gs"])
+def test_a_run_starts_from_the_exposures_of_its_photographs(changing, tmp_path, method):
+    trainer = trainer_of(changing, tmp_path, method, change=learned)
+    np.testing.assert_allclose(log_gains(trainer), of_training(trainer), atol=0.15 * STOPS)
+
+
+def test_seeds_have_the_mean_exposure(changing, pristine_scene, tmp_path):
+    """Their colours differ less from those of the scene in constant light than the photographs do."""
+    colours = {}
+    for name, scene in {"changing": changing, "constant": pristine_scene}.items():
+        trainer = trainer_of(scene, tmp_path / name, "shellgs_metric")
+        colours[name] = model_of(trainer).colors.detach()
+    count = min(map(len, colours.values()))
+    mean = torch.from_numpy(GAINS[[k for k in range(10) if k % 8]].mean(axis=0)).float()
+    expected = exposed(colours["constant"][:count], mean)
+    assert (colours["changing"][:count] - expected).abs().median() < 0.03
+
+
+def test_gains_stay_near_the_true_ones_and_have_a_mean_of_zero(trained):
+    found = log_gains(trained)
+    np.testing.assert_allclose(found.mean(axis=0), 0, atol=1e-7)
+    np.testing.assert_allclose(found, of_training(trained), atol=0.2 * STOPS)
+
+
+def test_their_mean_is_zero_whatever_the_optimizer_does():
+    exposures = Exposures(7)
+    exposures.start(np.random.default_rng(0).normal(3, 1, (7, 3)))
+    optimizer = torch.optim.Adam(exposures.parameters(), lr=0.5)
+    for view in range(7):
+        (exposures.log_gains[view] ** 2).sum().backward()
+        optimizer.step()
+    torch.testing.assert_close(exposures.log_gains.double().mean(dim=0), torch.zeros(3).double(), atol=1e-6, rtol=0)
+
+
+def test_a_photograph_is_compared_with_the_render_at_its_exposure(trained):
+    model, (camera, batch) = model_of(trained), data_of(trained).next_train(0)
+    exposures = model.exposures
+    assert exposures is not None
+    at_mean = model.get_outputs_for_camera(camera)["rgb"]
+    model.train()
+    in_training = model.get_outputs(camera)["rgb"]
+    model.eval()
+    gain = exposures.log_gains[batch["image_idx"]].detach()
+    inside = (at_mean < 0.95).all(dim=-1)
+    expected = exposed(at_mean, gain).clamp(0, 1)
+    torch.testing.assert_close(in_training.detach()[inside], expected[inside], atol=2e-3, rtol=0)
+
+
+def test_held_out_views_and_splats_do_not_depend_on_the_exposures(trained):
+    """Their mean is 0, so that what is rendered and exported has the mean exposure of the photographs."""
+    model = model_of(trained)
+    assert model.exposures is not None
+    run = TrainedRun(model, data_of(trained))
+    before, parameter = (render(trained), run.splats()), copy.deepcopy(model.exposures.parameter.data)
+    model.exposures.parameter.data = torch.randn_like(parameter)
+    after = render(trained), run.splats()
+    model.exposures.parameter.data = parameter
+    torch.testing.assert_close(before[0]["rgb"], after[0]["rgb"])
+    torch.testing.assert_close(before[1].harmonics, after[1].harmonics)
+
+
+def test_renders_are_as_bright_as_the_photographs_at_their_mean_exposure(trained):
+    model, dataset, apart = model_of(trained), data_of(trained).train_dataset, []
+    for index, gain in enumerate(of_training(trained)):
+        photograph = torch.from_numpy(dataset.get_numpy_image(index)) / 255
+        render = model.get_outputs_for_camera(dataset.cameras[index : index + 1])["rgb"]
+        apart.append((render - exposed(photograph, -torch.from_numpy(gain).float()).clamp(0, 1)).median())
+    assert max(abs(difference) for difference in apart) < 0.04
+
+
+def test_photographs_of_a_texture_are_brought_to_the_mean_exposure(trained):
+    """Those of training views by their learned exposures, held-out ones by their renders."""
+    found = TrainedRun(model_of(trained), data_of(trained)).log_gains()
+    np.testing.assert_allclose(found[:8], log_gains(trained), atol=1e-6)
+    mean = GAINS[[k for k in range(10) if k % 8]].mean(axis=0)
+    np.testing.assert_allclose(found[8:], GAINS[[0, 8]] - mean, atol=0.5 * STOPS)
+
+
+def test_a_resumed_run_has_the_same_exposures(changing, tmp_path, trained):
+    half = trainer_of(changing, tmp_path / "half", "shellgs_metric", 60)
+    half.config.steps_per_save = 30
+    half._last_step = 30
+    half.train()
+    resumed = trainer_of(changing, tmp_path / "resumed", "shellgs_metric", 60, load_dir=half.checkpoint_dir)
+    np.testing.assert_array_equal(log_gains(resumed), log_gains(half))
+    resumed.train()
+    np.testing.assert_allclose(log_gains(resumed), log_gains(trained), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"), [("fixed", "learned", "has no exposures"), ("learned", "fixed", "exposure learned")]
+)
+def test_a_checkpoint_with_the_other_setting_is_refused_in_a_sentence(pristine_scene, tmp_path, before, after, message):
+    def chosen(name):
+        return lambda config: setattr(config.pipeline.model, "exposure", name)
+
+    old = trainer_of(pristine_scene, tmp_path / "old", "photo_gs", 2, change=chosen(before))
+    old.train()
+    with pytest.raises(SystemExit, match=message):
+        trainer_of(pristine_scene, tmp_path / "new", "photo_gs", 4, load_dir=old.checkpoint_dir, change=chosen(after))
+
+
+def test_a_checkpoint_of_other_photographs_is_refused_for_training(pristine_scene, changing, tmp_path):
+    old = trainer_of(pristine_scene, tmp_path / "old", "photo_gs", 2, change=learned)
+    old.train()
+
+    def fewer(config):
+        learned(config)
+        config.pipeline.datamanager.dataparser.eval_interval = 3
+
+    with pytest.raises(SystemExit, match="exposures of 8 photographs"):
+        trainer_of(pristine_scene, tmp_path / "new", "photo_gs", 4, load_dir=old.checkpoint_dir, change=fewer)
+
+
+def test_the_log_has_their_spread(trained):
+    model, (camera, batch) = model_of(trained), data_of(trained).next_train(0)
+    model.train()
+    model.step = 0
+    metrics = model.get_metrics_dict(model.get_outputs(camera), batch)
+    model.eval()
+    stops = log_gains(trained).mean(axis=1) / STOPS
+    assert float(metrics["exposure_stops"]) == pytest.approx(stops.std(), rel=1e-4)

@@ -1,0 +1,124 @@
+"""Exposures of photographs by their colours of the same points, against gains that were made, and sRGB's curve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.occlusion.exposure import (
+    Exposed,
+    Sightings,
+    exposed,
+    log_gains,
+    sightings_of_points,
+    sightings_on_surface,
+)
+
+RNG = np.random.default_rng(0)
+VIEWS, POINTS = 12, 200
+GAINS = RNG.uniform(-0.4, 0.4, (VIEWS, 3))
+GAINS -= GAINS.mean(axis=0)
+UNKNOWN = np.zeros(VIEWS)
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def sightings(gains: np.ndarray = GAINS) -> Sightings:
+    """Points along a walk, each seen in three neighbouring views, in 8 bits."""
+    colours = RNG.uniform(0.05, 0.95, (POINTS, 3))
+    point = np.repeat(np.arange(POINTS), 3)
+    view = RNG.integers(0, VIEWS - 2, POINTS)[point] + np.tile(np.arange(3), POINTS)
+    return Sightings(view, point, (255 * srgb(colours[point] * np.exp(gains[view]))).round() / 255)
+
+
+@pytest.mark.parametrize("stops", [-0.7, 0.0, 0.7])
+def test_a_gain_in_linear_light_is_a_scale_about_the_foot_of_the_curve(stops):
+    linear = np.linspace(0.0072, 0.6, 50)[:, None].repeat(3, axis=1)  # above the toe
+    gained = exposed(torch.from_numpy(srgb(linear)), torch.full((3,), stops * np.log(2), dtype=torch.float64))
+    np.testing.assert_allclose(gained.numpy(), srgb(linear * 2**stops), atol=2e-6)
+
+
+def test_gains_are_found_along_a_walk_though_many_points_are_clipped():
+    np.testing.assert_allclose(log_gains(sightings(), UNKNOWN), GAINS, atol=0.02)
+
+
+def test_a_third_of_wrong_colours_does_not_change_the_gains():
+    seen = sightings()
+    wrong = RNG.uniform(size=len(seen.view)) < 0.15  # of 38 % of the points
+    colour = np.where(wrong[:, None], RNG.uniform(0.1, 0.9, seen.colour.shape), seen.colour)
+    np.testing.assert_allclose(log_gains(seen._replace(colour=colour), UNKNOWN), GAINS, atol=0.03)
+
+
+def test_residuals_are_least_in_absolute_value():
+    """Against a linear programme over all gains and points."""
+    views, points = 4, 12
+    view, point = np.indices((views, points)).reshape(2, -1)
+    seen = Sightings(view, point, RNG.uniform(0.2, 0.9, (views * points, 3)))
+    found = log_gains(seen, np.zeros(views))[:, 0]
+    log = 2.4 * np.log((seen.colour[:, 0] + 0.055) / 1.055)
+    count = len(log)
+    design = np.zeros((count, views + points))
+    design[np.arange(count), seen.view] = design[np.arange(count), views + seen.point] = 1
+    ones = np.eye(count)
+    solved = linprog(
+        np.r_[np.zeros(views + points), np.ones(count)],
+        np.block([[design, -ones], [-design, -ones]]),
+        np.r_[log, -log],
+        bounds=[(None, None)] * (views + points) + [(0, None)] * count,
+    )
+    residuals = log - found[seen.view]
+    least = sum(np.abs(r - np.median(r)).sum() for r in (residuals[seen.point == p] for p in range(points)))
+    assert least < 1.03 * solved.fun
+
+
+def test_a_photograph_without_points_takes_what_is_known():
+    seen = sightings()
+    known = GAINS.mean(axis=1)
+    without = Sightings(*(each[(seen.view != 5)] for each in seen))
+    found = log_gains(without, known)
+    assert found[5] - found.mean(axis=0) == pytest.approx(known[5], abs=0.03)
+    assert log_gains(Sightings(*(each[:0] for each in seen)), UNKNOWN) == pytest.approx(0)
+    # Where points tell, they count, whatever is known.
+    np.testing.assert_allclose(log_gains(seen, -known), GAINS, atol=0.04)
+
+
+def wall(x: float, gain: np.ndarray) -> Exposed:
+    """A view from x of a coloured wall at z = 4."""
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = -x
+    camera = Camera(viewmat, torch.tensor([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), 80, 60)
+    depth = torch.full((60, 80), 4.0)
+    points = (depth[..., None] * camera.rays()).numpy() + np.array([x, 0, 0])
+    linear = 0.35 + 0.2 * np.sin(np.stack([points[..., 0], points[..., 1], points[..., 0] + points[..., 1]], axis=-1))
+    return Exposed.of(camera, torch.from_numpy(srgb(linear * np.exp(gain))).float(), depth)
+
+
+def test_gains_are_found_on_a_surface_and_at_points_and_what_hides_it_does_not_count():
+    views = [wall(0.5 * index, gain) for index, gain in enumerate(GAINS)]
+    hidden = views[3].depth.clone()
+    hidden[:, :40] = 2.0
+    image = views[3].image.clone()
+    image[:, :40] = 0.5
+    views[3] = views[3]._replace(depth=hidden, image=image)
+    on_surface = sightings_on_surface(views)
+    np.testing.assert_allclose(log_gains(on_surface, UNKNOWN), GAINS, atol=0.02)
+    points = torch.from_numpy(RNG.uniform([-1, -1, 4], [7, 1, 4], (400, 3))).float()
+    everywhere = [slice(None)] * VIEWS
+    of_points = sightings_of_points(views, points, everywhere)
+    np.testing.assert_allclose(log_gains(of_points, UNKNOWN), GAINS, atol=0.03)
+    both = of_points.with_others(on_surface)
+    assert len(np.unique(both.point)) == len(np.unique(of_points.point)) + len(np.unique(on_surface.point))
+    observed = [np.arange(5), *[np.empty(0, int)] * (VIEWS - 1)]
+    assert set(sightings_of_points(views, points, observed).point) <= set(range(5))
+
+
+def test_the_gain_of_a_point_is_the_mean_of_the_photographs_that_show_it():
+    seen = Sightings(np.array([0, 1, 1]), np.array([0, 0, 2]), np.zeros((3, 3)))
+    means = seen.mean_of_views(GAINS, 3)
+    np.testing.assert_allclose(means, [(GAINS[0] + GAINS[1]) / 2, [0, 0, 0], GAINS[1]])
