@@ -29,7 +29,8 @@ def elementwise(function: Function, *inputs: Float[Tensor, "*#elements k"]) -> t
 
     Args:
         function: takes the list of coordinates of each input, and returns lists of coordinates. What it may do with
-            them is in :mod:`~.symbols`: arithmetic, comparisons, ``detach``, and some functions of torch.
+            them is in :mod:`~.symbols`: arithmetic, comparisons, ``detach``, and some functions of torch. It is
+            compiled once, so it must be the same object in each call.
         inputs: coordinates, along the last dimension, of elements in one or two dimensions, which are broadcast.
     """
     shape = torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))

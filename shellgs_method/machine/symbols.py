@@ -105,11 +105,12 @@ def _log(x: Symbol) -> Symbol:
 
 _FUNCTIONS: dict[Callable[..., Any], Callable[..., Symbol]] = {
     torch.where: _where,
-    torch.relu: lambda x: _where(x > 0, x, 0.0),
-    torch.abs: lambda x: _where(x > 0, x, -x),
+    # As in torch, NaN stays NaN.
+    torch.relu: lambda x: _where(x <= 0, 0.0, x),
+    torch.abs: lambda x: _where(x < 0, -x, x),
+    torch.clamp_min: lambda x, low: _where(x < low, low, x),
     torch.minimum: lambda a, b: _where(a < b, a, b),
     torch.maximum: lambda a, b: _where(a > b, a, b),
-    torch.clamp_min: lambda x, low: _where(x > low, x, low),
     torch.sqrt: _sqrt,
     torch.log: _log,
     torch.log2: lambda x: _log(x) * (1 / math.log(2)),

@@ -85,6 +85,13 @@ def test_an_output_without_a_gradient_costs_none(compiler):
     torch.testing.assert_close(torch.autograd.grad(total.sum(), a)[0], b)
 
 
+def test_what_is_not_a_number_stays_so(compiler):
+    def function(x):
+        return [[torch.relu(x[0]), torch.abs(x[0]), torch.clamp_min(x[0], 1.0), torch.sqrt(x[0]) + torch.log(x[0])]]
+
+    assert elementwise(function, torch.full((20, 1), math.nan))[0].isnan().all()
+
+
 def test_no_elements_are_no_error(compiler):
     total, products = elementwise(mixed, torch.zeros(0, 3), torch.zeros(0, 3), torch.ones(1))
     assert total.shape == (0, 1)
