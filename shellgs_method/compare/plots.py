@@ -16,6 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.runs import Run
+from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
@@ -83,12 +84,15 @@ def curves(runs: Sequence[Run], path: Path) -> bool:
 def exposures(runs: Sequence[Run], path: Path) -> bool:
     """Plot the exposures that the training photographs were found to have, in stops, in the order of their names.
 
-    One line per variant, of its first seed; False if no run learned any.
+    One line per variant, of its first seed whose checkpoint is still there and readable; False if no run learned any.
     """
     found: dict[str, Float[np.ndarray, "V 3"]] = {}
     for run in runs:
         if run.variant.ours and run.trained and run.variant.name not in found:
-            state = load_checkpoint(find_checkpoint(run.checkpoints))["pipeline"]
+            try:
+                state = load_checkpoint(find_checkpoint(run.checkpoints))["pipeline"]
+            except (FileNotFoundError, SceneError):  # the results of a finished run need none
+                continue
             if (stored := state.get("_model.exposures.parameter")) is not None:
                 found[run.variant.name] = ((stored - stored.mean(dim=0)) / np.log(2)).numpy()
     if not found:
