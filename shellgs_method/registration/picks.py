@@ -87,7 +87,7 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
         point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
         view = view_named(words[5], views, where)
         if view is None:
-            raise SceneError(f"{where}: {words[5]} is not a photograph of the scene")
+            raise SceneError(f"{where}: {words[5]} is not a photograph of the scene; quote a name with spaces")
         name = words[6] if len(words) > 6 else " ".join(words[:3])
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")
