@@ -615,13 +615,14 @@ def captured_views(tmp_path) -> list[View]:
     return [replace(view, name=name, image=Path(name)) for view, name in zip(rig(len(scene))[0], scene, strict=True)]
 
 
-def test_names_from_before_a_capture_still_mean_their_photographs(captured_views, tmp_path):
+def test_names_from_before_a_capture_still_mean_their_photographs(captured_views, tmp_path, caplog):
     (tmp_path / "geo.txt").write_text("".join(f"{name} {k} 2 3\n" for k, name in enumerate(USERS_NAMES.values())))
     (tmp_path / "gcp_list.txt").write_text("".join(f"1 2 3 {k} 5 {n} a\n" for k, n in enumerate(USERS_NAMES.values())))
     positions = read_positions(tmp_path / "geo.txt", captured_views)
     (pick,) = read_picks(tmp_path / "gcp_list.txt", captured_views)
     assert positions.unknown == []
     assert [view.name for view in positions.views] == [view.name for view in captured_views]
+    assert "IMG 0001 #2.JPG is images/IMG_0001__2.JPG, for example): pixels must be" in caplog.text
     assert pick.pixels == {view.name: (k, 5) for k, view in enumerate(captured_views)}
 
 
