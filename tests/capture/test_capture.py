@@ -16,6 +16,8 @@ from av.stream import Disposition
 from PIL import ExifTags, Image, ImageFilter
 from rich.progress import Progress
 from scenes import photograph, write_video
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
@@ -486,6 +488,25 @@ def test_photographs_that_do_not_belong_together_are_refused_with_advice(tmp_pat
     with pytest.raises(SceneError, match=r"only 0 of 4 photographs were found.*--matching exhaustive"):
         capture(folder, tmp_path / "scen å")
     assert [path.name for path in (tmp_path / "scen å").iterdir()] == ["capture"]
+
+
+@pytest.mark.slow
+def test_a_camera_that_only_turns_is_refused_for_its_lack_of_parallax(tmp_path):
+    """Photographs related by K R K⁻¹ alone, as of a tripod, with a sensor's noise."""
+    (tmp_path / "turned").mkdir()
+    random = np.random.default_rng(0)
+    blobs = sum(gaussian_filter(random.normal(0, 40 * size, (900, 1600)), size) for size in (2, 4, 8))
+    scene = Image.fromarray((128 + np.asarray(blobs)).clip(0, 255).astype(np.uint8)).convert("RGB")
+    K_scene, K = (np.array([[900.0, 0, w / 2], [0, 900, h / 2], [0, 0, 1]]) for w, h in ((1600, 900), (640, 480)))
+    for k, yaw in enumerate(np.linspace(-12, 12, 9)):
+        H = K_scene @ Rotation.from_euler("yx", [yaw, 4 * np.sin(k)], degrees=True).as_matrix() @ np.linalg.inv(K)
+        turned = scene.transform(
+            (640, 480), Image.Transform.PERSPECTIVE, (H / H[2, 2]).ravel()[:8], Image.Resampling.BICUBIC
+        )
+        noisy = np.asarray(turned) + random.normal(0, 3, (480, 640, 3))
+        Image.fromarray(noisy.clip(0, 255).astype(np.uint8)).save(tmp_path / "turned" / f"{k:02d}.png")
+    with pytest.raises(SceneError, match=r"show no parallax: .* Walk sideways"):
+        capture(tmp_path / "turned", tmp_path / "scene")
 
 
 def test_a_failure_of_colmap_is_reported_in_one_sentence(tmp_path):
