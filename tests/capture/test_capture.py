@@ -35,7 +35,7 @@ from shellgs_method.capture.photographs import (
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
-from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph
+from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph, read_image
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 QUIET = Progress(disable=True)
@@ -183,6 +183,16 @@ def test_an_hdr_video_is_tone_mapped_and_this_is_told(tmp_path, caplog, characte
     with Image.open(next((tmp_path / "frames").iterdir())) as frame:
         assert frame.size == (64, 48)
         assert np.asarray(frame).mean() == pytest.approx({"HLG": 233, "PQ": 255, None: 191}[name], abs=3)
+
+
+def test_the_flat_colours_of_hdr_photographs_are_told(tmp_path, caplog):
+    sdr, hlg = b"colrnclx\0\x01\0\x0d", b"colrnclx\0\x09\0\x12"  # primaries and transfer
+    assert sdr in PHONE.read_bytes()
+    (tmp_path / "hlg.heic").write_bytes(PHONE.read_bytes().replace(sdr, hlg))
+    read_image(PHONE)
+    assert "HDR" not in caplog.text
+    read_image(tmp_path / "hlg.heic")
+    assert "holds HDR photographs" in caplog.text
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no video" * 100])
