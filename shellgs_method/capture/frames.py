@@ -13,16 +13,18 @@ import numpy as np
 from av.stream import Disposition
 from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
+from PIL import Image
 from rich.progress import Progress
 from scipy.ndimage import laplace, median_filter
 
+from shellgs_method.capture.hdr import Transfer, tone_mapped
 from shellgs_method.errors import SceneError, notice
 
 FRAMES_PER_SECOND = 5
 """Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
 
 _PICTURES = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
-_HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics (ITU-T H.273)
+_HDR: dict[int, Transfer] = {16: "PQ", 18: "HLG"}  # transfer characteristics (ITU-T H.273)
 _NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
 
 
@@ -35,7 +37,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         SceneError: the file cannot be read as a video, or holds no frame.
     """
     with _opened(video) as (container, stream):
-        _tell_of_hdr(video, stream)
+        transfer = _hdr(video, stream)
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         sharpnesses, times = [], []
         for frame in container.decode(stream):
@@ -50,7 +52,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     with _opened(video) as (container, stream):
         for number, frame in enumerate(container.decode(stream)):
             if number in chosen:
-                image = frame.to_image().rotate(frame.rotation, expand=True)
+                image = _upright(frame, transfer)
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
                 progress.advance(task)
 
@@ -104,9 +106,19 @@ def _main_stream(video: Path, streams: Sequence[VideoStream]) -> VideoStream:
     return largest
 
 
-def _tell_of_hdr(video: Path, stream: VideoStream) -> None:
-    if kind := _HDR.get(stream.codec_context.color_trc):
+def _hdr(video: Path, stream: VideoStream) -> Transfer | None:
+    transfer = _HDR.get(stream.codec_context.color_trc)
+    if transfer:
         notice(
-            f"{video} is HDR ({kind}), and its frames are taken without tone mapping, with flat colours: for true "
-            "ones, record or export it as SDR, or convert it with ffmpeg's filters zscale and tonemap."
+            f"{video} is HDR ({transfer}), and its frames are tone-mapped to the colours of a photograph: bright walls "
+            "lose contrast; record or export it as SDR if you can."
         )
+    return transfer
+
+
+def _upright(frame: av.VideoFrame, transfer: Transfer | None) -> Image.Image:
+    if transfer is None:
+        image = frame.to_image()
+    else:
+        image = Image.fromarray(tone_mapped(frame.to_ndarray(format="rgb48le"), transfer))
+    return image.rotate(frame.rotation, expand=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import zlib
 from collections import Counter
@@ -17,11 +16,19 @@ from PIL import ExifTags, Image, ImageOps
 from shellgs_method.capture.config import Cameras
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write
-from shellgs_method.files.paths import DEVELOP, PHOTOGRAPHS, RAW, mask_names, photographs_in, tell_of_masks
+from shellgs_method.files.paths import (
+    CAPTURED,
+    DEVELOP,
+    PHOTOGRAPHS,
+    RAW,
+    captured_name,
+    mask_names,
+    photographs_in,
+    tell_of_masks,
+)
 
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv"}
 """Suffixes of videos, in lower case."""
-_FORMATS = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}  # these keep their format, others become PNG
 _LENS_TAGS = (
     ExifTags.Base.Make,
     ExifTags.Base.Model,
@@ -43,10 +50,7 @@ def find_photographs(folder: Path) -> dict[str, Path]:
     photographs = photographs_in(folder, deep=True)
     _tell_what_is_left_out(folder, photographs)
     for path in photographs:
-        relative = path.relative_to(folder)
-        kept = relative if path.suffix.lower() in _FORMATS else relative.with_suffix(".png")
-        # COLMAP's lists of pairs are split at blanks, and # starts a comment.
-        name = re.sub(r"[\s#]", "_", kept.as_posix())
+        name = captured_name(path.relative_to(folder))
         if name in found:
             raise SceneError(f"{found[name]} and {path} would both become {name} in the scene: rename one of them")
         found[name] = path
@@ -79,7 +83,7 @@ def add_photograph(source: Path, target: Path) -> None:
     from shellgs_method.files.photographs import read_image, without_hidden  # imports torch, which is slow
 
     target.parent.mkdir(parents=True, exist_ok=True)
-    wanted = _FORMATS[target.suffix.lower()]
+    wanted = CAPTURED[target.suffix.lower()]
     image = read_image(source)
     with Image.open(source) as stored:
         is_plain = stored.mode in ("L", "RGB") and not stored.has_transparency_data

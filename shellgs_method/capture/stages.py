@@ -28,7 +28,7 @@ from shellgs_method.capture.photographs import (
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work, listing
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
 
 WORK = Path("capture")
@@ -36,6 +36,9 @@ WORK = Path("capture")
 
 SUSPICIOUS_ERROR = 0.75
 """Mean reprojection error in pixels: correct models of real and synthetic facades had 0.4 to 0.65, folded ones more."""
+
+_HOMOGRAPHIES = (4, 5, 6)  # COLMAP's PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
+_NO_PARALLAX = 0.95  # share of such pairs: all of a camera on a tripod, a sixth of a walk along the synthetic facade
 
 _SIFT = {
     "fast": {"max_image_size": 1600, "max_num_features": 4096, "first_octave": 0},
@@ -200,7 +203,8 @@ class _Capture:
         with self.work.making("model", self.model_key) as folder:
             arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
             models = self._step("reconstruct", "finding cameras", len(self.names), None, **arguments)
-            (folder / "models.json").write_text(json.dumps({"photographs": self.names, "models": models}))
+            found = {"photographs": self.names, "models": models, "flat_pairs": _flat_pairs(database)}
+            (folder / "models.json").write_text(json.dumps(found))
 
     def _largest_model(self, found: dict[str, Any]) -> Summary:
         """Summary of the largest model.
@@ -212,6 +216,18 @@ class _Capture:
         largest: dict[str, Any] = models[0] if models else {"names": []}
         missing = sorted(set(names) - set(largest["names"]))
         registered = len(largest["names"])
+        is_flat = found.get("flat_pairs", 0) > _NO_PARALLAX
+        if is_flat and registered < LEAST_SHARE * len(names):
+            raise SceneError(
+                f"the photographs of {self.source} show no parallax: almost any two differ by a turn of the camera "
+                f"alone, or show one plane, and the cameras of only {registered} of {len(names)} were found. Walk "
+                "sideways along the building, a step between photographs; neither stand nor turn on the spot"
+            )
+        if is_flat:
+            notice(
+                f"The photographs of {self.source} show hardly any parallax: was the camera turned on the spot, or is "
+                "all it saw one plane? Look at the cameras' path before you go on."
+            )
         if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
             groups = f", in {len(models)} groups without enough overlap" if len(models) > 1 else ""
             shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
@@ -276,6 +292,12 @@ def _rows(database: Path, table: str) -> int:
             return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
     except sqlite3.Error:  # does not exist yet, or is busy
         return 0
+
+
+def _flat_pairs(database: Path) -> float:
+    """Share of the verified pairs that a homography explains: of a turning camera, or of a plane."""
+    counts = {kind: _rows(database, f"two_view_geometries WHERE rows > 0 AND config = {kind}") for kind in range(2, 9)}
+    return sum(counts[kind] for kind in _HOMOGRAPHIES) / max(1, sum(counts.values()))
 
 
 def _tidy(database: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
@@ -14,6 +15,8 @@ register_heif_opener()  # Pillow reads those of phones (.heic) from here on
 
 PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".hif", ".avif"))
 """Suffixes of photographs, in lower case."""
+CAPTURED = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
+"""Suffixes and formats of photographs that keep their format in a capture; others become PNG."""
 RAW = frozenset(
     f".{kind}"
     for kind in (
@@ -123,6 +126,13 @@ def _alike(one: str, other: str) -> bool:
 
 def _folded(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def captured_name(photograph: PurePath) -> str:
+    """Name in the scene of a photograph that is captured, by its path below the folder of photographs."""
+    kept = photograph if photograph.suffix.lower() in CAPTURED else photograph.with_suffix(".png")
+    # COLMAP's lists of pairs are split at blanks, and # starts a comment.
+    return re.sub(r"[\s#]", "_", kept.as_posix())
 
 
 def mask_names(photograph: PurePath) -> list[PurePath]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from PIL import ExifTags, Image, ImageOps
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
@@ -99,6 +99,10 @@ def read_image(path: Path) -> Image.Image:
     """
     with opened(path) as image:
         exif = image.getexif()
+        if image.info.get("nclx_profile", {}).get("transfer_characteristics") in (16, 18):  # of ITU-T H.273
+            notice(
+                f"{path.parent} holds HDR photographs (PQ or HLG), with flat colours here: better export them as SDR."
+            )
         if image.mode.startswith("I"):  # 16 bits
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")

@@ -7,13 +7,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.paths import captured_name
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.similarity import centred, fit_similarity, transformed
 from shellgs_method.shell.alignment import Alignment
@@ -166,15 +167,30 @@ def _is_header(words: Sequence[str]) -> bool:
 
 
 def view_named(name: str, views: Sequence[View], where: str) -> View | None:
-    """Find a view by its image's path in the scene or its file name; None if there is none.
+    """Find a view by its image's path in the scene or the end of it; None if there is none.
+
+    If no image is called so, the name may be the one before `shellgs capture`, or differ in upper and lower case.
 
     Raises:
-        SceneError: several images have this file name.
+        SceneError: several images have this name.
     """
-    matches = [view for view in views if name in (view.name, view.image.name)]
-    if len(matches) > 1:
-        raise SceneError(f"{where}: {name} is the name of several photographs: add folders")
-    return matches[0] if matches else None
+    for spelt in _SPELLINGS:
+        wanted = f"/{spelt(name)}"
+        ends = ((view, (f"/{spelt(view.name)}", f"/{spelt(view.image.name)}")) for view in views)
+        matches = [view for view, (path, file) in ends if path.endswith(wanted) or file == wanted]
+        if len(matches) > 1:
+            several = " or ".join(view.name for view in matches[:3])
+            raise SceneError(f"{where}: {name} is the name of several photographs: add folders ({several})")
+        if matches:
+            return matches[0]
+    return None
+
+
+def _captured(name: str) -> str:
+    return captured_name(PureWindowsPath(name))
+
+
+_SPELLINGS = (str, _captured, lambda name: _captured(name).casefold())  # the strictest first
 
 
 def are_numbers(words: Sequence[str]) -> bool:

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.photographs import View, to_camera
 from shellgs_method.registration.correspondences import (
     Correspondence,
@@ -87,7 +87,12 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
         point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
         view = view_named(words[5], views, where)
         if view is None:
-            raise SceneError(f"{where}: {words[5]} is not a photograph of the scene")
+            raise SceneError(f"{where}: {words[5]} is not a photograph of the scene; quote a name with spaces")
+        if PureWindowsPath(words[5]).name not in (PurePosixPath(view.name).name, view.image.name):
+            notice(
+                f"{path} names photographs as they were before the capture ({words[5]} is {view.name}, for example): "
+                "pixels must be those of the photographs in the scene, which have no lens distortion."
+            )
         name = words[6] if len(words) > 6 else " ".join(words[:3])
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")

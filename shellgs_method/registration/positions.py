@@ -56,7 +56,9 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
     unknown: list[str] = []
     for where, words in read_lines(path, "camera positions"):
         if len(words) < 4 or not are_numbers(words[1:4]):
-            raise SceneError(f"{where}: expected the image, then X Y Z in the shell's coordinates, separated by spaces")
+            raise SceneError(
+                f"{where}: expected the image, then X Y Z in the shell's coordinates; quote a name with spaces"
+            )
         view = view_named(words[0], views, where)
         if view is None:
             unknown.append(words[0])

@@ -16,10 +16,13 @@ from av.stream import Disposition
 from PIL import ExifTags, Image, ImageFilter
 from rich.progress import Progress
 from scenes import photograph, write_video
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.frames import extract_frames, sharpest
+from shellgs_method.capture.hdr import tone_mapped
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
     add_mask,
@@ -32,7 +35,7 @@ from shellgs_method.capture.photographs import (
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
-from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph
+from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph, read_image
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 QUIET = Progress(disable=True)
@@ -145,13 +148,51 @@ def test_a_file_of_a_cover_alone_is_refused(tmp_path):
         extract_frames(tmp_path / "song.mp4", tmp_path, 3, QUIET)
 
 
+# ITU-R BT.2408: 18 % grey is at 38 % of both, diffuse white at 75 % of HLG, 58 % of PQ.
+@pytest.mark.parametrize(("transfer", "grey", "white"), [("HLG", 0.38, 0.75), ("PQ", 0.38, 0.58)])
+def test_greys_of_hdr_are_as_bright_as_in_a_photograph(transfer, grey, white):
+    codes = np.array([0, grey, white, 0.9, 1.0])
+    mapped = tone_mapped(np.rint(65535 * np.tile(codes[:, None], (1, 1, 3))).astype(np.uint16), transfer)[0]
+    assert (mapped == mapped[:, :1]).all()
+    assert mapped[0, 0] == 0
+    assert mapped[1, 0] == pytest.approx(255 * (1.055 * (26 / 203) ** (1 / 2.4) - 0.055), abs=2)  # 26 of 203 nits
+    assert 225 < mapped[2, 0] < mapped[3, 0] < mapped[4, 0] + 1 <= 256  # highlights stay brighter than white
+
+
+def test_colours_of_hdr_below_the_knee_are_those_that_were_encoded():
+    colours = np.array([[200, 40, 30], [20, 120, 60], [30, 40, 150], [90, 90, 90]])
+    linear = ((colours / 255 + 0.055) / 1.055) ** 2.4 * 203 / 10000
+    wide = linear @ np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]).T
+    power = wide ** (2610 / 16384)  # PQ's inverse EOTF (ITU-R BT.2100)
+    codes = ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
+    np.testing.assert_allclose(tone_mapped(np.rint(65535 * codes[None]).astype(np.uint16), "PQ")[0], colours, atol=1)
+
+
 @pytest.mark.parametrize(("characteristic", "name"), [(18, "HLG"), (16, "PQ"), (1, None)])
-def test_the_flat_colours_of_an_hdr_video_are_told(tmp_path, caplog, characteristic, name):
-    add_streams(tmp_path / "walk.mkv", ((64, 48), 5, {"color_trc": characteristic}))
+def test_an_hdr_video_is_tone_mapped_and_this_is_told(tmp_path, caplog, characteristic, name):
+    white = Image.new("RGB", (64, 48), (191, 191, 191))  # 75 %: diffuse white of HLG, four times that of PQ
+    with av.open(str(tmp_path / "walk.mp4"), "w") as container:
+        stream = container.add_stream("libx265", rate=5, options={"x265-params": "log-level=none"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p10le"
+        stream.codec_context.color_trc = characteristic
+        for frame in [*[av.VideoFrame.from_image(white)] * 5, None]:
+            container.mux(stream.encode(frame))
     (tmp_path / "frames").mkdir()
-    extract_frames(tmp_path / "walk.mkv", tmp_path / "frames", 3, QUIET)
-    assert ("without tone mapping" in caplog.text) == (name is not None)
-    assert f"is HDR ({name})" in caplog.text or name is None
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 3, QUIET)
+    assert (f"is HDR ({name}), and its frames are tone-mapped" in caplog.text) == (name is not None)
+    with Image.open(next((tmp_path / "frames").iterdir())) as frame:
+        assert frame.size == (64, 48)
+        assert np.asarray(frame).mean() == pytest.approx({"HLG": 233, "PQ": 255, None: 191}[name], abs=3)
+
+
+def test_the_flat_colours_of_hdr_photographs_are_told(tmp_path, caplog):
+    sdr, hlg = b"colrnclx\0\x01\0\x0d", b"colrnclx\0\x09\0\x12"  # primaries and transfer
+    assert sdr in PHONE.read_bytes()
+    (tmp_path / "hlg.heic").write_bytes(PHONE.read_bytes().replace(sdr, hlg))
+    read_image(PHONE)
+    assert "HDR" not in caplog.text
+    read_image(tmp_path / "hlg.heic")
+    assert "holds HDR photographs" in caplog.text
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no video" * 100])
@@ -457,6 +498,25 @@ def test_photographs_that_do_not_belong_together_are_refused_with_advice(tmp_pat
     with pytest.raises(SceneError, match=r"only 0 of 4 photographs were found.*--matching exhaustive"):
         capture(folder, tmp_path / "scen å")
     assert [path.name for path in (tmp_path / "scen å").iterdir()] == ["capture"]
+
+
+@pytest.mark.slow
+def test_a_camera_that_only_turns_is_refused_for_its_lack_of_parallax(tmp_path):
+    """Photographs related by K R K⁻¹ alone, as of a tripod, with a sensor's noise."""
+    (tmp_path / "turned").mkdir()
+    random = np.random.default_rng(0)
+    blobs = sum(gaussian_filter(random.normal(0, 40 * size, (900, 1600)), size) for size in (2, 4, 8))
+    scene = Image.fromarray((128 + np.asarray(blobs)).clip(0, 255).astype(np.uint8)).convert("RGB")
+    K_scene, K = (np.array([[900.0, 0, w / 2], [0, 900, h / 2], [0, 0, 1]]) for w, h in ((1600, 900), (640, 480)))
+    for k, yaw in enumerate(np.linspace(-12, 12, 9)):
+        H = K_scene @ Rotation.from_euler("yx", [yaw, 4 * np.sin(k)], degrees=True).as_matrix() @ np.linalg.inv(K)
+        turned = scene.transform(
+            (640, 480), Image.Transform.PERSPECTIVE, (H / H[2, 2]).ravel()[:8], Image.Resampling.BICUBIC
+        )
+        noisy = np.asarray(turned) + random.normal(0, 3, (480, 640, 3))
+        Image.fromarray(noisy.clip(0, 255).astype(np.uint8)).save(tmp_path / "turned" / f"{k:02d}.png")
+    with pytest.raises(SceneError, match=r"show no parallax: .* Walk sideways"):
+        capture(tmp_path / "turned", tmp_path / "scene")
 
 
 def test_a_failure_of_colmap_is_reported_in_one_sentence(tmp_path):

@@ -18,6 +18,7 @@ from scenes import cast, write_colmap
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.capture.photographs import find_photographs
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.bound_cameras import BoundCameras
@@ -592,6 +593,47 @@ def test_an_invalid_line_of_a_positions_file_is_refused_with_its_number(rigged, 
     (tmp_path / "geo.txt").write_text(line)
     with pytest.raises(SceneError, match=re.escape(sentence)):
         read_positions(tmp_path / "geo.txt", rigged[0])
+
+
+USERS_NAMES = {
+    "IMG 0001 #2.JPG": '"IMG 0001 #2.JPG"',
+    "west wing/IMG_0002.HEIC": "'west wing\\IMG_0002.heic'",
+    "IMG_0003.JPG": "img_0003.jpg",
+    "east/IMG_0004.jpg": "east/IMG_0004.jpg",
+}
+"""Photographs before `shellgs capture`, and how a user's file may call them."""
+
+
+@pytest.fixture
+def captured_views(tmp_path) -> list[View]:
+    folder = tmp_path / "photographs"
+    for name in USERS_NAMES:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    names = {path: name for name, path in find_photographs(folder).items()}
+    scene = [f"images/{names[folder / name]}" for name in USERS_NAMES]
+    return [replace(view, name=name, image=Path(name)) for view, name in zip(rig(len(scene))[0], scene, strict=True)]
+
+
+def test_names_from_before_a_capture_still_mean_their_photographs(captured_views, tmp_path, caplog):
+    (tmp_path / "geo.txt").write_text("".join(f"{name} {k} 2 3\n" for k, name in enumerate(USERS_NAMES.values())))
+    (tmp_path / "gcp_list.txt").write_text("".join(f"1 2 3 {k} 5 {n} a\n" for k, n in enumerate(USERS_NAMES.values())))
+    positions = read_positions(tmp_path / "geo.txt", captured_views)
+    (pick,) = read_picks(tmp_path / "gcp_list.txt", captured_views)
+    assert positions.unknown == []
+    assert [view.name for view in positions.views] == [view.name for view in captured_views]
+    assert "IMG 0001 #2.JPG is images/IMG_0001__2.JPG, for example): pixels must be" in caplog.text
+    assert pick.pixels == {view.name: (k, 5) for k, view in enumerate(captured_views)}
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"), [("IMG 0001 #2.JPG 1 2 3", "quote a name with spaces"), ("IMG.jpg 1 2 3", "several")]
+)
+def test_a_name_that_may_mean_several_photographs_or_none_is_refused_with_its_line(rigged, tmp_path, line, sentence):
+    views = [replace(v, name=f"images/{n}") for v, n in zip(rigged[0], ("a/IMG.JPG", "b/IMG.JPG"), strict=False)]
+    (tmp_path / "geo.txt").write_text(line)
+    with pytest.raises(SceneError, match=f"line 1: .*{sentence}"):
+        read_positions(tmp_path / "geo.txt", views)
 
 
 # The repetition test
