@@ -98,7 +98,7 @@ def read_image(path: Path) -> Image.Image:
         SceneError: the image cannot be read, or holds floating-point numbers.
     """
     with opened(path) as image:
-        exif = image.getexif()
+        exif = _exif(image)
         if image.info.get("nclx_profile", {}).get("transfer_characteristics") in (16, 18):  # of ITU-T H.273
             notice(
                 f"{path.parent} holds HDR photographs (PQ or HLG), with flat colours here: better export them as SDR."
@@ -117,7 +117,7 @@ def read_mask(path: Path) -> Image.Image:
         SceneError: the image cannot be read, or is not black and white.
     """
     with opened(path) as image:
-        exif = image.getexif()
+        exif = _exif(image)
         mask = Image.fromarray(np.where(kept_pixels(image, path), 255, 0).astype(np.uint8))
     mask.info["exif"] = exif.tobytes()
     return mask
@@ -135,10 +135,18 @@ def exif_log_gains(paths: Sequence[Path]) -> Float64[np.ndarray, " V"]:
     return np.nan_to_num(found - np.nanmean(found)) if np.isfinite(found).any() else np.zeros(len(paths))
 
 
+def _exif(image: Image.Image) -> Image.Exif:
+    """EXIF data of an image; none where they are damaged."""
+    try:
+        return image.getexif()
+    except (SyntaxError, ValueError, OSError):
+        return Image.Exif()
+
+
 def _exif_log_gain(path: Path) -> float:
     """NaN where a photograph does not say it."""
     with opened(path, whole=False) as image:
-        tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        tags = _exif(image).get_ifd(ExifTags.IFD.Exif)
     try:
         seconds, aperture = float(tags[ExifTags.Base.ExposureTime]), float(tags[ExifTags.Base.FNumber])
         gain = seconds * float(np.ravel(tags[ExifTags.Base.ISOSpeedRatings])[0]) / aperture**2

@@ -12,9 +12,11 @@ import hashlib
 import itertools
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from filelock import FileLock
@@ -34,6 +36,7 @@ _FLAGS = (
 _LIBRARY = ("-fPIC", "-shared", "-mcpu=native" if sys.platform == "darwin" else "-march=native")
 
 _count = itertools.count(1)
+_failures: list[str] = []
 
 
 def compiles() -> bool:
@@ -49,17 +52,26 @@ def load_library(source: str) -> ctypes.CDLL | None:
     """
     try:
         if (compiler := system.compiler()) is None:
-            raise FileNotFoundError("there is no C++ compiler (g++ or clang++)")
+            raise FileNotFoundError("there is no C++ compiler (what CXX names, g++ or clang++)")
         key = hashlib.sha256("\n".join([source, compiler, *_FLAGS, *_LIBRARY, _processor()]).encode()).hexdigest()[:24]
         library = _folder() / f"{key}.so"
-        if not library.exists():
-            library.parent.mkdir(parents=True, exist_ok=True)
-            with FileLock(library.with_suffix(".lock")):
-                if not library.exists():
-                    _compile(compiler, source, library)
-        return ctypes.CDLL(str(library))
+        library.parent.mkdir(parents=True, exist_ok=True)
+        for _ in range(2):
+            if not library.exists():
+                with FileLock(library.with_suffix(".lock")):
+                    if not library.exists():
+                        _compile(compiler, source, library)
+            with suppress(OSError):
+                return ctypes.CDLL(str(library))
+            library.unlink()  # a damaged copy
+        raise OSError(f"{library} cannot be loaded")
     except OSError as error:
-        notice(f"Rasterizer and losses run without C++ kernels, several times slower: {error}")
+        if not _failures:
+            notice(
+                f"Some or all of rasterizer and losses run without C++ kernels, several times slower: {error}. "
+                f"They are kept in {_folder()}; the environment variable SHELLGS_CACHE names another folder."
+            )
+        _failures.append(str(error))
         return None
 
 
@@ -70,13 +82,14 @@ def _compile(compiler: str, source: str, library: Path) -> None:
         code.write_text(source)
         # The first is GCC's; without OpenMP, which clang may lack, loops run in one thread.
         for options in (("-fvect-cost-model=dynamic", "-fopenmp"), ("-fopenmp",), ("-Wno-unknown-pragmas",)):
-            command = [compiler, *_FLAGS, *options, *_LIBRARY, str(code), "-o", str(made)]
+            command = [*shlex.split(compiler), *_FLAGS, *options, *_LIBRARY, str(code), "-o", str(made)]
             result = subprocess.run(command, capture_output=True, text=True, check=False)
-            if result.returncode == 0:
+            if result.returncode == 0 and made.exists():
                 os.replace(made, library)
                 return
-    reason = next((line for line in result.stderr.splitlines() if "error" in line), result.stderr.strip())
-    raise OSError(f"{compiler} fails ({reason})")
+    lines = result.stderr.strip().splitlines()
+    telling = (line for words in ("No space left", "error", "") for line in lines if words in line)
+    raise OSError(f"{compiler} fails ({next(telling, f'exit status {result.returncode}')})")
 
 
 @functools.cache
@@ -86,8 +99,9 @@ def compiler_works() -> bool:
 
 
 def _folder() -> Path:
-    named = os.environ.get("SHELLGS_CACHE")
-    return Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "shellgs"
+    if named := os.environ.get("SHELLGS_CACHE"):
+        return Path(named).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "shellgs"
 
 
 def _processor() -> str:

@@ -36,8 +36,7 @@ def elementwise(function: Function, *inputs: Float[Tensor, "*#elements k"]) -> t
     shape = torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
     if in_cpp(*inputs) and min(shape) and shape[-1] >= LANES and _loop_of(function, _in_rows(inputs)):
         return _Elementwise.apply(function, *inputs)
-    outputs = function(*(each.unbind(-1) for each in inputs))
-    return tuple(torch.stack([each.broadcast_to(shape) for each in output], dim=-1) for output in outputs)
+    return _in_torch(function, inputs)
 
 
 def in_cpp(*tensors: Tensor) -> bool:
@@ -48,6 +47,12 @@ def in_cpp(*tensors: Tensor) -> bool:
 def dot(a: Sequence[Value], b: Sequence[Value | float]) -> Value:
     """Scalar product of two vectors, given by their coordinates."""
     return functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
+
+
+def _in_torch(function: Function, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    shape = torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
+    outputs = function(*(each.unbind(-1) for each in inputs))
+    return tuple(torch.stack([each.broadcast_to(shape) for each in output], dim=-1) for output in outputs)
 
 
 class _Elementwise(torch.autograd.Function):
@@ -65,11 +70,27 @@ class _Elementwise(torch.autograd.Function):
         given = tuple(each is not None for each in grad_outputs)
         wanted = ctx.needs_input_grad[1:]
         function = _gradient(ctx.function, len(inputs), given, wanted)
-        grads = iter(_run(function, [*inputs, *(each for each in grad_outputs if each is not None)]))
+        arguments = [*inputs, *(each for each in grad_outputs if each is not None)]
+        if _loop_of(function, _in_rows(arguments)) is None:  # the disk is full, …
+            return None, *_gradients_in_torch(ctx.function, inputs, grad_outputs, wanted)
+        grads = iter(_run(function, arguments))
         found = (next(grads) if want else None for want in wanted)
         return None, *(
             None if each is None else each.sum_to_size(x.shape) for each, x in zip(found, inputs, strict=True)
         )
+
+
+def _gradients_in_torch(
+    function: Function, inputs: Sequence[Tensor], grad_outputs: Sequence[Tensor | None], wanted: Sequence[bool]
+) -> list[Tensor | None]:
+    with torch.enable_grad():
+        leaves = [each.detach().requires_grad_(want) for each, want in zip(inputs, wanted, strict=True)]
+        pairs = zip(_in_torch(function, leaves), grad_outputs, strict=True)
+        pairs = [(output, grad) for output, grad in pairs if grad is not None and output.requires_grad]
+        outputs, given = zip(*pairs, strict=True)
+        needed = [each for each in leaves if each.requires_grad]
+        found = iter(torch.autograd.grad(outputs, needed, given, allow_unused=True))
+    return [next(found) if want else None for want in wanted]
 
 
 @functools.cache

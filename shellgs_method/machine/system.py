@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -36,9 +37,11 @@ def loads(library: str) -> bool:
 
 
 def compiler() -> str | None:
-    """Path of a C++ compiler with GCC's options and vectors: $CXX, g++ or clang++."""
-    named = os.environ.get("CXX")
-    return shutil.which(named) if named else shutil.which("g++") or shutil.which("clang++")
+    """Command of a C++ compiler with GCC's options and vectors: $CXX, which may have arguments, g++ or clang++."""
+    named = os.environ.get("CXX", "").strip()
+    if named:
+        return named if shutil.which(shlex.split(named)[0]) else None
+    return shutil.which("g++") or shutil.which("clang++")
 
 
 def missing_libraries() -> dict[str, str]:

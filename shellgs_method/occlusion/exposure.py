@@ -30,6 +30,8 @@ MAX_SIZE = 320
 """Longer side in pixels at which photographs are compared: a point's colour is a mean."""
 VISIBLE = 0.02
 """Relative depth by which a point may lie behind what a view shows without being hidden."""
+MOST_KNOWN = 2.0
+"""Greatest logarithm of a gain, against the median, that is believed without sightings: 2.9 stops."""
 _STEPS, _SMALLEST = 20, 0.02  # of the iterative reweighting; residual below which a sighting weighs no more
 _PRIOR = 1.0  # weight of what is known of a photograph without points: that of a sighting with a residual of 1
 
@@ -109,8 +111,8 @@ def log_gains(sightings: Sightings, known: Float64[ndarray, " V"]) -> Float64[nd
 
     Args:
         sightings: colours of points in the views.
-        known: logarithms of the views' gains as far as they are known otherwise, as from EXIF; they count where
-            sightings do not tell.
+        known: logarithms of the views' gains as far as they are known otherwise, as from EXIF; they count where no
+            view has sightings.
 
     Returns:
         Logarithms of the gains in linear light, with a mean of 0 over the views.
@@ -120,8 +122,13 @@ def log_gains(sightings: Sightings, known: Float64[ndarray, " V"]) -> Float64[nd
     view, point, colour = (each[plain] for each in sightings)
     point = np.unique(point, return_inverse=True)[1]
     logs = np.log((colour - BLACK) / (1 - BLACK)) / POWER
+    known = (known - np.median(known)).clip(-MOST_KNOWN, MOST_KNOWN)
     found = np.stack([_fitted(view, point, logs[:, c], known) for c in range(3)], axis=1)
-    return found - found.mean(axis=0)
+    told = np.bincount(view, minlength=len(known)) > 0
+    if not told.any():
+        return found - found.mean(axis=0)
+    # A view that is clipped, black or apart from the others says nothing, and must not move their mean.
+    return np.where(told[:, None], found - found[told].mean(axis=0), 0.0)
 
 
 def _fitted(

@@ -232,7 +232,9 @@ def test_psnr_of_a_constant_error_matches_its_closed_form():
 
 def test_metrics_of_an_exact_image_are_finite():
     target = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
-    assert image_errors(target, target) == {"psnr": 100.0, "ssim": pytest.approx(1.0)}
+    metrics = image_errors(target, target)
+    assert metrics.pop("cc_psnr") > 90  # of colours that are fitted
+    assert metrics == {"psnr": 100.0, "ssim": pytest.approx(1.0), "cc_ssim": pytest.approx(1.0)}
 
 
 def test_metrics_of_a_region_ignore_the_rest_of_the_image():
@@ -246,7 +248,8 @@ def test_metrics_of_a_region_ignore_the_rest_of_the_image():
     assert metrics["psnr_left"] == pytest.approx(-10 * np.log10(mse), abs=1e-3)
     similarity = ssim(rgb.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], 11)[0, :, :, :7]
     assert metrics["ssim_left"] == pytest.approx(similarity.mean().item(), abs=1e-5)
-    assert metrics.keys() == {"psnr", "ssim", "psnr_left", "ssim_left"}
+    names = {"psnr", "ssim", "psnr_left", "ssim_left"}
+    assert metrics.keys() == names | {f"cc_{name}" for name in names}
 
 
 def test_ssim_of_constant_images_equals_the_formula():
@@ -353,7 +356,7 @@ def test_a_view_without_a_reference_has_image_metrics_only(supported):
     reference = reference._replace(mask=EVERYWHERE & supported)
     metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
     assert ("depth_mae_m" in metrics) == supported
-    assert evaluate_view(rendering, photograph, CAMERA).keys() == {"psnr", "ssim"}
+    assert evaluate_view(rendering, photograph, CAMERA).keys() == {"psnr", "ssim", "cc_psnr", "cc_ssim"}
 
 
 def test_metrics_are_plain_floats():

@@ -13,7 +13,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from torch import Tensor
 
-from shellgs_method.machine import cpp
+from shellgs_method.machine import cpp, system
 from shellgs_method.machine.elementwise import dot, elementwise
 from shellgs_method.machine.symbols import Symbol
 
@@ -122,6 +122,7 @@ def test_of_two_processes_one_compiles_and_the_other_waits(compiler, tmp_path, m
 def test_a_folder_that_cannot_be_written_is_said_and_compiles_nothing(compiler, tmp_path, monkeypatch, caplog):
     (file := tmp_path / "file").write_text("")
     monkeypatch.setenv("SHELLGS_CACHE", str(file))
+    monkeypatch.setattr(cpp, "_failures", [])
     assert cpp.load_library('extern "C" int eight() { return 8; }\n') is None
     (record,) = caplog.records
     assert str(file) in record.getMessage()
@@ -132,12 +133,40 @@ def test_without_a_compiler_torch_serves_and_says_so(monkeypatch, caplog):
     monkeypatch.setenv("CXX", "no-such-compiler")
     cpp.compiler_works.cache_clear()
     cpp.load_library.cache_clear()
+    monkeypatch.setattr(cpp, "_failures", [])
     total, _ = elementwise(mixed, torch.ones(20, 3), torch.ones(20, 3), torch.ones(1))
     cpp.compiler_works.cache_clear()
     cpp.load_library.cache_clear()
     assert total.unique() == 3
     (record,) = caplog.records
     assert "no C++ compiler" in record.getMessage()
+
+
+def test_a_damaged_library_is_made_again(compiler, tmp_path, monkeypatch):
+    monkeypatch.setenv("SHELLGS_CACHE", str(tmp_path / "a folder"))
+    command = [sys.executable, "-c", COMPILE.format(6)]
+    subprocess.run(command, check=True, capture_output=True)
+    (library,) = (tmp_path / "a folder").glob("*.so")
+    library.write_bytes(b"")
+    assert subprocess.run(command, check=True, capture_output=True, text=True).stdout.endswith("6\n")
+
+
+def test_a_compiler_may_have_arguments(compiler, tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", f"{system.compiler()} -O1")
+    monkeypatch.setenv("SHELLGS_CACHE", str(tmp_path))
+    library = cpp.load_library('extern "C" int five() { return 5; }\n')
+    assert library is not None
+    assert library.five() == 5
+
+
+def test_where_the_derivative_cannot_be_compiled_torch_serves(compiler, monkeypatch):
+    def function(x, scale):
+        return [[scale[0] * each * each for each in x], [x[0]]]
+
+    x, scale = torch.randn(20, 3, requires_grad=True), torch.tensor([2.0])
+    squares, _ = elementwise(function, x, scale)
+    monkeypatch.setattr(cpp, "load_library", lambda _: None)
+    torch.testing.assert_close(torch.autograd.grad(squares.sum(), x)[0], 4 * x)
 
 
 def test_the_viewers_interrupt_while_a_kernel_compiles_passes_through_and_it_compiles_later(

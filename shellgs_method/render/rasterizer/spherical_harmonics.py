@@ -34,12 +34,13 @@ def spherical_harmonics(
 
 
 def _sum(direction: Sequence[Value], counts: Sequence[Value], *coefficients: Sequence[Value]) -> list[list[Value]]:
-    colours = [value for part in coefficients for value in part]  # three of each term
+    values = [value for part in coefficients for value in part]  # the channels of each term
+    channels = len(values) // len(counts)
     x, y, z = direction
     length = torch.sqrt(torch.clamp_min(x * x + y * y + z * z, 1e-24))
     harmonics = _harmonics(math.isqrt(len(counts)) - 1, [x / length, y / length, z / length])
     weights = [count * harmonic for count, harmonic in zip(counts, harmonics, strict=True)]
-    return [[dot(weights, colours[channel::3]) for channel in range(3)]]
+    return [[dot(weights, values[channel::channels]) for channel in range(channels)]]
 
 
 def _harmonics(degree: int, direction: Sequence[Value]) -> list[Value]:

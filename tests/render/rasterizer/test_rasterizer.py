@@ -94,11 +94,12 @@ def test_with_a_compiler_that_fails_rendering_works_and_warns_once(monkeypatch, 
     monkeypatch.delenv("SHELLGS_COMPILE", raising=False)
     cpp.compiler_works.cache_clear()
     cpp.load_library.cache_clear()
+    monkeypatch.setattr(cpp, "_failures", [])
     for _ in range(2):
         torch.testing.assert_close(render(50, 33, 21), expected, atol=1e-4, rtol=0)
     cpp.compiler_works.cache_clear()
     (warning,) = (record.getMessage() for record in caplog.records)
-    assert warning.endswith(f"several times slower: {failing} fails (error: no disk)")
+    assert f"several times slower: {failing} fails (error: no disk)" in warning
 
 
 def test_a_stack_of_splats_stops_before_the_transmittance_reaches_the_minimum():
