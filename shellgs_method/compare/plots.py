@@ -21,6 +21,7 @@ from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
+from shellgs_method.gaussians.exposures import Exposures
 from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.camera import upwards
 from shellgs_method.geometry.nearest import point_tree
@@ -94,7 +95,9 @@ def exposures(runs: Sequence[Run], path: Path) -> bool:
             except (FileNotFoundError, SceneError):  # the results of a finished run need none
                 continue
             if (stored := state.get("_model.exposures.parameter")) is not None:
-                found[run.variant.name] = ((stored - stored.mean(dim=0)) / np.log(2)).numpy()
+                learned = Exposures(len(stored))
+                learned.start(stored.numpy())
+                found[run.variant.name] = learned.stops.numpy()
     if not found:
         return False
     figure = Figure(figsize=(4 * len(found), 3), layout="constrained")

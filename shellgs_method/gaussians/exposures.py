@@ -31,7 +31,11 @@ class Exposures(nn.Module):
         self.parameter.data = torch.from_numpy(log_gains).to(self.parameter)
 
     @property
+    def stops(self) -> Float[Tensor, "V 3"]:
+        """The gains in stops."""
+        return self.log_gains.detach() / math.log(2)
+
+    @property
     def spread(self) -> Float[Tensor, ""]:
         """Standard deviation of the exposures in stops."""
-        stops = self.log_gains.detach().mean(dim=1) / math.log(2)
-        return stops.std(correction=0)
+        return self.stops.mean(dim=1).std(correction=0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.elementwise import Value, elementwise
+from shellgs_method.machine.elementwise import Value, cross, dot, elementwise
 
 
 def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[Tensor, "H W 3"]:
@@ -42,8 +42,7 @@ def _normal(
 ) -> list[list[Value]]:
     a = [one - other for one, other in zip(right, left, strict=True)]
     b = [one - other for one, other in zip(top, bottom, strict=True)]
-    normal = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    squared = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
-    length = torch.sqrt(torch.clamp_min(squared, 1e-36))
+    normal = cross(a, b)
+    length = torch.sqrt(torch.clamp_min(dot(normal, normal), 1e-36))
     known = (centre[2] > 0) & (right[2] > 0) & (left[2] > 0) & (top[2] > 0) & (bottom[2] > 0)
     return [[torch.where(known, each / length, 0.0) for each in normal]]

@@ -7,7 +7,7 @@ import functools
 import operator
 import textwrap
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -34,8 +34,8 @@ def elementwise(function: Function, *inputs: Float[Tensor, "*#elements k"]) -> t
         inputs: coordinates, along the last dimension, of elements in one or two dimensions, which are broadcast.
     """
     shape = torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
-    if in_cpp(*inputs) and min(shape) and shape[-1] >= LANES and _loop_of(function, _in_rows(inputs)):
-        return _Elementwise.apply(function, *inputs)
+    if in_cpp(*inputs) and min(shape) and shape[-1] >= LANES and (loop := _loop_of(function, inputs)):
+        return _Elementwise.apply(function, loop, *inputs)
     return _in_torch(function, inputs)
 
 
@@ -55,28 +55,36 @@ def _in_torch(function: Function, inputs: Sequence[Tensor]) -> tuple[Tensor, ...
     return tuple(torch.stack([each.broadcast_to(shape) for each in output], dim=-1) for output in outputs)
 
 
+def cross(a: Sequence[Value | float], b: Sequence[Value | float]) -> list[Value]:
+    """Vector product of two vectors, given by their coordinates."""
+    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
 class _Elementwise(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, function, *inputs):
+    def forward(ctx, function, loop, *inputs):
         ctx.set_materialize_grads(False)
         ctx.function = function
         ctx.save_for_backward(*inputs)
-        return _run(function, inputs)
+        return loop(inputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grad_outputs):
         inputs = ctx.saved_tensors
         given = tuple(each is not None for each in grad_outputs)
-        wanted = ctx.needs_input_grad[1:]
+        wanted = ctx.needs_input_grad[2:]
         function = _gradient(ctx.function, len(inputs), given, wanted)
         arguments = [*inputs, *(each for each in grad_outputs if each is not None)]
-        if _loop_of(function, _in_rows(arguments)) is None:  # the disk is full, …
-            return None, *_gradients_in_torch(ctx.function, inputs, grad_outputs, wanted)
-        grads = iter(_run(function, arguments))
+        loop = _loop_of(function, arguments)
+        if loop is None:  # the disk is full, …
+            return None, None, *_gradients_in_torch(ctx.function, inputs, grad_outputs, wanted)
+        grads = iter(loop(arguments))
         found = (next(grads) if want else None for want in wanted)
-        return None, *(
-            None if each is None else each.sum_to_size(x.shape) for each, x in zip(found, inputs, strict=True)
+        return (
+            None,
+            None,
+            *(None if each is None else each.sum_to_size(x.shape) for each, x in zip(found, inputs, strict=True)),
         )
 
 
@@ -108,22 +116,25 @@ def _gradient(function: Function, n_inputs: int, given: tuple[bool, ...], wanted
     return gradient
 
 
-def _run(function: Function, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    views = _in_rows(inputs)
-    loop = _loop_of(function, views)
-    assert loop is not None
-    library, widths = loop
-    (rows, columns), shape = views[0].shape[:2], torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
-    outputs = tuple(inputs[0].new_empty(*shape, width) for width in widths)
-    library.run(
-        min(torch.get_num_threads(), 1 + rows * columns // 4096),
-        ctypes.c_int64(rows),
-        ctypes.c_int64(columns),
-        (ctypes.c_void_p * len(views))(*(view.data_ptr() for view in views)),
-        (ctypes.c_int64 * len(views))(*(view.stride(0) for view in views)),
-        (ctypes.c_void_p * len(outputs))(*(output.data_ptr() for output in outputs)),
-    )
-    return outputs
+class _Loop(NamedTuple):
+    """A function's loop over inputs of one layout, and the numbers of coordinates of its outputs."""
+
+    library: ctypes.CDLL
+    widths: list[int]
+
+    def __call__(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        views, shape = _in_rows(inputs), torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
+        rows, columns = views[0].shape[:2]
+        outputs = tuple(inputs[0].new_empty(*shape, width) for width in self.widths)
+        self.library.run(
+            min(torch.get_num_threads(), 1 + rows * columns // 4096),
+            ctypes.c_int64(rows),
+            ctypes.c_int64(columns),
+            (ctypes.c_void_p * len(views))(*(view.data_ptr() for view in views)),
+            (ctypes.c_int64 * len(views))(*(view.stride(0) for view in views)),
+            (ctypes.c_void_p * len(outputs))(*(output.data_ptr() for output in outputs)),
+        )
+        return outputs
 
 
 def _in_rows(inputs: Sequence[Tensor]) -> list[Float[Tensor, "rows columns k"]]:
@@ -132,13 +143,13 @@ def _in_rows(inputs: Sequence[Tensor]) -> list[Float[Tensor, "rows columns k"]]:
     return [each[(None,) * (3 - each.dim())].expand(rows, columns, -1) for each in inputs]
 
 
-def _loop_of(function: Function, views: Sequence[Tensor]) -> tuple[ctypes.CDLL, list[int]] | None:
-    return _loop(function, tuple((view.shape[2], *view.stride()[1:]) for view in views))
+def _loop_of(function: Function, inputs: Sequence[Tensor]) -> _Loop | None:
+    return _loop(function, tuple((view.shape[2], *view.stride()[1:]) for view in _in_rows(inputs)))
 
 
 @functools.cache
-def _loop(function: Function, layouts: tuple[tuple[int, int, int], ...]) -> tuple[ctypes.CDLL, list[int]] | None:
-    """The compiled loop, and the numbers of coordinates of its outputs.
+def _loop(function: Function, layouts: tuple[tuple[int, int, int], ...]) -> _Loop | None:
+    """The compiled loop; None where it does not compile.
 
     ``layouts`` are each input's number of coordinates, and the strides of the columns and of the coordinates.
     """
@@ -161,7 +172,7 @@ def _loop(function: Function, layouts: tuple[tuple[int, int, int], ...]) -> tupl
     ]
     body = textwrap.indent("\n".join([*pointers, statements(results)]), 8 * " ")
     library = cpp.load_library(PRELUDE.format(lanes=LANES) + _SOURCE.format(body=body))
-    return None if library is None else (library, [len(output) for output in outputs])
+    return None if library is None else _Loop(library, [len(output) for output in outputs])
 
 
 _SOURCE = """

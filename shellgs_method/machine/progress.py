@@ -19,7 +19,6 @@ _NERFSTUDIO = re.compile(r"(\d+) \([\d.]+%\)")  # its table of iterations
 
 ItemT = TypeVar("ItemT")
 
-
 ITERATION = "Iteration"
 
 
@@ -44,9 +43,6 @@ class Stage(NamedTuple):
     def __str__(self) -> str:
         count = "" if self.item is None else f" {self.item}" + (f" of {self.total}{self.note}" if self.total else "")
         return self.what[0].lower() + self.what[1:] + count
-
-
-ITERATION = "Iteration"
 
 
 def tell(what: str) -> None:

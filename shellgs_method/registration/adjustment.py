@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
-from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import ColmapCamera, ColmapImage, Model, parameters_of
 from shellgs_method.geometry.distortion import PARAMETERS
 from shellgs_method.geometry.similarity import fit_similarity, scale_of, transformed
+from shellgs_method.machine.progress import track
 from shellgs_method.registration.bundle import (
     Bundle,
     Objective,
@@ -178,7 +178,7 @@ def _drawn_to(
     gates = [*np.full(_ROBUST, np.inf), *np.geomspace(REACH, GATE, _GATES)]
     gates += [GATE] * (_ROUNDS - len(gates))
     damping = 1e-4
-    for gate in track(gates, "bundle adjustment", transient=True):
+    for gate in track(gates, "Adjusting the cameras", len(gates)):
         # Points are triangulated again: those drawn to the shell say nothing of its noise, nor where they belong.
         free = intersected(objective, bundle, steps=5)
         pixel = _noise_of_pixels(free, seen)

@@ -283,7 +283,7 @@ def _held(system: _Linearised, bundle: Bundle, seen: Observations) -> np.ndarray
 
 
 def adjust(
-    objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4, converged: float = 1e-8
+    objective: Objective, bundle: Bundle, steps: int = 50, damping: float = 1e-4, converged: float = _CONVERGED
 ) -> tuple[Bundle, float]:
     """Minimise an objective from a start; return the minimum and the damping to go on with.
 

@@ -20,7 +20,8 @@ from collections.abc import Sequence
 
 import torch
 
-from shellgs_method.render.rasterizer.kernels import Evaluated, Kernels, Value
+from shellgs_method.machine.elementwise import Value
+from shellgs_method.render.rasterizer.kernels import Evaluated, Kernels
 from shellgs_method.render.rasterizer.projection import NEAR_PLANE
 
 _LOW_PASS = 1 / math.log(2)  # exponent over squared distance in pixels: rho = 2 |x - c|², alpha ~ exp(-rho / 2)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.machine.elementwise import Value, cross, dot, elementwise
 from shellgs_method.render.rasterizer.binning import touches
 from shellgs_method.render.rasterizer.projection import (
     NEAR_PLANE,
@@ -83,15 +83,13 @@ def _project(
 ) -> list[Sequence[Value]]:
     """Shape, two outlines, covariance, and whether the disc is visible, 1 or 0."""
     (z,), (opacity,), (fx, fy, cx, cy) = depth, opacity, intrinsics
-    rays = [(mean2d[0] - cx) / fx, (mean2d[1] - cy) / fy]
+    rays = [(mean2d[0] - cx) / fx, (mean2d[1] - cy) / fy, 1.0]
     tangents_u, tangents_v, normals = (rotate(axis, viewmat) for axis in rotated_axes(quat))
 
-    facing = normals[0] * rays[0] + normals[1] * rays[1] + normals[2]
-    length = torch.sqrt(rays[0].detach() * rays[0].detach() + rays[1].detach() * rays[1].detach() + 1)
-    shows = torch.abs(facing.detach()) > EDGE_ON * length
+    facing = dot(normals, rays)
+    shows = torch.abs(facing.detach()) > EDGE_ON * torch.sqrt(dot(rays, rays).detach())
     facing = torch.where(shows, facing, 1.0)
-    u = tangents_v[1] - tangents_v[2] * rays[1], tangents_v[2] * rays[0] - tangents_v[0]  # of t_v × ray
-    v = tangents_u[2] * rays[1] - tangents_u[1], tangents_u[0] - tangents_u[2] * rays[0]  # of ray × t_u
+    u, v = cross(tangents_v, rays), cross(rays, tangents_u)
     scale_u, scale_v, *_ = scale
     halves = math.sqrt(0.5 / math.log(2))  # exp(-u²/2) = 2^-(halves u)²
     shape_u, shape_v = halves / (scale_u * facing), halves / (scale_v * facing)
@@ -102,7 +100,7 @@ def _project(
     axes = ((tangents_u, scale_u), (tangents_v, scale_v))
     half_axes = [[(length * each).detach() for each in axis] for axis, length in axes]
     cutoff, z = cutoffs(opacity), z.detach()
-    x, y = ((z * each).detach() for each in rays)
+    x, y = ((z * each).detach() for each in rays[:2])
     outline, covars2d = _outline(x, y, z, half_axes, torch.sqrt(cutoff), intrinsics, size)
     radius, none = torch.sqrt(cutoff / 2), 0 * cutoff
     conic = 1 / (radius * radius)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from shellgs_method.render.rasterizer.kernels import Evaluated, Kernels, Value
+from shellgs_method.machine.elementwise import Value
+from shellgs_method.render.rasterizer.kernels import Evaluated, Kernels
 
 
 def _evaluate(shape: Sequence[Value], x: Value, y: Value) -> Evaluated:

@@ -16,18 +16,16 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import torch
 
+from shellgs_method.machine.elementwise import Value
 from shellgs_method.machine.symbols import Symbol
 from shellgs_method.render.rasterizer.projection import ALPHA_MAX, ALPHA_MIN
 
 TRANSMITTANCE_MIN = 1e-4  # a pixel stops before the splat that would reach it
 Z_MAX = math.log2(ALPHA_MAX / ALPHA_MIN)
-
-Value: TypeAlias = Any
-"""A tensor, or a symbol."""
 
 
 class Evaluated(NamedTuple):

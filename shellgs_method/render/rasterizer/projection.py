@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.elementwise import Value, dot, elementwise
+from shellgs_method.machine.elementwise import Value, cross, dot, elementwise
 from shellgs_method.render.rasterizer.binning import touches
 
 NEAR_PLANE = 0.01
@@ -165,11 +165,6 @@ def to_camera(point: Sequence[Value], viewmat: Sequence[Value]) -> list[Value]:
 def rotate(vector: Sequence[Value], viewmat: Sequence[Value]) -> list[Value]:
     """Rotate a vector from the world to the camera frame."""
     return [dot(viewmat[4 * i : 4 * i + 3], vector) for i in range(3)]
-
-
-def cross(a: Sequence[Value], b: Sequence[Value]) -> list[Value]:
-    """Vector product."""
-    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def halvings(opacity: Value) -> Value:
