@@ -6,6 +6,7 @@ python -m benchmarks.exposure outputs/exposure --scene scenes/herz-jesu-p25 --me
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -60,7 +61,9 @@ def main(
     changing = work / "scenes" / scene.name
     if not changing.exists():
         write_in_changing_light(scene, changing)
-        subprocess.run(["shellgs", "cast", str(changing)], check=True)
+        size = json.loads((scene / "cues/shell/manifest.json").read_text())["max_image_size"]
+        words = ["--max-image-size", str(size)] if size else []
+        subprocess.run(["shellgs", "cast", str(changing), *words], check=True)
     scenes = {"constant": scene, "changing": changing}
     means = {}
     for light, data in scenes.items():
