@@ -54,7 +54,7 @@ def supervision_panel(
 
 def _show_classes(ax: Axes, classes: UInt8[np.ndarray, "H W"]) -> None:
     """Show classes of surfaces in colours of their own, with a legend of those that are there; grey is none."""
-    palette = np.array([CLASS_COLOURS[each] for each in SurfaceClass] + [GREY / 255])
+    palette = np.array([*(CLASS_COLOURS[each] for each in SurfaceClass), (GREY / 255,) * 3])
     ax.imshow(palette[classes], interpolation="nearest")
     there = [each for each in SurfaceClass if (classes == each).any()]
     handles = [Patch(color=CLASS_COLOURS[each], label=each.word) for each in there]

@@ -129,7 +129,7 @@ def load_shell(
             usable = _without_outliers(*used, path)
             near = _referenced(used[0], used[1][usable])
             mesh = ShellMesh(*near, classes=geometry.classes[usable])
-            step = mesh_step(mesh.vertices, mesh.faces)
+            step = NO_STEP if geometry.drawn else mesh_step(mesh.vertices, mesh.faces)
             refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
             return replace(_with_area(mesh, path), step=step)
         step = cloud_step(geometry.vertices)

@@ -149,7 +149,7 @@ def outside(objects: Iterable[CityObject], path: Path, missing: Counter[str]) ->
     cut = triangulated(vertices, sizes, corners.reshape(-1), holes)
     left_out(path, int((sizes[~holes] < 3).sum()), int((~holes).sum()), "polygons, which have fewer than 3 corners")
     say_missed(path, len(cut.missed), int((~holes).sum()))
-    return Geometry(vertices, cut.faces, classes=np.array(found.classes, np.uint8)[cut.polygon])
+    return Geometry(vertices, cut.faces, classes=np.array(found.classes, np.uint8)[cut.polygon], drawn=True)
 
 
 def ring_of(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"]:

@@ -92,7 +92,10 @@ def read_ifc(path: Path) -> Geometry:
     if not count:
         raise SceneError(f"the shell {path} has no walls, roofs, windows or other outside of a building")
     return Geometry(
-        _on_the_map(model, np.concatenate(vertices), path), np.concatenate(faces), classes=np.concatenate(kinds)
+        _on_the_map(model, np.concatenate(vertices), path),
+        np.concatenate(faces),
+        classes=np.concatenate(kinds),
+        drawn=True,
     )
 
 
