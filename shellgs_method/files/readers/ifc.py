@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,6 +67,7 @@ def read_ifc(path: Path) -> Geometry:
 
     if path.suffix.lower() == ".ifc" and _END not in path.read_bytes()[-1000:]:
         raise ValueError("it does not end as an IFC does")
+    ifcopenshell.get_log()  # which empties it
     model: Any = ifcopenshell.open(str(path))
     products = [each for each in model.by_type("IfcProduct") if each.Representation]
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
@@ -89,6 +91,10 @@ def read_ifc(path: Path) -> Geometry:
             f"{path}: the geometry of {len(failed)} of {len(seen)} parts cannot be made, such as {failed[0].is_a()} "
             f"{failed[0].GlobalId}."
         )
+    faults = [line for line in ifcopenshell.get_log().splitlines() if line.startswith("[error]")]
+    if faults:
+        first = re.sub(r"\[.*?\] *", "", faults[0])
+        notice(f"{path}: {len(faults)} of its lines or shapes are faulty and may be missing, such as: {first}.")
     if not count:
         raise SceneError(f"the shell {path} has no walls, roofs, windows or other outside of a building")
     return Geometry(
@@ -163,6 +169,8 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     import ifcopenshell.util.geolocation
     import ifcopenshell.util.unit
 
+    if ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT") is None:
+        notice(f"{path}: it names no unit of length: its numbers are taken for metres.")
     known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
     if known is None:
         return points
