@@ -192,6 +192,25 @@ def test_a_link_to_nothing_and_one_to_itself_end_in_words(tmp_path: Path, caplog
         read_geometry(save(tmp_path / "b.gml", made.citygml(surfaces + dangling.replace("#nothing", "#c"))))
 
 
+def test_footprints_are_left_out_whatever_their_dimension(tmp_path: Path, caplog):
+    ring = "<gml:exterior><gml:LinearRing><gml:posList>0 0 1 0 1 1 0 0</gml:posList></gml:LinearRing></gml:exterior>"
+    member = f"<gml:surfaceMember><gml:Polygon>{ring}</gml:Polygon></gml:surfaceMember>"
+    foot = f"<bldg:lod0FootPrint><gml:MultiSurface>{member}</gml:MultiSurface></bldg:lod0FootPrint>"
+    faces = moved(house())
+    assert_cast_as(save(tmp_path / "a.gml", made.citygml(foot + made.surfaces_gml(faces, "2.0"))), faces)
+    assert "1 footprint (LoD 0)" in caplog.text
+
+
+def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplog):
+    faces = moved(house())
+    inside = moved(house(), NATIONAL + np.array([0, 0, -1.0]))
+    room = made.surfaces_gml(inside, "2.0", lod=4).replace("WallSurface", "InteriorWallSurface")
+    body = f"<bldg:interiorRoom><bldg:Room>{room}</bldg:Room></bldg:interiorRoom>"
+    text = made.citygml(made.surfaces_gml(faces, "2.0", lod=4) + body)
+    assert_cast_as(save(tmp_path / "a.gml", text), faces)
+    assert "1 Room" in caplog.text
+
+
 def test_terrain_is_ground(tmp_path: Path):
     corners = np.array([[0, 0, 0], [40, 0, 1], [40, 30, 2], [0, 30, 0.5]]) + NATIONAL
     faces = [Face([corners[[0, 1, 2]]], "GroundSurface"), Face([corners[[0, 2, 3]]], "GroundSurface")]
