@@ -73,10 +73,10 @@ def read_ifc(path: Path) -> Geometry:
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
     say_left_out(path, Counter(each.is_a() for each in products if classes[each.id()] is None))
     seen = [each for each in products if classes[each.id()] is not None]
-    shapes = list(_shapes(ifcopenshell.geom, model, seen))
     vertices, faces, kinds = [NO_POINTS], [NO_FACES], [NO_CLASSES]
-    count = 0
-    for shape in shapes:
+    count, made = 0, set[int]()
+    for shape in _shapes(ifcopenshell.geom, model, seen):
+        made.add(shape.id)
         matrix = np.array(shape.transformation.matrix).reshape(4, 4).T
         points = transformed(np.array(shape.geometry.verts).reshape(-1, 3), matrix)
         triangles = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
@@ -84,7 +84,6 @@ def read_ifc(path: Path) -> Geometry:
         faces.append(triangles + count)
         kinds.append(_with_glass(classes[shape.id], shape.geometry, len(triangles)))
         count += len(points)
-    made = {shape.id for shape in shapes}
     failed = [each for each in seen if each.id() not in made and _has_body(each)]
     if failed:
         notice(
@@ -106,7 +105,7 @@ def read_ifc(path: Path) -> Geometry:
 
 
 def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
-    """The triangulated shapes of products, in metres and their own placements, with openings cut."""
+    """The triangulated shapes of products, in metres and their placements, with openings cut; valid until the next."""
     iterator = geom.iterator(geom.settings(), model, 1, include=products) if products else None
     if iterator is not None and iterator.initialize():
         yield iterator.get()
