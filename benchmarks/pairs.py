@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from rich.console import Console
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
@@ -28,11 +29,11 @@ from shellgs_method.synthetic import FacadeConfig, write_scene
 FOLDED = 0.05
 """Error of the worst camera, as a share of the extent of all, at which a model is taken for folded: less than a bay."""
 
-_GLOBAL = """
+_INCREMENTAL = """
 import json, sys, zlib, pycolmap
-pycolmap.set_random_seed(0)
 database, photographs, output = sys.argv[1:]
-models = pycolmap.global_mapping(database, photographs, output, pycolmap.GlobalPipelineOptions(random_seed=0))
+options = pycolmap.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
+models = pycolmap.incremental_mapping(database, photographs, output, options)
 found = sorted(models.values(), key=lambda model: -model.num_reg_images())
 found[0].write(output)
 print(json.dumps([{
@@ -44,9 +45,9 @@ print(json.dumps([{
 """
 
 
-def _global(database: str, photographs: str, output: str) -> list[dict[str, Any]]:
-    """Global mapping (GLOMAP, Pan et al. 2024), in a process of its own."""
-    command = [sys.executable, "-c", _GLOBAL, database, photographs, output]
+def _incremental(database: str, photographs: str, output: str) -> list[dict[str, Any]]:
+    """Incremental mapping, in a process of its own."""
+    command = [sys.executable, "-c", _INCREMENTAL, database, photographs, output]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
@@ -69,8 +70,8 @@ CONTENDERS: dict[str, tuple[CaptureConfig, Steps]] = {
     "powers of two": (CaptureConfig(matching="sequential"), {**_NEIGHBOURS, "match": _with_powers_of_two}),
     "loops": (CaptureConfig(matching="sequential"), {}),
     "exhaustive": (CaptureConfig(matching="exhaustive"), {}),
-    "loops, global": (CaptureConfig(matching="sequential"), {"reconstruct": _global}),
-    "exhaustive, global": (CaptureConfig(matching="exhaustive"), {"reconstruct": _global}),
+    "loops, incremental": (CaptureConfig(matching="sequential"), {"reconstruct": _incremental}),
+    "exhaustive, incremental": (CaptureConfig(matching="exhaustive"), {"reconstruct": _incremental}),
 }
 """Settings of a capture, and steps of it that are replaced."""
 
@@ -127,7 +128,7 @@ def _row(truth: Path, scene: Path, config: CaptureConfig, replaced: Steps) -> st
             opened.executescript("DELETE FROM matches; DELETE FROM two_view_geometries")
     stages.run_step = step
     try:
-        capture(truth / "images", scene, config)
+        capture(truth / "images", scene, config, console=Console(quiet=True))
         errors = _errors(truth, scene)
     except SceneError as error:
         return f"{count} | {models} | {error}"

@@ -193,9 +193,9 @@ class _Capture:
         pairs = image_pairs(self.names, matching, self.config.overlap)
         apart, models = [], None
         if matching == "sequential":
-            pairs, apart, models = self._close_loops(database, pairs)
+            apart, models = self._close_loops(database, pairs)
         else:
-            self._match(database, pairs, "matching (exhaustive)")
+            self._match(database, pairs, "matching all pairs")
         with self.work.making("model", self.model_key) as folder:
             if models is None:
                 models = self._reconstruct(database, folder, "finding cameras")
@@ -204,10 +204,10 @@ class _Capture:
             found = {"photographs": self.names, "models": models, "apart": apart, "flat_pairs": _flat_pairs(database)}
             (folder / "models.json").write_text(json.dumps(found))
 
-    def _close_loops(self, database: Path, pairs: list[Pair]) -> tuple[list[Pair], list[Any], list[Any] | None]:
+    def _close_loops(self, database: Path, pairs: list[Pair]) -> tuple[list[Any], list[Any] | None]:
         """Match neighbours, then photographs that see the same by a coarse model from neighbours alone.
 
-        Returns the pairs, the models that did not join the largest, and, if there are no others, the coarse models.
+        Returns the models that did not join the largest and, if neighbours are all that matches, the coarse models.
         """
         coarse, joined = self.work.folder / "coarse", self.work.folder / "joined"
         if not self.work.has("coarse", self.model_key):
@@ -217,7 +217,7 @@ class _Capture:
                 (folder / "models.json").write_text(json.dumps({"models": models}))
         models = read_json(coarse / "models.json")["models"]
         if not models:
-            return pairs, [], models
+            return [], models
         bridges = self._step("find_bridges", "looking for bridges", 1, None, models=str(coarse))
         if not self.work.has("joined", self.model_key):
             if bridges:
@@ -230,11 +230,11 @@ class _Capture:
         where = {"models": str(joined), "matched": pairs + bridges, "each": self.config.overlap}
         loops = self._step("find_loops", "looking for loops", 1, None, **where)
         if not bridges and not loops:
-            return pairs, apart, models
+            return apart, models
         self._match(database, pairs + bridges + loops, "matching loops")
         where = {"database": str(database), "models": str(joined), "trusted": pairs}
         kept = self._step("settle", "checking loops", 1, None, **where)
-        return pairs, apart, None if kept else models
+        return apart, None if kept else models
 
     def _match(self, database: Path, pairs: list[Pair], description: str) -> None:
         done = partial(_rows, database, "two_view_geometries")

@@ -339,6 +339,16 @@ def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
     assert [lens.names for lens in groups] == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"]]
 
 
+def test_two_phones_and_a_zoom_in_one_folder_are_three_cameras(tmp_path):
+    for k, (maker, model, focal) in enumerate([("A", "1", 26), ("B", "1", 24), ("A", "1", 52)] * 2):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = maker, model
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal
+        photograph().save(tmp_path / f"{k}.jpg", exif=exif)
+    groups = group_by_lens(tmp_path, [f"{k}.jpg" for k in range(6)], "auto")
+    assert [lens.names for lens in groups] == [["0.jpg", "3.jpg"], ["1.jpg", "4.jpg"], ["2.jpg", "5.jpg"]]
+
+
 @pytest.mark.parametrize(("cameras", "count"), [("single", 1), ("folder", 2), ("image", 3)])
 def test_the_sharing_of_cameras_can_be_chosen(tmp_path, cameras, count):
     names = ["left/a.jpg", "left/b.jpg", "right/a.jpg"]
@@ -601,6 +611,33 @@ def without_colmap(monkeypatch) -> list[str]:
     return steps
 
 
+def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch, caplog):
+    for k in range(8):
+        (tmp_path / "photographs" / "ab"[k > 4]).mkdir(parents=True, exist_ok=True)
+        photograph(seed=k).save(tmp_path / "photographs" / "ab"[k > 4] / f"{k}.jpg")
+    model = {"points": 9, "reprojection_error": 0.5, "track_length": 3.0}
+    near, far = [f"a/{k}.jpg" for k in range(5)], [f"b/{k}.jpg" for k in range(5, 8)]
+    answers: dict[str, Any] = {
+        "reconstruct": [{"names": near, **model}, {"names": far, **model}],
+        "find_bridges": [[near[0], far[0]]],
+        "join": [{"names": far, "fault": "nobody knows why"}],
+        "find_loops": [],
+        "settle": 0,
+    }
+
+    def run_step(step: str, arguments: dict, **_):
+        if step == "undistort":
+            for name in ("images", "sparse"):
+                (Path(arguments["output"]) / name).mkdir()
+        return answers.get(step)
+
+    monkeypatch.setattr(stages, "run_step", run_step)
+    summary = capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(matching="sequential"))
+    assert summary.missing == far
+    assert "3 photographs of" in caplog.text
+    assert "b/5.jpg to b/7.jpg, did not join the others, nobody knows why" in caplog.text
+
+
 def exposure_of(seconds: float, iso: int = 200) -> Image.Exif:
     exif = Image.Exif()
     exif[ExifTags.Base.Make] = "a phone"  # without any tag here, Pillow writes none into a PNG
@@ -716,6 +753,23 @@ def test_cameras_of_the_synthetic_facade_are_found(truth, captured):
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.02 * np.ptp(positions, axis=0).max()
     focal = next(iter(true.values())).camera.K[0, 0].item()
     assert next(iter(found.values())).camera.K[0, 0].item() == pytest.approx(focal, rel=0.03)
+
+
+@pytest.mark.slow
+def test_two_passes_in_two_folders_are_one_model(truth, tmp_path):
+    """The way out near the wall and the way back farther off, the names of which say nothing of each other."""
+    names = sorted(path.name for path in (truth / "images").iterdir())
+    for k, name in enumerate(names):
+        target = tmp_path / "photographs" / ("out" if k < 12 else "back") / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(truth / "images" / name, target)
+    summary = capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(matching="sequential"))
+    assert len(summary.registered) >= 22
+    true = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=truth))}
+    found = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene"))}
+    positions = np.stack([true[name].camera.position.numpy() for name in found])
+    errors = similarity(np.stack([view.camera.position.numpy() for view in found.values()]), positions) - positions
+    assert np.linalg.norm(errors, axis=1).max() < 0.05 * np.ptp(positions, axis=0).max()  # a bay is three times as much
 
 
 @pytest.mark.slow
