@@ -45,7 +45,7 @@ print(json.dumps([{
 """
 
 
-def _incremental(database: str, photographs: str, output: str) -> list[dict[str, Any]]:
+def _incremental(database: str, photographs: str, output: str, has_parallax: bool) -> list[dict[str, Any]]:
     """Incremental mapping, in a process of its own."""
     command = [sys.executable, "-c", _INCREMENTAL, database, photographs, output]
     return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)

@@ -138,18 +138,19 @@ def settle(database: str, models: str, trusted: list[list[str]]) -> int:
     return kept
 
 
-def reconstruct(database: str, photographs: str, output: str) -> list[dict]:
+def reconstruct(database: str, photographs: str, output: str, has_parallax: bool) -> list[dict]:
     """Write all models, largest first, into numbered folders, and the largest into ``output``; return what they are.
 
-    Global mapping (GLOMAP, Pan et al. 2024) bends a long walk less than incremental mapping, which is the second try if
-    photographs are missing: it also copes with few matches.
+    Global mapping (GLOMAP, Pan et al. 2024) bends a long walk less than incremental mapping. The latter is tried if
+    photographs are missing, and without parallax, where it finds no cameras and the former invents them.
     """
     with pycolmap.Database.open(database) as opened:
         count = opened.num_images()
     with TemporaryDirectory(dir=output) as folder:
-        models = pycolmap.global_mapping(
-            database, photographs, folder, pycolmap.GlobalPipelineOptions(random_seed=SEED)
-        ).values()
+        models = []
+        if has_parallax:
+            options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
+            models = pycolmap.global_mapping(database, photographs, folder, options).values()
         if _registered_at_most(models) < count:
             options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
             others = pycolmap.incremental_mapping(

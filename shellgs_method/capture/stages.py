@@ -242,7 +242,8 @@ class _Capture:
 
     def _reconstruct(self, database: Path, folder: Path, description: str) -> list[dict[str, Any]]:
         arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
-        return self._step("reconstruct", description, len(self.names), None, **arguments)
+        has_parallax = _flat_pairs(database) <= _NO_PARALLAX
+        return self._step("reconstruct", description, len(self.names), None, **arguments, has_parallax=has_parallax)
 
     def _largest_model(self, found: dict[str, Any]) -> Summary:
         """Summary of the largest model.
