@@ -59,7 +59,7 @@ def main(
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     changing = work / "scenes" / scene.name
-    if not changing.exists():
+    if only != "constant" and not changing.exists():
         write_in_changing_light(scene, changing)
         size = json.loads((scene / "cues/shell/manifest.json").read_text())["max_image_size"]
         words = ["--max-image-size", str(size)] if size else []
