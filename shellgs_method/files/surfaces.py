@@ -1,4 +1,4 @@
-"""Read meshes and point clouds from files, in double precision."""
+"""Read meshes, building models and point clouds from files, in double precision."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from typing import Literal
 import numpy as np
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.readers.citygml import read_citygml
+from shellgs_method.files.readers.cityjson import read_cityjson
 from shellgs_method.files.readers.contents import Geometry, left_out, splats
 from shellgs_method.files.readers.gltf import read_gltf
+from shellgs_method.files.readers.ifc import read_ifc
 from shellgs_method.files.readers.meshes import read_obj, read_off, read_stl
 from shellgs_method.files.readers.pcd import read_pcd
 from shellgs_method.files.readers.ply import read_ply
@@ -29,6 +32,9 @@ READERS: dict[str, Callable[[Path], Geometry]] = {
     **dict.fromkeys((".xyz", ".pts", ".txt", ".asc", ".csv"), read_text_cloud),
     **dict.fromkeys((".las", ".laz"), read_las),
     ".e57": read_e57,
+    **dict.fromkeys((".ifc", ".ifczip"), read_ifc),
+    **dict.fromkeys((".gml", ".citygml", ".xml"), read_citygml),
+    **dict.fromkeys((".json", ".cityjson", ".jsonl"), read_cityjson),
 }
 SPLATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs")
 """Suffixes of formats that hold Gaussian splats only."""
@@ -58,8 +64,8 @@ def read_geometry(path: Path) -> Geometry:
     read = READERS.get(suffix)
     if read is None:
         raise SceneError(
-            f"the shell {path} is neither a mesh nor a point cloud that can be read: export it as one of "
-            f"{', '.join(READERS)}"
+            f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: export it as "
+            f"one of {', '.join(READERS)}"
         )
     try:
         geometry = read(path)

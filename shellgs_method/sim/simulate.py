@@ -22,6 +22,7 @@ from shellgs_method.sim.collision.collider import GROUND, Collider, make_collide
 from shellgs_method.sim.collision.distances import both_ways
 from shellgs_method.sim.deviations import Deviations, find_deviations
 from shellgs_method.sim.formats.readme import write_readme
+from shellgs_method.sim.formats.semantics import write_semantics
 from shellgs_method.sim.formats.usd import write_usd_layers, write_usd_world
 from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
 from shellgs_method.sim.look.texture import bake
@@ -113,11 +114,13 @@ def _building(
     textured = bake(fused, colours, made.photos, settings.texel)
     facts = write_visual(folder, textured, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
-    with_splats = write_usd_layers(folder, textured, collider.parts, made.splats, made.frame.metric)
+    classes = made.classes_at(textured.vertices[textured.faces].mean(axis=1))
+    with_splats = write_usd_layers(folder, textured, classes, collider.parts, made.splats, made.frame.metric)
+    write_semantics(folder, classes)
     deviations: Deviations | None = None
     if shell is not None:
         views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]
-        deviations = find_deviations(shell, fused, views, ahead, made.contradicted)
+        deviations = find_deviations(shell, fused, views, ahead, made.contradicted, classes=made.classes)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
