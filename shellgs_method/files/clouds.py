@@ -79,9 +79,9 @@ def merged(
                 continue
             low, high = np.percentile(usable, [1, 99], axis=0)  # outliers must not change the extent
             extent = float(np.max(high - low) or np.ptp(usable, axis=0).max())
-            origin = np.median(usable, axis=0) if origin is None else origin
             values = 0 if piece.normals is None else 3
-            means = VoxelMeans(origin, voxel or extent / _ACROSS or 1.0, MOST, values)
+            middle = np.median(usable, axis=0) if origin is None else origin
+            means = VoxelMeans(middle, voxel or extent / _ACROSS or 1.0, MOST, values)
         normals = None if piece.normals is None else np.nan_to_num(piece.normals, posinf=0, neginf=0)
         inside = means.add(piece.positions, normals)
         dropped += int((~inside).sum())

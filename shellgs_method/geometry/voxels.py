@@ -14,7 +14,8 @@ _BITS = 21
 _CELLS = 1 << _BITS
 """Voxels along each axis of a lattice, whose three indices are packed in 63 bits."""
 _PIECE = 1 << 18  # points sorted at once, in the cache
-_FEW = 0.01  # of the points, which may be absurdly far away
+_FEW = 0.01  # share of the points that may be left out, as absurdly far away
+_WIDEST = 32  # times the first lattice, beyond which all are
 
 
 def voxel_means(points: Float[ndarray, "N 3"], voxel: float) -> Float[ndarray, "M 3"]:
@@ -57,6 +58,7 @@ class VoxelMeans:
 
     def __init__(self, origin: Float64[ndarray, " 3"], voxel: float, most: int, values: int = 0) -> None:
         self.origin, self.voxel, self.most = origin, voxel, most
+        self._first, self._added = voxel, 0
         self._runs = [_Run(np.empty(0, np.int64), np.empty((0, 4 + values)))]
 
     def add(self, points: Float64[ndarray, "N 3"], values: Float[ndarray, "N C"] | None = None) -> Bool[ndarray, " N"]:
@@ -66,7 +68,8 @@ class VoxelMeans:
             piece = slice(start, start + _PIECE)
             local = points[piece] - self.origin
             cells, kept = self._cells(local)
-            while np.isfinite(local[~kept]).all(axis=1).sum() > _FEW * len(local):
+            self._added += len(local)
+            while self._is_short(local[~kept]):
                 self._merge(1)
                 self._double()
                 cells, kept = self._cells(local)
@@ -84,6 +87,11 @@ class VoxelMeans:
         counts = self._runs[0].sums[:, 0]
         means = self._runs[0].sums[:, 1:] / counts[:, None]
         return means[:, :3] + self.origin, means[:, 3:], counts
+
+    def _is_short(self, beyond: Float64[ndarray, "N 3"]) -> bool:
+        """Whether points beyond the lattice are too many, and not too far away, to be left out."""
+        near = np.isfinite(beyond).all(axis=1) & (np.abs(beyond) < _WIDEST * _CELLS * self._first).all(axis=1)
+        return near.sum() > _FEW * self._added
 
     def _cells(self, local: Float64[ndarray, "N 3"]) -> tuple[Int64[ndarray, "3 N"], Bool[ndarray, " N"]]:
         """Indices of the points' voxels, and which points are in the lattice."""
