@@ -133,11 +133,9 @@ def main(benchmark: Benchmark) -> None:
             size = path.stat().st_size / 1e9
             for name, code in (("bare", READ[suffix]), ("merged", READ["merged"])):
                 said, (seconds, cpu, memory, child) = measured(code, path)
-                console.print(
-                    f"{suffix}, {size:.2f} GB, {name}: {seconds:.0f} s, {cpu:.0f} s of CPU, {points / seconds / 1e6:.2f} "
-                    f"million points/s, {memory:.2f} GB of memory and {child:.2f} of its child. {said}",
-                    highlight=False,
-                )
+                speed = f"{seconds:.0f} s, {cpu:.0f} s of CPU, {points / seconds / 1e6:.2f} million points/s"
+                peaks = f"{memory:.2f} GB of memory and {child:.2f} of its child"
+                console.print(f"{suffix}, {size:.2f} GB, {name}: {speed}, {peaks}. {said}", highlight=False)
             path.unlink()
 
 

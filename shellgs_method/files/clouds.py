@@ -30,7 +30,7 @@ class VoxelCloud:
         points: mean point of each occupied voxel.
         counts: of how many points it is the mean.
         voxel: size of the voxels.
-        origin: a corner of them.
+        origin: point by which they are placed.
         sample: points as they are in the file, chosen at random.
         dropped: number of points left out that were NaN, infinite or absurdly far away.
         normals: mean normals, of any length; None if the file has none.
@@ -64,7 +64,7 @@ def merged(
         pieces: the points.
         voxel: size of the voxels, which is doubled where there would be more; None for a share of the extent of the
             first piece.
-        origin: a corner of the voxels; None for the median of the first piece.
+        origin: point by which the voxels are placed; None for the median of the first piece.
         within: cells outside which points are ignored; None for all points.
     """
     means, dropped, scanners, sample = None, 0, [NO_POINTS], _Sample()

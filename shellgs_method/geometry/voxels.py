@@ -47,7 +47,7 @@ class VoxelMeans:
     Where more than ``most`` voxels are occupied, or many points are beyond the lattice, the voxels' size is doubled.
 
     Args:
-        origin: middle of the lattice, which is 2²¹ voxels wide; a few points beyond it are not added.
+        origin: a point well inside the lattice, which is 2²¹ voxels wide; a few points beyond it are not added.
         voxel: size of a voxel.
         most: number of voxels.
         values: number of values of a point beside its position.
@@ -58,6 +58,9 @@ class VoxelMeans:
 
     def __init__(self, origin: Float64[ndarray, " 3"], voxel: float, most: int, values: int = 0) -> None:
         self.origin, self.voxel, self.most = origin, voxel, most
+        # A third of a voxel stays a third or two when voxels double: a wall at the origin is on no boundary, by which
+        # its points would be merged in two layers.
+        self._shift = _CELLS / 3
         self._first, self._added = voxel, 0
         self._runs = [_Run(np.empty(0, np.int64), np.empty((0, 4 + values)))]
 
@@ -97,7 +100,7 @@ class VoxelMeans:
         """Indices of the points' voxels, and which points are in the lattice."""
         columns = np.ascontiguousarray(local.T)  # numpy is slow along three columns
         with np.errstate(invalid="ignore", over="ignore"):
-            cells = np.floor(columns / self.voxel) + _CELLS // 2
+            cells = np.floor(columns / self.voxel + self._shift)
             return cells.astype(np.int64), ((cells >= 0) & (cells < _CELLS)).all(axis=0)
 
     def _append(self, run: _Run) -> None:
@@ -116,7 +119,7 @@ class VoxelMeans:
 
     def _double(self) -> None:
         """Double the size of the voxels, of which all are in one run."""
-        self.voxel *= 2
+        self.voxel, self._shift = 2 * self.voxel, self._shift / 2 + _CELLS // 4
         (run,) = self._runs
         halves = (((run.keys >> shift & (_CELLS - 1)) >> 1) + _CELLS // 4 for shift in (2 * _BITS, _BITS, 0))
         self._runs = [_Run.grouped(_packed(*halves), run.sums)]

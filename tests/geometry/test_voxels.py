@@ -15,19 +15,21 @@ def wall(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform([-9, -0.1, 0], [9, 0.1, 6], (count, 3)) + ORIGIN
 
 
-def expected(points: np.ndarray, voxel: float) -> dict[tuple, list[np.ndarray]]:
-    cells: dict[tuple, list[np.ndarray]] = {}
-    for point in points:
-        cells.setdefault(tuple(np.floor((point - ORIGIN) / voxel)), []).append(point)
-    return cells
+def cell(point: np.ndarray, voxel: float, thirds: int) -> tuple:
+    return tuple(np.floor((point - ORIGIN) / voxel + thirds / 3))
 
 
 def check(means: VoxelMeans, points: np.ndarray) -> None:
-    cells = expected(points, means.voxel)
+    """The origin is a third of a voxel from a boundary, before or behind it."""
+    thirds = round(3 * (means._shift % 1))
+    assert thirds in (1, 2)
+    cells: dict[tuple, list[np.ndarray]] = {}
+    for point in points:
+        cells.setdefault(cell(point, means.voxel, thirds), []).append(point)
     found, _, counts = means.means()
     assert len(found) == len(cells)
     for point, count in zip(found, counts, strict=True):
-        members = cells[tuple(np.floor((point - ORIGIN) / means.voxel))]
+        members = cells[cell(point, means.voxel, thirds)]
         assert count == len(members)
         np.testing.assert_allclose(point, np.mean(members, axis=0), rtol=0, atol=1e-8)
 
@@ -81,7 +83,7 @@ def test_values_are_averaged_with_their_points():
 
 def test_an_extent_of_many_voxels_is_sorted_like_a_short_one():
     """Where indices and order do not fit into one number."""
-    points = np.random.default_rng(0).uniform(-9, 9, (3000, 3)) * [1e5, 1e5, 1e4] + ORIGIN
+    points = np.random.default_rng(0).uniform(-6, 9, (3000, 3)) * 1e5 + ORIGIN
     means = VoxelMeans(ORIGIN, 1.0, 10_000)
     means.add(points)
     assert means.voxel == 1.0
@@ -102,3 +104,17 @@ def test_points_are_in_chosen_cells():
     cells = Cells(ORIGIN, 2.0, chosen)
     points = np.array([[5.0, 3, 1], [3, 3, 1], [5, 3, 2.5], [-1, 3, 1], [99, 3, 1], [np.nan, 3, 1]]) + ORIGIN
     np.testing.assert_array_equal(cells.contains(points), [True, False, False, False, False, False])
+
+
+@pytest.mark.parametrize("doublings", range(5))
+def test_a_wall_at_the_origin_is_merged_in_one_layer(doublings: int):
+    means = VoxelMeans(ORIGIN, 0.1, 10_000)
+    points = wall(5000)
+    points[:, 1] = ORIGIN[1] + np.random.default_rng(1).normal(0, 0.005, 5000)
+    means.add(points)
+    for _ in range(doublings):
+        means._merge(1)
+        means._double()
+    found, _, _ = means.means()
+    cells = np.floor((found - ORIGIN) / means.voxel + means._shift)[:, [0, 2]]
+    assert len(np.unique(cells, axis=0)) == len(found)

@@ -191,13 +191,12 @@ def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
 
 
 def _is_raster(rows: list[list[str]]) -> bool:
-    """Whether the first two columns step through the pixels of a scan, and what follows are no unit normals."""
-    pixels, rest = (np.array([row[part] for row in rows], np.float64) for part in (slice(0, 2), slice(2, 5)))
-    steps = np.abs(np.diff(pixels, axis=0))
-    along = (steps == 0).any(axis=1) if len(rows) > 1 else np.ones(1, bool)
-    return bool(
-        pixels.min() >= 0 and along.mean() > 0.9 and not np.allclose(np.linalg.norm(rest, axis=1), 1, atol=0.01)
-    )
+    """Whether the first two columns step through the pixels of a scan, not through heights that have normals."""
+    pixels = np.array([row[:2] for row in rows], np.float64)
+    along = (np.diff(pixels, axis=0) == 0).any(axis=1)
+    normals = [np.array(row[3:6], np.float64) for row in rows if len(row) >= 6 and all(map(_is_number, row[3:6]))]
+    unit = len(normals) > 0 and np.allclose(np.linalg.norm(normals, axis=1), 1, atol=0.01)
+    return bool(pixels.min() >= 0 and (len(rows) == 1 or along.mean() > 0.9) and not unit)
 
 
 def _shown(line: str) -> str:
