@@ -33,10 +33,10 @@ from shellgs_method.geometry.precision import mesh_step
 from shellgs_method.geometry.similarity import fit_similarity, transformed
 from shellgs_method.registration import proposal
 from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
+from shellgs_method.registration.orientations import scene_axes
 from shellgs_method.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.registration.positions import SurveyedPositions, align_positions, read_positions
 from shellgs_method.registration.proposal import Candidate
-from shellgs_method.registration.proposal import _main_wall as main_wall
 from shellgs_method.registration.refinement import refine
 from shellgs_method.registration.repetition import scan_shifts
 from shellgs_method.registration.report import shell_edges, write_report
@@ -227,15 +227,15 @@ def test_the_main_wall_is_the_same_in_each_run():
     wall = np.stack([random.uniform(0, 20, 3000), random.normal(0, 0.25, 3000), random.uniform(0, 8, 3000)], axis=1)
     ground = np.stack([random.uniform(0, 20, 2500), random.uniform(-9, 0, 2500), random.normal(0, 0.02, 2500)], axis=1)
     cameras, up = np.array([[5.0, -10, 2], [15, -10, 2]]), np.array([0.0, 0, 1])
-    found = [main_wall(np.concatenate([ground, wall]), cameras, up) for _ in range(20)]
-    assert len({cloud.axes.tobytes() for cloud in found}) == 1
-    assert np.degrees(np.arccos(-found[0].axes[2, 1])) < 1
+    found = [scene_axes(np.concatenate([ground, wall]), cameras, up)[0] for _ in range(20)]
+    assert len({axes.tobytes() for axes in found}) == 1
+    assert np.degrees(np.arccos(-found[0][2, 1])) < 1
 
 
 def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh, views, points, monkeypatch):
     """As a shell in millimetres gives, if taken for one in metres."""
     unsupported = [Candidate(np.eye(4), score=0.0)]
-    monkeypatch.setattr(proposal, "_upwards", lambda *_: [])
+    monkeypatch.setattr(proposal, "shell_axes", lambda *_: [])
     monkeypatch.setattr(proposal, "_refined", lambda *_: unsupported)
     with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
         place_by_guess(mesh, views, points, "shell/facade.glb", 1.0)

@@ -350,7 +350,7 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, capsys):
     assert "nan" not in page
 
 
-@pytest.mark.parametrize("words", ["run.yml out --parts 8", "--parts 8 run.yml out", "run.yml other.yml out --up z"])
+@pytest.mark.parametrize("words", ["run.yml out --parts 8", "--parts 8 run.yml out", "run.yml other.yml out --voxel 1"])
 def test_options_stand_before_the_runs_or_after_the_folder(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["shellgs", "sim", *words.split()])
