@@ -13,6 +13,8 @@ _ROLL, _PITCH = np.sin(np.radians(3)), np.sin(np.radians(30))
 """Sines of usual angles by which photographs are rolled, and by which cameras look up or down."""
 _ROLLED = np.sin(np.radians(20))
 """Sine of the angle from which a photograph is rolled, and tells nothing, unless it is rolled by a right angle."""
+_DOWN = 0.2
+"""Cosine between up and an image's upper edge below which a camera looks straight down."""
 _PAIRS = 300
 _MOST = 2000
 """Number of normals that are compared with each other, evenly taken from all."""
@@ -40,15 +42,16 @@ def upwards(
         level = np.where(np.abs(right @ up) <= np.abs(top @ up), 1.0, 0.0)[:, None]
         across, along = level * right + (1 - level) * top, level * top + (1 - level) * right
         fits = np.abs(across @ up) < _ROLLED
-        if 2 * fits.sum() < len(turns):
+        if fits.mean() < 0.6:
             return None
-        across, along = across[fits], along[fits] * np.sign(along[fits] @ up)[:, None]
+        across, above = across[fits], (along[fits] @ up)[:, None]
+        along = np.where(np.abs(above) > _DOWN, np.sign(above) * along[fits], up)
         # Least squares: images are rolled by little, and tilted by more.
         spread = across.T @ across / len(across)
         up = np.linalg.solve(spread + (_ROLL / _PITCH) ** 2 * np.eye(3), along.mean(axis=0))
         up /= np.linalg.norm(up)
     sign = (top @ up).mean()
-    if abs(sign) < 0.2:  # they look straight down, if anywhere
+    if abs(sign) < _DOWN:  # they look straight down, if anywhere
         sign = -(ahead @ up).mean()
         if abs(sign) < 0.5 or np.linalg.eigvalsh(spread)[1] < _ROLLED**2:
             return None

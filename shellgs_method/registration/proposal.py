@@ -200,11 +200,12 @@ def _refined(
 ) -> list[Candidate]:
     """The candidate refined from an error of ``reach`` metres, and measured; none if too few points are in reach."""
     last = max(FINAL_GATE, tolerance * sight.distance(start.survey_from_scene))
+    far = tolerance > _FIT
     try:
-        similarity = refine(surface, points, start.survey_from_scene, reach, last=last, steps=steps).survey_from_scene
+        found = refine(surface, points, start.survey_from_scene, reach, last=last, steps=steps, relative=far)
     except SceneError:
         return []
-    return [Candidate(similarity, sight.agreement(surface, similarity, tolerance))]
+    return [Candidate(found.survey_from_scene, sight.agreement(surface, found.survey_from_scene, tolerance))]
 
 
 def _distinct(candidates: Sequence[Candidate], spread: np.ndarray, count: int, apart: float) -> list[Candidate]:

@@ -89,6 +89,7 @@ def refine(
     rounding: float = 0.0,
     last: float = FINAL_GATE,
     steps: int = _STEPS,
+    relative: bool = False,
 ) -> Refinement:
     """Refine an alignment by fitting the SfM points to the shell.
 
@@ -104,6 +105,8 @@ def refine(
         rounding: largest error of the points and the shell by the rounding of their coordinates, in metres.
         last: the last limit, in metres.
         steps: most steps.
+        relative: measure distances relative to the scale, for a start whose scale is far off: in metres they are all
+            the less, the more the points shrink.
 
     Raises:
         SceneError: fewer than 7 points are within reach of the shell.
@@ -114,7 +117,7 @@ def refine(
     gates = np.geomspace(max(reach, last), last, steps // 2)
     evidence, used = None, np.ones(len(points), bool)
     for gate in np.append(gates, np.full(steps - len(gates), last)):
-        evidence, step, used = _solve(surface, transformed(points, similarity), gate)
+        evidence, step, used = _solve(surface, transformed(points, similarity), gate, relative)
         similarity = step @ similarity
         if gate == last and np.abs(step - np.eye(4)).max() < 1e-7:
             break
@@ -123,7 +126,9 @@ def refine(
     return Refinement(similarity, evidence, float(np.sqrt((moved**2).sum(axis=1).mean())))
 
 
-def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evidence, np.ndarray, np.ndarray]:
+def _solve(
+    surface: ShellSurface, points: np.ndarray, gate: float, relative: bool
+) -> tuple[Evidence, np.ndarray, np.ndarray]:
     """One step: its evidence, the similarity to apply, and the mask of points within the gate."""
     closest = surface.closest(points)
     offset = points - closest.point
@@ -140,8 +145,7 @@ def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evid
     arm = points - centre
     radius = float(np.sqrt(np.average((arm**2).sum(axis=1), weights=weight)))
     # Shift, rotation and scale are all in metres at that radius, so that their strengths can be compared.
-    # Distances are relative to the scale: in metres they would all be least if the points shrank onto a wall.
-    scale = (np.einsum("nd,nd->n", normal, arm) - distance)[:, None]
+    scale = (np.einsum("nd,nd->n", normal, arm) - relative * distance)[:, None]
     J = np.concatenate([normal, np.cross(arm, normal) / radius, scale / radius], axis=1)
     strengths, directions = np.linalg.eigh(J.T @ (weight[:, None] * J) / weight.sum())
     evidence = Evidence(directions.T[::-1], np.maximum(strengths[::-1], 0.0), centre, radius, int(used.sum()))

@@ -26,7 +26,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View, to_camera
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.undistortion import undistort
-from shellgs_method.geometry.axes import facade_axes
+from shellgs_method.geometry.axes import facade_axes, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
 from shellgs_method.geometry.precision import mesh_step
@@ -213,12 +213,38 @@ def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface
     assert error(surface, found, survey_from_scene) < 0.02
 
 
-def test_a_proposal_is_right_for_a_shell_tilted_in_its_file(mesh, surface, views, points, survey_from_scene):
-    turned = displaced(0.0, 50.0, 0.0, seed=7)
-    askew = ShellMesh(transformed(mesh.vertices, turned), mesh.faces)
+def turned(axis: str) -> np.ndarray:
+    """The motion that turns the shell so that an axis of its file, or none, is up."""
+    if axis == "none":
+        return displaced(0.0, 50.0, 0.0, seed=7)
+    motion = np.eye(4)
+    motion[:3, :3] = turn(np.eye(3)[2], np.eye(3)["xyz".index(axis)])
+    return motion
+
+
+@pytest.mark.parametrize("axis", ["x", "none"])
+def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
+    motion = turned(axis)
+    askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
     alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
-    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ turned)
+    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ motion)
     assert error(surface, found, survey_from_scene) < 0.02
+
+
+@pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
+def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
+    motion = turned(axis)
+    alignment = Alignment(TRUTH @ np.linalg.inv(motion), "shell/facade.obj").seen_by(views)
+    assert alignment.up is not None
+    cosine = alignment.up @ motion[:3, :3] @ [0.0, 0, 1]
+    assert np.degrees(np.arccos(min(cosine, 1.0))) <= within
+    path = tmp_path / "alignment.json"
+    alignment.save(path)
+    assert Alignment.load(path) == alignment
+    older = json.loads(path.read_text())
+    del older["up"]
+    path.write_text(json.dumps(older))
+    np.testing.assert_array_equal(Alignment.load(path).up, alignment.up)
 
 
 def test_the_main_wall_is_the_same_in_each_run():
