@@ -41,7 +41,7 @@ def align(
 
     Args:
         scene: Scene folder.
-        shell: Mesh or point cloud of the shell.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy).
         picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
         positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.

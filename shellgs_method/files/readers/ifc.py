@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,15 +67,16 @@ def read_ifc(path: Path) -> Geometry:
 
     if path.suffix.lower() == ".ifc" and _END not in path.read_bytes()[-1000:]:
         raise ValueError("it does not end as an IFC does")
+    ifcopenshell.get_log()  # which empties it
     model: Any = ifcopenshell.open(str(path))
     products = [each for each in model.by_type("IfcProduct") if each.Representation]
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
     say_left_out(path, Counter(each.is_a() for each in products if classes[each.id()] is None))
     seen = [each for each in products if classes[each.id()] is not None]
-    shapes = list(_shapes(ifcopenshell.geom, model, seen))
     vertices, faces, kinds = [NO_POINTS], [NO_FACES], [NO_CLASSES]
-    count = 0
-    for shape in shapes:
+    count, made = 0, set[int]()
+    for shape in _shapes(ifcopenshell.geom, model, seen):
+        made.add(shape.id)
         matrix = np.array(shape.transformation.matrix).reshape(4, 4).T
         points = transformed(np.array(shape.geometry.verts).reshape(-1, 3), matrix)
         triangles = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
@@ -82,13 +84,16 @@ def read_ifc(path: Path) -> Geometry:
         faces.append(triangles + count)
         kinds.append(_with_glass(classes[shape.id], shape.geometry, len(triangles)))
         count += len(points)
-    made = {shape.id for shape in shapes}
     failed = [each for each in seen if each.id() not in made and _has_body(each)]
     if failed:
         notice(
             f"{path}: the geometry of {len(failed)} of {len(seen)} parts cannot be made, such as {failed[0].is_a()} "
             f"{failed[0].GlobalId}."
         )
+    faults = [line for line in ifcopenshell.get_log().splitlines() if line.startswith("[error]")]
+    if faults:
+        first = re.sub(r"\[.*?\] *", "", faults[0])
+        notice(f"{path}: {len(faults)} of its lines or shapes are faulty and may be missing, such as: {first}.")
     if not count:
         raise SceneError(f"the shell {path} has no walls, roofs, windows or other outside of a building")
     return Geometry(
@@ -100,7 +105,7 @@ def read_ifc(path: Path) -> Geometry:
 
 
 def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
-    """The triangulated shapes of products, in metres and their own placements, with openings cut."""
+    """The triangulated shapes of products, in metres and their placements, with openings cut; valid until the next."""
     iterator = geom.iterator(geom.settings(), model, 1, include=products) if products else None
     if iterator is not None and iterator.initialize():
         yield iterator.get()
@@ -163,6 +168,8 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     import ifcopenshell.util.geolocation
     import ifcopenshell.util.unit
 
+    if ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT") is None:
+        notice(f"{path}: it names no unit of length: its numbers are taken for metres.")
     known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
     if known is None:
         return points
