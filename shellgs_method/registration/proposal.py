@@ -31,15 +31,15 @@ from shellgs_method.shell.surface import ShellSurface
 AMBIGUOUS = 0.90
 """Share of the best score from which another candidate is reported as a rival."""
 _SAMPLES = 20_000  # points of the shell's surface
-_FEW, _MANY = 800, 4000  # SfM points that candidates are refined with, at first and in the end
+_FEW, _MANY = 250, 4000  # SfM points that candidates are refined with, at first and in the end
 _CELLS = 20_000  # of the shell's grid
-_SCALE_STEP = 1.07
+_SCALE_STEP = 1.06
 _LARGEST = 2_000_000  # cells of a grid that the shell is shifted in
 _PEAKS = 3  # shifts kept per orientation and scale
 _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with points
 # Candidates that are measured and refined, and tolerances relative to the distance: errors of SfM points grow with it,
 # and what a smaller scale brings nearer to the shell fits no better.
-_MEASURED, _REFINED, _POLISHED = 1000, 40, 8
+_MEASURED, _REFINED, _POLISHED = 1000, 250, 8
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
 _DIFFERENT_FROM_AFAR = 0.01
@@ -94,7 +94,7 @@ def propose(
     starts = _distinct(starts, spread, _REFINED, 2 * search.cell)
     found = []
     for start in track(starts, "Refining candidates", len(starts)):
-        found += _refined(surface, few, sight, start, 2 * search.cell, _COARSE, 16)
+        found += _refined(surface, few, sight, start, 2 * search.cell, _COARSE, 10)
     found = _distinct(found, spread, _POLISHED, _DIFFERENT)
     polished = []
     for start in track(found, "Refining the best", len(found)):
