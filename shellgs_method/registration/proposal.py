@@ -39,7 +39,7 @@ _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with
 # Candidates that are measured and refined, and tolerances relative to the distance: errors of SfM points grow with it,
 # and what a smaller scale brings nearer to the shell fits no better.
 _MEASURED, _POLISHED = 1000, 8
-_ROUNDS = ((250, 250, 2, 10), (40, 800, 4, 20))  # candidates, SfM points, reach in cells, steps
+_ROUNDS = ((250, 250, 1, 2, 10), (60, 800, 3, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
 _MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
@@ -92,8 +92,8 @@ def propose(
         for start in track(starts, "Measuring candidates", len(starts))
     ]
     shuffled = np.random.default_rng(0).permutation(near)
-    for number, (count, few, reach, steps) in enumerate(_ROUNDS, 1):
-        starts = _distinct(starts, spread, count, search.cell)
+    for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
+        starts = _distinct(starts, spread, count, apart * search.cell)
         starts = [
             refined
             for start in track(starts, f"Refining candidates, round {number}", len(starts))
