@@ -99,7 +99,8 @@ def propose(
             for start in track(starts, f"Refining candidates, round {number}", len(starts))
             for refined in _refined(surface, shuffled[:few], sight, start, reach * search.cell, _COARSE, steps)
         ]
-    starts = _distinct(starts, spread, _POLISHED, _DIFFERENT)
+    different = max([_DIFFERENT, *(_DIFFERENT_FROM_AFAR * sight.distance(s.survey_from_scene) for s in starts[:1])])
+    starts = _distinct(starts, spread, _POLISHED, different)
     polished = []
     for start in track(starts, "Refining the best", len(starts)):
         reach = 2 * _COARSE * sight.distance(start.survey_from_scene)
@@ -111,7 +112,6 @@ def propose(
             f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
             "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"
         )
-    different = max(_DIFFERENT, _DIFFERENT_FROM_AFAR * sight.distance(polished[0].survey_from_scene))
     best, *others = _distinct(polished, spread, _POLISHED, different)
     return [best, *(replace(other, displacement=_displacement(best, other, spread)) for other in others)]
 
