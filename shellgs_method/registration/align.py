@@ -14,7 +14,8 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import read_model, read_points
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import ADJUSTED, SceneLayout
-from shellgs_method.geometry.axes import facade_axes, likely_up
+from shellgs_method.files.surfaces import usual_up
+from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
@@ -224,6 +225,14 @@ def place_by_guess(
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)
+
+
+def up_in_words(alignment: Alignment) -> str:
+    """What is up in the shell's file, by the cameras."""
+    if alignment.up is None:
+        usual = name_of(usual_up(alignment.shell))
+        return f"The cameras do not tell which way is up: it is taken to be {usual} of the shell's file."
+    return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
 
 
 def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:
