@@ -98,7 +98,8 @@ class TrainedRun:
         """The shell in the frame; the scene must have one."""
         assert self.shell is not None
         alignment, shell = self.shell
-        return ShellMesh(shell.vertices * alignment.metres_per_shell_unit - self.frame.offset, shell.faces)
+        placed = shell.vertices * alignment.metres_per_shell_unit - self.frame.offset
+        return ShellMesh(placed, shell.faces, classes=shell.classes)
 
     @property
     def model_scale(self) -> float:

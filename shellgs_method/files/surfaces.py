@@ -1,4 +1,4 @@
-"""Read meshes and point clouds from files, in double precision."""
+"""Read meshes, building models and point clouds from files, in double precision."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ import numpy as np
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.clouds import Cloud, damaged
+from shellgs_method.files.readers.citygml import read_citygml
+from shellgs_method.files.readers.cityjson import read_cityjson
 from shellgs_method.files.readers.contents import Geometry, splats
 from shellgs_method.files.readers.gltf import read_gltf
+from shellgs_method.files.readers.ifc import read_ifc
 from shellgs_method.files.readers.meshes import read_obj, read_off, read_stl
 from shellgs_method.files.readers.pcd import read_pcd
 from shellgs_method.files.readers.ply import ply_points, read_ply
@@ -25,6 +28,9 @@ MESHES: dict[str, Callable[[Path], Geometry]] = {
     **dict.fromkeys((".glb", ".gltf"), read_gltf),
     ".stl": read_stl,
     ".off": read_off,
+    **dict.fromkeys((".ifc", ".ifczip"), read_ifc),
+    **dict.fromkeys((".gml", ".citygml", ".xml"), read_citygml),
+    **dict.fromkeys((".json", ".cityjson", ".jsonl"), read_cityjson),
 }
 CLOUDS: dict[str, Callable[[Path], Iterator[Points]]] = {
     ".pcd": read_pcd,
@@ -63,8 +69,8 @@ def read_surface(path: Path) -> Geometry | Cloud:
     read = MESHES.get(suffix)
     if read is None:
         raise SceneError(
-            f"the shell {path} is neither a mesh nor a point cloud that can be read: export it as one of "
-            f"{', '.join([*MESHES, *CLOUDS])}"
+            f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: export it as "
+            f"one of {', '.join([*MESHES, *CLOUDS])}"
         )
     try:
         if suffix == ".ply" and ply_points(path) is not None:

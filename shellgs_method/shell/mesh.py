@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write, content_hash
@@ -20,6 +20,7 @@ from shellgs_method.files.surfaces import read_geometry, read_surface
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
+from shellgs_method.geometry.surface_classes import NO_CLASSES, classes_of
 from shellgs_method.geometry.triangles import area_vectors
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
 from shellgs_method.shell.spacing import Sights, as_seen
@@ -39,6 +40,7 @@ class ShellMesh:
         faces: three vertex indices per triangle.
         meshing: how a point cloud was meshed; None if the file holds a mesh.
         step: step of the coordinates in the file.
+        classes: :class:`~shellgs_method.geometry.surface_classes.SurfaceClass` of each triangle; OTHER if not given.
 
     Raises:
         SceneError: the arrays are not such a mesh.
@@ -48,9 +50,11 @@ class ShellMesh:
     faces: Int64[np.ndarray, "F 3"]
     meshing: Meshing | None = None
     step: Step = NO_STEP
+    classes: UInt8[np.ndarray, " F"] = field(default_factory=NO_CLASSES.copy)
 
     def __post_init__(self) -> None:
-        """Check what Open3D does not: it accepts indices out of range."""
+        """Check what Open3D does not, which accepts indices out of range, and fill in the classes."""
+        object.__setattr__(self, "classes", classes_of(self.faces, self.classes))
         if len(self.faces) == 0:
             raise SceneError("the shell has no triangles")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
@@ -103,8 +107,9 @@ def load_shell(
     mesh is cached as ``<cache>/<file name>.<mesher>.ply`` until the cloud changes, or cameras see other parts of it.
 
     Args:
-        path: a mesh (ply, obj, glb, gltf, stl, off) or a cloud (ply, pcd, xyz, xyzrgb, pts, ptx, txt, asc, csv, las,
-            laz, e57; the last three need the extras ``las`` and ``e57``).
+        path: a mesh (ply, obj, glb, gltf, stl, off), a building's model (ifc, gml, json; IFC needs the extra ``bim``)
+            or a cloud (ply, pcd, xyz, xyzrgb, pts, ptx, txt, asc, csv, las, laz, e57; the last three need the extras
+            ``las`` and ``e57``).
         surface: what the file holds, if it was read already.
         cache: folder for the mesh of a point cloud; None for no cache.
         cameras: cameras that see the surface, in the shell's frame and unit. Where they see a large cloud, it is meshed
@@ -127,8 +132,10 @@ def load_shell(
     try:
         if isinstance(surface, Geometry):
             used = _referenced(surface.vertices, surface.faces)
-            mesh = ShellMesh(*_referenced(*_without_outliers(*used, path)))
-            step = mesh_step(mesh.vertices, mesh.faces)
+            usable = _without_outliers(*used, path)
+            near = _referenced(used[0], used[1][usable])
+            mesh = ShellMesh(*near, classes=surface.classes[usable])
+            step = NO_STEP if surface.drawn else mesh_step(mesh.vertices, mesh.faces)
             refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
             return replace(_with_area(mesh, path), step=step)
         whole = surface.whole
@@ -178,11 +185,11 @@ def _read_cached(cached: Path, source: Path, cameras: Sequence[Camera], spacing:
         return None
 
 
-def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Drop vertices that are not finite or absurdly far away, and their triangles."""
+def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> Bool[np.ndarray, " F"]:
+    """Mask of the triangles all of whose vertices are finite and not absurdly far away."""
     kept = inliers(vertices, _FAR)
     if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
-        return vertices, faces
+        return np.ones(len(faces), bool)
     usable = kept[faces].all(axis=1)
     if not usable.any():
         raise SceneError("every triangle of the shell has a NaN or infinite vertex")
@@ -191,7 +198,7 @@ def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tu
         f"{path}: dropped {(~usable).sum()} of {len(faces)} triangles with a NaN or infinite vertex, or one absurdly "
         f"far away, at {place}."
     )
-    return vertices, faces[usable]
+    return usable
 
 
 def _referenced(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,4 +218,4 @@ def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
     if path is not None:
         notice(f"{path}: dropped {flat.sum()} of {len(flat)} triangles, which have no area.")
     vertices, faces = _referenced(mesh.vertices, mesh.faces[~flat])
-    return replace(mesh, vertices=vertices, faces=faces)
+    return replace(mesh, vertices=vertices, faces=faces, classes=mesh.classes[~flat])
