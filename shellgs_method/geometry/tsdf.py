@@ -225,7 +225,7 @@ def _joined(parts: list[tuple[trimesh.Trimesh, Bool[np.ndarray, " F"]]]) -> trim
     for mesh, chosen in parts:
         vertices.append(mesh.vertices)
         faces.append(mesh.faces[chosen] + count)
-        colours.append(np.asarray(mesh.visual.vertex_colors)[:, :3])  # pyright: ignore[reportAttributeAccessIssue]
+        colours.append(np.asarray(mesh.visual.vertex_colors)[:, :3])  # pyright: ignore
         count += len(mesh.vertices)
     places, first, index = np.unique(np.concatenate(vertices), axis=0, return_index=True, return_inverse=True)
     shades = np.concatenate(colours)[first]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of, trainer_of
 
@@ -63,7 +63,7 @@ def test_tiles_of_one_lattice_meet_without_a_seam(sphere, monkeypatch):
     tiled = fuse((view_of_sphere(camera_at(angle)) for angle in np.linspace(-0.6, 0.6, 7)), ROOM, 0.05)
     assert len(tiled.faces) == len(sphere.faces)
     assert len(tiled.vertices) == len(sphere.vertices)
-    assert cKDTree(tiled.triangles_center).query(sphere.triangles_center)[0].max() < 1e-6
+    assert KDTree(tiled.triangles_center).query(sphere.triangles_center)[0].max() < 1e-6
     assert tiled.area == pytest.approx(sphere.area)
 
 
@@ -90,7 +90,7 @@ def test_a_long_street_is_meshed_as_finely_as_a_house_of_it(monkeypatch):
     assert np.quantile(errors[0], 0.95) == pytest.approx(np.quantile(errors[1], 0.95), rel=0.2)
     assert np.quantile(errors[0], 0.95) < 0.02
     here = whole.vertices[whole.vertices[:, 0] < 5]
-    assert cKDTree(here).query(part.vertices[part.vertices[:, 0] < 4.9])[0].max() < 1e-5
+    assert KDTree(here).query(part.vertices[part.vertices[:, 0] < 4.9])[0].max() < 1e-5
 
 
 def test_views_of_a_sphere_fuse_to_a_sphere(sphere):
