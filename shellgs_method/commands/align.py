@@ -132,6 +132,7 @@ def align(
         )
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
+    validation = validation.with_checks(placement.checks)
     candidate = unfinished(scene / ADJUSTED)
     try:
         if bundle_adjust and validation.verdict != "refused":

@@ -21,8 +21,7 @@ from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
-from shellgs_method.geometry.axes import facade_axes
-from shellgs_method.geometry.camera import upwards
+from shellgs_method.geometry.axes import facade_axes, likely_up
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.voxels import voxel_means
 
@@ -162,7 +161,7 @@ def _resolution(shot: Snapshot) -> tuple[str, float]:
 def _facade_axes(shots: Sequence[Snapshot]) -> Float[np.ndarray, "3 3"]:
     """Right, up and out of the facade, as rows."""
     normals = [shot.shell_normal[shot.mask[..., 0]][::20].astype(float) @ shot.viewmat[:3, :3] for shot in shots]
-    return facade_axes(np.concatenate(normals), upwards(shot.camera for shot in shots))
+    return facade_axes(np.concatenate(normals), likely_up(shot.camera for shot in shots))
 
 
 def _world(shot: Snapshot, depth: Float[np.ndarray, "H W 1"]) -> Float[np.ndarray, "N 3"]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.clouds import Cloud, damaged
@@ -43,9 +43,9 @@ SPLATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs")
 """Suffixes of formats that hold Gaussian splats only."""
 
 
-def up_axis(shell: str) -> Literal["y", "z"]:
-    """The axis of a shell's file that points up: y in glTF, by that format's convention, else z."""
-    return "y" if shell.lower().endswith((".glb", ".gltf")) else "z"
+def usual_up(shell: str) -> Float64[np.ndarray, " 3"]:
+    """The direction upwards in a shell's file where cameras do not tell: y in glTF, by that format's rule, else z."""
+    return np.eye(3)[1 if shell.lower().endswith((".glb", ".gltf")) else 2]
 
 
 def read_surface(path: Path) -> Geometry | Cloud:

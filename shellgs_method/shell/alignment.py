@@ -20,6 +20,7 @@ from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.scene import ALIGNMENT
+from shellgs_method.geometry.axes import upwards
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
@@ -41,6 +42,7 @@ class Alignment:
         cameras: cameras it was found for, in whose frame alone it is valid; none in files of older versions.
         model: COLMAP model of these, relative to the scene's folder, if they were adjusted to the shell; else empty.
         spacing: size in metres of the voxels in which a point cloud is merged; None for what the cameras resolve.
+        up: the shell's direction upwards, a unit vector: as the cameras tell if None, where they tell.
 
     Raises:
         SceneError: the matrix is not a similarity, or mirrors, the mesher is unknown, or the spacing is not positive.
@@ -56,6 +58,7 @@ class Alignment:
     cameras: BoundCameras = field(default_factory=BoundCameras)
     model: str = ""
     spacing: float | None = None
+    up: Float64[np.ndarray, " 3"] | None = None
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -65,6 +68,7 @@ class Alignment:
         _check_similarity(matrix)
         if not 0 < self.metres_per_shell_unit < np.inf:
             raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
+        object.__setattr__(self, "up", self._upwards() if self.up is None else _direction(self.up))
         if self.mesher not in get_args(Mesher):
             raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
         if self.spacing is not None and not 0 < self.spacing < np.inf:
@@ -84,6 +88,15 @@ class Alignment:
         """The rotation from the shell's axes to the scene's, exactly orthonormal."""
         u, _, vt = np.linalg.svd(self.shell_to_scene[:3, :3])
         return u @ vt
+
+    def _upwards(self) -> Float64[np.ndarray, " 3"] | None:
+        """Up in the shell's frame by the cameras; exactly an axis of it if they agree with that."""
+        up = upwards(self.cameras.cameras.values(), [sign * axis for axis in self.rotation.T for sign in (1, -1)])
+        return None if up is None else _direction(self.rotation.T @ up)
+
+    def seen_by(self, views: Sequence[View]) -> Alignment:
+        """The alignment bound to the cameras of views, which tell what is up."""
+        return replace(self, cameras=BoundCameras.of(views), up=None)
 
     @property
     def metres_per_unit(self) -> float:
@@ -177,7 +190,7 @@ class Alignment:
         same = known is not None and not known.cameras.changed(views)
         if known is None or not same or not known.places_like(self):
             model = known.model if known and same else self.model
-            replace(self, cameras=BoundCameras.of(views), model=model).save(path)
+            replace(self, model=model).seen_by(views).save(path)
 
     @classmethod
     def load(cls, path: Path) -> Alignment:
@@ -200,8 +213,8 @@ class Alignment:
             metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
             cameras = BoundCameras.from_json(fields.get("cameras", {}))
             model = str(fields.get("model", ""))
-            spacing = fields.get("spacing")
-            spacing = None if spacing is None else float(spacing)
+            spacing = None if fields.get("spacing") is None else float(fields["spacing"])
+            up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)  # older files lack it
             return cls(
                 matrix,
                 str(fields["shell"]),
@@ -213,6 +226,7 @@ class Alignment:
                 cameras,
                 model,
                 spacing,
+                up,
             )
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
@@ -255,6 +269,7 @@ class Alignment:
         return {
             **vars(self),
             "shell_to_scene": self.shell_to_scene.tolist(),
+            "up": None if self.up is None else self.up.tolist(),
             "metrics": dict(self.metrics),
             "cameras": self.cameras.to_json(),
         }
@@ -274,6 +289,17 @@ def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
     if matrix.shape != (4, 4):
         raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")
     return matrix
+
+
+def _direction(vector: np.ndarray) -> Float64[np.ndarray, " 3"]:
+    """A unit vector, exactly an axis where it is one but for rounding."""
+    vector = np.asarray(vector, dtype=np.float64)
+    length = np.linalg.norm(vector) if vector.shape == (3,) else np.nan
+    if not 0 < length < np.inf:
+        raise SceneError("the alignment's up is no direction of three numbers, such as [0, 0, 1]")
+    unit = vector / length
+    nearest = np.round(unit)
+    return nearest if np.abs(unit - nearest).max() < 1e-9 else unit
 
 
 def _check_similarity(matrix: np.ndarray) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64, UInt8
 from scipy.ndimage import binary_dilation
 
 from shellgs_method.errors import SceneError
+from shellgs_method.export.frame import Z
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
 from shellgs_method.files.cue_maps import find_cues
@@ -204,4 +205,4 @@ def moved_into(
             f"{scene} is {away / 1000:.0f} km from the first building: are both shells in the same coordinate system?"
         )
     to_scene = frame.to_scene @ np.linalg.inv(between)
-    return SimFrame(frame.name, to_scene, home.offset, True, "z", home.to_national), between @ motion
+    return SimFrame(frame.name, to_scene, home.offset, True, Z, home.to_national), between @ motion

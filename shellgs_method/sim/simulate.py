@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from shellgs_method.errors import SceneError
-from shellgs_method.export.frame import UpAxis
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_write
@@ -42,7 +41,6 @@ def simulate(
     out: Path,
     settings: SimSettings,
     log: Callable[[str], None] = print,
-    up: UpAxis | None = None,
     truths: Sequence[Callable[[np.ndarray], Triangles]] = (),
 ) -> tuple[dict, list[Chapter]]:
     """Export the buildings of trained runs to one folder that simulators load.
@@ -52,7 +50,6 @@ def simulate(
         out: output folder.
         settings: export settings.
         log: called with each message for the user.
-        up: axis of the shells' frames that points up; that of their format if None.
         truths: for each run, a function from the similarity (scene to world) to the true geometry, where known.
 
     Returns:
@@ -68,7 +65,7 @@ def simulate(
     names: list[str] = []
     buildings, chapters, home = [], [], None
     for number, config in enumerate(configs):
-        run = TrainedRun.load(config, up)
+        run = TrainedRun.load(config)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
         made.warn_if_unaligned(log)
