@@ -28,7 +28,7 @@ def test_twenty_million_points_are_merged_in_half_a_gigabyte(tmp_path: Path, suf
     WRITERS[suffix](path, 20_000_000)
     said, (_, _, memory, child) = measured(READ["merged"], path)
     path.unlink()
-    assert said.startswith("20000000 points in ")
+    assert "20000000 points in " in said
     assert memory + child < 0.75
 
 
