@@ -2,7 +2,7 @@
 
 A crash in COLMAP's C++ must not end the caller, and pycolmap conflicts with other libraries. The job is one line of
 JSON on standard input; each line on standard output is progress, the last one the result. The process ends with its
-parent, whose end closes standard input.
+parent, whose end closes standard input. Images are read and written by pycolmap, beside whose libpng Pillow's crashes.
 """
 
 # pycolmap 4.1 to 4.2 imported before zlib corrupts it: the next png that is written aborts.
@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from PIL import Image
 
 SEED = 0
 _MIN_OPENCV = 10  # photographs needed to calibrate OPENCV's four distortion coefficients
@@ -100,13 +99,21 @@ def undistort(model: str, photographs: str, masks: str | None, output: str) -> N
     reconstruction = pycolmap.Reconstruction(model)
     for image in (reconstruction.image(i) for i in reconstruction.reg_image_ids()):
         camera, path = reconstruction.camera(image.camera_id), Path(masks) / f"{image.name}.png"
-        mask = np.asarray(Image.open(path)) if path.is_file() else np.full((camera.height, camera.width), 255, np.uint8)
-        bitmap, _ = pycolmap.undistort_image(
-            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(mask), camera
-        )
+        bitmap, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), _mask(path, camera), camera)
         target = (Path(output) / "masks" / image.name).with_suffix(".png")
         target.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.where(bitmap.to_array().squeeze() > 127, 255, 0).astype(np.uint8)).save(target)
+        kept = np.where(bitmap.to_array().squeeze() > 127, 255, 0).astype(np.uint8)
+        if not pycolmap.Bitmap.from_array(kept).write(target):
+            raise OSError(f"{target} cannot be written")
+
+
+def _mask(path: Path, camera: pycolmap.Camera) -> pycolmap.Bitmap:
+    """A mask; white where there is no file."""
+    if not path.is_file():
+        return pycolmap.Bitmap.from_array(np.full((camera.height, camera.width), 255, np.uint8))
+    if (mask := pycolmap.Bitmap.read(path, as_rgb=False)) is None:
+        raise OSError(f"{path} cannot be read")
+    return mask
 
 
 def main() -> None:
