@@ -17,14 +17,13 @@ from PIL import Image
 from rich.progress import Progress
 from scipy.ndimage import laplace, median_filter
 
-from shellgs_method.capture.hdr import Transfer, tone_mapped
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.transfer import HDR, Transfer, tone_mapped
 
 FRAMES_PER_SECOND = 5
 """Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
 
 _PICTURES = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
-_HDR: dict[int, Transfer] = {16: "PQ", 18: "HLG"}  # transfer characteristics (ITU-T H.273)
 _NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
 
 
@@ -107,7 +106,7 @@ def _main_stream(video: Path, streams: Sequence[VideoStream]) -> VideoStream:
 
 
 def _hdr(video: Path, stream: VideoStream) -> Transfer | None:
-    transfer = _HDR.get(stream.codec_context.color_trc)
+    transfer = HDR.get(stream.codec_context.color_trc)
     if transfer:
         notice(
             f"{video} is HDR ({transfer}), and its frames are tone-mapped to the colours of a photograph: bright walls "

@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.frames import extract_frames, sharpest
-from shellgs_method.capture.hdr import tone_mapped
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
     add_mask,
@@ -36,6 +35,7 @@ from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph, read_image
+from shellgs_method.files.transfer import linear_of, srgb, tone_mapped
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 QUIET = Progress(disable=True)
@@ -185,14 +185,28 @@ def test_an_hdr_video_is_tone_mapped_and_this_is_told(tmp_path, caplog, characte
         assert np.asarray(frame).mean() == pytest.approx({"HLG": 233, "PQ": 255, None: 191}[name], abs=3)
 
 
-def test_the_flat_colours_of_hdr_photographs_are_told(tmp_path, caplog):
-    sdr, hlg = b"colrnclx\0\x01\0\x0d", b"colrnclx\0\x09\0\x12"  # primaries and transfer
-    assert sdr in PHONE.read_bytes()
-    (tmp_path / "hlg.heic").write_bytes(PHONE.read_bytes().replace(sdr, hlg))
+def test_an_hdr_photograph_is_tone_mapped_and_this_is_told(caplog):
     read_image(PHONE)
     assert "HDR" not in caplog.text
-    read_image(tmp_path / "hlg.heic")
-    assert "holds HDR photographs" in caplog.text
+    pixels = np.asarray(read_image(PHONE.with_name("hlg.heic"))).astype(int)
+    assert "holds HDR photographs (HLG), which are tone-mapped" in caplog.text
+    codes = np.array([[0.38] * 3, [0.75] * 3, [0.9] * 3, [0.5, 0.2, 0.2]])  # of its four patches, in 10 bits
+    expected = tone_mapped(np.rint(65535 * codes[None]).astype(np.uint16), "HLG")[0].astype(int)
+    np.testing.assert_allclose(pixels[16, 8::16], expected, atol=2)
+
+
+def test_8_bits_of_an_hdr_photograph_are_tone_mapped_too(tmp_path):
+    sdr, hlg = b"colrnclx\0\x01\0\x0d", b"colrnclx\0\x09\0\x12"  # primaries and transfer
+    (tmp_path / "hlg.heic").write_bytes(PHONE.read_bytes().replace(sdr, hlg))
+    plain, mapped = (np.asarray(read_image(path)) for path in (PHONE, tmp_path / "hlg.heic"))
+    wide = plain.astype(np.uint16) * 257
+    np.testing.assert_allclose(mapped.astype(int), tone_mapped(wide, "HLG").astype(int), atol=1)
+
+
+def test_the_curve_of_srgb_and_its_inverse_agree():
+    stored = np.arange(256) / 255
+    np.testing.assert_allclose(srgb(linear_of(stored)), stored, atol=1e-7)
+    assert linear_of(np.array([0.5]))[0] == pytest.approx(0.21404114, abs=1e-7)  # IEC 61966-2-1
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no video" * 100])
