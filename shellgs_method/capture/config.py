@@ -10,6 +10,7 @@ from shellgs_method.errors import SceneError
 
 Matching = Literal["auto", "sequential", "exhaustive"]
 Cameras = Literal["auto", "single", "folder", "image"]
+CameraType = Literal["auto", "perspective", "equirectangular"]
 
 LEAST_SHARE, LEAST_REGISTERED = 0.6, 3
 """Smallest share and number of photographs that must be registered."""
@@ -29,6 +30,9 @@ class CaptureConfig:
     cameras: Cameras = "auto"
     """Photographs that share a camera: all (single), those of a folder, or none (image). If auto: those with the same
     size, lens and zoom."""
+    camera_type: CameraType = "auto"
+    """Photographs are ordinary ones (perspective), or panoramas of 360° cameras (equirectangular), which are cut into
+    ordinary ones. If auto: panoramas are those that say so in their metadata, or else go around by their pixels."""
     quality: Literal["fast", "high"] = "fast"
     """Image size for features: 1600 pixels (fast), or 3200 and the doubled image (high), several times slower."""
     masks: Optional[Path] = None

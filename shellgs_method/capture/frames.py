@@ -56,6 +56,12 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
                 progress.advance(task)
 
 
+def first_frame(video: Path) -> av.VideoFrame | None:
+    """The first frame of a video, if it has one."""
+    with _opened(video) as (container, stream):
+        return next(container.decode(stream), None)
+
+
 def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
     """Variance of the Laplacian."""
     return float(laplace(grey.astype(np.float32)).var())

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
@@ -28,7 +29,7 @@ from shellgs_method.files.paths import (
     tell_of_masks,
 )
 
-VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv"}
+VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
 """Suffixes of videos, in lower case."""
 _LENS_TAGS = (
     ExifTags.Base.Make,
@@ -106,7 +107,7 @@ def keep_exposure(source: Path, undistorted: Path) -> None:
     """
     with Image.open(source) as stored:
         known = tags_of(stored)
-    exposure = {tag: known[tag] for tag in _EXPOSURE_TAGS if tag in known}
+    exposure: dict[int, Any] = {tag: known[tag] for tag in _EXPOSURE_TAGS if tag in known}
     if not exposure:
         return
     with Image.open(undistorted) as image:
@@ -209,10 +210,12 @@ class Lens:
     Attributes:
         size: width and height in pixels.
         names: names of the photographs.
+        focal: focal length in pixels of a pinhole camera with its centre in the middle; None if it is to be calibrated.
     """
 
     size: tuple[int, int]
     names: list[str]
+    focal: float | None = None
 
 
 def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[Lens]:

@@ -18,16 +18,21 @@ import numpy as np
 import pycolmap
 
 SEED = 0
+_CALIBRATED = "SIMPLE_PINHOLE"  # model of cameras whose focal length is known, as no others have
 _MIN_OPENCV = 10  # photographs needed to calibrate OPENCV's four distortion coefficients
 
 
-def extract(database: str, photographs: str, lenses: list[dict], masks: str | None, sift: dict) -> None:
+def extract(
+    database: str, photographs: str, lenses: list[dict], rigs: list[list[dict]], masks: str | None, sift: dict
+) -> None:
     """Extract features of all photographs that have none yet; each lens is one camera.
 
     Args:
         database: COLMAP's database.
         photographs: folder of the photographs.
-        lenses: size and names of the photographs that share a camera.
+        lenses: size and names of the photographs that share a camera, and its focal length in pixels, if it is known.
+        rigs: cameras that move together: the prefix of their photographs' names, whose rest is the same for those that
+            are taken at once, and the rotation from the first camera.
         masks: folder of masks, ``<name>.png``, black where no features are wanted.
         sift: maximum image size, number of features, and first octave for photographs of 1000 pixels and more: 0 skips
             the doubled image, which smaller photographs need.
@@ -39,10 +44,17 @@ def extract(database: str, photographs: str, lenses: list[dict], masks: str | No
         reader = pycolmap.ImageReaderOptions(
             camera_model="OPENCV" if len(lens["names"]) >= _MIN_OPENCV else "SIMPLE_RADIAL", mask_path=masks or ""
         )
+        if lens["focal"]:
+            width, height = lens["size"]
+            reader.camera_model = _CALIBRATED
+            reader.camera_params = f"{lens['focal']},{width / 2},{height / 2}"
         with pycolmap.Database.open(database) as opened:  # may hold the results of an interrupted run
-            cameras = [image.camera_id for image in opened.read_all_images() if image.name in lens["names"]]
-        if cameras:
-            reader.existing_camera_id = cameras[0]
+            images = opened.read_all_images()
+            cameras = {image.camera_id for image in images if image.name in lens["names"]}
+            # A camera is written before the features of its first photograph.
+            unused = {camera.camera_id for camera in opened.read_all_cameras()} - {image.camera_id for image in images}
+        if cameras or unused:
+            reader.existing_camera_id = min(cameras or unused)
         pycolmap.extract_features(
             database,
             photographs,
@@ -51,6 +63,22 @@ def extract(database: str, photographs: str, lenses: list[dict], masks: str | No
             reader_options=reader,
             extraction_options=options,
         )
+    if rigs:
+        with pycolmap.Database.open(database) as opened:
+            pycolmap.apply_rig_config([_rig(cameras) for cameras in rigs], opened)
+
+
+def _rig(cameras: list[dict]) -> pycolmap.RigConfig:
+    configs = []
+    for number, camera in enumerate(cameras):
+        config = pycolmap.RigConfigCamera()
+        config.ref_sensor, config.image_prefix = number == 0, camera["prefix"]
+        if number:
+            config.cam_from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(camera["rotation"])), np.zeros(3))
+        configs.append(config)
+    rig = pycolmap.RigConfig()
+    rig.cameras = configs
+    return rig
 
 
 def match(database: str, pairs: str) -> None:
@@ -61,8 +89,11 @@ def match(database: str, pairs: str) -> None:
             opened.clear_two_view_geometries()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
+    # Pairs of rigs are verified together, others one by one.
+    options = pycolmap.FeatureMatchingOptions(rig_verification=True, skip_image_pairs_in_same_frame=True)
     pycolmap.match_image_pairs(
         database,
+        matching_options=options,
         pairing_options=pycolmap.ImportedPairingOptions(match_list_path=pairs),
         verification_options=verification,
     )
@@ -71,6 +102,10 @@ def match(database: str, pairs: str) -> None:
 def reconstruct(database: str, photographs: str, output: str) -> list[dict]:
     """Run incremental mapping and write the largest model; return a description of all models, largest first."""
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
+    with pycolmap.Database.open(database) as opened:
+        known = {camera.camera_id for camera in opened.read_all_cameras() if camera.model.name == _CALIBRATED}
+        options.constant_cameras = known
+        options.constant_rigs = {rig.rig_id for rig in opened.read_all_rigs() if rig.ref_sensor_id.id in known}
     models = pycolmap.incremental_mapping(
         database, photographs, output, options, next_image_callback=lambda: print(flush=True)
     )

@@ -18,6 +18,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
 from shellgs_method.capture.pairs import choose_matching, image_pairs
+from shellgs_method.capture.panoramas import (
+    FACES,
+    add_faces,
+    add_mask_faces,
+    face_lenses,
+    face_pairs,
+    face_rig,
+    face_size,
+    find_panoramas,
+    is_face,
+    says_panorama,
+    taken_at_once,
+    video_says_panorama,
+)
 from shellgs_method.capture.photographs import (
     add_mask,
     add_photograph,
@@ -120,7 +134,8 @@ class _Capture:
         self.transparent = [] if self.is_video else [n for n, path in self.photographs.items() if has_alpha(path)]
         self.masked = [name for name in self.photographs if name in self.masks or name in self.transparent]
         # Keys of all that each stage depends on; a stage depends on all earlier ones.
-        self.photographs_key = fingerprint(listing(self.photographs), config.frames if self.is_video else None)
+        frames = config.frames if self.is_video else None
+        self.photographs_key = fingerprint(listing(self.photographs), frames, config.camera_type)
         alpha = [self.transparent] if self.transparent else []
         self.masks_key = fingerprint(self.photographs_key, listing(self.masks), *alpha)
         self.features_key = fingerprint(self.masks_key, config.cameras, config.quality)
@@ -150,6 +165,7 @@ class _Capture:
 
     def _photographs(self) -> None:
         if not self.work.has("photographs", self.photographs_key):
+            said = self._said_to_be_panoramas()
             with self.work.making("photographs", self.photographs_key) as folder:
                 if self.is_video:
                     from shellgs_method.capture.frames import extract_frames
@@ -158,19 +174,49 @@ class _Capture:
                 else:
                     for name, path in self.progress.track(self.photographs.items(), description="reading photographs"):
                         add_photograph(path, folder / name)
+                self._cut_panoramas(folder, said)
         self.folder = self.work.folder / "photographs"
-        self.names = sorted(p.relative_to(self.folder).as_posix() for p in self.folder.rglob("*") if p.is_file())
+        self.names = _files(self.folder)
         if len(self.names) < LEAST_REGISTERED:
             raise SceneError(f"a scene needs at least {LEAST_REGISTERED} photographs, not {len(self.names)}")
         if self.masked and not self.work.has("masks", self.masks_key):
             with self.work.making("masks", self.masks_key) as folder:
                 for name in self.progress.track(self.masked, description="reading masks"):
-                    add_mask(self.masks.get(name), self.photographs[name], self.folder / name, folder / f"{name}.png")
+                    source, target = self.photographs[name], folder / f"{name}.png"
+                    is_whole = (self.folder / name).exists()
+                    add_mask(self.masks.get(name), source, self.folder / name if is_whole else source, target)
+                    if not is_whole:
+                        add_mask_faces(target, folder, name, self.folder)
+
+    def _said_to_be_panoramas(self) -> set[str]:
+        """Names of the sources that are panoramas, by the user's word or by their metadata."""
+        if self.config.camera_type != "auto":
+            return set(self.photographs) if self.config.camera_type == "equirectangular" else set()
+        says = video_says_panorama if self.is_video else says_panorama
+        return {name for name, path in self.photographs.items() if says(path)}
+
+    def _cut_panoramas(self, folder: Path, said: set[str]) -> None:
+        """Cut the panoramas among the photographs into those of their faces."""
+        if self.config.camera_type == "perspective":
+            return
+        names = _files(folder)
+        panoramas = find_panoramas(folder, names, names if self.is_video and said else said)
+        size = face_size(folder, panoramas)
+        for name in self.progress.track(panoramas, description="cutting panoramas"):
+            add_faces(folder / name, folder, name, size)
+            (folder / name).unlink()
+        if panoramas:
+            notice(
+                f"{len(panoramas)} panoramas of 360° are cut into {len(FACES)} photographs each, of {size}x{size} "
+                "pixels; none looks down, where who holds the camera is."
+            )
 
     def _features(self) -> Path:
         """Extract features; return the database."""
         database = self.work.growing("features", self.features_key) / "database.db"
-        lenses = group_by_lens(self.folder, self.names, self.config.cameras)
+        faces = [name for name in self.names if is_face(name)]
+        ordinary = [name for name in self.names if not is_face(name)]
+        lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
         self._step(
             "extract",
             "finding features",
@@ -179,6 +225,7 @@ class _Capture:
             database=str(database),
             photographs=str(self.folder),
             lenses=[asdict(lens) for lens in lenses],
+            rigs=[face_rig()] if faces else [],
             masks=str(self.work.folder / "masks") if self.masked else None,
             sift=_SIFT[self.config.quality],
         )
@@ -188,10 +235,13 @@ class _Capture:
     def _model(self, database: Path) -> None:
         if self.work.has("model", self.model_key):
             return
-        matching = choose_matching(self.config.matching, len(self.names), self.is_video)
-        pairs = image_pairs(len(self.names), matching, self.config.overlap)
+        shots = taken_at_once(self.names)
+        matching = choose_matching(self.config.matching, len(shots), self.is_video)
+        near = image_pairs(len(shots), matching, self.config.overlap)
+        turned = matching == "exhaustive"
+        pairs = [pair for i, j in near for pair in face_pairs(shots[i], shots[j], turned=turned)]
         listed = database.with_name("pairs.txt")
-        listed.write_text("".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs))
+        listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
         self._step(
             "match",
             f"matching ({matching})",
@@ -283,6 +333,11 @@ class _Capture:
         return run_step(
             step, arguments, log=log, progress=self.progress, description=description, total=total, count=count
         )
+
+
+def _files(folder: Path) -> list[str]:
+    """Names of the files in a folder and below."""
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
 def _rows(database: Path, table: str) -> int:
