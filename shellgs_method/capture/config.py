@@ -9,7 +9,7 @@ from typing import Literal, Optional
 from shellgs_method.errors import SceneError
 
 Matching = Literal["auto", "sequential", "exhaustive"]
-Cameras = Literal["auto", "single", "folder", "image"]
+Cameras = Literal["auto", "single", "folder", "rig", "image"]
 CameraType = Literal["auto", "perspective", "equirectangular"]
 
 LEAST_SHARE, LEAST_REGISTERED = 0.6, 3
@@ -28,8 +28,9 @@ class CaptureConfig:
     overlap: int = 10
     """Number of next photographs to match each with, if sequential. Reduce it if identical windows are confused."""
     cameras: Cameras = "auto"
-    """Photographs that share a camera: all (single), those of a folder, or none (image). If auto: those with the same
-    size, lens and zoom."""
+    """Photographs that share a camera: all (single), those of a folder, those of a folder whose camera is mounted with
+    those of the others, which took the photographs of the same name at once (rig), or none (image). If auto: those with
+    the same size, lens and zoom."""
     camera_type: CameraType = "auto"
     """Photographs are ordinary ones (perspective), or panoramas of 360° cameras (equirectangular), which are cut into
     ordinary ones. If auto: panoramas are those that say so in their metadata, or else go around by their pixels."""

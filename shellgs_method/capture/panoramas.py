@@ -218,14 +218,6 @@ def is_face(name: str) -> bool:
     return name.startswith(tuple(FACES))
 
 
-def taken_at_once(names: Sequence[str]) -> list[list[str]]:
-    """Photographs that were cut from one panorama, in the order of the panoramas' names; others are alone."""
-    shots: dict[str, list[str]] = {}
-    for name in names:
-        shots.setdefault(name.partition("/")[2] if is_face(name) else name, []).append(name)
-    return [shots[name] for name in sorted(shots)]
-
-
 def face_pairs(shot: Sequence[str], other: Sequence[str], *, turned: bool) -> Iterator[tuple[str, str]]:
     """Pairs of photographs of two shots: all if the camera may have ``turned`` between, else of faces that overlap."""
     for a, b in product(shot, other):

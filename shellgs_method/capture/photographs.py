@@ -232,6 +232,7 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
             "auto": (size, *(str(tags.get(tag)) for tag in _LENS_TAGS)),
             "single": (),
             "folder": (name.rpartition("/")[0],),
+            "rig": (name.partition("/")[0],),
             "image": (name,),
         }[cameras]
         lens = groups.setdefault(key, Lens(size, []))

@@ -10,6 +10,7 @@ import zlib  # noqa: F401  isort: skip
 
 import json
 import os
+import shutil
 import sys
 import threading
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 import pycolmap
 
 SEED = 0
+_RIGID_DEGREES, _RIGID_STEPS = 3.0, 0.5  # most that cameras which are mounted together move against each other
 _CALIBRATED = "SIMPLE_PINHOLE"  # model of cameras whose focal length is known, as no others have
 _MIN_OPENCV = 10  # photographs needed to calibrate OPENCV's four distortion coefficients
 
@@ -73,7 +75,7 @@ def _rig(cameras: list[dict]) -> pycolmap.RigConfig:
     for number, camera in enumerate(cameras):
         config = pycolmap.RigConfigCamera()
         config.ref_sensor, config.image_prefix = number == 0, camera["prefix"]
-        if number:
+        if number and "rotation" in camera:
             config.cam_from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(camera["rotation"])), np.zeros(3))
         configs.append(config)
     rig = pycolmap.RigConfig()
@@ -89,11 +91,11 @@ def match(database: str, pairs: str) -> None:
             opened.clear_two_view_geometries()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
-    # Pairs of rigs are verified together, others one by one.
-    options = pycolmap.FeatureMatchingOptions(rig_verification=True, skip_image_pairs_in_same_frame=True)
+    with pycolmap.Database.open(database) as opened:
+        has_rigs = any(rig.num_sensors() > 1 for rig in opened.read_all_rigs())
     pycolmap.match_image_pairs(
         database,
-        matching_options=options,
+        matching_options=pycolmap.FeatureMatchingOptions(rig_verification=has_rigs),
         pairing_options=pycolmap.ImportedPairingOptions(match_list_path=pairs),
         verification_options=verification,
     )
@@ -121,6 +123,41 @@ def reconstruct(database: str, photographs: str, output: str) -> list[dict]:
         }
         for model in ranked
     ]
+
+
+def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> dict:
+    """Find how cameras of a rig are mounted from a model of each for itself, and all again as a rig.
+
+    Args:
+        database: COLMAP's database, which is changed.
+        photographs: folder of the photographs.
+        model: folder of the model, which is replaced.
+        prefixes: what the names of each camera's photographs begin with.
+
+    Returns:
+        ``models``, as :func:`reconstruct`; or ``loose``: the prefix of a camera that is not mounted with the first one,
+        and how it moved against it, in degrees and in steps from one shot to the next, the medians.
+    """
+    single = pycolmap.Reconstruction(model)
+    poses = {image.name: image.cam_from_world() for image in (single.image(i) for i in single.reg_image_ids())}
+    first = [poses[name] for name in sorted(poses) if name.startswith(prefixes[0])]
+    path = np.array([pose.inverse().translation for pose in first]).reshape(-1, 3)
+    step = np.median(np.linalg.norm(np.diff(path, axis=0), axis=1)) if len(path) > 1 else 0.0
+    for prefix in prefixes[1:]:
+        of_first = {name: prefixes[0] + name.removeprefix(prefix) for name in poses if name.startswith(prefix)}
+        mounted = [poses[name] * poses[other].inverse() for name, other in of_first.items() if other in poses]
+        if len(mounted) < 2:
+            return {"loose": [prefix, None, None]}
+        turned = np.degrees(min(np.median([a.rotation.angle_to(b.rotation) for b in mounted]) for a in mounted))
+        at = np.array([pose.inverse().translation for pose in mounted])
+        moved = np.median(np.linalg.norm(at - np.median(at, axis=0), axis=1)) / max(step, 1e-12)
+        if turned > _RIGID_DEGREES or moved > _RIGID_STEPS:
+            return {"loose": [prefix, float(turned), float(moved)]}
+    with pycolmap.Database.open(database) as opened:
+        pycolmap.apply_rig_config([_rig([{"prefix": prefix} for prefix in prefixes])], opened, single)
+    for numbered in filter(Path.is_dir, Path(model).iterdir()):
+        shutil.rmtree(numbered)
+    return {"models": reconstruct(database, photographs, model)}
 
 
 def undistort(model: str, photographs: str, masks: str | None, output: str) -> None:
@@ -156,7 +193,8 @@ def main() -> None:
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.set_random_seed(SEED)
-    step = {"extract": extract, "match": match, "reconstruct": reconstruct, "undistort": undistort}[job.pop("step")]
+    steps = extract, match, reconstruct, mount, undistort
+    step = {step.__name__: step for step in steps}[job.pop("step")]
     print(json.dumps(step(**job)), flush=True)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,6 @@ from shellgs_method.capture.panoramas import (
     find_panoramas,
     is_face,
     says_panorama,
-    taken_at_once,
     video_says_panorama,
 )
 from shellgs_method.capture.photographs import (
@@ -41,6 +41,7 @@ from shellgs_method.capture.photographs import (
     keep_exposure,
 )
 from shellgs_method.capture.process import run_step
+from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
 from shellgs_method.capture.work import Work, listing
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
@@ -216,6 +217,13 @@ class _Capture:
         database = self.work.growing("features", self.features_key) / "database.db"
         faces = [name for name in self.names if is_face(name)]
         ordinary = [name for name in self.names if not is_face(name)]
+        if self.config.cameras == "rig" and faces:
+            raise SceneError(
+                "--cameras rig is for ordinary photographs, and panoramas are among these: capture them apart"
+            )
+        if self.config.cameras == "auto":
+            tell_of_a_rig(ordinary)
+        self.rig = folders(ordinary) if self.config.cameras == "rig" else []
         lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
         self._step(
             "extract",
@@ -235,11 +243,13 @@ class _Capture:
     def _model(self, database: Path) -> None:
         if self.work.has("model", self.model_key):
             return
-        shots = taken_at_once(self.names)
+        shots = taken_at_once(self.names, self.rig or FACES)
         matching = choose_matching(self.config.matching, len(shots), self.is_video)
         near = image_pairs(len(shots), matching, self.config.overlap)
         turned = matching == "exhaustive"
         pairs = [pair for i, j in near for pair in face_pairs(shots[i], shots[j], turned=turned)]
+        if self.rig:
+            pairs += [pair for shot in shots for pair in combinations(shot, 2)]
         listed = database.with_name("pairs.txt")
         listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
         self._step(
@@ -253,8 +263,32 @@ class _Capture:
         with self.work.making("model", self.model_key) as folder:
             arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
             models = self._step("reconstruct", "finding cameras", len(self.names), None, **arguments)
+            if self.rig and models:
+                models = self._mounted(database, folder)
             found = {"photographs": self.names, "models": models, "flat_pairs": _flat_pairs(database)}
             (folder / "models.json").write_text(json.dumps(found))
+
+    def _mounted(self, database: Path, folder: Path) -> list[dict[str, Any]]:
+        """Find the cameras of a rig again, together, from those in a folder, which they replace.
+
+        Raises:
+            SceneError: the cameras are not mounted together.
+        """
+        with self.work.making("rig", self.model_key) as copied:
+            copy = copied / database.name  # a resumed capture begins without the rig
+            with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
+                source.backup(target)
+            where = {"database": str(copy), "photographs": str(self.folder), "model": str(folder)}
+            found = self._step("mount", "finding the rig", len(self.names), None, prefixes=self.rig, **where)
+        self.work.drop("rig")
+        if "loose" in found:
+            prefix, turned, moved = found["loose"]
+            how = f"turned by {turned:.1f}° and moved by {moved:.1f} steps" if moved else "never found together"
+            raise SceneError(
+                f"the cameras of {self.rig[0]} and {prefix} are not mounted together, or photographs of the same name "
+                f"were not taken at once: against each other, they are {how}. Try --cameras folder"
+            )
+        return found["models"]
 
     def _largest_model(self, found: dict[str, Any]) -> Summary:
         """Summary of the largest model.

@@ -636,6 +636,42 @@ def test_the_light_of_a_photograph_is_that_of_its_exif_data(tmp_path):
     np.testing.assert_array_equal(exif_log_gains([tmp_path / "none.jpg"]), [0])
 
 
+def rows(database: Path, query: str) -> list[tuple]:
+    with closing(sqlite3.connect(database)) as connection:
+        return sorted(connection.execute(query).fetchall(), key=repr)
+
+
+def test_features_that_were_stopped_before_the_first_photograph_are_found_as_if_they_were_not(tmp_path):
+    """COLMAP writes a camera, and its rig, when it has read the first photograph: seconds before its features."""
+    (tmp_path / "photographs").mkdir()
+    for name in ("0.png", "1.png", "2.png"):
+        photograph(200, 150, seed=int(name[0])).save(tmp_path / "photographs" / name)
+    lenses = [{"size": [200, 150], "names": names, "focal": None} for names in (["0.png", "1.png"], ["2.png"])]
+    sift = {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}
+
+    def extract(database: Path, count: int) -> None:
+        job = {"photographs": str(tmp_path / "photographs"), "masks": None, "rigs": [], "sift": sift}
+        job |= {"database": str(database), "lenses": lenses[:count]}
+        run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
+
+    whole, stopped = tmp_path / "whole.db", tmp_path / "stopped.db"
+    for kept in (0, 1):  # lenses that were finished
+        whole.unlink(missing_ok=True)
+        stopped.unlink(missing_ok=True)
+        extract(whole, 2)
+        extract(stopped, kept + 1)
+        with closing(sqlite3.connect(stopped)) as connection, connection:
+            of_last = f"(SELECT image_id FROM images WHERE camera_id = {kept + 1})"
+            for table in ("keypoints", "descriptors"):
+                connection.execute(f"DELETE FROM {table} WHERE image_id IN {of_last}")
+            connection.execute(f"DELETE FROM frame_data WHERE data_id IN {of_last}")
+            connection.execute("DELETE FROM frames WHERE frame_id NOT IN (SELECT frame_id FROM frame_data)")
+            connection.execute(f"DELETE FROM images WHERE camera_id = {kept + 1}")
+        extract(stopped, 2)
+        for query in ("SELECT * FROM cameras", "SELECT * FROM rigs", "SELECT name, camera_id FROM images"):
+            assert rows(stopped, query) == rows(whole, query)
+
+
 @pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])
 def test_deleted_parts_of_a_captured_scene_are_made_again(tmp_path, without_colmap, deleted):
     for k in range(3):

@@ -20,9 +20,9 @@ from shellgs_method.capture.panoramas import (
     face_pairs,
     find_panoramas,
     says_panorama,
-    taken_at_once,
     video_says_panorama,
 )
+from shellgs_method.capture.rigs import taken_at_once
 from shellgs_method.errors import SceneError
 
 
@@ -81,7 +81,7 @@ def test_faces_are_named_by_panorama_and_belong_together(tmp_path):
         add_faces(tmp_path / name, tmp_path / "faces", name, 64)
     photograph().save(tmp_path / "faces" / "b.jpg")
     names = sorted(p.relative_to(tmp_path / "faces").as_posix() for p in (tmp_path / "faces").rglob("*.jpg"))
-    two, one, alone = taken_at_once(names)
+    two, one, alone = taken_at_once(names, FACES)
     assert one == [f"{prefix}a/1.jpg" for prefix in sorted(FACES)]
     assert two == [f"{prefix}2.jpg" for prefix in sorted(FACES)]
     assert alone == ["b.jpg"]
