@@ -51,6 +51,13 @@ def depth_colours(
     return _scale_colours("viridis", (depth.astype(float) - near) / max(far - near, 1e-6), mask)
 
 
+def deviation_colours(distance: Shaped[np.ndarray, "*shape"], full: float) -> UInt8[np.ndarray, "*shape 3"]:
+    """Colours of signed distances in 8 bits: red at ``full`` in front, white at 0, blue behind, grey where NaN."""
+    strength = np.clip(np.nan_to_num(distance) / full, -1, 1)[..., None]
+    colours = 255 - 255 * np.where(strength > 0, strength * [0.1, 1, 1], -strength * [1, 1, 0.1])
+    return np.where(np.isnan(distance)[..., None], GREY, colours).round().astype(np.uint8)
+
+
 def _scale_colours(
     name: str, share: Float[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:

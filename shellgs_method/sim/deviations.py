@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, Int64
 
+from shellgs_method.evaluation.colours import deviation_colours
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.camera import Camera, in_view
 from shellgs_method.geometry.triangles import Triangles
@@ -19,7 +20,6 @@ EDGE = 0.15
 """Longest edge in metres of the triangles into which the shell is subdivided."""
 REACH = 0.5
 """Search range in front of and behind the shell, in metres."""
-GREY = (150, 150, 150)
 FULL = 0.2
 """Distance in metres of the full colours: red in front of the shell, blue behind it."""
 
@@ -66,7 +66,7 @@ class Deviations:
     def write(self, path: Path) -> None:
         """Write the coloured shell as ply: red where the building is in front of it, blue behind, grey where unseen."""
         mesh = trimesh.Trimesh(
-            self.surface.vertices, self.surface.faces, face_colors=coloured(self.distance), process=False
+            self.surface.vertices, self.surface.faces, face_colors=deviation_colours(self.distance, FULL), process=False
         )
         content = mesh.export(file_type="ply")
         with atomic_write(path) as file:
@@ -122,14 +122,6 @@ def along_normals(small: Triangles, places: Float64[np.ndarray, "F 3"], other: T
     """Signed distance of another surface along each triangle's normal, seen from outside; NaN if none is in reach."""
     t = other.cast(places + REACH * small.normals, -small.normals).t
     return np.where(t < 2 * REACH, REACH - t, np.nan)
-
-
-def coloured(distance: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 4"]:
-    """RGBA colours: white at 0, red in front of the shell, blue behind it, grey where unknown."""
-    strength = np.clip(np.nan_to_num(distance) / FULL, -1, 1)[:, None]
-    colours = 255 - 255 * np.where(strength > 0, strength * [0.1, 1, 1], -strength * [1, 1, 0.1])
-    colours = np.where(np.isnan(distance)[:, None], GREY, colours)
-    return np.concatenate([colours, np.full((len(colours), 1), 255)], axis=1).round().astype(np.uint8)
 
 
 def _region(

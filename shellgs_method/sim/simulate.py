@@ -16,6 +16,7 @@ from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import GROUND, Collider, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
@@ -28,7 +29,6 @@ from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.trials.engine import import_mujoco
-from shellgs_method.sim.winding import outward
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""

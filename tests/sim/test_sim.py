@@ -21,6 +21,7 @@ from shellgs_method.export.frame import Frame
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.building import moved_into
 from shellgs_method.sim.collision.collider import Collider, leaks, make_collider, standing_before, thickness
 from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
@@ -30,7 +31,6 @@ from shellgs_method.sim.collision.planes import find_planes
 from shellgs_method.sim.deviations import find_deviations
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo, bake
-from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import RECESS, Layout, building, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk

@@ -23,6 +23,7 @@ from shellgs_method.export.splats import Splats
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, make_collider
 from shellgs_method.sim.collision.parts import Part
@@ -36,7 +37,6 @@ from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
 from shellgs_method.sim.trials.engine import beams, compiled, import_mujoco, lidar, load, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
-from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import Layout, shell
 from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk as stroll
