@@ -32,7 +32,9 @@ _OVERLAPPING = 60  # degrees between the directions of faces that share much: th
 _HEADER = 1 << 18  # bytes of a file in which its XMP metadata begin
 _PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
 _WIDTHS = re.compile(rb"GPano:(?:FullPano|CroppedAreaImage)WidthPixels\s*(?:=\s*[\"']|>)\s*(\d+)")
-_CLOSED = 3.0  # most a panorama's first column differs from its last, in differences of neighbours
+# Most that a panorama's first column differs from its last, in differences of neighbouring columns: at most 1.7 in 20
+# rendered panoramas, 3.6 and more in 61 photographs that were cropped to the same shape, 11 in the median.
+_CLOSED = 3.0
 _NOISE = 1.0  # of colours
 _COMPARED = 9  # photographs
 

@@ -65,9 +65,13 @@ def extract(
             reader_options=reader,
             extraction_options=options,
         )
-    if rigs:
-        with pycolmap.Database.open(database) as opened:
+    with pycolmap.Database.open(database) as opened:
+        if rigs and not _has_rigs(opened):
             pycolmap.apply_rig_config([_rig(cameras) for cameras in rigs], opened)
+
+
+def _has_rigs(database: pycolmap.Database) -> bool:
+    return any(rig.num_sensors() > 1 for rig in database.read_all_rigs())
 
 
 def _rig(cameras: list[dict]) -> pycolmap.RigConfig:
@@ -92,7 +96,7 @@ def match(database: str, pairs: str) -> None:
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     with pycolmap.Database.open(database) as opened:
-        has_rigs = any(rig.num_sensors() > 1 for rig in opened.read_all_rigs())
+        has_rigs = _has_rigs(opened)
     pycolmap.match_image_pairs(
         database,
         matching_options=pycolmap.FeatureMatchingOptions(rig_verification=has_rigs),

@@ -12,6 +12,7 @@ from PIL import Image
 from scenes import photograph, write_video
 from scipy.spatial.transform import Rotation
 
+from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.panoramas import (
     FACES,
@@ -24,6 +25,8 @@ from shellgs_method.capture.panoramas import (
 )
 from shellgs_method.capture.rigs import taken_at_once
 from shellgs_method.errors import SceneError
+from shellgs_method.synthetic.appearance import developed
+from shellgs_method.synthetic.scene import Facade, FacadeConfig
 
 
 def directions(width: int) -> np.ndarray:
@@ -272,3 +275,35 @@ def test_a_mask_of_a_panorama_is_cut_as_it_and_ordinary_photographs_stay_whole(t
             expected = np.zeros((64, 64), np.uint8)
             expected[:, kept] = 255
             np.testing.assert_array_equal(np.asarray(image), expected)
+
+
+def write_panoramas(folder: Path, facade: Facade) -> np.ndarray:
+    """Panoramas along a facade, a little tilted, 1024 pixels wide; returns their positions in metres."""
+    folder.mkdir()
+    random, directions_of = np.random.default_rng(0), directions(1024).astype(np.float32)
+    x = np.linspace(-1, facade.layout.length + 1, 10)
+    centres = np.stack([x, -5 + 0.5 * np.sin(x), np.full(len(x), 2.0)], axis=-1).astype(np.float32)
+    facing = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # camera to building
+    for k, centre in enumerate(centres):
+        turned = facing @ Rotation.from_euler("YXZ", random.normal(0, [10, 2, 2]), degrees=True).as_matrix()
+        rays = (directions_of @ turned.T).astype(np.float32).reshape(-1, 3)
+        image = developed(facade.daylight.radiance(centre, rays).reshape(512, 1024, 3), random)
+        Image.fromarray(image).save(folder / f"{k:02d}.jpg", quality=95, subsampling=0)
+    return centres
+
+
+@pytest.mark.slow
+def test_panoramas_of_a_walk_are_found_where_they_were_taken(tmp_path):
+    facade = Facade.build(FacadeConfig(bays=3, storeys=2))
+    true = write_panoramas(tmp_path / "photographs", facade)
+    summary = capture(tmp_path / "photographs", tmp_path / "scene")
+    assert not summary.missing
+    views = {view.name: view.camera for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene"))}
+    assert len(views) == 80
+    front = np.stack([views[f"images/yaw000-pitch00/{k:02d}.jpg"].position.numpy() for k in range(10)])
+    for prefix in FACES:
+        same = np.stack([views[f"images/{prefix}{k:02d}.jpg"].position.numpy() for k in range(10)])
+        np.testing.assert_allclose(same, front, atol=1e-9)
+    a, b = front - front.mean(axis=0), true - true.mean(axis=0)
+    rotation, scale = Rotation.align_vectors(b, a)[0], np.linalg.norm(b) / np.linalg.norm(a)
+    assert np.linalg.norm(scale * rotation.apply(a) - b, axis=1).max() < 0.03
