@@ -11,13 +11,14 @@ import re
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float32, Float64, Shaped
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -205,14 +206,21 @@ def cut(
     panorama: Shaped[np.ndarray, "H W *C"], face: Face, size: int, interpolation: int
 ) -> Shaped[np.ndarray, "{size} {size} *C"]:
     """The image of a face of a panorama, which holds longitudes along its width and latitudes along its height."""
-    height, width = panorama.shape[:2]
+    u, v = _pixels(face, size, panorama.shape[1], panorama.shape[0])
+    return cv2.remap(panorama, u, v, interpolation, borderMode=cv2.BORDER_WRAP)
+
+
+@lru_cache(maxsize=8)  # the faces, which are the same in all panoramas of a size
+def _pixels(
+    face: Face, size: int, width: int, height: int
+) -> tuple[Float32[np.ndarray, "{size} {size}"], Float32[np.ndarray, "{size} {size}"]]:
+    """Columns and rows of a panorama that the pixels of a face show, from the centre of its first pixel."""
     x = (np.arange(size) + 0.5) / (size / 2) - 1  # at depth 1
     rays = np.stack([*np.meshgrid(x, x), np.ones((size, size))], axis=-1) @ face.rotation.T
     longitude = np.arctan2(rays[..., 0], rays[..., 2])
     latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
-    u = (longitude / (2 * np.pi) + 0.5) * width - 0.5  # OpenCV's pixel centres are whole numbers
-    v = (0.5 - latitude / np.pi) * height - 0.5
-    return cv2.remap(panorama, u.astype(np.float32), v.astype(np.float32), interpolation, borderMode=cv2.BORDER_WRAP)
+    u, v = (longitude / (2 * np.pi) + 0.5) * width - 0.5, (0.5 - latitude / np.pi) * height - 0.5
+    return u.astype(np.float32), v.astype(np.float32)
 
 
 def is_face(name: str) -> bool:
