@@ -10,8 +10,8 @@ LEAST_SHOTS = 3
 """Least number of shots from which it is found how cameras are mounted."""
 
 
-def taken_at_once(names: Sequence[str], cameras: Collection[str]) -> list[list[str]]:
-    """Photographs of the same name in the folders of a rig's cameras, in the order of these names; others are alone.
+def taken_at_once(names: Sequence[str], cameras: Collection[str]) -> dict[str, list[str]]:
+    """Photographs by their names below the folders of a rig's cameras, in the order of these; others are alone.
 
     Args:
         names: names of photographs, with forward slashes.
@@ -20,7 +20,7 @@ def taken_at_once(names: Sequence[str], cameras: Collection[str]) -> list[list[s
     shots: dict[str, list[str]] = {}
     for name in names:
         shots.setdefault(name.partition("/")[2] if name.startswith(tuple(cameras)) else name, []).append(name)
-    return [shots[name] for name in sorted(shots)]
+    return dict(sorted(shots.items()))
 
 
 def folders(names: Sequence[str]) -> list[str]:
@@ -31,7 +31,7 @@ def folders(names: Sequence[str]) -> list[str]:
     """
     prefixes = sorted({name.partition("/")[0] + "/" for name in names if "/" in name})
     shots = taken_at_once(names, prefixes)
-    if sum(len(shot) > 1 for shot in shots) < LEAST_SHOTS:
+    if sum(len(shot) > 1 for shot in shots.values()) < LEAST_SHOTS:
         raise SceneError(
             "--cameras rig needs a folder for each camera, and the same name for photographs that are taken at once, "
             f"at least {LEAST_SHOTS} times: put them into such folders, or use --cameras folder"
@@ -43,7 +43,7 @@ def tell_of_a_rig(names: Sequence[str]) -> None:
     """Tell the user that photographs are named as those of a rig, which may be chance."""
     prefixes = sorted({name.partition("/")[0] + "/" for name in names if "/" in name})
     shots = taken_at_once(names, prefixes)
-    if len(prefixes) > 1 and len(shots) >= LEAST_SHOTS and all(len(shot) == len(prefixes) for shot in shots):
+    if len(prefixes) > 1 and len(shots) >= LEAST_SHOTS and all(len(shot) == len(prefixes) for shot in shots.values()):
         notice(
             f"The folders {', '.join(prefix.rstrip('/') for prefix in prefixes)} hold photographs of the same names: "
             "if cameras that are mounted together took those of a name at once, --cameras rig uses this."

@@ -84,7 +84,9 @@ def test_faces_are_named_by_panorama_and_belong_together(tmp_path):
         add_faces(tmp_path / name, tmp_path / "faces", name, 64)
     photograph().save(tmp_path / "faces" / "b.jpg")
     names = sorted(p.relative_to(tmp_path / "faces").as_posix() for p in (tmp_path / "faces").rglob("*.jpg"))
-    two, one, alone = taken_at_once(names, FACES)
+    shots = taken_at_once(names, FACES)
+    assert list(shots) == ["2.jpg", "a/1.jpg", "b.jpg"]
+    two, one, alone = shots.values()
     assert one == [f"{prefix}a/1.jpg" for prefix in sorted(FACES)]
     assert two == [f"{prefix}2.jpg" for prefix in sorted(FACES)]
     assert alone == ["b.jpg"]
