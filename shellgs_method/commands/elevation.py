@@ -6,7 +6,7 @@ from math import inf
 from pathlib import Path
 from typing import Optional
 
-from shellgs_method.commands.common import RunConfig, UpAxis, console
+from shellgs_method.commands.common import RunConfig, console
 from shellgs_method.errors import SceneError
 
 
@@ -14,7 +14,6 @@ def elevation(
     config: RunConfig,
     output: Optional[Path] = None,
     pixel: Optional[float] = None,
-    up: Optional[UpAxis] = None,
 ) -> None:
     """Draw the walls of a trained run to scale: colours, depth, and deviations from the shell.
 
@@ -25,7 +24,6 @@ def elevation(
         config: The run's config.yml.
         output: Folder. If not set: elevation beside the config.
         pixel: Size of a pixel in metres. If not set: that of the photographs' on the facade.
-        up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.export.elevation import MARGIN, draw, walls_of, write_elevation
     from shellgs_method.export.runs import TrainedRun
@@ -34,7 +32,7 @@ def elevation(
 
     if pixel is not None and not 0 < pixel < inf:
         raise SceneError("--pixel must be above 0")
-    output, run = output or config.with_name("elevation"), TrainedRun.load(config, up)
+    output, run = output or config.with_name("elevation"), TrainedRun.load(config)
     walls, mesh = walls_of(run), run.surface(MARGIN)
     surface, pixel, facts = Triangles(mesh.vertices, mesh.faces), pixel or run.resolution(run.box(MARGIN)) or 0.01, {}
     for number, wall in enumerate(track(walls, "Drawing wall", len(walls)), 1):

@@ -6,9 +6,21 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 from torch import Tensor
 
+from shellgs_method.geometry.surface_classes import SurfaceClass
+
 GREY = 153  # grey level of pixels without a value
+CLASS_COLOURS = {
+    SurfaceClass.OTHER: to_rgb("#999933"),
+    SurfaceClass.WALL: to_rgb("#ddcc77"),
+    SurfaceClass.WINDOW: to_rgb("#332288"),
+    SurfaceClass.DOOR: to_rgb("#882255"),
+    SurfaceClass.ROOF: to_rgb("#cc6677"),
+    SurfaceClass.GROUND: to_rgb("#117733"),
+}
+"""Colours of the classes of surfaces: Paul Tol's muted scheme, which the colour-blind tell apart."""
 MAX_ERROR = 45.0
 """Angle in degrees at which the error scale saturates."""
 

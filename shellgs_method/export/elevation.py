@@ -91,10 +91,10 @@ def walls_of(run: TrainedRun) -> list[Wall]:
     """
     if run.shell is None:
         raise SceneError("an elevation needs the aligned shell, which says what is upright and how long a metre is")
-    shell, up = run.shell_in_frame, np.array({"y": [0.0, 1, 0], "z": [0.0, 0, 1]}[run.frame.up])
+    shell = run.shell_in_frame
     cameras = [run.frame.camera(view.camera) for dataset in run.datasets for view in dataset.views]
     surface, _ = outward(Triangles(shell.vertices, shell.faces), positions(cameras))
-    walls = find_walls(surface, cameras, up)
+    walls = find_walls(surface, cameras, run.frame.up)
     if not walls:
         raise SceneError("the photographs see no upright surface of the shell: there is nothing to draw")
     return [wall.widened(MARGIN) for wall in walls]

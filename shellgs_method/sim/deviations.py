@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from shellgs_method.evaluation.colours import deviation_colours
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.camera import Camera, in_view
+from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass, classes_of
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import connected
 
@@ -38,6 +39,7 @@ class Region:
         distance: median signed distance in metres, positive in front of the shell.
         centre: centre in the simulation frame.
         photograph: name of the photograph that shows it best.
+        part: class of the shell there, such as "window"; "other" if its file knows none.
     """
 
     what: str
@@ -45,6 +47,7 @@ class Region:
     distance: float
     centre: tuple[float, float, float]
     photograph: str
+    part: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +83,9 @@ def find_deviations(
     threshold: float,
     contradicted: Contradicted | None = None,
     least: float = 0.05,
+    classes: UInt8[np.ndarray, " S"] = NO_CLASSES,
 ) -> Deviations:
-    """Compare the shell with the reconstruction along its normals.
+    """Compare the shell with the reconstruction along its normals; a region is of one class.
 
     Args:
         shell: shell, wound so that normals point outside.
@@ -90,8 +94,10 @@ def find_deviations(
         threshold: distance in metres above which they differ.
         contradicted: distances from the photographs themselves, used instead of the reconstruction where not NaN.
         least: minimum area of a region in square metres.
+        classes: class of each of the shell's triangles; OTHER if not given.
     """
-    small = Triangles(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
+    *cut, source = trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20, return_index=True)
+    small, classes = Triangles(*cut), classes_of(shell.faces, classes)[source]
     centres = small.centres
     best, score = np.full(len(centres), -1), np.zeros(len(centres))
     for number, (_, camera) in enumerate(views):
@@ -111,10 +117,12 @@ def find_deviations(
         distance = np.where(np.isfinite(said), said, distance)
     flagged = np.abs(np.nan_to_num(distance)) > threshold
     regions = []
+    names = [name for name, _ in views]
     for what, chosen in (("before", flagged & (distance > 0)), ("behind", flagged & (distance < 0))):
-        for group in connected(small.faces, np.flatnonzero(chosen)):
-            if (area := small.areas[group].sum()) >= least:
-                regions.append(_region(what, float(area), group, centres, distance, best, [name for name, _ in views]))
+        for part in map(SurfaceClass, np.unique(classes[chosen])):
+            for group in connected(small.faces, np.flatnonzero(chosen & (classes == part))):
+                if (area := small.areas[group].sum()) >= least:
+                    regions.append(_region(what, part, float(area), group, centres, distance, best, names))
     return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
 
 
@@ -126,6 +134,7 @@ def along_normals(small: Triangles, places: Float64[np.ndarray, "F 3"], other: T
 
 def _region(
     what: str,
+    part: SurfaceClass,
     area: float,
     group: Int64[np.ndarray, " G"],
     centres: np.ndarray,
@@ -136,4 +145,5 @@ def _region(
     shown = np.bincount(best[group][best[group] >= 0], minlength=len(names))
     x, y, z = np.median(centres[group], axis=0).round(3).tolist()
     photograph = names[int(shown.argmax())] if shown.any() else ""
-    return Region(what, round(area, 3), round(float(np.median(distance[group])), 3), (x, y, z), photograph)
+    away = round(float(np.median(distance[group])), 3)
+    return Region(what, round(area, 3), away, (x, y, z), photograph, part.word)
