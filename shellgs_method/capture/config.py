@@ -20,12 +20,14 @@ class CaptureConfig:
     """Settings of structure from motion and of the frames taken from a video."""
 
     frames: int = 200
-    """Maximum number of frames taken from a video; never more than five per second."""
+    """Maximum number of frames taken from a video; never more than five per second, and fewer where the picture moves
+    little."""
     matching: Matching = "auto"
-    """Photographs to match: neighbours in the order of their names (sequential) or all pairs (exhaustive). If auto:
-    sequential for a video and for more than 60 photographs."""
+    """Photographs to match: neighbours in the order of their names, then those that see the same by a first model
+    (sequential), or all pairs (exhaustive). If auto: sequential for a video and for more than 60 photographs."""
     overlap: int = 10
-    """Number of next photographs to match each with, if sequential. Reduce it if identical windows are confused."""
+    """Number of next photographs to match each with, and of others that see the same, if sequential. Reduce it if
+    identical windows are confused."""
     cameras: Cameras = "auto"
     """Photographs that share a camera: all (single), those of a folder, or none (image). If auto: those with the same
     size, lens and zoom."""

@@ -1,4 +1,4 @@
-"""Extract the sharpest frame of each segment of a video."""
+"""Extract the sharpest frame of each stretch of a video, in which the picture moves by as much as in the others."""
 
 from __future__ import annotations
 
@@ -15,21 +15,26 @@ from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
 from PIL import Image
 from rich.progress import Progress
-from scipy.ndimage import laplace, median_filter
+from scipy.ndimage import laplace, median_filter, uniform_filter1d
 
 from shellgs_method.capture.hdr import Transfer, tone_mapped
 from shellgs_method.errors import SceneError, notice
 
 FRAMES_PER_SECOND = 5
 """Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
+STEP = 0.05
+"""Motion of the picture from one frame to the next, in widths: ten frames on, half of the picture is still in view."""
 
 _PICTURES = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
 _HDR: dict[int, Transfer] = {16: "PQ", 18: "HLG"}  # transfer characteristics (ITU-T H.273)
 _NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
+_SMALL = 128  # pixels, the width at which motion is measured
+_PACE = 0.2  # seconds between the frames that motion is measured between: pixels, not fractions of one
+_BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
 
 def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> None:
-    """Write the sharpest frame of each of at most ``count`` equal segments of a video, upright, as JPEG.
+    """Write the sharpest frame of each of at most ``count`` stretches of equal motion of a video, upright, as JPEG.
 
     Files are numbered by their frames in the video. Of several videos in a file, the largest is used, and told.
 
@@ -39,15 +44,23 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     with _opened(video) as (container, stream):
         transfer = _hdr(video, stream)
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
-        sharpnesses, times = [], []
+        sharpnesses, times, marks, shifts, before = [], [], [], [], None
         for frame in container.decode(stream):
             half = frame.reformat(frame.width // 2, frame.height // 2, format="gray")
             sharpnesses.append(sharpness(half.to_ndarray()))
             times.append(frame.time if frame.time is not None else len(times) / float(stream.average_rate or 30))
+            if not marks or times[-1] >= marks[-1] + _PACE:
+                height = max(1, round(_SMALL * frame.height / frame.width))
+                small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
+                marks.append(times[-1])
+                shifts.append(shift(small if before is None else before, small))
+                before = small
             progress.update(task, completed=len(times))
         if not times:
             raise SceneError(f"{video} holds no frames: is it a complete video?")
-    chosen = sharpest(np.array(sharpnesses), np.array(times), count)
+    since = np.array(times) - min(times)
+    moved = np.interp(times, marks, travelled(np.array(shifts)))
+    chosen = sharpest(np.array(sharpnesses), *stretches(moved, since, count))
     task = progress.add_task("keeping the sharpest", total=len(chosen))
     with _opened(video) as (container, stream):
         for number, frame in enumerate(container.decode(stream)):
@@ -62,17 +75,59 @@ def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
     return float(laplace(grey.astype(np.float32)).var())
 
 
-def sharpest(sharpnesses: Float[np.ndarray, " N"], times: Float[np.ndarray, " N"], count: int) -> set[int]:
-    """Indices of the sharpest frame in each of at most ``count`` equal segments of time.
+def shift(before: UInt8[np.ndarray, "H W"], after: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, " 2"]:
+    """Shift of the picture between two frames, down and to the right, in widths.
+
+    By phase correlation (Kuglin and Hines 1975), whose peak a parabola refines.
+    """
+    window = np.outer(np.hanning(before.shape[0]), np.hanning(before.shape[1]))
+    after_, before_ = (np.fft.rfft2(window * (grey - grey.mean())) for grey in (after, before))
+    cross = after_ * before_.conj()
+    peak = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-9), before.shape)
+    row, column = np.unravel_index(peak.argmax(), peak.shape)
+    return np.array([_refined(peak[:, column], row), _refined(peak[row], column)]) / before.shape[1]
+
+
+def _refined(values: Float[np.ndarray, " N"], at: np.integer) -> float:
+    """Position of the peak of periodic values, between -N/2 and N/2."""
+    left, top, right = values[at - 1], values[at], values[(at + 1) % len(values)]
+    offset = 0.5 * (left - right) / min(left - 2 * top + right, -1e-12)
+    half = len(values) // 2
+    return (float(at) + half) % len(values) - half + float(np.clip(offset, -0.5, 0.5))
+
+
+def travelled(shifts: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
+    """Length of the picture's path up to each mark, without the hand's shake, which cancels out within a second."""
+    return np.cumsum(np.linalg.norm(uniform_filter1d(shifts, round(1 / _PACE), axis=0), axis=1))
+
+
+def stretches(
+    moved: Float[np.ndarray, " N"], since: Float[np.ndarray, " N"], count: int
+) -> tuple[Float[np.ndarray, " N"], int]:
+    """Progress of each frame from 0 to 1, of motion and a little of time, and the number of stretches to cut it into.
+
+    There are at most ``count``, at most five a second, at least one a second, and otherwise one for each :data:`STEP`.
+
+    Args:
+        moved: path of the picture in widths, of :func:`travelled`.
+        since: seconds since the first frame.
+        count: maximum number.
+    """
+    by_time, by_motion = (x / max(x[-1], 1e-6) for x in (since, moved - moved[0]))
+    wanted = max(since[-1], by_motion[-1] * (moved[-1] - moved[0]) / STEP)
+    number = max(1, min(count, round(FRAMES_PER_SECOND * since[-1]), round(wanted)))
+    return (_BY_TIME * by_time + (1 - _BY_TIME) * by_motion) / (_BY_TIME + (1 - _BY_TIME) * by_motion[-1]), number
+
+
+def sharpest(sharpnesses: Float[np.ndarray, " N"], progress: Float[np.ndarray, " N"], count: int) -> set[int]:
+    """Indices of the sharpest frame in each of ``count`` equal stretches of a progress from 0 to 1.
 
     Sharpness is relative to the median of neighbouring frames, or a blurred textured wall would beat a sharp plain one.
     """
     relative = sharpnesses / np.maximum(median_filter(sharpnesses, _NEIGHBOURHOOD), 1e-6)
-    since = times - times.min()
-    count = max(1, min(count, round(FRAMES_PER_SECOND * since.max())))
-    # The small offset keeps rounding from moving a frame on a border into the segment before.
-    segment = np.minimum(since / max(since.max(), 1e-6) * count + 1e-6, count - 1).astype(int)
-    members = (np.flatnonzero(segment == k) for k in range(count))
+    # The small offset keeps rounding from moving a frame on a border into the stretch before.
+    stretch = np.minimum(progress * count + 1e-6, count - 1).astype(int)
+    members = (np.flatnonzero(stretch == k) for k in range(count))
     return {int(m[relative[m].argmax()]) for m in members if len(m)}
 
 

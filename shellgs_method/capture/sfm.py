@@ -12,13 +12,20 @@ import json
 import os
 import sys
 import threading
+from collections.abc import Collection, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pycolmap
 from PIL import Image
 
+from loops import DRIFT, View, agree, bridges, loops, shared  # pyright: ignore[reportMissingImports]  isort: skip
+
 SEED = 0
+_BRIDGES = 16  # views of a model that are matched with those of another, if there are two
+_MIN_JOINING = 30  # matches of points that join two models
+_RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
 _MIN_OPENCV = 10  # photographs needed to calibrate OPENCV's four distortion coefficients
 
 
@@ -54,39 +61,206 @@ def extract(database: str, photographs: str, lenses: list[dict], masks: str | No
         )
 
 
-def match(database: str, pairs: str) -> None:
-    """Match and verify the listed pairs that have no matches yet."""
+def match(database: str, pairs: list[list[str]]) -> None:
+    """Match and verify the pairs of names that have no matches yet, and forget all others."""
     with pycolmap.Database.open(database) as opened:
-        if opened.num_matched_image_pairs() > len(Path(pairs).read_text().splitlines()):  # from other settings
-            opened.clear_matches()
-            opened.clear_two_view_geometries()
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        wanted = {pycolmap.image_pair_to_pair_id(numbers[a], numbers[b]) for a, b in pairs}
+        for pair in {pair for pair, _ in zip(*opened.read_all_matches(), strict=True)} - wanted:  # of other settings
+            _forget(opened, *pycolmap.pair_id_to_image_pair(pair), matches=True)
+    listed = Path(database).with_name("pairs.txt")
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     pycolmap.match_image_pairs(
         database,
-        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=pairs),
+        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
         verification_options=verification,
     )
 
 
-def reconstruct(database: str, photographs: str, output: str) -> list[dict]:
-    """Run incremental mapping and write the largest model; return a description of all models, largest first."""
-    options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
-    models = pycolmap.incremental_mapping(
-        database, photographs, output, options, next_image_callback=lambda: print(flush=True)
-    )
-    ranked = sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+def find_bridges(models: str) -> list[list[str]]:
+    """Pairs of names to match between models."""
+    groups = [sorted(image.name for image in _registered(model)) for model in _read(models)]
+    return [list(pair) for pair in bridges(groups, max(_BRIDGES // max(1, len(groups) - 1), 4))]
+
+
+def join(database: str, models: str, output: str) -> list[dict]:
+    """Write models in the frame of the largest, as far as matches agree on one; return names and faults of the others.
+
+    The similarity of a model is one that most matches between points agree on. If matches that do not agree with it
+    agree on another, as those of identical windows do, it is in doubt.
+    """
+    joined, apart = _read(models)[:1], _read(models)[1:]
+    faults: dict[int, str] = {}
+    while True:
+        for model in apart:
+            similarity, faults[id(model)] = _similarity(database, model, joined)
+            if similarity is not None:
+                model.transform(similarity)
+                joined.append(model)
+                apart.remove(model)
+                break
+        else:
+            break
+    for k, model in enumerate(joined):
+        folder = Path(output) / str(k)
+        folder.mkdir()
+        model.write(folder)
+    return [{"names": [image.name for image in _registered(model)], "fault": faults[id(model)]} for model in apart]
+
+
+def find_loops(models: str, matched: list[list[str]], each: int) -> list[list[str]]:
+    """Pairs of names that see the same by the joined models: ``each`` for each photograph beside the matched ones."""
+    views, points = _views(_read(models))
+    names = list(views)
+    number = {name: k for k, name in enumerate(names)}
+    known = {(number[a], number[b]) for a, b in matched if a in number and b in number}
+    chosen = loops(shared(list(views.values()), points), {(min(p), max(p)) for p in known}, each)
+    return [[names[i], names[j]] for i, j in chosen]
+
+
+def settle(database: str, models: str, trusted: list[list[str]]) -> int:
+    """Forget matches of all but the trusted pairs that the joined models contradict; return how many pairs are left."""
+    views, points = _views(_read(models))
+    known = {frozenset(pair) for pair in trusted}
+    kept = 0
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        for a, b, matches in _verified(opened):
+            if {names[a], names[b]} in known:
+                continue
+            both = names[a] in views and names[b] in views
+            if both and agree(views[names[a]], views[names[b]], points, matches):
+                kept += 1
+            else:
+                _forget(opened, a, b)
+    return kept
+
+
+def reconstruct(database: str, photographs: str, output: str, has_parallax: bool) -> list[dict]:
+    """Write all models, largest first, into numbered folders, and the largest into ``output``; return what they are.
+
+    Global mapping (GLOMAP, Pan et al. 2024) bends a long walk less than incremental mapping. The latter is tried if
+    photographs are missing, and without parallax, where it finds no cameras and the former invents them.
+    """
+    with pycolmap.Database.open(database) as opened:
+        count = opened.num_images()
+    with TemporaryDirectory(dir=output) as folder:
+        models = []
+        if has_parallax:
+            options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
+            models = pycolmap.global_mapping(database, photographs, folder, options).values()
+        if _registered_at_most(models) < count:
+            options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
+            others = pycolmap.incremental_mapping(
+                database, photographs, folder, options, next_image_callback=lambda: print(flush=True)
+            ).values()
+            models = max(models, others, key=_registered_at_most)
+    ranked = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    for k, model in enumerate(ranked):
+        (Path(output) / str(k)).mkdir()
+        model.write(Path(output) / str(k))
     if ranked:
         ranked[0].write(output)
     return [
         {
-            "names": sorted(model.image(i).name for i in model.reg_image_ids()),
+            "names": sorted(image.name for image in _registered(model)),
             "points": model.num_points3D(),
             "reprojection_error": model.compute_mean_reprojection_error(),
             "track_length": model.compute_mean_track_length(),
         }
         for model in ranked
     ]
+
+
+def _registered_at_most(models: Collection[pycolmap.Reconstruction]) -> int:
+    return max((model.num_reg_images() for model in models), default=0)
+
+
+def _read(models: str) -> list[pycolmap.Reconstruction]:
+    """The models in a folder's numbered folders, largest first."""
+    read = [pycolmap.Reconstruction(folder) for folder in sorted(Path(models).iterdir()) if folder.is_dir()]
+    return sorted(read, key=lambda model: -model.num_reg_images())
+
+
+def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [model.image(i) for i in model.reg_image_ids()]
+
+
+def _views(models: list[pycolmap.Reconstruction]) -> tuple[dict[str, View], np.ndarray]:
+    """Views by the names of their photographs, and the points, of models in one frame."""
+    views, positions = {}, [np.zeros((0, 3))]
+    for model in models:
+        start, numbers = sum(map(len, positions)), {point: k for k, point in enumerate(model.points3D)}
+        positions.append(np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3))
+        for image in _registered(model):
+            camera = model.camera(image.camera_id)
+            size, centre = (
+                np.array([camera.width, camera.height]),
+                np.array([camera.principal_point_x, camera.principal_point_y]),
+            )
+            focal = np.array([camera.focal_length_x, camera.focal_length_y])
+            features = np.asarray(camera.cam_from_img(np.array([point.xy for point in image.points2D])))
+            points = [start + numbers[p.point3D_id] if p.has_point3D() else -1 for p in image.points2D]
+            extent = np.maximum(centre, size - centre) / focal
+            views[image.name] = View(image.cam_from_world().matrix(), extent, features, np.array(points))
+    return dict(sorted(views.items())), np.concatenate(positions)
+
+
+def _verified(database: pycolmap.Database) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Numbers of the images of each verified pair, and its matches (M, 2)."""
+    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        yield *pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
+
+
+def _forget(database: pycolmap.Database, a: int, b: int, *, matches: bool = False) -> None:
+    if matches and database.exists_matches(a, b):
+        database.delete_matches(a, b)
+    if database.exists_two_view_geometry(a, b):
+        database.delete_two_view_geometry(a, b)
+
+
+def _similarity(
+    database: str, model: pycolmap.Reconstruction, joined: list[pycolmap.Reconstruction]
+) -> tuple[pycolmap.Sim3d | None, str]:
+    """Similarity from a model's frame to that of the joined ones; if there is none, why."""
+    own, own_points = _views([model])
+    others, their_points = _views(joined)
+    source, target, distances = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        for a, b, matches in _verified(opened):
+            if names[a] in others and names[b] in own:
+                a, b, matches = b, a, matches[:, ::-1]
+            if names[a] not in own or names[b] not in others:
+                continue
+            view, other = own[names[a]], others[names[b]]
+            known = matches[(view.points[matches[:, 0]] >= 0) & (other.points[matches[:, 1]] >= 0)]
+            source.append(own_points[view.points[known[:, 0]]])
+            target.append(their_points[other.points[known[:, 1]]])
+            distances.append(np.linalg.norm(target[-1] - other.position, axis=1))
+    X, Y, tolerance = np.concatenate(source), np.concatenate(target), DRIFT * np.concatenate(distances)
+    best, agreeing = _consensus(X, Y, tolerance)
+    if best is None or agreeing.sum() < _MIN_JOINING:
+        return None, "no photographs of it match others"
+    _, rivals = _consensus(X[~agreeing], Y[~agreeing], tolerance[~agreeing])
+    if rivals.sum() > _RIVAL * agreeing.sum():
+        return None, "its matches with others, perhaps of identical windows, contradict each other"
+    return best, ""
+
+
+def _consensus(X: np.ndarray, Y: np.ndarray, tolerance: np.ndarray) -> tuple[pycolmap.Sim3d | None, np.ndarray]:
+    """Similarity from points X to Y that most agree with, and which do."""
+    nobody = np.zeros(len(X), bool)
+    if len(X) < _MIN_JOINING:
+        return None, nobody
+    options = pycolmap.RANSACOptions(max_error=float(np.median(tolerance)), random_seed=SEED, min_inlier_ratio=0.05)
+    similarity = pycolmap.estimate_sim3d_robust(X, Y, options)
+    if similarity is None:
+        return None, nobody
+    moved = X @ similarity.matrix()[:, :3].T + similarity.matrix()[:, 3]
+    return similarity, np.linalg.norm(moved - Y, axis=1) < tolerance
 
 
 def undistort(model: str, photographs: str, masks: str | None, output: str) -> None:
@@ -114,7 +288,8 @@ def main() -> None:
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.set_random_seed(SEED)
-    step = {"extract": extract, "match": match, "reconstruct": reconstruct, "undistort": undistort}[job.pop("step")]
+    steps = extract, match, find_bridges, join, find_loops, settle, reconstruct, undistort
+    step = {step.__name__: step for step in steps}[job.pop("step")]
     print(json.dumps(step(**job)), flush=True)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing, suppress
@@ -17,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
-from shellgs_method.capture.pairs import choose_matching, image_pairs
+from shellgs_method.capture.pairs import Pair, choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
     add_mask,
     add_photograph,
@@ -189,22 +190,60 @@ class _Capture:
         if self.work.has("model", self.model_key):
             return
         matching = choose_matching(self.config.matching, len(self.names), self.is_video)
-        pairs = image_pairs(len(self.names), matching, self.config.overlap)
-        listed = database.with_name("pairs.txt")
-        listed.write_text("".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs))
-        self._step(
-            "match",
-            f"matching ({matching})",
-            len(pairs),
-            partial(_rows, database, "two_view_geometries"),
-            database=str(database),
-            pairs=str(listed),
-        )
+        pairs = image_pairs(self.names, matching, self.config.overlap)
+        apart, models = [], None
+        if matching == "sequential":
+            apart, models = self._close_loops(database, pairs)
+        else:
+            self._match(database, pairs, "matching all pairs")
         with self.work.making("model", self.model_key) as folder:
-            arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
-            models = self._step("reconstruct", "finding cameras", len(self.names), None, **arguments)
-            found = {"photographs": self.names, "models": models, "flat_pairs": _flat_pairs(database)}
+            if models is None:
+                models = self._reconstruct(database, folder, "finding cameras")
+            else:
+                shutil.copytree(self.work.folder / "coarse", folder, dirs_exist_ok=True)
+            found = {"photographs": self.names, "models": models, "apart": apart, "flat_pairs": _flat_pairs(database)}
             (folder / "models.json").write_text(json.dumps(found))
+
+    def _close_loops(self, database: Path, pairs: list[Pair]) -> tuple[list[Any], list[Any] | None]:
+        """Match neighbours, then photographs that see the same by a coarse model from neighbours alone.
+
+        Returns the models that did not join the largest and, if neighbours are all that matches, the coarse models.
+        """
+        coarse, joined = self.work.folder / "coarse", self.work.folder / "joined"
+        if not self.work.has("coarse", self.model_key):
+            self._match(database, pairs, "matching neighbours")
+            with self.work.making("coarse", self.model_key) as folder:
+                models = self._reconstruct(database, folder, "finding cameras by neighbours")
+                (folder / "models.json").write_text(json.dumps({"models": models}))
+        models = read_json(coarse / "models.json")["models"]
+        if not models:
+            return [], models
+        bridges = self._step("find_bridges", "looking for bridges", 1, None, models=str(coarse))
+        if not self.work.has("joined", self.model_key):
+            if bridges:
+                self._match(database, pairs + bridges, "matching groups of photographs")
+            with self.work.making("joined", self.model_key) as folder:
+                where = {"database": str(database), "models": str(coarse), "output": str(folder)}
+                apart = self._step("join", "joining groups of photographs", 1, None, **where)
+                (folder / "apart.json").write_text(json.dumps({"models": apart}))
+        apart = read_json(joined / "apart.json")["models"]
+        where = {"models": str(joined), "matched": pairs + bridges, "each": self.config.overlap}
+        loops = self._step("find_loops", "looking for loops", 1, None, **where)
+        if not bridges and not loops:
+            return apart, models
+        self._match(database, pairs + bridges + loops, "matching loops")
+        where = {"database": str(database), "models": str(joined), "trusted": pairs}
+        kept = self._step("settle", "checking loops", 1, None, **where)
+        return apart, None if kept else models
+
+    def _match(self, database: Path, pairs: list[Pair], description: str) -> None:
+        done = partial(_rows, database, "two_view_geometries")
+        self._step("match", description, len(pairs), done, database=str(database), pairs=pairs)
+
+    def _reconstruct(self, database: Path, folder: Path, description: str) -> list[dict[str, Any]]:
+        arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
+        has_parallax = _flat_pairs(database) <= _NO_PARALLAX
+        return self._step("reconstruct", description, len(self.names), None, **arguments, has_parallax=has_parallax)
 
     def _largest_model(self, found: dict[str, Any]) -> Summary:
         """Summary of the largest model.
@@ -237,7 +276,20 @@ class _Capture:
                 "exhaustive and --quality high; leave out photographs of other things; photograph with more overlap, "
                 "in small sidesteps rather than turns on the spot; from a video, take more --frames"
             )
+        for model in models[1:]:
+            if len(model["names"]) >= LEAST_REGISTERED:
+                self._tell_of_a_pass_apart(sorted(set(model["names"]) - set(largest["names"])), found.get("apart", []))
         return Summary(missing=missing, registered=largest.pop("names"), **largest)
+
+    def _tell_of_a_pass_apart(self, names: list[str], faults: list[dict[str, Any]]) -> None:
+        if not names:
+            return
+        because = next((each["fault"] for each in faults if set(names) & set(each["names"])), "too little overlap")
+        notice(
+            f"{len(names)} photographs of {self.source}, {names[0]} to {names[-1]}, did not join the others, "
+            f"{because}: "
+            "take some on the way from one pass to the other, in small steps, and with a corner of the building in view"
+        )
 
     def _missing_parts(self) -> list[str]:
         """Parts of the scene that are neither in place nor ready to be moved there."""

@@ -30,6 +30,7 @@ def align(
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
     mesher: Optional[Mesher] = None,
+    spacing: Optional[float] = None,
     paths: Paths = PATHS,
 ) -> None:
     """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.
@@ -40,7 +41,7 @@ def align(
 
     Args:
         scene: Scene folder.
-        shell: Mesh or point cloud of the shell.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy).
         picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
         positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
@@ -53,6 +54,8 @@ def align(
         mesher: How a point cloud is meshed, here and wherever the alignment is used: planes (ball pivoting between
             them), bpa (ball pivoting alone) or poisson (for round shapes). If not set: that of the existing alignment,
             else planes.
+        spacing: Size in metres of the voxels in which the points of a cloud are merged, here and wherever the alignment
+            is used. If not set: that of the existing alignment, else what the cameras resolve.
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import read_views
@@ -114,8 +117,8 @@ def align(
         method, unit = mesher or "planes", metres_per_shell_unit
         unaligned = load_shell(shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
         placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
-    placement = replace(placement, alignment=placement.alignment.meshed_by(mesher))
-    mesh = placement.alignment.load_shell(scene, views, place.geometry if place else None)
+    placement = replace(placement, alignment=placement.alignment.meshed_by(mesher, spacing))
+    mesh = placement.alignment.load_shell(scene, views, place.surface if place else None)
     misplacement = misplaced(placement, mesh, views, points)
     if refine is not None and misplacement:
         raise SceneError(f"the alignment cannot be refined: {misplacement}")

@@ -11,7 +11,7 @@ from shellgs_method.commands.common import console
 from shellgs_method.sim.settings import SimSettings
 
 _SIM = SimSettings()
-_PACKAGES = {"pxr.UsdGeom": "usd-core", "xatlas": "xatlas", "shapely": "shapely", "mapbox_earcut": "mapbox-earcut"}
+_PACKAGES = {"pxr.UsdGeom": "usd-core", "xatlas": "xatlas", "shapely": "shapely"}
 
 
 def sim(

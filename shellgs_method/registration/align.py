@@ -142,7 +142,7 @@ def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
 def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[Placement, Adjustment | None]:
     """Adjust the cameras of a scene to the shell; return the placement, and None if they are left as is.
 
-    Surveyed camera positions that the placement was found by are priors.
+    Picks and surveyed camera positions that the placement was found by are priors.
 
     Args:
         placement: the shell's place, found with the cameras as they are.
@@ -160,11 +160,13 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     alignment = placement.alignment
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
-    surveyed = [point for point in placement.correspondences if point.is_used and not isinstance(point, PickedPoint)]
+    used = [point for point in placement.correspondences if point.is_used]
+    picks = [point for point in used if isinstance(point, PickedPoint)]
+    surveyed = [point for point in used if not isinstance(point, PickedPoint)]
     _, names = read_points(layout.data, folder, layout.images_path)
     known = {point.name: transformed(point.shell, surface.survey_from_shell) for point in surveyed}
     scatter = max(_RTK, float(np.median([point.residual for point in surveyed]))) if surveyed else _RTK
-    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter)
+    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter, picks)
     if adjustment.shifted > _ELSEWHERE:
         raise SceneError(
             f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which is "

@@ -17,11 +17,12 @@ from PIL import ExifTags, Image, ImageFilter
 from rich.progress import Progress
 from scenes import photograph, write_video
 from scipy.ndimage import gaussian_filter
+from scipy.ndimage import shift as translated
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
-from shellgs_method.capture.frames import extract_frames, sharpest
+from shellgs_method.capture.frames import extract_frames, sharpest, shift, stretches, travelled
 from shellgs_method.capture.hdr import tone_mapped
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
@@ -76,7 +77,8 @@ def numbers(folder: Path) -> list[int]:
 
 def test_no_blurred_frame_of_a_video_is_extracted(tmp_path):
     blurred = {k for k in range(40) if k % 4 != k // 10}
-    frames = [photograph(seed=k) for k in range(40)]
+    wide = photograph(480, 96)
+    frames = [wide.crop((8 * k, 0, 8 * k + 160, 96)) for k in range(40)]
     write_video(
         tmp_path / "walk.mp4",
         [f.filter(ImageFilter.GaussianBlur(3)) if k in blurred else f for k, f in enumerate(frames)],
@@ -92,11 +94,41 @@ def test_sharpness_is_relative_to_the_neighbourhood():
     # A textured stretch, then a plain one; every frame of the first is sharper than any of the second.
     sharpnesses = np.concatenate([np.full(50, 100.0), np.full(50, 1.0)])
     sharpnesses[[20, 70]] *= 1.5
-    assert sharpest(sharpnesses, np.arange(100) / 10, 2) == {20, 70}
+    assert sharpest(sharpnesses, np.linspace(0, 1, 100), 2) == {20, 70}
 
 
-def test_a_video_gives_at_most_five_frames_a_second():
-    assert len(sharpest(np.ones(60), np.arange(60) / 30, 200)) == 10
+def test_a_video_gives_between_one_and_five_frames_a_second():
+    since = np.arange(60) / 30
+    assert stretches(np.linspace(0, 9, 60), since, 200)[1] == 10
+    assert stretches(np.zeros(60), since, 200)[1] == 2
+    assert stretches(np.linspace(0, 0.3, 60), since, 200)[1] == 6  # 0.3 widths in steps of 0.05
+    assert stretches(np.linspace(0, 9, 60), since, 7)[1] == 7
+
+
+@pytest.mark.parametrize("moved", [(0, 3), (2, -5), (-6.4, 20.7)])
+def test_the_shift_of_a_picture_is_found(moved):
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(300, 400)), 3)
+    grey = 255 * (noise - noise.min()) / np.ptp(noise)
+    before, after = (translated(grey, by)[100:172, 100:228].astype(np.uint8) for by in ((0, 0), moved))
+    np.testing.assert_allclose(128 * shift(before, after), moved, atol=0.7)
+
+
+def test_a_shake_is_no_way_and_a_walk_is():
+    shake = np.diff(np.random.default_rng(0).normal(0, 0.02, (301, 2)), axis=0)
+    assert travelled(shake)[-1] < 0.25 * np.linalg.norm(shake, axis=1).sum()
+    assert travelled(shake + np.array([0, 0.03]))[-1] == pytest.approx(9, rel=0.1)
+
+
+def test_frames_are_spread_by_motion(tmp_path):
+    """A walk of 40 frames that stands still for the middle 20."""
+    noise = np.asarray(photograph(480, 96, seed=1).filter(ImageFilter.GaussianBlur(2)))
+    at = np.concatenate([np.arange(10) * 12, np.full(20, 120), 120 + np.arange(10) * 12])
+    write_video(tmp_path / "walk.mp4", [Image.fromarray(noise[:, x : x + 160]) for x in at], rate=10)
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 10, QUIET)
+    taken = np.array(numbers(tmp_path / "frames"))
+    assert len(taken) == 10
+    assert ((taken >= 10) & (taken < 30)).sum() <= 3  # by time alone it is five
 
 
 def test_frames_of_a_rotated_video_are_upright(tmp_path):
@@ -307,6 +339,16 @@ def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
     assert [lens.names for lens in groups] == [["a.jpg", "b.jpg"], ["c.jpg"], ["d.jpg"]]
 
 
+def test_two_phones_and_a_zoom_in_one_folder_are_three_cameras(tmp_path):
+    for k, (maker, model, focal) in enumerate([("A", "1", 26), ("B", "1", 24), ("A", "1", 52)] * 2):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = maker, model
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal
+        photograph().save(tmp_path / f"{k}.jpg", exif=exif)
+    groups = group_by_lens(tmp_path, [f"{k}.jpg" for k in range(6)], "auto")
+    assert [lens.names for lens in groups] == [["0.jpg", "3.jpg"], ["1.jpg", "4.jpg"], ["2.jpg", "5.jpg"]]
+
+
 @pytest.mark.parametrize(("cameras", "count"), [("single", 1), ("folder", 2), ("image", 3)])
 def test_the_sharing_of_cameras_can_be_chosen(tmp_path, cameras, count):
     names = ["left/a.jpg", "left/b.jpg", "right/a.jpg"]
@@ -411,9 +453,14 @@ def test_matching_depends_on_the_input_unless_it_is_chosen(asked, count, is_vide
     assert choose_matching(asked, count, is_video) == chosen
 
 
-def test_sequential_pairs_reach_as_far_as_the_overlap():
-    assert image_pairs(4, "sequential", 2) == [(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)]
-    assert len(image_pairs(20, "exhaustive", 2)) == 20 * 19 // 2
+def test_sequential_pairs_reach_as_far_as_the_overlap_within_a_folder():
+    assert image_pairs(["a/0", "a/1", "a/2", "b/0", "b/1"], "sequential", 1) == [
+        ("a/0", "a/1"),
+        ("a/1", "a/2"),
+        ("b/0", "b/1"),
+    ]
+    assert len(image_pairs(list("abcd"), "sequential", 2)) == 5
+    assert len(image_pairs(list("abcd"), "exhaustive", 2)) == 6
 
 
 # Work folder
@@ -524,7 +571,7 @@ def test_a_failure_of_colmap_is_reported_in_one_sentence(tmp_path):
     with pytest.raises(SceneError, match=r"finding features failed in COLMAP \(.+\); all its messages are in"):
         run_step(
             "match",
-            {"database": str(tmp_path / "database.db"), "pairs": str(tmp_path / "pairs.txt")},
+            {"database": str(tmp_path / "database.db"), "pairs": []},
             log=tmp_path / "log",
             progress=QUIET,
             description="finding features",
@@ -562,6 +609,33 @@ def without_colmap(monkeypatch) -> list[str]:
 
     monkeypatch.setattr("shellgs_method.capture.stages.run_step", run_step)
     return steps
+
+
+def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch, caplog):
+    for k in range(8):
+        (tmp_path / "photographs" / "ab"[k > 4]).mkdir(parents=True, exist_ok=True)
+        photograph(seed=k).save(tmp_path / "photographs" / "ab"[k > 4] / f"{k}.jpg")
+    model = {"points": 9, "reprojection_error": 0.5, "track_length": 3.0}
+    near, far = [f"a/{k}.jpg" for k in range(5)], [f"b/{k}.jpg" for k in range(5, 8)]
+    answers: dict[str, Any] = {
+        "reconstruct": [{"names": near, **model}, {"names": far, **model}],
+        "find_bridges": [[near[0], far[0]]],
+        "join": [{"names": far, "fault": "nobody knows why"}],
+        "find_loops": [],
+        "settle": 0,
+    }
+
+    def run_step(step: str, arguments: dict, **_):
+        if step == "undistort":
+            for name in ("images", "sparse"):
+                (Path(arguments["output"]) / name).mkdir()
+        return answers.get(step)
+
+    monkeypatch.setattr(stages, "run_step", run_step)
+    summary = capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(matching="sequential"))
+    assert summary.missing == far
+    assert "3 photographs of" in caplog.text
+    assert "b/5.jpg to b/7.jpg, did not join the others, nobody knows why" in caplog.text
 
 
 def exposure_of(seconds: float, iso: int = 200) -> Image.Exif:
@@ -679,6 +753,23 @@ def test_cameras_of_the_synthetic_facade_are_found(truth, captured):
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.02 * np.ptp(positions, axis=0).max()
     focal = next(iter(true.values())).camera.K[0, 0].item()
     assert next(iter(found.values())).camera.K[0, 0].item() == pytest.approx(focal, rel=0.03)
+
+
+@pytest.mark.slow
+def test_two_passes_in_two_folders_are_one_model(truth, tmp_path):
+    """The way out near the wall and the way back farther off, the names of which say nothing of each other."""
+    names = sorted(path.name for path in (truth / "images").iterdir())
+    for k, name in enumerate(names):
+        target = tmp_path / "photographs" / ("out" if k < 12 else "back") / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(truth / "images" / name, target)
+    summary = capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(matching="sequential"))
+    assert len(summary.registered) >= 22
+    true = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=truth))}
+    found = {Path(view.name).name: view for view in read_views(FacadeDataParserConfig(data=tmp_path / "scene"))}
+    positions = np.stack([true[name].camera.position.numpy() for name in found])
+    errors = similarity(np.stack([view.camera.position.numpy() for view in found.values()]), positions) - positions
+    assert np.linalg.norm(errors, axis=1).max() < 0.05 * np.ptp(positions, axis=0).max()  # a bay is three times as much
 
 
 @pytest.mark.slow

@@ -25,7 +25,9 @@ from shellgs_method.export.splats import Splats
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.axes import turn
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import outward
 from shellgs_method.shell import Alignment, load_shell
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, make_collider
@@ -40,7 +42,6 @@ from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
 from shellgs_method.sim.trials.engine import beams, compiled, import_mujoco, lidar, load, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
-from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import Layout, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk as stroll
@@ -81,7 +82,8 @@ def write_building(folder: Path, collider: Collider, name: str = "facade", place
     write_parts(folder / place, collider.parts)
     look = painted(collider.surface)
     write_visual(folder / place, look, 30)
-    write_usd_layers(folder / place, look, collider.parts, some_splats(), metric)
+    classes = np.where(look.vertices[look.faces].mean(axis=1)[:, 2] > 3, SurfaceClass.WALL, SurfaceClass.DOOR)
+    write_usd_layers(folder / place, look, classes.astype(np.uint8), collider.parts, some_splats(), metric)
     return Building(name, place, len(collider.parts))
 
 
@@ -249,6 +251,20 @@ def test_the_compliance_checker_finds_faults(tmp_path):
     stage.DefinePrim("/a", "Mesh")
     stage.GetRootLayer().Save()
     assert compliance_errors(stage)
+
+
+def test_the_usd_labels_each_triangle_once(world):
+    stage = import_pxr("sim").Usd.Stage.Open(str(world / "usd" / "visual.usdc"))
+    labels = {}
+    for name in ("wall", "door"):
+        subset = stage.GetPrimAtPath(f"/visual/mesh/{name}")
+        assert list(subset.GetAttribute("semantics:labels:class").Get()) == [name]
+        labels[name] = np.array(subset.GetAttribute("indices").Get())
+    mesh = import_pxr("sim").UsdGeom.Mesh(stage.GetPrimAtPath("/visual/mesh"))
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    heights = np.array(mesh.GetPointsAttr().Get())[faces].mean(axis=1)[:, 2]
+    np.testing.assert_array_equal(labels["wall"], np.flatnonzero(heights > 3))
+    np.testing.assert_array_equal(labels["door"], np.flatnonzero(heights <= 3))
 
 
 def test_usd_colliders_are_the_parts(world, collider):

@@ -1,0 +1,101 @@
+"""Where a walk meets itself again, by a coarse model of its cameras: pairs worth matching, and matches to believe.
+
+Identical windows match as well as the same window does, and no geometry of two views tells them apart. The coarse
+model, from neighbours alone, does: it drifts by centimetres, and a bay is metres. Only numpy is imported, because
+`sfm.py` imports this file beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+DRIFT = 0.05
+"""Largest error of a coarse model, in focal lengths: 35 cm at 7 m; a bay of 3 m at 30 m is twice as much."""
+_SAMPLE = 200  # points of a view that are projected into all others
+_RATIO, _COSINE = 3.0, 0.75  # of distances and between directions, within which features match
+_LEAST_SHARE = 0.25  # of a view's points
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera of the coarse model, in its frame.
+
+    Attributes:
+        viewmat: world to camera, (3, 4), OpenCV.
+        extent: tangents of the half field of view, (2,).
+        features: undistorted features in units of the focal length, (F, 2).
+        points: index of each feature's point, (F,); -1 if it has none.
+    """
+
+    viewmat: np.ndarray
+    extent: np.ndarray
+    features: np.ndarray
+    points: np.ndarray
+
+    @property
+    def position(self) -> np.ndarray:
+        """Centre of the camera."""
+        return -self.viewmat[:, :3].T @ self.viewmat[:, 3]
+
+    def project(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Projections (N, 2) in units of the focal length, and depths (N,), of positions (N, 3)."""
+        x = positions @ self.viewmat[:, :3].T + self.viewmat[:, 3]
+        return x[:, :2] / np.where(x[:, 2:] == 0, 1e-12, x[:, 2:]), x[:, 2]
+
+
+def shared(views: list[View], points: np.ndarray) -> np.ndarray:
+    """Share (N, N) of the points of view i that view j must see too, from about as near and in about that direction."""
+    shares = np.zeros((len(views), len(views)))
+    for i, view in enumerate(views):
+        seen = np.unique(view.points[view.points >= 0])
+        X = points[seen[:: max(1, len(seen) // _SAMPLE)]]
+        ray_i = X - view.position
+        distance_i = np.linalg.norm(ray_i, axis=1)
+        for j, other in enumerate(views):
+            projected, depth = other.project(X)
+            ray = X - other.position
+            distance = np.linalg.norm(ray, axis=1)
+            cosine = (ray * ray_i).sum(axis=1) / np.maximum(distance * distance_i, 1e-12)
+            ratio = np.maximum(distance, distance_i) / np.maximum(np.minimum(distance, distance_i), 1e-12)
+            visible = (depth > 0) & (np.abs(projected) < other.extent).all(axis=1)
+            shares[i, j] = (visible & (cosine > _COSINE) & (ratio < _RATIO)).mean() if len(X) else 0.0
+    return shares
+
+
+def loops(shares: np.ndarray, matched: set[tuple[int, int]], count: int) -> list[tuple[int, int]]:
+    """Pairs i < j beside the matched ones: of each view, the ``count`` others that see most of the same.
+
+    Args:
+        shares: (N, N), of :func:`shared`.
+        matched: pairs i < j.
+        count: number of pairs for each view.
+    """
+    mutual = np.minimum(shares, shares.T)
+    for i, j in matched:
+        mutual[i, j] = mutual[j, i] = 0
+    np.fill_diagonal(mutual, 0)
+    best = np.argsort(-mutual, axis=1, kind="stable")[:, :count]
+    return sorted(
+        {(min(i, j), max(i, j)) for i in range(len(best)) for j in map(int, best[i]) if mutual[i, j] >= _LEAST_SHARE}
+    )
+
+
+def agree(first: View, second: View, points: np.ndarray, matches: np.ndarray) -> bool:
+    """Whether matches (M, 2) of features lie where the coarse model has their points, in the median."""
+    offsets = []
+    for a, b, (ia, ib) in ((first, second, matches.T), (second, first, matches.T[::-1])):
+        known = a.points[ia] >= 0
+        projected, depth = b.project(points[a.points[ia[known]]])
+        offset = np.linalg.norm(projected - b.features[ib[known]], axis=1)
+        offsets.append(np.where(depth > 0, offset, np.inf))
+    together = np.concatenate(offsets)
+    return len(together) > 0 and float(np.median(together)) < DRIFT
+
+
+def bridges(groups: list[list[str]], count: int) -> list[tuple[str, str]]:
+    """Pairs of views of different groups, which may share some: of each at most ``count`` views, evenly spread."""
+    spread = [{group[int(x)] for x in np.linspace(0, len(group) - 1, count)} for group in groups]
+    return sorted({(min(i, j), max(i, j)) for a, b in combinations(spread, 2) for i in a for j in b if i != j})

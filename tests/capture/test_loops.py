@@ -1,0 +1,88 @@
+"""Loops of a walk: which pairs a coarse model proposes, and which matches it contradicts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from shellgs_method.capture.loops import DRIFT, View, agree, bridges, loops, shared
+
+BAY = 3.0
+EXTENT = np.array([0.65, 0.4])
+
+
+def wall() -> np.ndarray:
+    """Points of a wall at y = 0, half a metre apart."""
+    x, z = np.meshgrid(np.arange(-20, 60, 0.5), np.arange(0, 10, 0.5))
+    return np.stack([x, 0 * x, z], axis=-1).reshape(-1, 3)
+
+
+def facing(x: float, distance: float, points: np.ndarray, drift: float = 0.0, shifted: float = 0.0) -> View:
+    """A camera before the wall, whose model is off by ``drift`` and whose features are ``shifted`` along the wall."""
+    R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    true, modelled = (View(np.c_[R, -R @ [u, -distance, 4.0]], EXTENT, points, points) for u in (x, x + drift))
+    features, depth = true.project(points)
+    seen = (depth > 0) & (np.abs(features) < EXTENT).all(axis=1)
+    features += np.array([shifted / distance, 0])
+    return View(modelled.viewmat, EXTENT, features, np.where(seen, np.arange(len(points)), -1))
+
+
+def test_views_share_what_both_must_see():
+    points = wall()
+    shares = shared([facing(x, d, points) for x, d in ((0, 8), (5.2, 8), (40, 8), (0, 16), (0, 40))], points)
+    np.testing.assert_allclose(np.diag(shares), 1)
+    assert shares[0, 1] == pytest.approx(0.5, abs=0.1)  # a field of 10.4 m, half of it on
+    assert shares[0, 2] == 0
+    assert shares[0, 3] == 1
+    assert shares[3, 0] == pytest.approx(0.3, abs=0.15)
+    assert shares[0, 4] == 0  # five times as far: features have other scales
+
+
+def test_a_view_behind_the_wall_shares_nothing():
+    points = wall()
+    behind = facing(0, -8, points)
+    assert shared([facing(0, 8, points), behind], points)[0, 1] == 0
+
+
+def test_the_way_back_is_matched_with_the_way_out():
+    points = wall()
+    out = [facing(x, 8, points) for x in np.arange(0, 30, 1.0)]
+    views = out + out[::-1]
+    matched = {(i, j) for i in range(60) for j in range(i + 1, 60) if j - i <= 10}
+    found = loops(shared(views, points), matched, 3)
+    assert not matched & set(found)
+    assert all(i < 30 <= j and abs(59 - j - i) <= 6 for i, j in found)
+    assert {k for pair in found for k in pair} >= set(range(24)) | set(range(36, 60))  # the turn is matched
+
+
+def matches(first: View, second: View) -> np.ndarray:
+    both = np.flatnonzero((first.points >= 0) & (second.points >= 0))
+    return np.stack([both, both], axis=1)
+
+
+@pytest.mark.parametrize("distance", [5, 10, 20])
+def test_matches_that_are_a_bay_off_are_contradicted_and_drift_is_not(distance):
+    points = wall()
+    first, second = facing(0, distance, points), facing(1, distance, points, drift=0.5 * DRIFT * distance)
+    assert agree(first, second, points, matches(first, second))
+    confused = facing(1, distance, points, shifted=BAY)
+    assert not agree(first, confused, points, matches(first, second))
+
+
+def test_matches_without_points_are_not_believed():
+    points = wall()
+    first, second = facing(0, 8, points), facing(1, 8, points)
+    none = np.flatnonzero((first.points < 0) & (second.points < 0))[:50]
+    assert not agree(first, second, points, np.stack([none, none], axis=1))
+
+
+def test_groups_are_bridged_by_views_that_are_spread_over_each():
+    first, second, third = ([f"{group}{k:02d}" for k in range(n)] for group, n in (("a", 100), ("b", 30), ("c", 2)))
+    pairs = bridges([first, second, third], 4)
+    assert len(pairs) == len(set(pairs)) == 4 * 4 + 4 * 2 + 4 * 2
+    assert {a for a, _ in pairs if a in first} == {"a00", "a33", "a66", "a99"}
+    assert all(a < b for a, b in pairs)
+
+
+def test_a_view_of_two_groups_is_not_matched_with_itself():
+    assert bridges([["a", "b"], ["b", "c"]], 2) == [("a", "b"), ("a", "c"), ("b", "c")]
