@@ -71,7 +71,7 @@ LIMITS = {
     "agreement": Limit(
         0.65, 0.55, "a shell elsewhere shows walls where photographs show none, and hides what they show"
     ),
-    "elsewhere": Limit(0.8, 0.86, "where the shell stands as well elsewhere, neither place is proved"),
+    "elsewhere": Limit(0.8, 0.93, "where the shell stands as well elsewhere, neither place is proved"),
     "step": Limit(FINE, COARSEST, f"an error of half a step does not average out; {REMEDY}"),
     "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
     "bent_pixels": Limit(1.05, 1.2, "points that were not adjusted to fit worse if cameras are bent"),
