@@ -58,8 +58,10 @@ def main(
         more: more words for ns-train.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if not (scene / "cues/checked").exists():  # which the scene in changing light has
+        raise SystemExit(f"the photographs of {scene} were not compared with its shell: run `shellgs cast` on it")
     changing = work / "scenes" / scene.name
-    if not changing.exists():
+    if only != "constant" and not changing.exists():
         write_in_changing_light(scene, changing)
         size = json.loads((scene / "cues/shell/manifest.json").read_text())["max_image_size"]
         words = ["--max-image-size", str(size)] if size else []

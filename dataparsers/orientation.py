@@ -19,7 +19,7 @@ from PIL import ExifTags, Image
 from shellgs_method.errors import notice
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
-from shellgs_method.geometry.camera import in_view, upwards
+from shellgs_method.geometry.camera import image_up, in_view
 from shellgs_method.registration.sfm_frame import may_be_of
 
 if TYPE_CHECKING:
@@ -104,5 +104,5 @@ def _by_axes(views: Sequence[View], straight: Sequence[View]) -> bool | None:
     """Whether cameras are as upright as those of photographs that are stored upright; None if that is unclear."""
     if not straight:
         return None
-    cosine = float(upwards(view.camera for view in views) @ upwards(view.camera for view in straight))
+    cosine = float(image_up(view.camera for view in views) @ image_up(view.camera for view in straight))
     return True if cosine > _ALIKE else False if cosine < _UNLIKE else None

@@ -12,6 +12,7 @@ from shellgs_method.commands.cast import cast
 from shellgs_method.commands.compare import compare
 from shellgs_method.commands.demo import demo
 from shellgs_method.commands.doctor import doctor
+from shellgs_method.commands.elevation import elevation
 from shellgs_method.commands.evaluate import evaluate
 from shellgs_method.commands.mesh import mesh
 from shellgs_method.commands.mono import mono
@@ -19,7 +20,7 @@ from shellgs_method.commands.sim import sim
 from shellgs_method.commands.splats import splats
 from shellgs_method.errors import refusals_end_the_program
 
-COMMANDS = (demo, capture, align, cast, mono, compare, evaluate, mesh, splats, sim, doctor)
+COMMANDS = (demo, capture, align, cast, mono, compare, evaluate, mesh, splats, elevation, sim, doctor)
 
 
 def main() -> None:

@@ -32,6 +32,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses import PAPER_ITERATIONS
 from shellgs_method.losses.objective import Cues, ExtraLossConfig, GeometryLossConfig, Objective, Trust, ViewLosses
 from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.losses.transients import Transients
 from shellgs_method.machine.threads import ThreadsByLoad
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.render.maps import DepthKind, Geometry, Primitive
@@ -44,6 +45,10 @@ SURFACE_EVERY = 500
 its learning rate in each: once densification is over, by centimetres in between."""
 DEGREE_EVERY = 1000
 """Iterations of a run of 30 000 between two degrees of the spherical harmonics."""
+
+TRANSIENTS_FROM = 1 / 3
+"""Share of a run after which transients are left out. Before, all photographs hide what is not learned yet by something
+else each, such as a distant house, and none would ever learn it."""
 
 
 @dataclass
@@ -65,6 +70,9 @@ class FacadeModelConfig(SplatfactoModelConfig):
     exposure: Literal["fixed", "learned"] = "fixed"
     """Whether each training photograph has an exposure and a white balance of its own, learned with the run. What is
     rendered outside training, and exported, has their mean."""
+    transients: Literal["fitted", "ignored"] = "fitted"
+    """Whether the photometric loss leaves out what only one photograph shows, such as passers-by, beside the shell too:
+    where it differs from its render much more than other photographs do at the same place."""
     depth: DepthKind = "expected"
     """Depth that is rendered and supervised: expected, median (discs only), plane (of the composited plane), or mode
     (of the heavier of two layers; expected in training)."""
@@ -143,6 +151,7 @@ class FacadeModel(SplatfactoModel):
         self.crop_box = None
         self.metres_per_unit: float | None = metadata.get("metres_per_unit")
         self.exposures = Exposures(self.num_train_data) if config.exposure == "learned" else None
+        self.transients = Transients(self.num_train_data) if config.transients == "ignored" else None
         self.objective = Objective(
             config.cues, config.trust, config.geometry, config.extra, self.metres_per_unit, metadata.get("shell_error")
         )
@@ -315,7 +324,7 @@ class FacadeModel(SplatfactoModel):
 
     @property
     def _renders_geometry(self) -> bool:
-        return not self.training or self.objective.needs_geometry
+        return not self.training or self.objective.needs_geometry or self.transients is not None
 
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: object) -> NoReturn:
         """Refuse what commands for radiance fields ask for."""
@@ -353,8 +362,17 @@ class FacadeModel(SplatfactoModel):
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """The objective's terms of the view that was rendered last."""
         view, progress = self._view(batch, outputs["background"]), self.step / self.num_iterations
-        losses = self.objective(view, batch, outputs["rgb"], self.geometry, progress)
+        transient = self._transient(view, batch["image_idx"], outputs["rgb"]) if self.training else None
+        losses = self.objective(view, batch, outputs["rgb"], self.geometry, progress, transient)
         return losses | self.objective.of_shapes(self.scales, self.info["radii"][0] > 0)
+
+    def _transient(self, view: ViewLosses, index: int, rgb: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"] | None:
+        if self.transients is None or self.geometry is None or self.step < TRANSIENTS_FROM * self.num_iterations:
+            return None
+        images = view.photometric.target, rgb.detach()
+        if self.exposures is not None:
+            images = (exposed(image, -self.exposures.log_gains[index].detach()) for image in images)
+        return self.transients(index, *images, self.geometry.depth.detach(), self.geometry.camera)
 
     def _view(self, batch: dict, background: Tensor) -> ViewLosses:
         changes = self.config.background_color == "random" and batch["image"].shape[-1] == 4

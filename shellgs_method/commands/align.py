@@ -30,6 +30,7 @@ def align(
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
     mesher: Optional[Mesher] = None,
+    spacing: Optional[float] = None,
     paths: Paths = PATHS,
 ) -> None:
     """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.
@@ -40,7 +41,7 @@ def align(
 
     Args:
         scene: Scene folder.
-        shell: Mesh or point cloud of the shell.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy).
         picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
         positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
@@ -53,6 +54,8 @@ def align(
         mesher: How a point cloud is meshed, here and wherever the alignment is used: planes (ball pivoting between
             them), bpa (ball pivoting alone) or poisson (for round shapes). If not set: that of the existing alignment,
             else planes.
+        spacing: Size in metres of the voxels in which the points of a cloud are merged, here and wherever the alignment
+            is used. If not set: that of the existing alignment, else what the cameras resolve.
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import read_views
@@ -74,10 +77,12 @@ def align(
         refined,
         seen_again,
         unbent,
+        up_in_words,
     )
     from shellgs_method.registration.frames import ShellPlace
     from shellgs_method.registration.report import write_report
     from shellgs_method.registration.sfm_frame import check_points
+    from shellgs_method.registration.units import unit_doubted
     from shellgs_method.registration.validation import validate
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
     from shellgs_method.shell.cast import renew_error
@@ -112,8 +117,8 @@ def align(
         method, unit = mesher or "planes", metres_per_shell_unit
         unaligned = load_shell(shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
         placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
-    placement = replace(placement, alignment=placement.alignment.meshed_by(mesher))
-    mesh = placement.alignment.load_shell(scene, views, place.geometry if place else None)
+    placement = replace(placement, alignment=placement.alignment.meshed_by(mesher, spacing))
+    mesh = placement.alignment.load_shell(scene, views, place.surface if place else None)
     misplacement = misplaced(placement, mesh, views, points)
     if refine is not None and misplacement:
         raise SceneError(f"the alignment cannot be refined: {misplacement}")
@@ -129,6 +134,7 @@ def align(
         )
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
+    validation = validation.with_checks(placement.checks)
     candidate = unfinished(scene / ADJUSTED)
     try:
         if bundle_adjust and validation.verdict != "refused":
@@ -140,11 +146,14 @@ def align(
                 placement = seen_again(placement, views, picks)
                 after = validate(mesh, placement.alignment, views, points, placement.correspondences)
                 validation = after.after(adjustment, validation)
+        validated = validation.validated(views)
+        told = [up_in_words(validated), unit_doubted(replace(validation, alignment=validated), mesh, views)]
+        placement = replace(placement, history=[*placement.history, *filter(None, told)])
         write_report(scene / REPORT, mesh, validation, placement.history)
         if validation.verdict != "refused":
             if candidate.is_dir():
                 replace_folder(scene / ADJUSTED, candidate)
-            validation.validated(views).save(target)
+            validated.save(target)
             renew_error(scene)
     finally:
         shutil.rmtree(candidate, ignore_errors=True)

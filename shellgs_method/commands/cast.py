@@ -25,6 +25,7 @@ def cast(
     metres_per_shell_unit: float = 1.0,
     max_image_size: Optional[int] = None,
     mesher: Optional[Mesher] = None,
+    spacing: Optional[float] = None,
     check: bool = True,
     paths: Paths = PATHS,
 ) -> None:
@@ -37,13 +38,15 @@ def cast(
 
     Args:
         scene: Scene folder.
-        shell: Mesh or point cloud of the shell, with --matrix. If not set: the one in scene/shell/alignment.json.
+        shell: Mesh, model or point cloud of the shell, with --matrix. If not set: that of scene/shell/alignment.json.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size.
         mesher: How a point cloud is meshed: planes (ball pivoting between them), bpa (ball pivoting alone) or poisson
             (for round shapes). If not set: as the alignment was validated; another one leaves it without a verdict.
+        spacing: Size in metres of the voxels in which the points of a cloud are merged. If not set: as the alignment
+            was validated, or what the cameras resolve.
         check: Compare the photographs to find what occludes the shell.
         paths: Paths of the scene's files.
     """
@@ -67,9 +70,10 @@ def cast(
         if not alignment.cameras.cameras:
             unbound = f"{scene / ALIGNMENT} does not say which cameras it was found for"
             console.print(f"{unbound}: `shellgs align {scene}` records them.")
-    aligned = alignment.meshed_by(mesher)
+    aligned = alignment.meshed_by(mesher, spacing)
     if aligned != alignment and alignment.verdict:
-        console.print(f"The alignment was validated with another mesher: run `shellgs align {scene}` again.")
+        how = "mesher" if aligned.mesher != alignment.mesher else "spacing"
+        console.print(f"The alignment was validated with another {how}: run `shellgs align {scene}` again.")
     start = time.monotonic()
     placed = PlacedShell.load(scene, views, aligned)
     if meshing := placed.mesh.meshing:

@@ -23,7 +23,6 @@ Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 RunConfig = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG")]
 Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
 PATHS = ScenePaths()
-UpAxis = Literal["y", "z"]
 Mesher = Literal["planes", "bpa", "poisson"]
 
 

@@ -6,7 +6,7 @@ from math import inf
 from pathlib import Path
 from typing import Optional
 
-from shellgs_method.commands.common import RunConfig, UpAxis, console, place
+from shellgs_method.commands.common import RunConfig, console, place
 from shellgs_method.errors import SceneError
 
 
@@ -16,7 +16,6 @@ def mesh(
     voxel: Optional[float] = None,
     faces: int = 200_000,
     margin: float = 0.5,
-    up: Optional[UpAxis] = None,
 ) -> None:
     """Write a triangle mesh of a trained run, in metres in the shell's frame, and print its errors.
 
@@ -27,10 +26,9 @@ def mesh(
         config: The run's config.yml.
         output: Mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
         voxel: Voxel size in metres, at least half of what the photographs resolve. If not set: the size of a pixel on
-            the facade.
+            the facade, in the median of the photographs, however long the facade is.
         faces: Number of triangles that the mesh is decimated to.
         margin: Distance from the shell, in metres, beyond which geometry is left out.
-        up: Axis of the shell's frame that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
     from shellgs_method.export.meshes import METRE_FORMATS, check_mesh_format, write_mesh
@@ -41,7 +39,7 @@ def mesh(
     check_mesh_format(output)
     if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
         raise SceneError("--faces must be at least 4, --voxel above 0 and --margin at least 0")
-    run = TrainedRun.load(config, up)
+    run = TrainedRun.load(config)
     surface = decimate(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, surface)
     write_mesh(output, surface, run.frame, metrics)

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import tyro
 
-from shellgs_method.commands.common import UpAxis, console
+from shellgs_method.commands.common import console
 from shellgs_method.sim.settings import SimSettings
 
 _SIM = SimSettings()
-_PACKAGES = {"pxr.UsdGeom": "usd-core", "xatlas": "xatlas", "shapely": "shapely", "mapbox_earcut": "mapbox-earcut"}
+_PACKAGES = {"pxr.UsdGeom": "usd-core", "xatlas": "xatlas", "shapely": "shapely"}
 
 
 def sim(
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG [CONFIG ...] FOLDER")],
     settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
-    up: Optional[UpAxis] = None,
 ) -> None:
     """Write assets for MuJoCo, Isaac Sim and Gazebo: convex colliders, a textured mesh, splats, and a report.
 
@@ -26,7 +25,6 @@ def sim(
     Args:
         paths: config.yml of each run, then the output folder.
         settings: Settings.
-        up: Axis of the shells' frames that points up. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.machine.extras import import_extra
     from shellgs_method.sim.trials.engine import import_mujoco
@@ -40,7 +38,7 @@ def sim(
         console.print(sentence, highlight=False)
 
     *configs, out = paths or (Path(),)  # one list: of two, the first takes all paths that an option follows
-    metrics, _ = simulate(configs, out, settings, report, up)
+    metrics, _ = simulate(configs, out, settings, report)
     for sentence in metrics["summary"]:
         report(sentence)
     console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how accurate it is.")

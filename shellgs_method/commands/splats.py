@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Optional
 
-from shellgs_method.commands.common import RunConfig, UpAxis, console, place
+from shellgs_method.commands.common import RunConfig, console, place
 
 
 def splats(
     config: RunConfig,
     output: Optional[Path] = None,
-    up: Optional[UpAxis] = None,
 ) -> None:
     """Write the Gaussians of a trained run as a ply for splat viewers, in metres in the shell's frame.
 
@@ -20,14 +19,13 @@ def splats(
     Args:
         config: The run's config.yml.
         output: Output ply. If not set: splats.ply beside the config.
-        up: Axis of the shell's frame that points up, written to the json. If not set: y for a glTF shell, else z.
     """
     from shellgs_method.export.runs import TrainedRun
     from shellgs_method.export.splats import check_splats_format, write_splats
 
     output = output or config.with_name("splats.ply")
     check_splats_format(output)
-    run = TrainedRun.load(config, up)
+    run = TrainedRun.load(config)
     count = write_splats(output, run.splats())
     run.frame.describe(output, {"splats": count})
     console.print(f"{output}: {count} Gaussians. {place(run.frame)}")

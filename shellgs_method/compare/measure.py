@@ -91,6 +91,8 @@ class Snapshot:
 def measure(config_path: Path, half: Half | None = None, renders: Path | None = None) -> dict:
     """Measure a run as ns-eval does, with our geometric metrics for every method.
 
+    ``exposure_stops`` are the learned exposures of the training photographs, [V, 3], or None.
+
     Args:
         config_path: config.yml of the run.
         half: half of the facade to measure; None for that which the run held out, or for all of it.
@@ -117,10 +119,12 @@ def measure(config_path: Path, half: Half | None = None, renders: Path | None = 
         if renders and "shell_mask" in batch and batch["shell_mask"].any():
             name = f"{index:04d}-{Path(datamanager.eval_dataset.views[index].name).stem}.npz"
             _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(renders / name)
+    learned = model.exposures if isinstance(model, FacadeModel) else None
     return {
         "experiment_name": config.experiment_name,
         "method_name": config.method_name,
         "checkpoint": str(checkpoint),
+        "exposure_stops": learned.stops.tolist() if learned is not None else None,
         "results": mean_over_views(metrics, deviation=True),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,17 +17,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from shellgs_method.compare.measure import Snapshot
 from shellgs_method.compare.runs import Run
-from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import back_project
 from shellgs_method.evaluation.figures import Panel, save_figure, save_strip
 from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS
 from shellgs_method.evaluation.view import VOXEL_METRES, VOXEL_SHARE
-from shellgs_method.gaussians.exposures import Exposures
-from shellgs_method.geometry.axes import facade_axes
-from shellgs_method.geometry.camera import upwards
+from shellgs_method.geometry.axes import facade_axes, likely_up
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.voxels import voxel_means
-from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
 
 CURVES = tuple(
     c for c in (*MAIN_COLUMNS, *SURFACE_COLUMNS) if c.key in ("psnr", "normal_deg", "depth_mae_m", "chamfer_m")
@@ -85,19 +82,14 @@ def curves(runs: Sequence[Run], path: Path) -> bool:
 def exposures(runs: Sequence[Run], path: Path) -> bool:
     """Plot the exposures that the training photographs were found to have, in stops, in the order of their names.
 
-    One line per variant, of its first seed whose checkpoint is still there and readable; False if no run learned any.
+    One panel per variant, of its first seed that is measured; False if no run learned any.
     """
     found: dict[str, Float[np.ndarray, "V 3"]] = {}
     for run in runs:
-        if run.variant.ours and run.trained and run.variant.name not in found:
-            try:
-                state = load_checkpoint(find_checkpoint(run.checkpoints))["pipeline"]
-            except (FileNotFoundError, SceneError):  # the results of a finished run need none
-                continue
-            if (stored := state.get("_model.exposures.parameter")) is not None:
-                learned = Exposures(len(stored))
-                learned.start(stored.numpy())
-                found[run.variant.name] = learned.stops.numpy()
+        if run.variant.name not in found and run.metrics().exists():
+            stops = json.loads(run.metrics().read_text()).get("exposure_stops")
+            if stops is not None:
+                found[run.variant.name] = np.array(stops)
     if not found:
         return False
     figure = Figure(figsize=(4 * len(found), 3), layout="constrained")
@@ -169,7 +161,7 @@ def _resolution(shot: Snapshot) -> tuple[str, float]:
 def _facade_axes(shots: Sequence[Snapshot]) -> Float[np.ndarray, "3 3"]:
     """Right, up and out of the facade, as rows."""
     normals = [shot.shell_normal[shot.mask[..., 0]][::20].astype(float) @ shot.viewmat[:3, :3] for shot in shots]
-    return facade_axes(np.concatenate(normals), upwards(shot.camera for shot in shots))
+    return facade_axes(np.concatenate(normals), likely_up(shot.camera for shot in shots))
 
 
 def _world(shot: Snapshot, depth: Float[np.ndarray, "H W 1"]) -> Float[np.ndarray, "N 3"]:

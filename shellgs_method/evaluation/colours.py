@@ -6,9 +6,21 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 from torch import Tensor
 
+from shellgs_method.geometry.surface_classes import SurfaceClass
+
 GREY = 153  # grey level of pixels without a value
+CLASS_COLOURS = {
+    SurfaceClass.OTHER: to_rgb("#999933"),
+    SurfaceClass.WALL: to_rgb("#ddcc77"),
+    SurfaceClass.WINDOW: to_rgb("#332288"),
+    SurfaceClass.DOOR: to_rgb("#882255"),
+    SurfaceClass.ROOF: to_rgb("#cc6677"),
+    SurfaceClass.GROUND: to_rgb("#117733"),
+}
+"""Colours of the classes of surfaces: Paul Tol's muted scheme, which the colour-blind tell apart."""
 MAX_ERROR = 45.0
 """Angle in degrees at which the error scale saturates."""
 
@@ -49,6 +61,13 @@ def depth_colours(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colours of depths in 8 bits: dark at ``near``, light at ``far``, grey outside the mask."""
     return _scale_colours("viridis", (depth.astype(float) - near) / max(far - near, 1e-6), mask)
+
+
+def deviation_colours(distance: Shaped[np.ndarray, "*shape"], full: float) -> UInt8[np.ndarray, "*shape 3"]:
+    """Colours of signed distances in 8 bits: red at ``full`` in front, white at 0, blue behind, grey where NaN."""
+    strength = np.clip(np.nan_to_num(distance) / full, -1, 1)[..., None]
+    colours = 255 - 255 * np.where(strength > 0, strength * [0.1, 1, 1], -strength * [1, 1, 0.1])
+    return np.where(np.isnan(distance)[..., None], GREY, colours).round().astype(np.uint8)
 
 
 def _scale_colours(

@@ -18,8 +18,8 @@ from torch import Tensor
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View
-from shellgs_method.geometry.axes import facade_axes
-from shellgs_method.geometry.camera import Camera, upwards
+from shellgs_method.geometry.axes import facade_axes, likely_up
+from shellgs_method.geometry.camera import Camera
 
 Half = Literal["A", "B"]
 
@@ -92,5 +92,5 @@ def facade_holdout(maps: CueMaps, views: Sequence[View], width: float, half: Hal
             f"the shell maps of {maps.scene} show no wall to cut into bands: "
             "run `shellgs cast SCENE`, or train without a holdout"
         )
-    axis = facade_axes(np.concatenate(normals), upwards(view.camera for view in views))[0]
+    axis = facade_axes(np.concatenate(normals), likely_up(view.camera for view in views))[0]
     return Holdout(torch.from_numpy(axis), width / (maps.manifest.metres_per_unit or 1.0), half)

@@ -7,11 +7,14 @@ from collections.abc import Sequence
 import matplotlib
 import numpy as np
 from jaxtyping import UInt8
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
-from shellgs_method.evaluation.colours import GREY, normal_colours
+from shellgs_method.evaluation.colours import CLASS_COLOURS, GREY, normal_colours
 from shellgs_method.files.cue_maps import CueMap, Findings
+from shellgs_method.geometry.surface_classes import SurfaceClass
 
 
 def supervision_panel(
@@ -26,10 +29,11 @@ def supervision_panel(
         kind: source of the maps, for the titles.
     """
     height, width = cue.mask.shape
-    figure = Figure(figsize=(16, 4.2 * height / width + 0.9), dpi=120, layout="constrained")
-    axes = figure.subplots(1, 4)
-    titles = ("RGB", f"{kind} depth", "camera-space normal", f"valid mask ({cue.mask.mean():.0%})")
-    for ax, letter, title in zip(axes, "abcd", titles, strict=True):
+    titles = ["RGB", f"{kind} depth", "camera-space normal", f"valid mask ({cue.mask.mean():.0%})"]
+    titles += [] if cue.classes is None else ["class"]
+    figure = Figure(figsize=(4 * len(titles), 4.2 * height / width + 0.9), dpi=120, layout="constrained")
+    axes = figure.subplots(1, len(titles))
+    for ax, letter, title in zip(axes, "abcde", titles, strict=False):
         ax.set_title(f"({letter}) {title}")
         ax.set_axis_off()
     axes[0].imshow(image)
@@ -43,7 +47,18 @@ def supervision_panel(
     axes[3].imshow(cue.mask, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     axes[3].set_axis_on()  # a frame, without which a mask that is white everywhere is not there on white paper
     axes[3].set(xticks=[], yticks=[])
+    if cue.classes is not None:
+        _show_classes(axes[4], np.where(cue.mask, cue.classes, len(SurfaceClass)))
     return figure
+
+
+def _show_classes(ax: Axes, classes: UInt8[np.ndarray, "H W"]) -> None:
+    """Show classes of surfaces in colours of their own, with a legend of those that are there; grey is none."""
+    palette = np.array([*(CLASS_COLOURS[each] for each in SurfaceClass), (GREY / 255,) * 3])
+    ax.imshow(palette[classes], interpolation="nearest")
+    there = [each for each in SurfaceClass if (classes == each).any()]
+    handles = [Patch(color=CLASS_COLOURS[each], label=each.word) for each in there]
+    ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=6, frameon=False, fontsize=8)
 
 
 def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float64
 
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.axes import name_of
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of
 from shellgs_method.shell import Alignment, ShellMesh
 
-UpAxis = Literal["y", "z"]
-
+Z = np.array([0.0, 0.0, 1.0])
 FAR = 1000.0
 """Distance from the origin above which coordinates are shifted: there float32 has steps of 0.06 mm."""
 
@@ -31,14 +31,14 @@ class Frame:
         to_scene: similarity from this frame to the scene's.
         offset: to add to coordinates to get those of the shell, or of the scene, in this frame's unit.
         metric: whether the unit is the metre; otherwise it is unknown.
-        up: the axis that points up.
+        up: the direction upwards, a unit vector.
     """
 
     name: Literal["shell", "scene"]
     to_scene: Float64[np.ndarray, "4 4"]
     offset: Float64[np.ndarray, " 3"]
     metric: bool
-    up: UpAxis
+    up: Float64[np.ndarray, " 3"]
 
     @property
     def scale(self) -> float:
@@ -56,7 +56,7 @@ class Frame:
         description = {
             "frame": self.name,
             "unit": "metre" if self.metric else "unknown",
-            "up": self.up,
+            "up": name_of(self.up),
             "offset": self.offset.tolist(),
             "to_scene": self.to_scene.tolist(),
         }
@@ -64,7 +64,7 @@ class Frame:
             file.write((json.dumps(description | facts, indent=1) + "\n").encode())
 
 
-def shell_frame(alignment: Alignment, shell: ShellMesh, up: UpAxis = "z") -> Frame:
+def shell_frame(alignment: Alignment, shell: ShellMesh, up: Float64[np.ndarray, " 3"] = Z) -> Frame:
     """The shell's frame in metres; for a georeferenced shell shifted by whole hundreds of metres to its middle."""
     metres = alignment.metres_per_shell_unit
     bounds = shell.bounds * metres
@@ -74,11 +74,11 @@ def shell_frame(alignment: Alignment, shell: ShellMesh, up: UpAxis = "z") -> Fra
     return Frame("shell", alignment.shell_to_scene @ to_shell, offset, metric=True, up=up)
 
 
-def scene_frame(up: UpAxis = "z", middle: Float64[np.ndarray, " 3"] | None = None) -> Frame:
+def scene_frame(up: Float64[np.ndarray, " 3"] = Z, middle: Float64[np.ndarray, " 3"] | None = None) -> Frame:
     """The scene's own frame, whose unit is unknown; large coordinates are shifted as those of a shell.
 
     Args:
-        up: the axis that points up.
+        up: the direction upwards.
         middle: a point in the middle of the scene; the origin if None.
     """
     middle = np.zeros(3) if middle is None else middle

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -11,12 +11,11 @@ from shellgs_method.errors import SceneError, check_output
 from shellgs_method.export.frame import Frame
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.usd import USD_FORMATS, add_mesh, import_pxr, make_collider, new_stage
+from shellgs_method.geometry.axes import name_of, turn
 
 if TYPE_CHECKING:
     import trimesh
 
-Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Turns z-up coordinates into y-up ones."""
 MESH_FORMATS = (".ply", ".obj", ".glb", *USD_FORMATS)
 METRE_FORMATS = (".glb", *USD_FORMATS)
 """Formats whose unit is the metre, even if it is unknown: glTF by its specification, USD as its readers need it."""
@@ -38,31 +37,37 @@ def check_mesh_format(path: Path) -> None:
 def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | None = None) -> None:
     """Write a mesh, and beside it (``.json``) its frame, the offset of georeferenced coordinates, and ``facts``.
 
-    glTF is y-up and in metres by its specification, so coordinates are rotated for it; USD states its up axis and unit;
-    ply and obj state neither. Coordinates in the files are float32, which is why the frame is near the facade.
+    glTF is y-up and in metres by its specification, so coordinates are rotated for it; USD states its up axis, y or z,
+    and its unit; ply and obj state neither. Coordinates in the files are float32, which is why the frame is near the
+    facade.
     """
     check_mesh_format(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    format, turned = path.suffix.lower(), path.suffix.lower() == ".glb" and frame.up == "z"
+    format, up = path.suffix.lower(), frame.up
+    stated = {".glb": ("y",), **dict.fromkeys(USD_FORMATS, ("y", "z"))}.get(format)
+    if stated and name_of(up) not in stated:
+        to = np.eye(3)["xyz".index(stated[-1])]
+        turned = np.eye(4)
+        turned[:3, :3] = turn(up, to)
+        mesh, up = mesh.copy().apply_transform(turned), to
     if format in USD_FORMATS:
-        _write_usd(path, mesh, frame)
+        _write_usd(path, mesh, "y" if name_of(up) == "y" else "z", frame.metric)
     else:
-        placed = mesh.copy().apply_transform(Y_UP) if turned else mesh
-        content: Any = placed.export(file_type=format[1:])
+        content: Any = mesh.export(file_type=format[1:])
         with atomic_write(path) as file:
             file.write(content.encode() if isinstance(content, str) else content)
-    about = {"up_in_file": "y" if turned else frame.up, "faces": len(mesh.faces)}
+    about = {"up_in_file": name_of(up), "faces": len(mesh.faces)}
     about |= {"unit_in_file": "metre"} if format in METRE_FORMATS else {}
     frame.describe(path, about | mesh.metadata | (facts or {}))
 
 
-def _write_usd(path: Path, mesh: trimesh.Trimesh, frame: Frame) -> None:
+def _write_usd(path: Path, mesh: trimesh.Trimesh, up: Literal["y", "z"], metric: bool) -> None:
     """Write a stage whose default prim is a static collider made of the triangles themselves.
 
     A convex hull would close the windows and doors.
     """
     pxr = import_pxr("usd", f"{path}: USD")
-    with new_stage(pxr, path, frame.up, frame.metric) as stage:
+    with new_stage(pxr, path, up, metric) as stage:
         prim = add_mesh(pxr, stage, "/facade", np.asarray(mesh.vertices), np.asarray(mesh.faces))
         prim.CreateDoubleSidedAttr(True)
         colours = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3] / 255, dtype=np.float32)  # pyright: ignore

@@ -17,14 +17,15 @@ from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, mean_over_views
 from shellgs_method.evaluation.regions import reference_errors
 from shellgs_method.evaluation.view import OPAQUE
-from shellgs_method.export.frame import Frame, UpAxis, scene_frame, shell_frame
+from shellgs_method.export.frame import Frame, scene_frame, shell_frame
 from shellgs_method.export.splats import Splats
 from shellgs_method.files.photographs import load_mask
-from shellgs_method.files.surfaces import up_axis
+from shellgs_method.files.surfaces import usual_up
+from shellgs_method.geometry.axes import likely_up
 from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.geometry.tsdf import DepthView, fuse
+from shellgs_method.geometry.tsdf import DepthView, fuse, least_voxel
 from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
 from shellgs_method.occlusion.exposure import Sightings, log_gains
@@ -50,11 +51,9 @@ class TrainedRun:
 
     model: FacadeModel
     datamanager: FacadeDataManager
-    up: UpAxis | None = None
-    """Up axis of the shell's frame, or else of the scene's; if None, y for a glTF shell, else z."""
 
     @classmethod
-    def load(cls, config: Path, up: UpAxis | None = None) -> TrainedRun:
+    def load(cls, config: Path) -> TrainedRun:
         """Load the last checkpoint of the run that ``config`` (config.yml) belongs to.
 
         Raises:
@@ -65,7 +64,7 @@ class TrainedRun:
         model, datamanager = pipeline.model, pipeline.datamanager
         if not isinstance(model, FacadeModel) or not isinstance(datamanager, FacadeDataManager):
             raise SceneError(f"{config} is not a run of a ShellGS method: only these render the depth that is needed")
-        return cls(model, datamanager, up)
+        return cls(model, datamanager)
 
     @property
     def datasets(self) -> tuple[FacadeDataset, FacadeDataset]:
@@ -83,22 +82,25 @@ class TrainedRun:
         alignment = Alignment.load(scene / ALIGNMENT)
         views = [view for dataset in self.datasets for view in dataset.views]
         alignment.check_cameras(scene, views)
+        alignment = alignment if alignment.cameras.cameras else alignment.seen_by(views)
         return alignment, alignment.load_shell(scene, views)
 
     @cached_property
     def frame(self) -> Frame:
         """The shell's frame in metres, else the scene's."""
         if self.shell is None:
-            cameras = positions(view.camera for dataset in self.datasets for view in dataset.views)
-            return scene_frame(self.up or "z", cameras.mean(axis=0))
-        return shell_frame(*self.shell, up=self.up or up_axis(self.shell[0].shell))
+            cameras = [view.camera for dataset in self.datasets for view in dataset.views]
+            return scene_frame(likely_up(cameras), positions(cameras).mean(axis=0))
+        alignment, shell = self.shell
+        return shell_frame(alignment, shell, usual_up(alignment.shell) if alignment.up is None else alignment.up)
 
     @property
     def shell_in_frame(self) -> ShellMesh:
         """The shell in the frame; the scene must have one."""
         assert self.shell is not None
         alignment, shell = self.shell
-        return ShellMesh(shell.vertices * alignment.metres_per_shell_unit - self.frame.offset, shell.faces)
+        placed = shell.vertices * alignment.metres_per_shell_unit - self.frame.offset
+        return ShellMesh(placed, shell.faces, classes=shell.classes)
 
     @property
     def model_scale(self) -> float:
@@ -130,12 +132,14 @@ class TrainedRun:
 
         In the frame's unit; 0 if no view shows enough points.
         """
+        return min(self.footprints(box), default=0.0)
+
+    def footprints(self, box: Box) -> list[float]:
+        """A pixel's size at the SfM points inside a box, in each view that shows enough, in the frame's unit."""
         points = self.sfm_points[box.contains(self.sfm_points)]
         cameras = [self.frame.camera(view.camera) for dataset in self.datasets for view in dataset.views]
         depths = [(in_view(camera, points)[2], float(camera.K[0, 0])) for camera in cameras]
-        return min(
-            (float(np.median(depth)) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY), default=0.0
-        )
+        return [float(np.median(depth)) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY]
 
     def surface(
         self, margin: float, voxel: float | None = None, views: Iterable[DepthView] | None = None
@@ -153,6 +157,8 @@ class TrainedRun:
                 f"voxels of {voxel:g}{unit} are finer than the photographs resolve, whose pixels are {resolved:.2g}"
                 f"{unit} on the facade: give a --voxel of at least half of that, or leave it out"
             )
+        if voxel is None and (pixels := self.footprints(box)):
+            voxel = max(float(np.median(pixels)), least_voxel(box))
         return self.facade(fuse(self.views() if views is None else views, box, voxel), margin)
 
     def facade(self, mesh: trimesh.Trimesh, margin: float) -> trimesh.Trimesh:

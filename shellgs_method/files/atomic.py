@@ -7,8 +7,9 @@ import json
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import IO, Any
@@ -16,7 +17,10 @@ from typing import IO, Any
 import psutil
 
 from shellgs_method.errors import SceneError
+from shellgs_method.machine.cache import cache_folder
 
+_LARGE = 1 << 24  # bytes, which are hashed in a moment
+_SETTLED = 2_000_000_000  # ns after a change, within which another may have the same time
 _UNFINISHED = re.compile(r"\.(.+)\.(\d{1,9})\.tmp(\.\w+)?")
 
 
@@ -82,12 +86,35 @@ def _delete(path: Path) -> None:
 
 
 def content_hash(path: Path) -> str:
-    """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden files are ignored."""
-    digest = hashlib.sha256()
+    """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden files are ignored.
+
+    That of a large file is kept in the user's cache, until the file's size, times or inode change.
+    """
     if path.is_dir():
+        digest = hashlib.sha256()
         for file in sorted(file for file in path.rglob("[!.]*") if file.is_file()):
             digest.update(f"{file.relative_to(path).as_posix()}\0{content_hash(file)}\n".encode())
         return digest.hexdigest()
+    stat = path.stat()
+    if stat.st_size < _LARGE:
+        return _hashed(path)
+    state = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_dev, stat.st_ino]
+    known = cache_folder() / "hashes" / f"{hashlib.sha256(os.fsencode(path.resolve())).hexdigest()}.json"
+    with suppress(OSError, SceneError, KeyError):  # not known, or damaged
+        record = read_json(known)
+        if record["state"] == state:
+            return str(record["sha256"])
+    sha256 = _hashed(path)
+    if time.time_ns() - max(stat.st_mtime_ns, stat.st_ctime_ns) > _SETTLED:
+        with suppress(OSError):  # a cache on a full disk or of another user
+            known.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(known) as file:
+                file.write(json.dumps({"state": state, "sha256": sha256}).encode())
+    return sha256
+
+
+def _hashed(path: Path) -> str:
+    digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)

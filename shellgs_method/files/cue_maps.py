@@ -321,7 +321,9 @@ def source_hash(path: Path) -> str:
         with suppress(SceneError):
             fields = read_json(path)
             if "shell_to_scene" in fields:
-                return fingerprint({name: fields.get(name, usual) for name, usual in PLACING.items()})
+                placing = {name: fields.get(name, usual) for name, usual in PLACING.items()}
+                spacing = {"spacing": fields["spacing"]} if fields.get("spacing") else {}  # older files have none
+                return fingerprint(placing | spacing)
     return content_hash(path)
 
 

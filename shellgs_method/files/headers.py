@@ -20,7 +20,7 @@ _TYPES = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 """Numpy's types, without byte order, by their names in PLY."""
-_LONGEST_HEADER = 1 << 16
+_LONGEST_HEADER = 1 << 20  # of ours, which name cameras; others are short
 
 
 @dataclass

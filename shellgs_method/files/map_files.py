@@ -17,7 +17,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float16, Float32
+from jaxtyping import Bool, Float16, Float32, UInt8
 from torch import Tensor
 
 from shellgs_method.files.atomic import atomic_write
@@ -53,11 +53,14 @@ class CueMap:
         depth: forward z-depth in scene units, 0 where there is none.
         normal: unit normal in the camera frame, facing the camera.
         mask: true where the maps supervise.
+        classes: :class:`~shellgs_method.geometry.surface_classes.SurfaceClass` of the surface, OTHER where there is
+            none; None if nothing is known of classes.
     """
 
     depth: Float32[np.ndarray, "H W"]
     normal: Float16[np.ndarray, "H W 3"]
     mask: Bool[np.ndarray, "H W"]
+    classes: UInt8[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,7 @@ def resampled(cue: CueMap, camera: Camera) -> CueMap:
     weights = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right])
     between = (weights * corners).sum(axis=0)
     depth = np.where(smooth, 1 / np.where(smooth, between, 1), cue.depth[near]).astype(np.float32)
-    return CueMap(depth, cue.normal[near], cue.mask[near])
+    return CueMap(depth, cue.normal[near], cue.mask[near], None if cue.classes is None else cue.classes[near])
 
 
 def write_map(path: Path, cue: CueMap, record: MapRecord) -> None:
@@ -167,7 +170,8 @@ def write_map(path: Path, cue: CueMap, record: MapRecord) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         text = np.array(json.dumps(asdict(record)))
-        _write_npz(file, {"depth": cue.depth, "normal": cue.normal, "mask": cue.mask, "record": text})
+        known = {} if cue.classes is None else {"classes": cue.classes}
+        _write_npz(file, {"depth": cue.depth, "normal": cue.normal, "mask": cue.mask, **known, "record": text})
 
 
 def _write_npz(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
@@ -197,6 +201,7 @@ def read_arrays(path: Path, camera: Camera) -> CueMap:
             _read_array(archive, "depth", size, "float32"),
             _read_array(archive, "normal", (*size, 3), "float16"),
             _read_array(archive, "mask", size, "bool"),
+            _read_array(archive, "classes", size, "uint8") if "classes.npy" in archive.namelist() else None,
         )
 
 
@@ -221,7 +226,8 @@ def _read_array(
 def damage(cue: CueMap, camera: Camera) -> str | None:
     """What is wrong with the arrays of a map, in words; None if nothing is."""
     size = (camera.height, camera.width)
-    for name, shape, dtype in (("depth", size, "float32"), ("normal", (*size, 3), "float16"), ("mask", size, "bool")):
+    arrays = [("depth", size, "float32"), ("normal", (*size, 3), "float16"), ("mask", size, "bool")]
+    for name, shape, dtype in arrays if cue.classes is None else [*arrays, ("classes", size, "uint8")]:
         array = getattr(cue, name)
         if array.shape != shape or array.dtype != dtype:
             return f"its {name} is {array.dtype} {list(array.shape)}, not {dtype} {list(shape)}"

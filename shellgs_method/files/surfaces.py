@@ -1,32 +1,41 @@
-"""Read meshes and point clouds from files, in double precision."""
+"""Read meshes, building models and point clouds from files, in double precision."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.readers.contents import Geometry, left_out, splats
+from shellgs_method.files.clouds import Cloud, damaged
+from shellgs_method.files.readers.citygml import read_citygml
+from shellgs_method.files.readers.cityjson import read_cityjson
+from shellgs_method.files.readers.contents import Geometry, splats
 from shellgs_method.files.readers.gltf import read_gltf
+from shellgs_method.files.readers.ifc import read_ifc
 from shellgs_method.files.readers.meshes import read_obj, read_off, read_stl
 from shellgs_method.files.readers.pcd import read_pcd
-from shellgs_method.files.readers.ply import read_ply
+from shellgs_method.files.readers.ply import ply_points, read_ply
+from shellgs_method.files.readers.points import NO_POINTS, Points
 from shellgs_method.files.readers.scans import read_e57, read_las
-from shellgs_method.files.readers.text_clouds import read_text_cloud
-from shellgs_method.machine.open3d import reason
+from shellgs_method.files.readers.text_clouds import read_ptx, read_text_cloud
 
-READERS: dict[str, Callable[[Path], Geometry]] = {
+MESHES: dict[str, Callable[[Path], Geometry]] = {
     ".ply": read_ply,
     ".obj": read_obj,
     **dict.fromkeys((".glb", ".gltf"), read_gltf),
     ".stl": read_stl,
     ".off": read_off,
+    **dict.fromkeys((".ifc", ".ifczip"), read_ifc),
+    **dict.fromkeys((".gml", ".citygml", ".xml"), read_citygml),
+    **dict.fromkeys((".json", ".cityjson", ".jsonl"), read_cityjson),
+}
+CLOUDS: dict[str, Callable[[Path], Iterator[Points]]] = {
     ".pcd": read_pcd,
-    **dict.fromkeys((".xyz", ".pts", ".txt", ".asc", ".csv"), read_text_cloud),
+    **dict.fromkeys((".xyz", ".xyzrgb", ".pts", ".txt", ".asc", ".csv"), read_text_cloud),
+    ".ptx": read_ptx,
     **dict.fromkeys((".las", ".laz"), read_las),
     ".e57": read_e57,
 }
@@ -34,13 +43,13 @@ SPLATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs")
 """Suffixes of formats that hold Gaussian splats only."""
 
 
-def up_axis(shell: str) -> Literal["y", "z"]:
-    """The axis of a shell's file that points up: y in glTF, by that format's convention, else z."""
-    return "y" if shell.lower().endswith((".glb", ".gltf")) else "z"
+def usual_up(shell: str) -> Float64[np.ndarray, " 3"]:
+    """The direction upwards in a shell's file where cameras do not tell: y in glTF, by that format's rule, else z."""
+    return np.eye(3)[1 if shell.lower().endswith((".glb", ".gltf")) else 2]
 
 
-def read_geometry(path: Path) -> Geometry:
-    """Read all triangles or points of a file, in the precision it stores.
+def read_surface(path: Path) -> Geometry | Cloud:
+    """Read all triangles of a file, in the precision it stores; or open a point cloud, whose points are not yet read.
 
     What a file holds beside them, or marks as no part of the surface, is left out, with a warning that counts it.
 
@@ -55,30 +64,37 @@ def read_geometry(path: Path) -> Geometry:
     suffix = path.suffix.lower()
     if suffix in SPLATS:
         raise splats(path)
-    read = READERS.get(suffix)
+    if suffix in CLOUDS:
+        return Cloud(path, CLOUDS[suffix])
+    read = MESHES.get(suffix)
     if read is None:
         raise SceneError(
-            f"the shell {path} is neither a mesh nor a point cloud that can be read: export it as one of "
-            f"{', '.join(READERS)}"
+            f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: export it as "
+            f"one of {', '.join([*MESHES, *CLOUDS])}"
         )
     try:
+        if suffix == ".ply" and ply_points(path) is not None:
+            return Cloud(path, ply_points)
         geometry = read(path)
     except SceneError:
         raise
     except Exception as error:  # each format's reader raises errors of its own for a damaged file
-        raise SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason(error)})") from error
-    return geometry if len(geometry.faces) else _without_misses(geometry, path)
+        raise damaged(path, error) from error
+    if len(geometry.faces) or not len(geometry.vertices):
+        return geometry
+    return Cloud(path, lambda _: iter([Points(geometry.vertices)]))
 
 
-def _without_misses(cloud: Geometry, path: Path) -> Geometry:
-    """Drop what scanners write where a ray hit nothing: points at exactly 0 0 0, which may be far from all others.
+def read_geometry(path: Path) -> Geometry:
+    """All triangles or points of a file at once; see :func:`read_surface`.
 
-    One among the others is taken for a point of the surface.
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: as :func:`read_surface`.
     """
-    missed = ~cloud.vertices.any(axis=1)
-    others = cloud.vertices[~missed]
-    among = len(others) and (np.nanmin(others, axis=0) <= 0).all() and (np.nanmax(others, axis=0) >= 0).all()
-    if not missed.any() or (missed.sum() == 1 and among):
-        return cloud
-    left_out(path, int(missed.sum()), len(missed), "points at exactly 0 0 0, which are misses of the scanner")
-    return replace(cloud, vertices=others)
+    surface = read_surface(path)
+    if isinstance(surface, Geometry):
+        return surface
+    pieces = [Points(NO_POINTS), *surface]
+    positions, scanners = ([getattr(piece, name) for piece in pieces] for name in ("positions", "scanners"))
+    return Geometry(np.concatenate(positions), scanners=np.concatenate(scanners))

@@ -109,7 +109,10 @@ def in_view(
     return inside, pixels[inside], depth[inside]
 
 
-def upwards(cameras: Iterable[Camera]) -> Float64[np.ndarray, " 3"]:
-    """Mean up direction of the cameras in the world, a unit vector; tilted where they look up or down."""
+def image_up(cameras: Iterable[Camera]) -> Float64[np.ndarray, " 3"]:
+    """Mean direction in the world to the upper edge of the images, a unit vector; tilted where cameras look up or down.
+
+    :func:`~shellgs_method.geometry.axes.upwards` is upright.
+    """
     up = -np.mean([camera.viewmat[1, :3].detach().cpu().double().numpy() for camera in cameras], axis=0)
     return up / np.linalg.norm(up)

@@ -144,10 +144,19 @@ class Objective:
         return view
 
     def __call__(
-        self, view: ViewLosses, batch: dict, rgb: Float[Tensor, "H W 3"], geometry: Geometry | None, progress: float
+        self,
+        view: ViewLosses,
+        batch: dict,
+        rgb: Float[Tensor, "H W 3"],
+        geometry: Geometry | None,
+        progress: float,
+        transient: Bool[Tensor, "H W 1"] | None = None,
     ) -> dict[str, Tensor]:
-        """Weighted terms of a rendered view of a batch, at ``progress`` in [0, 1] of the run."""
-        losses = {"photometric": view.photometric(rgb)}
+        """Weighted terms of a rendered view of a batch, at ``progress`` in [0, 1] of the run.
+
+        R leaves out the pixels that are ``transient``.
+        """
+        losses = {"photometric": view.photometric(rgb, transient)}
         if geometry is not None:
             losses |= self_losses(geometry, self.extra, progress, kept_pixels(batch, rgb), view.with_cue)
             if view.cue is not None:

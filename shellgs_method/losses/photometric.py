@@ -34,10 +34,15 @@ class PhotometricLoss:
         self.target = made.photograph  # one copy in memory
         return made
 
-    def __call__(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Loss of one render, of colours in [0, 1]."""
-        if self.mask is not None:
-            rgb = rgb.where(self.mask, self.target)
+    def __call__(
+        self, rgb: Float[Tensor, "H W 3"], transient: Bool[Tensor, "H W 1"] | None = None
+    ) -> Float[Tensor, ""]:
+        """Loss of one render, of colours in [0, 1], without the pixels that are ``transient``."""
+        mask = self.mask
+        if transient is not None:
+            mask = ~transient if mask is None else mask & ~transient
+        if mask is not None:
+            rgb = rgb.where(mask, self.target)
         l1, dissimilarity = (rgb - self.target).abs(), 1 - ssim(rgb, self._ssim_target)
         errors = (1 - self.ssim_weight) * l1 + self.ssim_weight * dissimilarity
-        return errors.mean() if self.mask is None else weighted_mean(errors, self.mask)
+        return errors.mean() if mask is None else weighted_mean(errors, mask)

@@ -23,6 +23,7 @@ from filelock import FileLock
 
 from shellgs_method.errors import notice
 from shellgs_method.machine import system
+from shellgs_method.machine.cache import cache_folder
 from shellgs_method.machine.progress import tell
 
 # The vectors are written out in the sources: -O3 compiles four times as long for a twentieth of the speed.
@@ -54,7 +55,7 @@ def load_library(source: str) -> ctypes.CDLL | None:
         if (compiler := system.compiler()) is None:
             raise FileNotFoundError("there is no C++ compiler (what CXX names, g++ or clang++)")
         key = hashlib.sha256("\n".join([source, compiler, *_FLAGS, *_LIBRARY, _processor()]).encode()).hexdigest()[:24]
-        library = _folder() / f"{key}.so"
+        library = cache_folder() / f"{key}.so"
         library.parent.mkdir(parents=True, exist_ok=True)
         for _ in range(2):
             if not library.exists():
@@ -69,7 +70,7 @@ def load_library(source: str) -> ctypes.CDLL | None:
         if not _failures:
             notice(
                 f"Some or all of rasterizer and losses run without C++ kernels, several times slower: {error}. "
-                f"They are kept in {_folder()}; the environment variable SHELLGS_CACHE names another folder."
+                f"They are kept in {cache_folder()}; the environment variable SHELLGS_CACHE names another folder."
             )
         _failures.append(str(error))
         return None
@@ -96,12 +97,6 @@ def _compile(compiler: str, source: str, library: Path) -> None:
 def compiler_works() -> bool:
     """Whether a library can be compiled and loaded."""
     return load_library('extern "C" int works() { return 1; }\n') is not None
-
-
-def _folder() -> Path:
-    if named := os.environ.get("SHELLGS_CACHE"):
-        return Path(named).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "shellgs"
 
 
 def _processor() -> str:

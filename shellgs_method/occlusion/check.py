@@ -19,6 +19,7 @@ from torch.nn.functional import interpolate
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import workers
 from shellgs_method.occlusion.colours import ColourModel
@@ -127,12 +128,18 @@ class _TrainingViews:
     """The views as they were taken."""
     sweeps: dict[str, Sweep]
     colours: ColourModel
+    windows: bool
+    """Whether the shell's model has windows: elsewhere, nothing is seen behind it."""
 
     @classmethod
     def of(cls, views: Sequence[View], shell: CueMaps, unfinished: Path) -> _TrainingViews:
         """Sweep all views; sweeps of an interrupted check are read from the folder ``unfinished``."""
         size = shell.manifest.max_image_size
-        taken = {view.name: _shell_view(view, shell.require(view.name, view.camera.shrunk(size))) for view in views}
+        taken, windows = {}, False
+        for view in views:
+            cue = shell.require(view.name, view.camera.shrunk(size))
+            taken[view.name] = _shell_view(view, cue)
+            windows |= cue.classes is not None and bool((cue.classes == SurfaceClass.WINDOW).any())
         exposures = [_exposed(seen) for seen in taken.values()]
         gains = _gains(exposures)
         shell_views = {
@@ -153,7 +160,7 @@ class _TrainingViews:
                 with atomic_write(files[name]) as stream:
                     stream.write(content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
-        return cls(shell_views, exposures, sweeps, ColourModel(shell_views.values(), sweeps.values()))
+        return cls(shell_views, exposures, sweeps, ColourModel(shell_views.values(), sweeps.values()), windows)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -178,7 +185,10 @@ class _TrainingViews:
         hidden = static | moved | beyond
         confirmed = _resized(found.score.float(), size).numpy() < CONFIRMED
         score_behind, farther = self._behind(seen, size)
-        kinds = [static, beyond, moved, score_behind > REFLECTED, confirmed]
+        behind = score_behind > REFLECTED
+        if cue.classes is not None and self.windows:
+            behind &= cue.classes == SurfaceClass.WINDOW
+        kinds = [static, beyond, moved, behind, confirmed]
         depth = cue.depth * np.select(kinds, [_relative_depth(found, size), 2.0, 1.0, farther, 1.0], 0.0)
         return CueMap(np.where(hit, depth, 0).astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
 

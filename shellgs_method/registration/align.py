@@ -14,9 +14,9 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import read_model, read_points
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import ADJUSTED, SceneLayout
-from shellgs_method.files.surfaces import up_axis
-from shellgs_method.geometry.axes import facade_axes
-from shellgs_method.geometry.camera import positions, upwards
+from shellgs_method.files.surfaces import usual_up
+from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
+from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import Adjustment, adjusted
@@ -24,9 +24,15 @@ from shellgs_method.registration.correspondences import Correspondence, measured
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
-from shellgs_method.registration.proposal import propose
+from shellgs_method.registration.proposal import AMBIGUOUS, propose
 from shellgs_method.registration.refinement import refine
-from shellgs_method.registration.validation import rounding_of, steps_in_metres
+from shellgs_method.registration.validation import (
+    Check,
+    agreement_check,
+    rival_check,
+    rounding_of,
+    steps_in_metres,
+)
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.surface import ShellSurface
@@ -52,12 +58,14 @@ class Placement:
         history: one sentence per step, for the report.
         correspondences: picks or camera positions with their residuals, if any.
         proposed: whether it comes from coarse registration and the user has not accepted it yet.
+        checks: how sure it is that the shell is nowhere else, for the validation.
     """
 
     alignment: Alignment
     history: Sequence[str] = ()
     correspondences: Sequence[Correspondence] = ()
     proposed: bool = False
+    checks: Sequence[Check] = ()
 
 
 def place_as_before(path: Path, views: Sequence[View]) -> Placement:
@@ -134,7 +142,7 @@ def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
 def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[Placement, Adjustment | None]:
     """Adjust the cameras of a scene to the shell; return the placement, and None if they are left as is.
 
-    Surveyed camera positions that the placement was found by are priors.
+    Picks and surveyed camera positions that the placement was found by are priors.
 
     Args:
         placement: the shell's place, found with the cameras as they are.
@@ -152,11 +160,13 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     alignment = placement.alignment
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
-    surveyed = [point for point in placement.correspondences if point.is_used and not isinstance(point, PickedPoint)]
+    used = [point for point in placement.correspondences if point.is_used]
+    picks = [point for point in used if isinstance(point, PickedPoint)]
+    surveyed = [point for point in used if not isinstance(point, PickedPoint)]
     _, names = read_points(layout.data, folder, layout.images_path)
     known = {point.name: transformed(point.shell, surface.survey_from_shell) for point in surveyed}
     scatter = max(_RTK, float(np.median([point.residual for point in surveyed]))) if surveyed else _RTK
-    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter)
+    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter, picks)
     if adjustment.shifted > _ELSEWHERE:
         raise SceneError(
             f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which is "
@@ -200,25 +210,31 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
 def place_by_guess(
     mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shell: str, metres_per_shell_unit: float
 ) -> Placement:
-    """Propose an alignment by coarse registration, from the outline of the main wall.
-
-    The shell's up axis is y in glTF, by that format's convention, and z in all other formats, unless its walls
-    are not aligned with it.
+    """Propose an alignment by coarse registration; the shell may have any orientation in its file.
 
     Raises:
         SceneError: the points show no wall, or it fits nowhere.
     """
     surface = ShellSurface(mesh, metres_per_shell_unit)
-    up = np.array([0.0, 1.0, 0.0] if up_axis(shell) == "y" else [0.0, 0.0, 1.0])
-    cameras = [view.camera for view in views]
-    best, *rivals = propose(surface, points.positions, positions(cameras), upwards(cameras), up)
-    history = ["Proposed from the outline of the main wall; not yet confirmed."]
+    best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views))
+    history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
         for rival in rivals
+        if rival.score >= AMBIGUOUS * best.score
     ]
+    checks = [agreement_check(best.score), *(rival_check(rival.score / best.score) for rival in rivals[:1])]
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
-    return Placement(Alignment(matrix, shell, metres_per_shell_unit, source="proposal"), history, proposed=True)
+    alignment = Alignment(matrix, shell, metres_per_shell_unit, source="proposal")
+    return Placement(alignment, history, proposed=True, checks=checks)
+
+
+def up_in_words(alignment: Alignment) -> str:
+    """What is up in the shell's file, by the cameras."""
+    if alignment.up is None:
+        usual = name_of(usual_up(alignment.shell))
+        return f"The cameras do not tell which way is up: it is taken to be {usual} of the shell's file."
+    return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
 
 
 def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:
@@ -249,7 +265,7 @@ def refined(
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
     result = refine(surface, points.positions, start, reach, rounding_of(steps))
     _, triangle = surface.samples(5000)
-    axes = facade_axes(surface.normals[triangle], start[:3, :3] @ upwards(view.camera for view in views))
+    axes = facade_axes(surface.normals[triangle], start[:3, :3] @ likely_up(view.camera for view in views))
     sentence = f"Refined against {result.evidence.points} SfM points, which moved by {result.moved:.3f} m."
     if words := result.evidence.in_words(axes):
         sentence += f" Left unchanged, as the points do not determine it: {'; '.join(words)}."

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.surfaces import read_geometry
+from shellgs_method.files.readers.contents import Geometry
+from shellgs_method.files.surfaces import read_surface
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.triangles import area_vectors, sampled
@@ -31,7 +32,7 @@ class ShellPlace:
         path: the shell's file.
 
     Attributes:
-        geometry: what the file holds.
+        surface: what the file holds.
         middle: centre of the shell.
         size: diagonal of its box.
 
@@ -41,12 +42,12 @@ class ShellPlace:
     """
 
     def __init__(self, path: Path) -> None:
-        self.geometry = geometry = read_geometry(path)
-        points = geometry.vertices
-        if len(geometry.faces) and geometry.faces.max() < len(points):
-            areas = np.linalg.norm(area_vectors(points, geometry.faces), axis=1)
+        self.surface = surface = read_surface(path)
+        points = surface.vertices if isinstance(surface, Geometry) else surface.whole.points
+        if isinstance(surface, Geometry) and len(surface.faces) and surface.faces.max() < len(points):
+            areas = np.linalg.norm(area_vectors(points, surface.faces), axis=1)
             if np.isfinite(areas).all() and areas.any():
-                points = sampled(points, geometry.faces, areas, _SAMPLES)[0]
+                points = sampled(points, surface.faces, areas, _SAMPLES)[0]
         points = points[inliers(points)]
         if len(points) == 0:
             raise SceneError(f"the shell {path} has no points")

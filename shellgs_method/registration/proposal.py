@@ -1,9 +1,10 @@
-"""Coarse registration: propose an alignment from the up direction, the main wall and its outline.
+"""Coarse registration: propose an alignment from the SfM points, the cameras and the shell alone.
 
 Facades repeat themselves, so feature descriptors can register them a whole number of bays off, with perfect scores.
-Instead, the search is exhaustive over all alignments that put the main wall of the SfM points upright on a wall of the
-shell: which wall, at which scale, where on it. The best ones are refined and ranked, and close rivals of the best are
-reported. The result is a proposal for the user to check.
+Instead, the search is exhaustive: over the orientations that put walls of the SfM points on walls of the shell, over
+scales, and, by correlation of coarse grids, over all shifts. The best placements are measured along the cameras'
+sightlines, refined, and measured again, ever more finely; close rivals of the best are reported. The result is a
+proposal for the user to check.
 """
 
 from __future__ import annotations
@@ -13,29 +14,36 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.ndimage import maximum_filter
-from scipy.signal import fftconvolve
+from scipy.fft import irfftn, next_fast_len, rfftn
+from scipy.ndimage import uniform_filter
 
 from shellgs_method.errors import SceneError
-from shellgs_method.geometry.axes import main_direction, wall_axes
-from shellgs_method.geometry.nearest import point_tree
-from shellgs_method.geometry.planes import fitted_plane, largest_plane
+from shellgs_method.files.photographs import View
+from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.machine.progress import track
+from shellgs_method.registration.orientations import scene_axes, shell_axes
 from shellgs_method.registration.refinement import FINAL_GATE, refine
+from shellgs_method.registration.sightlines import Sightlines
 from shellgs_method.shell.surface import ShellSurface
 
 AMBIGUOUS = 0.90
 """Share of the best score from which another candidate is reported as a rival."""
-_DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ
-_PEAKS = 6  # shifts kept per wall and scale, a metre or more apart
-_KEPT = 10  # candidates kept per wall
-_REFINED = 20  # candidates refined, of all walls
-_FEW = 1000  # SfM points that suffice to rank candidates; the result is fitted to all
-_SCALE_STEP = 1.04
-_FLAT = 0.05  # distance from the SfM wall, relative to the points' extent, within which points are on it
-_COARSE, _FIT = 0.50, 0.10  # metres from the shell within which a point fits, before refinement and after
-_BESIDE = 0.50  # metres
-_REACH = 1.0  # metres
+_SAMPLES = 20_000  # points of the shell's surface
+_CELLS = 20_000  # of the shell's grid
+_SCALE_STEP = 1.06
+_LARGEST = 2_000_000  # cells of a grid that the shell is shifted in
+_PEAKS = 3  # shifts kept per orientation and scale
+_EMPTY = 0.5  # weight of cells that sightlines pass through, against those with points
+# Candidates that are measured and refined, and tolerances relative to the distance: errors of SfM points grow with it,
+# and what a smaller scale brings nearer to the shell fits no better.
+_MEASURED, _POLISHED = 1000, 8
+_ROUNDS = ((250, 250, 1, 2, 10), (60, 800, 3, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
+_MANY = 4000  # SfM points in the end
+_ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
+_DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
+_DIFFERENT_FROM_AFAR = 0.01
 
 
 @dataclass(frozen=True)
@@ -44,8 +52,7 @@ class Candidate:
 
     Attributes:
         survey_from_scene: similarity.
-        score: harmonic mean of the share of the wall's SfM points within 10 cm of the shell and the share of the
-            shell's surface with SfM points near it.
+        score: agreement with the cameras' sightlines; between cells of grids at first.
         displacement: mean displacement of the shell from the best candidate, in metres.
     """
 
@@ -54,211 +61,183 @@ class Candidate:
     displacement: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Cloud:
-    """SfM points, those on or near their main wall, and right, up and out of that wall, as rows."""
-
-    points: Float64[np.ndarray, "N 3"]
-    wall: Float64[np.ndarray, "W 3"]
-    axes: Float64[np.ndarray, "3 3"]
-
-    def thinned(self) -> _Cloud:
-        return replace(self, points=_some(self.points, _FEW), wall=_some(self.wall, _FEW))
-
-
 def propose(
-    surface: ShellSurface,
-    points: Float64[np.ndarray, "N 3"],
-    cameras: Float64[np.ndarray, "V 3"],
-    scene_up: Float64[np.ndarray, " 3"],
-    shell_up: Float64[np.ndarray, " 3"],
+    surface: ShellSurface, points: SparsePoints, views: Sequence[View], scene_up: Float64[np.ndarray, " 3"]
 ) -> list[Candidate]:
-    """Propose alignments, the best first, followed by those whose score is within 10 % of it.
+    """Propose alignments, the best first, and what fits best elsewhere.
 
     Args:
-        surface: the shell.
+        surface: the shell, in any orientation.
         points: SfM points in the scene's frame.
-        cameras: positions of the cameras, all outside the building.
+        views: photographs, all taken from outside the building.
         scene_up: approximate up direction of the cameras.
-        shell_up: up in the shell's frame; if its walls are not aligned with it, their own directions are tried instead.
 
     Raises:
         SceneError: the SfM points have no main wall, or it fits nowhere.
     """
-    cloud = _main_wall(points, cameras, scene_up)
-    few = cloud.thinned()
-    samples, triangle = surface.samples(20_000)
+    samples, triangle = surface.samples(_SAMPLES)
     normals = surface.normals[triangle]
-    spread = _some(samples, 5000)
+    spread = samples[:200]
+    cameras = positions(view.camera for view in views)
+    near = _most(points.positions)
+    sight = Sightlines.of(views, points)
+    search = _Search.of(samples, near, sight)
+    turns = [to.T @ axes for axes in scene_axes(near, cameras, scene_up) for to in shell_axes(normals)]
     starts: list[Candidate] = []
-    for up in _upwards(normals, shell_up):
-        for axes, wall in _shell_walls(samples, normals, up):
-            # The best of each wall: scores by cells are not comparable between walls of different sizes.
-            starts += _distinct(_wall_candidates(cloud, axes, wall), spread, _KEPT)
-    starts = [replace(s, score=_score(surface, spread, few, s.survey_from_scene, _COARSE)) for s in starts]
-    found = _refined(surface, spread, few, _best_first(starts)[:_REFINED], _REACH)
-    found = _refined(surface, spread, cloud, _close_to_best(_distinct(found, spread, _KEPT)), 2 * FINAL_GATE)
-    found = [candidate for candidate in found if candidate.score > 0]
-    if not found:
+    for turn in track(turns, "Trying orientations", len(turns)):
+        starts += search.placed(turn)
+    starts = _distinct(starts, spread, _MEASURED, search.cell)
+    starts = [
+        replace(start, score=sight.agreement(surface, start.survey_from_scene, _ROUGH))
+        for start in track(starts, "Measuring candidates", len(starts))
+    ]
+    shuffled = np.random.default_rng(0).permutation(near)
+    for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
+        starts = _distinct(starts, spread, count, apart * search.cell)
+        starts = [
+            refined
+            for start in track(starts, f"Refining candidates, round {number}", len(starts))
+            for refined in _refined(surface, shuffled[:few], sight, start, reach * search.cell, _COARSE, steps)
+        ]
+    different = max([_DIFFERENT, *(_DIFFERENT_FROM_AFAR * sight.distance(s.survey_from_scene) for s in starts[:1])])
+    starts = _distinct(starts, spread, _POLISHED, different)
+    polished = []
+    for start in track(starts, "Refining the best", len(starts)):
+        reach = 2 * _COARSE * sight.distance(start.survey_from_scene)
+        polished += _refined(surface, shuffled[:_MANY], sight, start, reach, _FIT, 30)
+    polished = [candidate for candidate in polished if candidate.score > 0]
+    if not polished:
         size = float(np.ptp(surface.vertices, axis=0).max())
         raise SceneError(
             f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
             "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"
         )
-    best, *rivals = _close_to_best(_best_first(found))
-    return [best, *(replace(rival, displacement=_displacement(best, rival, spread)) for rival in rivals)]
+    best, *others = _distinct(polished, spread, _POLISHED, different)
+    return [best, *(replace(other, displacement=_displacement(best, other, spread)) for other in others)]
 
 
-def _main_wall(points: np.ndarray, cameras: np.ndarray, up: np.ndarray) -> _Cloud:
-    rng = np.random.default_rng(0)
-    size = float(np.linalg.norm(np.percentile(points, 90, axis=0) - np.percentile(points, 10, axis=0)))
-    left = points
-    for _ in range(5):
-        if len(left) < 50:
-            break
-        members = largest_plane(left, 0.01 * size, rng)
-        if not members.any():
-            break
-        centre, out = fitted_plane(left[members])
-        if abs(out @ up) < 0.5:
-            out = out * np.sign((cameras.mean(0) - centre) @ out)
-            near = np.abs((points - centre) @ out) < _FLAT * size
-            return _Cloud(points, points[near], wall_axes(out, up))
-        left = left[~members]
-    raise SceneError("the SfM points have no upright wall to start from: pick points and use --picks")
+@dataclass(frozen=True)
+class _Search:
+    """The search over scales and shifts.
 
-
-def _upwards(normals: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
-    """Up directions of the shell to try: ``up``, or if its walls are not aligned with it, their axes in both signs."""
-    first = _main_line(normals)
-    across = normals[np.abs(normals @ first) < 0.2]
-    if len(across) < 100:
-        return [up]
-    axes = wall_axes(first, _main_line(across))
-    return [up] if np.abs(axes @ up).max() > 0.97 else [*axes, *-axes]
-
-
-def _main_line(normals: np.ndarray) -> np.ndarray:
-    """Direction of the most normals within 20°, which a shell may have in either sign."""
-    return main_direction(np.concatenate([normals, -normals]), within=20)
-
-
-def _shell_walls(samples: np.ndarray, normals: np.ndarray, up: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield right, up and out of up to four walls of the shell, from either side, and surface samples on each."""
-    upright = np.abs(normals @ up) < 0.2
-    samples, normals = samples[upright], normals[upright]
-    for _ in range(4):
-        if len(samples) < 1000:
-            return
-        out = _main_line(normals)
-        out = out - (out @ up) * up
-        out /= np.linalg.norm(out)
-        alike = np.abs(normals @ out) > 0.94
-        height = samples @ out
-        peak, edges = np.histogram(height[alike], bins=np.arange(height.min() - 0.5, height.max() + 1.0, 0.5))
-        level = edges[peak.argmax()] + 0.25
-        wall = np.abs(height - level) < 1.0
-        for side in (out, -out):
-            yield wall_axes(side, up), samples[wall]
-        samples, normals = samples[~(wall & alike)], normals[~(wall & alike)]
-
-
-def _wall_candidates(cloud: _Cloud, axes: np.ndarray, samples: np.ndarray) -> list[Candidate]:
-    """Best candidates on one wall, over all scales and all shifts by whole cells.
-
-    Both walls are grids of cells; their correlation counts, for all shifts at once, the points in the shell's cells
-    and the shell's cells that have points.
+    Attributes:
+        samples: points of the shell's surface.
+        points: SfM points.
+        empty: points in the air that sightlines pass through.
+        cell: length of a cell in metres.
     """
-    flat, wall = cloud.wall @ cloud.axes.T, samples @ axes.T
-    middle, target = np.median(flat, axis=0), (wall.min(0) + wall.max(0)) / 2
-    boxes = [np.percentile(p[:, :2], [2, 98], axis=0) for p in (wall, flat)]
-    sizes = [np.ptp(box, axis=0) for box in boxes]
-    margin = 0.2 * sizes[1]  # a few points far out would make large grids of empty cells
-    flat = flat[((flat[:, :2] > boxes[1][0] - margin) & (flat[:, :2] < boxes[1][1] + margin)).all(axis=1)]
-    ratios = sizes[0] / np.maximum(sizes[1], 1e-9)
-    cell = max(0.25, float(sizes[0].max()) / 300)
-    steps = int(np.log(1.6 * ratios.max() / (0.6 * ratios.min())) / np.log(_SCALE_STEP))
-    found = []
-    shell_cells = _cells(wall - target, cell)
-    for scale in 0.6 * ratios.min() * _SCALE_STEP ** np.arange(steps + 1):
-        scaled = scale * (flat - middle)
-        if np.ptp(scaled, axis=0)[:2].max() > 4 * sizes[0].max():
-            break
-        counts, occupied = (_cells(scaled, cell, counted) for counted in (True, False))
-        hits, covered = (fftconvolve(shell_cells[0], c[::-1, ::-1, ::-1]) for c in (counts[0], occupied[0]))
-        precision, recall = hits / counts[0].sum(), covered / shell_cells[0].sum()
-        score = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
-        best = score.max(axis=2)  # over the shifts normal to the wall
-        peaks = np.argwhere(best == maximum_filter(best, 2 * round(1.0 / cell) + 1))
-        for u, v in peaks[np.argsort(-best[tuple(peaks.T)])][:_PEAKS]:
-            index = np.array([u, v, score[u, v].argmax()])
-            shift = (index - np.array(counts[0].shape) + 1 + shell_cells[1] - counts[1]) * cell
-            similarity = np.eye(4)
-            similarity[:3, :3] = scale * axes.T @ cloud.axes
-            similarity[:3, 3] = axes.T @ (target + shift - scale * middle)
-            found.append(Candidate(similarity, float(best[u, v])))
-    return found
+
+    samples: np.ndarray
+    points: np.ndarray
+    empty: np.ndarray
+    cell: float
+
+    @classmethod
+    def of(cls, samples: np.ndarray, points: np.ndarray, sight: Sightlines) -> _Search:
+        size = np.ptp(samples, axis=0)
+        cell = float(np.prod(np.maximum(size, 0.05 * size.max())) / _CELLS) ** (1 / 3)
+        rng = np.random.default_rng(0)
+        share = rng.uniform(0.0, 0.95, (12, len(sight.points), 1))
+        empty = (sight.origins + share * (sight.points - sight.origins)).reshape(-1, 3)
+        low, high = points.min(0), points.max(0)
+        return cls(samples, points, empty[((empty > low) & (empty < high)).all(axis=1)], cell)
+
+    def placed(self, turn: np.ndarray) -> Iterator[Candidate]:
+        """The best candidates of an orientation: the rotation from the scene's axes to the survey's."""
+        points, empty = self.points @ turn.T, self.empty @ turn.T
+        boxes = [np.percentile(each, [3, 97], axis=0) for each in (self.samples, points)]
+        ratios = np.sort(np.ptp(boxes[0], axis=0) / np.maximum(np.ptp(boxes[1], axis=0), 1e-9))
+        lowest, highest = 0.5 * ratios[0], 1.6 * ratios[2]
+        steps = int(np.log(highest / lowest) / np.log(_SCALE_STEP)) + 1
+        first = np.floor(self.samples.min(0) / self.cell).astype(int) - 1
+        shell = _grid(self.samples, first, np.floor(self.samples.max(0) / self.cell).astype(int) + 2, self.cell)
+        soft = np.maximum(shell, uniform_filter(shell, 3) * 3).clip(max=1.0)
+        spectra: dict[tuple[int, ...], np.ndarray] = {}
+        for scale in highest * _SCALE_STEP ** -np.arange(steps):
+            placed, passed = scale * points, scale * empty
+            low, high = (np.floor(each / self.cell).astype(int) for each in (placed.min(0), placed.max(0)))
+            size = high - low + 1
+            shape = tuple(int(next_fast_len(int(n), real=True) or n) for n in shell.shape + size)
+            if np.prod(shape) > _LARGEST:  # much larger than the shell
+                continue
+            occupied = _grid(placed, low, high + 1, self.cell)
+            free = _grid(passed, low, high + 1, self.cell)
+            free[occupied > 0] = 0
+            if shape not in spectra:
+                spectra[shape] = np.asarray(rfftn(soft, shape))
+            weighted = occupied / (occupied.sum() + 0.5 * shell.sum()) - _EMPTY * free / (free.sum() + shell.sum())
+            spectrum = np.asarray(rfftn(weighted.astype(np.float32), shape))
+            score = np.asarray(irfftn(spectra[shape] * np.conj(spectrum), shape))
+            for index, value in _peaks(score):
+                shift = np.array([i if i < n else i - m for i, n, m in zip(index, shell.shape, shape, strict=True)])
+                similarity = np.eye(4)
+                similarity[:3, :3] = scale * turn
+                similarity[:3, 3] = (first + shift - low) * self.cell
+                yield Candidate(similarity, value)
 
 
-def _cells(points: np.ndarray, cell: float, counted: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Dense grid with the number of points in each cell (or 1 if there are any), and the index of its lowest cell."""
-    index = np.floor(points / cell).astype(int)
-    inside = np.abs(points[:, 2]) < 2.0
-    index = index[inside]
-    low = index.min(0)
-    grid = np.zeros(index.max(0) - low + 1, np.float32)
-    np.add.at(grid, tuple((index - low).T), 1.0)
-    return (grid if counted else (grid > 0).astype(np.float32)), low
+def _grid(points: np.ndarray, low: np.ndarray, end: np.ndarray, cell: float) -> np.ndarray:
+    """Dense grid from one cell to before another: 1 where there are points."""
+    index = np.floor(points / cell).astype(int) - low
+    index = index[((index >= 0) & (index < end - low)).all(axis=1)]
+    grid = np.zeros(end - low, np.float32)
+    grid[tuple(index.T)] = 1.0
+    return grid
+
+
+def _peaks(score: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
+    """The largest values, a few cells apart, and their indices."""
+    for _ in range(_PEAKS):
+        index = tuple(int(i) for i in np.unravel_index(score.argmax(), score.shape))
+        yield index, float(score[index])
+        score[tuple(slice(max(i - 2, 0), i + 3) for i in index)] = -np.inf
 
 
 def _refined(
-    surface: ShellSurface, spread: np.ndarray, cloud: _Cloud, starts: Sequence[Candidate], reach: float
+    surface: ShellSurface,
+    points: np.ndarray,
+    sight: Sightlines,
+    start: Candidate,
+    reach: float,
+    tolerance: float,
+    steps: int,
 ) -> list[Candidate]:
-    """Refine candidates, leaving out those with too few points in reach."""
-    found = []
-    for start in starts:
-        try:
-            similarity = refine(surface, cloud.points, start.survey_from_scene, reach).survey_from_scene
-        except SceneError:
-            continue
-        found.append(Candidate(similarity, _score(surface, spread, cloud, similarity, _FIT)))
-    return found
+    """The candidate refined from an error of ``reach`` metres, and measured; none if too few points are in reach."""
+    last = max(FINAL_GATE, tolerance * sight.distance(start.survey_from_scene))
+    far = tolerance > _FIT
+    try:
+        found = refine(surface, points, start.survey_from_scene, reach, last=last, steps=steps, relative=far)
+    except SceneError:
+        return []
+    return [Candidate(found.survey_from_scene, sight.agreement(surface, found.survey_from_scene, tolerance))]
 
 
-def _score(surface: ShellSurface, spread: np.ndarray, cloud: _Cloud, similarity: np.ndarray, fit: float) -> float:
-    placed = transformed(cloud.wall, similarity)
-    precision = float((surface.distance(placed) < fit).mean())
-    recall = float(np.isfinite(point_tree(placed).query(spread, distance_upper_bound=_BESIDE)[0]).mean())
-    return 2 * precision * recall / max(precision + recall, 1e-9)
-
-
-def _best_first(candidates: Sequence[Candidate]) -> list[Candidate]:
-    return sorted(candidates, key=lambda candidate: -candidate.score)
-
-
-def _close_to_best(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates whose score is within 10 % of the first, which is the best."""
-    return [candidate for candidate in candidates if candidate.score >= AMBIGUOUS * candidates[0].score]
-
-
-def _distinct(candidates: Sequence[Candidate], spread: np.ndarray, count: int) -> list[Candidate]:
-    """Up to ``count`` candidates, best first, each the best of a group of similar ones."""
-    kept: list[Candidate] = []
-    for candidate in _best_first(candidates):
-        if all(_displacement(other, candidate, spread) > _DIFFERENT for other in kept):
-            kept.append(candidate)
+def _distinct(candidates: Sequence[Candidate], spread: np.ndarray, count: int, apart: float) -> list[Candidate]:
+    """Up to ``count`` candidates, best first, each the best of those less than ``apart`` metres from it."""
+    best = sorted(candidates, key=lambda candidate: -candidate.score)
+    # Where the shell is in the scene, relative to the size of it there: shells of all scales are compared alike.
+    placed = [transformed(spread, np.linalg.inv(candidate.survey_from_scene)) for candidate in best]
+    metres = [np.cbrt(np.linalg.det(candidate.survey_from_scene[:3, :3])) for candidate in best]
+    kept: list[int] = []
+    for k in range(len(best)):
+        if kept:
+            moved = np.linalg.norm(np.stack([placed[other] for other in kept]) - placed[k], axis=2).mean(axis=1)
+            if (moved * metres[k] <= apart).any():
+                continue
+        kept.append(k)
         if len(kept) == count:
             break
-    return kept
+    return [best[k] for k in kept]
 
 
 def _displacement(one: Candidate, other: Candidate, spread: np.ndarray) -> float:
     """Mean displacement of the shell between two candidates, in metres."""
-    some = spread[:200]
-    moved = transformed(some, one.survey_from_scene @ np.linalg.inv(other.survey_from_scene))
-    return float(np.linalg.norm(moved - some, axis=1).mean())
+    moved = transformed(spread, one.survey_from_scene @ np.linalg.inv(other.survey_from_scene))
+    return float(np.linalg.norm(moved - spread, axis=1).mean())
 
 
-def _some(points: np.ndarray, count: int) -> np.ndarray:
-    """Random subset of up to ``count`` points, the same in each call."""
-    return np.random.default_rng(0).permutation(points)[:count]
+def _most(points: np.ndarray) -> np.ndarray:
+    """The points that are near the others: a few far out would make large grids of empty cells."""
+    low, high = np.percentile(points, [5, 95], axis=0)
+    margin = 0.35 * (high - low)
+    return points[((points > low - margin) & (points < high + margin)).all(axis=1)]

@@ -87,12 +87,15 @@ def refine(
     survey_from_scene: Float64[np.ndarray, "4 4"],
     reach: float,
     rounding: float = 0.0,
+    last: float = FINAL_GATE,
+    steps: int = _STEPS,
+    relative: bool = False,
 ) -> Refinement:
     """Refine an alignment by fitting the SfM points to the shell.
 
     Each step applies the similarity that best moves the points onto the planes of their closest triangles (Chen and
     Medioni 1991, with a scale), weighted by Tukey's biweight, whose limit shrinks from ``reach`` to
-    :data:`FINAL_GATE` and the rounding of the coordinates. Directions that the points do not determine stay unchanged.
+    ``last`` and the rounding of the coordinates. Directions that the points do not determine stay unchanged.
 
     Args:
         surface: the shell.
@@ -100,17 +103,21 @@ def refine(
         survey_from_scene: initial similarity.
         reach: largest error of the initial similarity, in metres.
         rounding: largest error of the points and the shell by the rounding of their coordinates, in metres.
+        last: the last limit, in metres.
+        steps: most steps.
+        relative: measure distances relative to the scale, for a start whose scale is far off: in metres they are all
+            the less, the more the points shrink.
 
     Raises:
         SceneError: fewer than 7 points are within reach of the shell.
     """
     start = transformed(points, survey_from_scene)
     similarity = survey_from_scene
-    last = FINAL_GATE + rounding
-    gates = np.geomspace(max(reach, last), last, _STEPS // 2)
+    last += rounding
+    gates = np.geomspace(max(reach, last), last, steps // 2)
     evidence, used = None, np.ones(len(points), bool)
-    for gate in np.append(gates, np.full(_STEPS - len(gates), last)):
-        evidence, step, used = _solve(surface, transformed(points, similarity), gate)
+    for gate in np.append(gates, np.full(steps - len(gates), last)):
+        evidence, step, used = _solve(surface, transformed(points, similarity), gate, relative)
         similarity = step @ similarity
         if gate == last and np.abs(step - np.eye(4)).max() < 1e-7:
             break
@@ -119,7 +126,9 @@ def refine(
     return Refinement(similarity, evidence, float(np.sqrt((moved**2).sum(axis=1).mean())))
 
 
-def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evidence, np.ndarray, np.ndarray]:
+def _solve(
+    surface: ShellSurface, points: np.ndarray, gate: float, relative: bool
+) -> tuple[Evidence, np.ndarray, np.ndarray]:
     """One step: its evidence, the similarity to apply, and the mask of points within the gate."""
     closest = surface.closest(points)
     offset = points - closest.point
@@ -135,19 +144,36 @@ def _solve(surface: ShellSurface, points: np.ndarray, gate: float) -> tuple[Evid
     centre = np.average(points, axis=0, weights=weight)
     arm = points - centre
     radius = float(np.sqrt(np.average((arm**2).sum(axis=1), weights=weight)))
-    # Shift, rotation and scale are all in metres at that radius, so that their strengths can be compared.
-    scale = np.einsum("nd,nd->n", normal, arm)[:, None]
-    J = np.concatenate([normal, np.cross(arm, normal) / radius, scale / radius], axis=1)
+    J = motions(arm, normal, radius)
+    J[:, 6] -= relative * distance / radius
     strengths, directions = np.linalg.eigh(J.T @ (weight[:, None] * J) / weight.sum())
     evidence = Evidence(directions.T[::-1], np.maximum(strengths[::-1], 0.0), centre, radius, int(used.sum()))
     gradient = evidence.directions @ (J.T @ (weight * distance) / weight.sum())
     known = ~evidence.weak
     update = -(gradient[known] / evidence.strengths[known]) @ evidence.directions[known]
-    return evidence, _similarity(update, centre, radius), used
+    return evidence, similarity_by(update, centre, radius), used
 
 
-def _similarity(update: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """4x4 matrix of (shift, rotation, scale) about a centre."""
+def motions(
+    arm: Float64[np.ndarray, "N 3"], normal: Float64[np.ndarray, "N 3"], radius: float
+) -> Float64[np.ndarray, "N 7"]:
+    """Derivatives, by (shift, rotation, scale), of distances from planes with these normals.
+
+    All seven are in metres at the radius, so that their strengths can be compared.
+
+    Args:
+        arm: the points, from the centre of rotation and scale.
+        normal: normals of the planes.
+        radius: typical length of an arm.
+    """
+    scale = np.einsum("nd,nd->n", normal, arm)[:, None]
+    return np.concatenate([normal, np.cross(arm, normal) / radius, scale / radius], axis=1)
+
+
+def similarity_by(
+    update: Float64[np.ndarray, " 7"], centre: Float64[np.ndarray, " 3"], radius: float
+) -> Float64[np.ndarray, "4 4"]:
+    """The similarity of (shift, rotation, scale) about a centre, in the units of :func:`motions`."""
     matrix = np.eye(4)
     matrix[:3, :3] = np.exp(update[6] / radius) * Rotation.from_rotvec(update[3:6] / radius).as_matrix()
     matrix[:3, 3] = centre + update[:3] - matrix[:3, :3] @ centre

@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.photographs import View
-from shellgs_method.geometry.axes import facade_axes
-from shellgs_method.geometry.camera import positions, upwards
+from shellgs_method.geometry.axes import facade_axes, likely_up
+from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.precision import COARSEST, FINE, REMEDY, Step, camera_step
 from shellgs_method.geometry.similarity import transformed
@@ -69,6 +68,10 @@ LIMITS = {
     ),
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
+    "agreement": Limit(
+        0.65, 0.55, "a shell elsewhere shows walls where photographs show none, and hides what they show"
+    ),
+    "elsewhere": Limit(0.8, 0.86, "where the shell stands as well elsewhere, neither place is proved"),
     "step": Limit(FINE, COARSEST, f"an error of half a step does not average out; {REMEDY}"),
     "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
     "bent_pixels": Limit(1.05, 1.2, "points that were not adjusted to fit worse if cameras are bent"),
@@ -137,8 +140,11 @@ class Validation:
 
     def validated(self, views: Sequence[View]) -> Alignment:
         """The alignment with its verdict and metrics, bound to the cameras of the views that it was validated with."""
-        cameras = BoundCameras.of(views)
-        return replace(self.alignment, verdict=self.verdict, metrics=self.metrics(), cameras=cameras)
+        return replace(self.alignment, verdict=self.verdict, metrics=self.metrics()).seen_by(views)
+
+    def with_checks(self, checks: Sequence[Check]) -> Validation:
+        """This validation with more checks."""
+        return replace(self, checks=[*self.checks, *checks])
 
     def after(self, adjustment: Adjustment, before: Validation) -> Validation:
         """This validation, of adjusted cameras, with what was held out of the adjustment."""
@@ -227,7 +233,7 @@ def validate(
     if size.verdict == "refused":
         return Validation(alignment, [sight, size], supports)
     cameras = transformed(positions(view.camera for view in views), survey_from_scene)
-    up = survey_from_scene[:3, :3] @ upwards(support.view.camera for support in seeing)
+    up = survey_from_scene[:3, :3] @ likely_up(view.camera for view in views)
     axes = facade_axes(np.concatenate([support.normals for support in seeing]), up)
     placed = transformed(points.positions, survey_from_scene)
     signed = _signed_distances(surface, placed, cameras)
@@ -250,6 +256,16 @@ def validate(
         survey_from_scene=survey_from_scene,
     )
     return replace(measured, checks=[sight, size, *_checks(measured)])
+
+
+def agreement_check(agreement: float) -> Check:
+    """The check of a proposal's agreement with what the cameras saw."""
+    return _check("agreement", agreement, "Agreement with the cameras' sightlines", "{:.0%}")
+
+
+def rival_check(relative: float) -> Check:
+    """The check of the agreement elsewhere, relative to that of a proposal."""
+    return _check("elsewhere", relative, "Agreement elsewhere, relative to that in place", "{:.2f}")
 
 
 def steps_in_metres(

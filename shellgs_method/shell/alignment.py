@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, read_json, remove_leftovers
 from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.scene import ALIGNMENT
-from shellgs_method.geometry.camera import positions
+from shellgs_method.geometry.axes import upwards
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
 from shellgs_method.shell.mesh import ShellMesh, load_shell
@@ -38,9 +41,11 @@ class Alignment:
         mesher: method that meshes a point cloud.
         cameras: cameras it was found for, in whose frame alone it is valid; none in files of older versions.
         model: COLMAP model of these, relative to the scene's folder, if they were adjusted to the shell; else empty.
+        spacing: size in metres of the voxels in which a point cloud is merged; None for what the cameras resolve.
+        up: the shell's direction upwards, a unit vector: as the cameras tell if None, where they tell.
 
     Raises:
-        SceneError: the matrix is not a similarity, or mirrors, or the mesher is unknown.
+        SceneError: the matrix is not a similarity, or mirrors, the mesher is unknown, or the spacing is not positive.
     """
 
     shell_to_scene: Float64[np.ndarray, "4 4"]
@@ -52,6 +57,8 @@ class Alignment:
     mesher: Mesher = "planes"
     cameras: BoundCameras = field(default_factory=BoundCameras)
     model: str = ""
+    spacing: float | None = None
+    up: Float64[np.ndarray, " 3"] | None = None
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -61,8 +68,11 @@ class Alignment:
         _check_similarity(matrix)
         if not 0 < self.metres_per_shell_unit < np.inf:
             raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
+        object.__setattr__(self, "up", self._upwards() if self.up is None else _direction(self.up))
         if self.mesher not in get_args(Mesher):
             raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
+        if self.spacing is not None and not 0 < self.spacing < np.inf:
+            raise SceneError(f"points cannot be merged in voxels of {self.spacing:g} m: give a --spacing above 0")
 
     def __eq__(self, other: object) -> bool:
         """Compare all fields."""
@@ -78,6 +88,15 @@ class Alignment:
         """The rotation from the shell's axes to the scene's, exactly orthonormal."""
         u, _, vt = np.linalg.svd(self.shell_to_scene[:3, :3])
         return u @ vt
+
+    def _upwards(self) -> Float64[np.ndarray, " 3"] | None:
+        """Up in the shell's frame by the cameras; exactly an axis of it if they agree with that."""
+        up = upwards(self.cameras.cameras.values(), [sign * axis for axis in self.rotation.T for sign in (1, -1)])
+        return None if up is None else _direction(self.rotation.T @ up)
+
+    def seen_by(self, views: Sequence[View]) -> Alignment:
+        """The alignment bound to the cameras of views, which tell what is up."""
+        return replace(self, cameras=BoundCameras.of(views), up=None)
 
     @property
     def metres_per_unit(self) -> float:
@@ -102,6 +121,7 @@ class Alignment:
             and self.shell == other.shell
             and self.metres_per_shell_unit == other.metres_per_shell_unit
             and self.mesher == other.mesher
+            and self.spacing == other.spacing
         )
 
     def check_cameras(self, scene: Path, views: Sequence[View]) -> None:
@@ -116,34 +136,40 @@ class Alignment:
                 f"`shellgs align {shlex.quote(str(scene))}` to validate it with these, or align the shell to them again"
             )
 
-    def meshed_by(self, mesher: Mesher | None) -> Alignment:
-        """Return the same alignment with another mesher, without a verdict; None keeps the mesher."""
-        if mesher is None or mesher == self.mesher:
+    def meshed_by(self, mesher: Mesher | None, spacing: float | None = None) -> Alignment:
+        """Return the same alignment with another mesher or spacing, without a verdict; None keeps either."""
+        mesher, spacing = mesher or self.mesher, self.spacing if spacing is None else spacing
+        if (mesher, spacing) == (self.mesher, self.spacing):
             return self
-        return replace(self, mesher=mesher, verdict="", metrics={})
+        return replace(self, mesher=mesher, spacing=spacing, verdict="", metrics={})
 
-    def load_shell(self, scene: Path, views: Sequence[View], geometry: Geometry | None = None) -> ShellMesh:
+    def load_shell(self, scene: Path, views: Sequence[View], surface: Geometry | Cloud | None = None) -> ShellMesh:
         """Load the shell's mesh, in its own frame; the mesh of a point cloud is cached in ``scene/shell``.
 
         Args:
             scene: the scene's folder.
-            views: photographs of the shell, whose cameras orient the normals of a point cloud.
-            geometry: what the shell's file holds, if it was read already.
+            views: photographs of the shell, whose cameras say where and how finely a point cloud is meshed.
+            surface: what the shell's file holds, if it was read already.
 
         Raises:
             FileNotFoundError: the shell is missing.
             SceneError: the shell cannot be used, or its coordinates were rounded by decimetres.
         """
-        cameras = positions(view.camera for view in views)
-        viewpoints = transformed(cameras, np.linalg.inv(self.shell_to_scene))
         return load_shell(
             scene / self.shell,
-            geometry=geometry,
+            surface=surface,
             cache=scene / "shell",
-            viewpoints=viewpoints,
+            cameras=[self._in_shell(view.camera) for view in views],
             mesher=self.mesher,
+            spacing=self.spacing,
             metres_per_unit=self.metres_per_shell_unit,
         )
+
+    def _in_shell(self, camera: Camera) -> Camera:
+        """A camera of the scene in the shell's frame and unit."""
+        viewmat = camera.viewmat.detach().cpu().double().numpy() @ self.shell_to_scene
+        viewmat[:3] /= self.scale
+        return replace(camera, viewmat=torch.from_numpy(viewmat), K=camera.K.detach().cpu().double())
 
     def apply(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Transform points of the shell to the scene's frame, in double precision."""
@@ -164,7 +190,7 @@ class Alignment:
         same = known is not None and not known.cameras.changed(views)
         if known is None or not same or not known.places_like(self):
             model = known.model if known and same else self.model
-            replace(self, cameras=BoundCameras.of(views), model=model).save(path)
+            replace(self, model=model).seen_by(views).save(path)
 
     @classmethod
     def load(cls, path: Path) -> Alignment:
@@ -187,7 +213,21 @@ class Alignment:
             metrics = {str(name): None if value is None else float(value) for name, value in known.items()}
             cameras = BoundCameras.from_json(fields.get("cameras", {}))
             model = str(fields.get("model", ""))
-            return cls(matrix, str(fields["shell"]), float(unit), str(source), verdict, metrics, mesher, cameras, model)
+            spacing = None if fields.get("spacing") is None else float(fields["spacing"])
+            up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)  # older files lack it
+            return cls(
+                matrix,
+                str(fields["shell"]),
+                float(unit),
+                str(source),
+                verdict,
+                metrics,
+                mesher,
+                cameras,
+                model,
+                spacing,
+                up,
+            )
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
         except SceneError as error:
@@ -229,6 +269,7 @@ class Alignment:
         return {
             **vars(self),
             "shell_to_scene": self.shell_to_scene.tolist(),
+            "up": None if self.up is None else self.up.tolist(),
             "metrics": dict(self.metrics),
             "cameras": self.cameras.to_json(),
         }
@@ -248,6 +289,17 @@ def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
     if matrix.shape != (4, 4):
         raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")
     return matrix
+
+
+def _direction(vector: np.ndarray) -> Float64[np.ndarray, " 3"]:
+    """A unit vector, exactly an axis where it is one but for rounding."""
+    vector = np.asarray(vector, dtype=np.float64)
+    length = np.linalg.norm(vector) if vector.shape == (3,) else np.nan
+    if not 0 < length < np.inf:
+        raise SceneError("the alignment's up is no direction of three numbers, such as [0, 0, 1]")
+    unit = vector / length
+    nearest = np.round(unit)
+    return nearest if np.abs(unit - nearest).max() < 1e-9 else unit
 
 
 def _check_similarity(matrix: np.ndarray) -> None:

@@ -19,7 +19,7 @@ from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.precision import FINE, camera_step, refuse_coarse
 from shellgs_method.machine.progress import track
 from shellgs_method.shell.alignment import ALIGNMENT, Alignment
-from shellgs_method.shell.clouds import VERSION, Meshing
+from shellgs_method.shell.clouds import VERSION
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
 
@@ -119,7 +119,7 @@ def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: 
     maps = CueMaps.create(
         scene,
         "shell",
-        command=_command(max_image_size, meshing) + flags,
+        command=_command(max_image_size, recorded if meshing else None) + flags,
         sources=[scene / recorded.shell, scene / ALIGNMENT, scene / MASKS, *_mask_sources(scene, views)],
         revisions={"mesher": f"{meshing.mesher} {VERSION}"} if meshing else {},
         metres_per_unit=recorded.metres_per_unit,
@@ -157,12 +157,14 @@ def renew_error(scene: Path) -> None:
             maps.with_error(Alignment.load(scene / ALIGNMENT).error)
 
 
-def _command(max_image_size: int | None, meshing: Meshing | None) -> str:
+def _command(max_image_size: int | None, of_cloud: Alignment | None) -> str:
     command = "shellgs cast {scene}"
     if max_image_size:
         command += f" --max-image-size {max_image_size}"
-    if meshing and meshing.mesher != "planes":
-        command += f" --mesher {meshing.mesher}"
+    if of_cloud and of_cloud.mesher != "planes":
+        command += f" --mesher {of_cloud.mesher}"
+    if of_cloud and of_cloud.spacing:
+        command += f" --spacing {of_cloud.spacing:g}"
     return command
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import Delaunay, QhullError
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.clouds import VoxelCloud
 from shellgs_method.geometry.nearest import point_tree
-from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.planes import largest_plane
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.machine.open3d import import_open3d, reason
@@ -22,10 +22,9 @@ log = logging.getLogger(__name__)
 
 Mesher = Literal["planes", "bpa", "poisson"]
 
-VERSION = 2
+VERSION = 3
 """Version of the meshers and of what the readers of clouds leave out: clouds are meshed again if it changes."""
 
-CELLS = 1500  # cells along the cloud's extent in which points are merged: 2 cm of 30 m
 LONGEST_EDGE = 3.0  # this and the next two lengths are in units of the cloud's spacing
 NEIGHBOURHOOD = 2.5
 BALLS = 0.8, 1.6
@@ -40,9 +39,10 @@ class Meshing:
 
     Attributes:
         mesher: method.
-        points: number of points in the file.
+        points: number of points in the file, or of those where cameras see it.
         dropped: number of them that were NaN, infinite or absurdly far away.
-        spacing: mean distance between neighbouring points after merging them in cells.
+        voxel: size of the voxels in which they were merged.
+        spacing: mean distance between neighbouring points after that.
         planes: number of planes found by RANSAC.
         triangles: number of triangles of the mesh.
         meshed: share of the points within one spacing of the mesh.
@@ -53,6 +53,7 @@ class Meshing:
     mesher: Mesher
     points: int
     dropped: int
+    voxel: float
     spacing: float
     planes: int
     triangles: int
@@ -72,7 +73,7 @@ class Meshing:
 
 
 def mesh_cloud(
-    points: Float64[np.ndarray, "N 3"],
+    cloud: VoxelCloud,
     viewpoints: Float64[np.ndarray, "V 3"],
     mesher: Mesher = "planes",
 ) -> tuple[Float64[np.ndarray, "M 3"], Int64[np.ndarray, "F 3"], Meshing]:
@@ -84,9 +85,9 @@ def mesh_cloud(
     times the spacing of the points.
 
     Args:
-        points: positions in any frame, possibly georeferenced; NaN and duplicates are dropped.
+        cloud: merged points in any frame, possibly georeferenced.
         viewpoints: positions of scanners or cameras; a point's normal faces the nearest. Without viewpoints, normals
-            are made consistent with their neighbours.
+            agree with those of the file, or else with their neighbours.
         mesher: method.
 
     Returns:
@@ -95,34 +96,30 @@ def mesh_cloud(
     Raises:
         SceneError: the points make no surface.
     """
-    usable = inliers(points)
-    if not usable.any():
-        raise SceneError("the point cloud has no points" if len(points) == 0 else "all points are NaN or infinite")
-    if not usable.all():
-        log.warning(
-            "dropped %d of %d points that are NaN or infinite, or absurdly far away", (~usable).sum(), len(points)
-        )
-    kept = points[usable]
-    origin = np.median(kept, axis=0)  # squares of georeferenced coordinates would lose precision
-    kept = kept - origin
+    if cloud.dropped:
+        what = "that are NaN or infinite, or absurdly far away"
+        log.warning("dropped %d of %d points %s", cloud.dropped, cloud.total + cloud.dropped, what)
+    if cloud.total == 0:
+        raise SceneError("all points are NaN or infinite" if cloud.dropped else "the point cloud has no points")
+    origin = np.median(cloud.points, axis=0)  # squares of georeferenced coordinates would lose precision
     try:
-        cloud = _Cloud.of(kept, viewpoints - origin)
-        parts = list(_MESHERS[mesher](cloud))
+        points = _Points.of(cloud.points - origin, viewpoints - origin, cloud.normals)
+        parts = list(_MESHERS[mesher](points))
     except RuntimeError as error:  # raised by Open3D, for too few points for example
         raise SceneError(f"the points make no surface with the mesher {mesher!r} ({reason(error)})") from error
     vertices, faces = _merge(parts)
     if len(faces) == 0:
         raise SceneError(f"the points make no surface with the mesher {mesher!r}: try another, or a denser cloud")
-    sample = np.random.default_rng(0).permutation(len(kept))[:200_000]
-    distance = Triangles(vertices, faces).distance(kept[sample])
+    distance = Triangles(vertices, faces).distance(cloud.sample - origin)
     report = Meshing(
         mesher=mesher,
-        points=len(points),
-        dropped=int((~usable).sum()),
-        spacing=cloud.spacing,
+        points=cloud.total + cloud.dropped,
+        dropped=cloud.dropped,
+        voxel=cloud.voxel,
+        spacing=points.spacing,
         planes=sum(part.is_plane for part in parts),
         triangles=len(faces),
-        meshed=float((distance <= cloud.spacing).mean()),
+        meshed=float((distance <= points.spacing).mean()),
         median=float(np.median(distance)),
         p95=float(np.percentile(distance, 95)),
     )
@@ -137,7 +134,7 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class _Cloud:
+class _Points:
     """Evenly thinned points near the origin, with oriented normals and their spacing."""
 
     points: Float64[np.ndarray, "N 3"]
@@ -146,11 +143,7 @@ class _Cloud:
     roughness: float  # standard deviation of the points across the surface
 
     @classmethod
-    def of(cls, points: np.ndarray, viewpoints: np.ndarray) -> _Cloud:
-        low, high = np.percentile(points, [1, 99], axis=0)  # outliers must not change the extent
-        extent = np.max(high - low) or np.ptp(points, axis=0).max()
-        legacy = _legacy(points)
-        points = np.asarray((legacy.voxel_down_sample(extent / CELLS) if extent > 0 else legacy).points)
+    def of(cls, points: np.ndarray, viewpoints: np.ndarray, known: np.ndarray | None) -> _Points:
         spread = np.linalg.svd(points - points.mean(0), compute_uv=False) if len(points) > 1 else np.zeros(2)
         if not spread[1] > 1e-6 * spread[0]:
             what = "is a single point" if spread[0] == 0 else "lies on one straight line"
@@ -163,20 +156,20 @@ class _Cloud:
         search = import_open3d().geometry.KDTreeSearchParamHybrid(NEIGHBOURHOOD * spacing, 30)
         legacy.estimate_covariances(search)
         variances, axes = np.linalg.eigh(np.asarray(legacy.covariances))
-        normals = _oriented(points, axes[:, :, 0], viewpoints)
+        normals = _oriented(points, axes[:, :, 0], viewpoints, known)
         return cls(points, normals, spacing, float(np.sqrt(np.median(variances[:, 0].clip(0)))))
 
 
-def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray) -> np.ndarray:
-    if len(viewpoints):
-        towards = viewpoints[point_tree(viewpoints).query(points)[1]] - points
+def _oriented(points: np.ndarray, normals: np.ndarray, viewpoints: np.ndarray, known: np.ndarray | None) -> np.ndarray:
+    towards = viewpoints[point_tree(viewpoints).query(points)[1]] - points if len(viewpoints) else known
+    if towards is not None:
         return np.where(np.einsum("nc,nc->n", normals, towards)[:, None] < 0, -normals, normals)
     legacy = _legacy(points, normals)
     legacy.orient_normals_consistent_tangent_plane(min(10, len(points) - 1))
     return np.asarray(legacy.normals)
 
 
-def _planes(cloud: _Cloud) -> Iterator[_Part]:
+def _planes(cloud: _Points) -> Iterator[_Part]:
     """Mesh planes one by one, the largest first, then their seams and the remaining points by ball pivoting."""
     rng, points = np.random.default_rng(0), cloud.points.copy()
     plane = np.full(len(points), NO_PLANE)
@@ -210,7 +203,7 @@ def _flat(points: Float64[np.ndarray, "N 3"], longest: float) -> _Part | None:
     return _Part(centre + flat @ axes, faces.astype(np.int64), is_plane=True) if len(faces) else None
 
 
-def _mesh_seams(cloud: _Cloud, plane: Int64[np.ndarray, " N"]) -> _Part:
+def _mesh_seams(cloud: _Points, plane: Int64[np.ndarray, " N"]) -> _Part:
     """Mesh the points between planes, and those on no plane, by ball pivoting."""
     neighbours = point_tree(cloud.points).query(cloud.points, min(12, len(plane)))[1]
     seam = (plane == NO_PLANE) | (plane[neighbours] != plane[:, None]).any(axis=1)
@@ -229,11 +222,11 @@ def _balls(points: np.ndarray, normals: np.ndarray, spacing: float) -> _Part:
     return _Part(np.asarray(mesh.vertices), np.asarray(mesh.triangles, np.int64))
 
 
-def _ball_pivoting(cloud: _Cloud) -> Iterator[_Part]:
+def _ball_pivoting(cloud: _Points) -> Iterator[_Part]:
     yield _balls(cloud.points, cloud.normals, cloud.spacing)
 
 
-def _poisson(cloud: _Cloud) -> Iterator[_Part]:
+def _poisson(cloud: _Points) -> Iterator[_Part]:
     """Screened Poisson reconstruction (Kazhdan and Hoppe 2013), trimmed by distance: density would fill windows."""
     cells = np.ptp(cloud.points, axis=0).max() / (2 * cloud.spacing)
     depth = int(np.clip(np.round(np.log2(cells)), 5, 10))
@@ -245,7 +238,7 @@ def _poisson(cloud: _Cloud) -> Iterator[_Part]:
     yield _Part(vertices, faces[near[faces].all(axis=1)])
 
 
-_MESHERS: dict[Mesher, Callable[[_Cloud], Iterator[_Part]]] = {
+_MESHERS: dict[Mesher, Callable[[_Points], Iterator[_Part]]] = {
     "planes": _planes,
     "bpa": _ball_pivoting,
     "poisson": _poisson,

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.readers.contents import Geometry
-from shellgs_method.files.surfaces import read_geometry
+from shellgs_method.files.readers.points import NO_POINTS
+from shellgs_method.files.surfaces import read_geometry, read_surface
+from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.outliers import inliers
 from shellgs_method.geometry.precision import NO_STEP, Step, cloud_step, mesh_step, refuse_coarse
+from shellgs_method.geometry.surface_classes import NO_CLASSES, classes_of
 from shellgs_method.geometry.triangles import area_vectors
 from shellgs_method.shell.clouds import VERSION, Mesher, Meshing, mesh_cloud
+from shellgs_method.shell.spacing import Sights, as_seen
 
 COMMENT = "comment shellgs "
 _FAR = 1e4
 """Times the median distance from the median vertex beyond which a vertex is not the building's, but at the origin of
 national coordinates, for example. It would stretch every box and take most of the area."""
-SCANNER = "scanner"
-"""Source of the viewpoints: scanner positions in the file."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,7 @@ class ShellMesh:
         faces: three vertex indices per triangle.
         meshing: how a point cloud was meshed; None if the file holds a mesh.
         step: step of the coordinates in the file.
+        classes: :class:`~shellgs_method.geometry.surface_classes.SurfaceClass` of each triangle; OTHER if not given.
 
     Raises:
         SceneError: the arrays are not such a mesh.
@@ -44,9 +50,11 @@ class ShellMesh:
     faces: Int64[np.ndarray, "F 3"]
     meshing: Meshing | None = None
     step: Step = NO_STEP
+    classes: UInt8[np.ndarray, " F"] = field(default_factory=NO_CLASSES.copy)
 
     def __post_init__(self) -> None:
-        """Check what Open3D does not: it accepts indices out of range."""
+        """Check what Open3D does not, which accepts indices out of range, and fill in the classes."""
+        object.__setattr__(self, "classes", classes_of(self.faces, self.classes))
         if len(self.faces) == 0:
             raise SceneError("the shell has no triangles")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
@@ -84,27 +92,30 @@ def without_area(vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, 
 def load_shell(
     path: Path,
     *,
-    geometry: Geometry | None = None,
+    surface: Geometry | Cloud | None = None,
     cache: Path | None = None,
-    viewpoints: Float64[np.ndarray, "V 3"] | None = None,
+    cameras: Sequence[Camera] = (),
     mesher: Mesher = "planes",
+    spacing: float | None = None,
     metres_per_unit: float = 1.0,
 ) -> ShellMesh:
     """Load a shell, a triangle mesh or a point cloud, in double precision if the file has it.
 
     Points and vertices that are NaN, infinite or absurdly far away are dropped, with their triangles, as are triangles
-    without area; what is dropped is counted. Vertices of no triangle are dropped. A point cloud is meshed by
-    :func:`~shellgs_method.shell.clouds.mesh_cloud`; its mesh is cached as
-    ``<cache>/<file name>.<mesher>.ply`` until the cloud changes.
+    without area; what is dropped is counted. Vertices of no triangle are dropped. A point cloud is merged by
+    :func:`~shellgs_method.shell.spacing.as_seen` and meshed by :func:`~shellgs_method.shell.clouds.mesh_cloud`; its
+    mesh is cached as ``<cache>/<file name>.<mesher>.ply`` until the cloud changes, or cameras see other parts of it.
 
     Args:
-        path: a mesh (ply, obj, glb, gltf, stl, off) or a cloud (ply, pcd, xyz, pts, txt, asc, csv, las, laz, e57; the
-            last three need the extras ``las`` and ``e57``).
-        geometry: what the file holds, if it was read already.
+        path: a mesh (ply, obj, glb, gltf, stl, off), a building's model (ifc, gml, json; IFC needs the extra ``bim``)
+            or a cloud (ply, pcd, xyz, xyzrgb, pts, ptx, txt, asc, csv, las, laz, e57; the last three need the extras
+            ``las`` and ``e57``).
+        surface: what the file holds, if it was read already.
         cache: folder for the mesh of a point cloud; None for no cache.
-        viewpoints: positions that see the surface, in the shell's frame. They orient the normals of a cloud whose file
-            has no scanner positions. A mesh cached for other viewpoints is made again.
+        cameras: cameras that see the surface, in the shell's frame and unit. Where they see a large cloud, it is meshed
+            as finely as they resolve. They orient the normals of a cloud whose file has no scanner positions.
         mesher: method that meshes a point cloud.
+        spacing: size of the voxels in which a point cloud is merged, in metres; None for what the cameras resolve.
         metres_per_unit: 1 for a shell in metres.
 
     Raises:
@@ -114,45 +125,39 @@ def load_shell(
     """
     path = Path(path)
     cached = None if cache is None else cache / f"{path.name}.{mesher}.ply"
-    if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, viewpoints)):
+    if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, cameras, spacing)):
         refuse_coarse(mesh.step.scaled(metres_per_unit), f"the coordinates of {path}")
         return mesh
-    geometry = geometry or read_geometry(path)
+    surface = surface or read_surface(path)
     try:
-        if len(geometry.faces) or not len(geometry.vertices):
-            used = _referenced(geometry.vertices, geometry.faces)
-            mesh = ShellMesh(*_referenced(*_without_outliers(*used, path)))
-            step = mesh_step(mesh.vertices, mesh.faces)
+        if isinstance(surface, Geometry):
+            used = _referenced(surface.vertices, surface.faces)
+            usable = _without_outliers(*used, path)
+            near = _referenced(used[0], used[1][usable])
+            mesh = ShellMesh(*near, classes=surface.classes[usable])
+            step = NO_STEP if surface.drawn else mesh_step(mesh.vertices, mesh.faces)
             refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
             return replace(_with_area(mesh, path), step=step)
-        step = cloud_step(geometry.vertices)
+        whole = surface.whole
+        step = cloud_step(whole.sample)
         refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
-        seen_from = viewpoints if viewpoints is not None and not len(geometry.scanners) else geometry.scanners
-        mesh = _with_area(ShellMesh(*mesh_cloud(geometry.vertices, seen_from, mesher), step))
+        sights = Sights.of(cameras, whole.points) if cameras and len(whole.points) else None
+        cloud = as_seen(surface, sights, spacing and spacing / metres_per_unit, metres_per_unit)
+        viewpoints = whole.scanners if len(whole.scanners) else positions(cameras)
+        mesh = _with_area(ShellMesh(*mesh_cloud(cloud, viewpoints, mesher), step))
     except SceneError as error:
-        raise SceneError(f"{path}: {error}") from error
+        raise error if str(path) in str(error) else SceneError(f"{path}: {error}") from error
     if cached is not None:
-        _write_cached(mesh, cached, path, SCANNER if len(geometry.scanners) else _seen_from(viewpoints))
+        _write_cached(mesh, cached, path, {"spacing": spacing, "sights": sights.to_json() if sights else []})
     return mesh
 
 
-def _seen_from(viewpoints: np.ndarray | None) -> list[float] | None:
-    return None if viewpoints is None or not len(viewpoints) else viewpoints.mean(axis=0).tolist()
-
-
-def _seen_alike(before: list[float] | str | None, now: list[float] | None, mesh: ShellMesh) -> bool:
-    """Whether the viewpoints orient the normals as before: an alignment's last centimetres flip none."""
-    if before is None or now is None or before == SCANNER:
-        return now is None or before == SCANNER
-    return bool(np.linalg.norm(np.subtract(before, now)) <= 0.1 * np.ptp(mesh.bounds, axis=0).max())
-
-
-def _write_cached(mesh: ShellMesh, cached: Path, source: Path, seen_from: list[float] | str | None) -> None:
-    """Write the mesh as a PLY of doubles, with a comment that identifies its source."""
+def _write_cached(mesh: ShellMesh, cached: Path, source: Path, made_for: dict[str, Any]) -> None:
+    """Write the mesh as a PLY of doubles, with a comment that identifies its source and what it was made for."""
     assert mesh.meshing is not None
     source_record = {"version": VERSION, "sha256": content_hash(source), "meshing": asdict(mesh.meshing)}
     step = {"lengths": mesh.step.lengths.tolist(), "rounded": mesh.step.rounded}
-    record = json.dumps(source_record | {"seen_from": seen_from, "step": step})
+    record = json.dumps(source_record | made_for | {"step": step})
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("indices", "<i4", 3)])
     faces["count"], faces["indices"] = 3, mesh.faces
     header = ["ply", "format binary_little_endian 1.0", COMMENT + record, f"element vertex {len(mesh.vertices)}"]
@@ -163,27 +168,28 @@ def _write_cached(mesh: ShellMesh, cached: Path, source: Path, seen_from: list[f
         file.write("\n".join(header).encode() + mesh.vertices.astype("<f8").tobytes() + faces.tobytes())
 
 
-def _read_cached(cached: Path, source: Path, viewpoints: np.ndarray | None) -> ShellMesh | None:
-    """Read a cached mesh; None if it is damaged or was made from another cloud or for other viewpoints."""
+def _read_cached(cached: Path, source: Path, cameras: Sequence[Camera], spacing: float | None) -> ShellMesh | None:
+    """Read a cached mesh; None if it is damaged, or was made from another cloud, or for other cameras or spacing."""
     try:
         with cached.open("rb") as file:
-            comment = file.read(4096).decode(errors="replace").splitlines()[2]
+            comment = [file.readline(1 << 20).decode(errors="replace") for _ in range(3)][2]
         record = json.loads(comment.removeprefix(COMMENT))
-        if (record["version"], record["sha256"]) != (VERSION, content_hash(source)):
+        if (record["version"], record["sha256"], record["spacing"]) != (VERSION, content_hash(source), spacing):
+            return None
+        if cameras and not Sights.from_json(record["sights"]).covers(Sights.of(cameras, NO_POINTS)):
             return None
         geometry = read_geometry(cached)
         step = Step(np.array(record["step"]["lengths"], np.float64), record["step"]["rounded"])
-        mesh = ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]), step)
-        return mesh if _seen_alike(record["seen_from"], _seen_from(viewpoints), mesh) else None
+        return ShellMesh(geometry.vertices, geometry.faces, Meshing(**record["meshing"]), step)
     except (OSError, IndexError, KeyError, TypeError, ValueError):  # missing or damaged: it is made again
         return None
 
 
-def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Drop vertices that are not finite or absurdly far away, and their triangles."""
+def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> Bool[np.ndarray, " F"]:
+    """Mask of the triangles all of whose vertices are finite and not absurdly far away."""
     kept = inliers(vertices, _FAR)
     if kept.all() or len(faces) == 0 or faces.max() >= len(vertices) or faces.min() < 0:
-        return vertices, faces
+        return np.ones(len(faces), bool)
     usable = kept[faces].all(axis=1)
     if not usable.any():
         raise SceneError("every triangle of the shell has a NaN or infinite vertex")
@@ -192,7 +198,7 @@ def _without_outliers(vertices: np.ndarray, faces: np.ndarray, path: Path) -> tu
         f"{path}: dropped {(~usable).sum()} of {len(faces)} triangles with a NaN or infinite vertex, or one absurdly "
         f"far away, at {place}."
     )
-    return vertices, faces[usable]
+    return usable
 
 
 def _referenced(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -212,4 +218,4 @@ def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
     if path is not None:
         notice(f"{path}: dropped {flat.sum()} of {len(flat)} triangles, which have no area.")
     vertices, faces = _referenced(mesh.vertices, mesh.faces[~flat])
-    return replace(mesh, vertices=vertices, faces=faces)
+    return replace(mesh, vertices=vertices, faces=faces, classes=mesh.classes[~flat])

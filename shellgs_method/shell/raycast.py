@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float16, Float32, Float64
+from jaxtyping import Float16, Float32, Float64, UInt8
 
 from shellgs_method.files.cue_maps import CueMap
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.geometry.triangles import Hits, Triangles
 from shellgs_method.shell.mesh import ShellMesh
+
+_SAME = 1e-4
+"""Share of a depth by which an opening may lie behind a wall to be drawn on it: many times what float32 rounds."""
 
 
 class ShellCaster:
@@ -35,6 +39,10 @@ class ShellCaster:
         self.extent = float(np.ptp(placed, axis=0).max())
         placed -= self.origin
         self.triangles = Triangles(placed, mesh.faces)
+        opening = np.isin(mesh.classes, (SurfaceClass.WINDOW, SurfaceClass.DOOR))
+        self._openings = Triangles(placed, mesh.faces[opening]) if opening.any() else None
+        self._classes = np.append(mesh.classes, np.uint8(SurfaceClass.OTHER))  # the last for misses
+        self._opening_classes = np.append(mesh.classes[opening], np.uint8(SurfaceClass.OTHER))
         self._offsets = np.einsum("fc,fc->f", self.triangles.normals, placed[mesh.faces[:, 0]])  # n · x = d
         self._rays = np.empty((0, 0, 6), np.float32)
 
@@ -56,11 +64,25 @@ class ShellCaster:
         return rays
 
     def cast(self, camera: Camera) -> CueMap:
-        """Cast the shell into a camera: z-depth in scene units, normals facing the camera, and the mask of hits."""
-        hits = self.triangles.cast_rays(self.rays(camera))
+        """Cast the shell into a camera: z-depth in scene units, normals facing the camera, mask of hits, classes."""
+        rays = self.rays(camera)
+        hits = self.triangles.cast_rays(rays)
         mask = hits.triangle >= 0
         hits.t[~mask] = 0
-        return CueMap(hits.t, self._facing(camera).take(hits.triangle, axis=0, mode="wrap"), mask)  # -1: the last row
+        normal = self._facing(camera).take(hits.triangle, axis=0, mode="wrap")  # -1: the last row
+        return CueMap(hits.t, normal, mask, self._classes_of(hits, rays))
+
+    def _classes_of(self, hits: Hits, rays: Float32[np.ndarray, "H W 6"]) -> UInt8[np.ndarray, "H W"] | None:
+        """Class of the surface at each hit; None if the shell has none. A window drawn on a wall is a window."""
+        if not self._classes.any():
+            return None
+        classes = self._classes.take(hits.triangle, mode="wrap")
+        if self._openings is None:
+            return classes
+        opening = self._openings.cast_rays(rays)
+        return np.where(
+            opening.t <= (1 + _SAME) * hits.t, self._opening_classes.take(opening.triangle, mode="wrap"), classes
+        )
 
     def _facing(self, camera: Camera) -> Float16[np.ndarray, "F+1 3"]:
         """Normal of each triangle in the camera's frame, facing the camera; the last row is zero, for misses.

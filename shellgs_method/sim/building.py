@@ -9,16 +9,18 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, UInt8
 from scipy.ndimage import binary_dilation
 
 from shellgs_method.errors import SceneError
+from shellgs_method.export.frame import Z
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
 from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.tsdf import DepthView, decimate
 from shellgs_method.occlusion import shell_verdicts
@@ -44,6 +46,7 @@ class Reconstruction:
         frame: simulation frame.
         fused: surface fused from the rendered depth, with vertex colours.
         shell: shell of any winding; None if the scene has none.
+        classes: class of each of the shell's triangles; empty if there is none.
         splats: Gaussians.
         views: training and held-out views.
         hidden: for each view, mask of reconstructed objects well in front of the shell: poles, trees, cars.
@@ -55,6 +58,7 @@ class Reconstruction:
     frame: SimFrame
     fused: trimesh.Trimesh
     shell: Triangles | None
+    classes: UInt8[np.ndarray, " F"]
     splats: Splats
     views: list[View]
     hidden: list[Bool[np.ndarray, "h w"]]
@@ -91,6 +95,7 @@ class Reconstruction:
             frame,
             fused.apply_transform(motion),
             shell,
+            run.shell_in_frame.classes if run.shell else NO_CLASSES,
             run.splats().transformed(motion),
             views,
             hidden,
@@ -140,6 +145,14 @@ class Reconstruction:
             return np.full(len(points), np.nan)
         verdicts = shell_verdicts(self.folder, self.views, transformed(points, self.frame.to_scene))
         return np.where(verdicts.differs, verdicts.distance / self.frame.scale, np.nan)
+
+    def classes_at(self, points: Float64[np.ndarray, "N 3"]) -> UInt8[np.ndarray, " N"]:
+        """Class of the shell nearest to points in the simulation frame; OTHER where it is not near."""
+        if self.shell is None or not self.classes.any():
+            return np.full(len(points), SurfaceClass.OTHER, np.uint8)
+        closest = self.shell.closest(points)
+        near = np.linalg.norm(points - closest.point, axis=1) < MARGIN
+        return np.where(near, self.classes[closest.triangle], np.uint8(SurfaceClass.OTHER))
 
     def warn_if_unaligned(self, log: Callable[[str], None]) -> None:
         """Tell the user what is different without an aligned shell."""
@@ -192,4 +205,4 @@ def moved_into(
             f"{scene} is {away / 1000:.0f} km from the first building: are both shells in the same coordinate system?"
         )
     to_scene = frame.to_scene @ np.linalg.inv(between)
-    return SimFrame(frame.name, to_scene, home.offset, True, "z", home.to_national), between @ motion
+    return SimFrame(frame.name, to_scene, home.offset, True, Z, home.to_national), between @ motion

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, Int64
 
+from shellgs_method.evaluation.colours import deviation_colours
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.camera import Camera, in_view
+from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass, classes_of
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import connected
 
@@ -19,7 +21,6 @@ EDGE = 0.15
 """Longest edge in metres of the triangles into which the shell is subdivided."""
 REACH = 0.5
 """Search range in front of and behind the shell, in metres."""
-GREY = (150, 150, 150)
 FULL = 0.2
 """Distance in metres of the full colours: red in front of the shell, blue behind it."""
 
@@ -38,6 +39,7 @@ class Region:
         distance: median signed distance in metres, positive in front of the shell.
         centre: centre in the simulation frame.
         photograph: name of the photograph that shows it best.
+        part: class of the shell there, such as "window"; "other" if its file knows none.
     """
 
     what: str
@@ -45,6 +47,7 @@ class Region:
     distance: float
     centre: tuple[float, float, float]
     photograph: str
+    part: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +69,7 @@ class Deviations:
     def write(self, path: Path) -> None:
         """Write the coloured shell as ply: red where the building is in front of it, blue behind, grey where unseen."""
         mesh = trimesh.Trimesh(
-            self.surface.vertices, self.surface.faces, face_colors=coloured(self.distance), process=False
+            self.surface.vertices, self.surface.faces, face_colors=deviation_colours(self.distance, FULL), process=False
         )
         content = mesh.export(file_type="ply")
         with atomic_write(path) as file:
@@ -80,8 +83,9 @@ def find_deviations(
     threshold: float,
     contradicted: Contradicted | None = None,
     least: float = 0.05,
+    classes: UInt8[np.ndarray, " S"] = NO_CLASSES,
 ) -> Deviations:
-    """Compare the shell with the reconstruction along its normals.
+    """Compare the shell with the reconstruction along its normals; a region is of one class.
 
     Args:
         shell: shell, wound so that normals point outside.
@@ -90,8 +94,10 @@ def find_deviations(
         threshold: distance in metres above which they differ.
         contradicted: distances from the photographs themselves, used instead of the reconstruction where not NaN.
         least: minimum area of a region in square metres.
+        classes: class of each of the shell's triangles; OTHER if not given.
     """
-    small = Triangles(*trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20)[:2])
+    *cut, source = trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20, return_index=True)
+    small, classes = Triangles(*cut), classes_of(shell.faces, classes)[source]
     centres = small.centres
     best, score = np.full(len(centres), -1), np.zeros(len(centres))
     for number, (_, camera) in enumerate(views):
@@ -111,10 +117,12 @@ def find_deviations(
         distance = np.where(np.isfinite(said), said, distance)
     flagged = np.abs(np.nan_to_num(distance)) > threshold
     regions = []
+    names = [name for name, _ in views]
     for what, chosen in (("before", flagged & (distance > 0)), ("behind", flagged & (distance < 0))):
-        for group in connected(small.faces, np.flatnonzero(chosen)):
-            if (area := small.areas[group].sum()) >= least:
-                regions.append(_region(what, float(area), group, centres, distance, best, [name for name, _ in views]))
+        for part in map(SurfaceClass, np.unique(classes[chosen])):
+            for group in connected(small.faces, np.flatnonzero(chosen & (classes == part))):
+                if (area := small.areas[group].sum()) >= least:
+                    regions.append(_region(what, part, float(area), group, centres, distance, best, names))
     return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
 
 
@@ -124,16 +132,9 @@ def along_normals(small: Triangles, places: Float64[np.ndarray, "F 3"], other: T
     return np.where(t < 2 * REACH, REACH - t, np.nan)
 
 
-def coloured(distance: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 4"]:
-    """RGBA colours: white at 0, red in front of the shell, blue behind it, grey where unknown."""
-    strength = np.clip(np.nan_to_num(distance) / FULL, -1, 1)[:, None]
-    colours = 255 - 255 * np.where(strength > 0, strength * [0.1, 1, 1], -strength * [1, 1, 0.1])
-    colours = np.where(np.isnan(distance)[:, None], GREY, colours)
-    return np.concatenate([colours, np.full((len(colours), 1), 255)], axis=1).round().astype(np.uint8)
-
-
 def _region(
     what: str,
+    part: SurfaceClass,
     area: float,
     group: Int64[np.ndarray, " G"],
     centres: np.ndarray,
@@ -144,4 +145,5 @@ def _region(
     shown = np.bincount(best[group][best[group] >= 0], minlength=len(names))
     x, y, z = np.median(centres[group], axis=0).round(3).tolist()
     photograph = names[int(shown.argmax())] if shown.any() else ""
-    return Region(what, round(area, 3), round(float(np.median(distance[group])), 3), (x, y, z), photograph)
+    away = round(float(np.median(distance[group])), 3)
+    return Region(what, round(area, 3), away, (x, y, z), photograph, part.word)

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.export.frame import Frame
-from shellgs_method.geometry.camera import Camera, positions, upwards
+from shellgs_method.export.frame import Frame, Z
+from shellgs_method.geometry.axes import turn
+from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
 
-UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""Turns y-up coordinates into z-up ones."""
 LOWEST = 0.002
 """Share of a shell's points that may lie below the ground: its lower edge is never quite even."""
 
@@ -47,43 +46,30 @@ def sim_frame(
     surface's lower edge.
 
     Args:
-        frame: frame of the exported results; z up, y up, or the scene's, rotated upright by the cameras' up axes.
+        frame: frame of the exported results, which is turned upright.
         surface: points of the shell, or else of the reconstruction, in that frame.
         cameras: cameras of the photographs, in the scene.
         ground: ground height in the shell's own coordinates, in metres; the surface's lower edge if None.
     """
     from_scene = np.linalg.inv(frame.to_scene)
-    turn = np.eye(4)
-    if frame.name == "scene":
-        turn[:3, :3] = _upright(from_scene[:3, :3] @ upwards(cameras))
-    elif frame.up == "y":
-        turn[:3, :3] = UPRIGHT
-    offset = turn[:3, :3] @ frame.offset
-    upright = transformed(surface, turn) + offset
-    origin = np.median(transformed(transformed(positions(cameras), from_scene), turn), axis=0) + offset
-    origin[2] = np.quantile(upright[:, 2], LOWEST) if ground is None else ground
+    upright = np.eye(4)
+    upright[:3, :3] = turn(frame.up, Z)
+    offset = upright[:3, :3] @ frame.offset
+    points = transformed(surface, upright) + offset
+    origin = np.median(transformed(transformed(positions(cameras), from_scene), upright), axis=0) + offset
+    origin[2] = np.quantile(points[:, 2], LOWEST) if ground is None else ground
     origin[:2] = np.round(origin[:2]) if frame.metric else origin[:2]
-    motion = turn.copy()
+    motion = upright.copy()
     motion[:3, 3] = offset - origin
     back = np.linalg.inv(motion)
     to_national = np.eye(4)
-    to_national[:3, :3], to_national[:3, 3] = turn[:3, :3].T, turn[:3, :3].T @ origin
+    to_national[:3, :3], to_national[:3, 3] = upright[:3, :3].T, upright[:3, :3].T @ origin
     sim = SimFrame(
         frame.name,
         frame.to_scene @ back,
         to_national[:3, 3],
         frame.metric,
-        "z",
+        Z,
         to_national if frame.metric else np.eye(4),
     )
     return sim, motion
-
-
-def _upright(up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The smallest rotation of a direction to the z axis (Rodrigues)."""
-    up = up / np.linalg.norm(up)
-    axis, cosine = np.cross(up, [0.0, 0, 1]), up[2]
-    if cosine < -1 + 1e-9:
-        return np.diag([1.0, -1, -1])
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from shellgs_method.geometry.axes import main_direction
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.sim.winding import spread
+from shellgs_method.geometry.winding import spread
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,7 +167,8 @@ def _section(
         yield f", the largest {REGIONS}:</p>" if len(regions) > REGIONS else ":</p>"
         rows = [
             (
-                "missing in the scan" if region.what == "before" else "gone, or deeper",
+                "missing in the shell" if region.what == "before" else "gone, or deeper",
+                region.part,
                 f"{region.area:.2f}",
                 f"{100 * region.distance:+.0f}",
                 " ".join(f"{value:.2f}" for value in region.centre),
@@ -175,7 +176,7 @@ def _section(
             )
             for region in regions[:REGIONS]
         ]
-        yield table(("what", "area (m²)", "distance (cm)", "place (m)", "photograph"), rows)
+        yield table(("what", "part", "area (m²)", "distance (cm)", "place (m)", "photograph"), rows)
 
 
 def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:

@@ -11,16 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from shellgs_method.errors import SceneError
-from shellgs_method.export.frame import UpAxis
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import GROUND, Collider, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
 from shellgs_method.sim.deviations import Deviations, find_deviations
 from shellgs_method.sim.formats.readme import write_readme
+from shellgs_method.sim.formats.semantics import write_semantics
 from shellgs_method.sim.formats.usd import write_usd_layers, write_usd_world
 from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
 from shellgs_method.sim.look.texture import bake
@@ -28,7 +29,6 @@ from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.trials.engine import import_mujoco
-from shellgs_method.sim.winding import outward
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
@@ -41,7 +41,6 @@ def simulate(
     out: Path,
     settings: SimSettings,
     log: Callable[[str], None] = print,
-    up: UpAxis | None = None,
     truths: Sequence[Callable[[np.ndarray], Triangles]] = (),
 ) -> tuple[dict, list[Chapter]]:
     """Export the buildings of trained runs to one folder that simulators load.
@@ -51,7 +50,6 @@ def simulate(
         out: output folder.
         settings: export settings.
         log: called with each message for the user.
-        up: axis of the shells' frames that points up; that of their format if None.
         truths: for each run, a function from the similarity (scene to world) to the true geometry, where known.
 
     Returns:
@@ -67,7 +65,7 @@ def simulate(
     names: list[str] = []
     buildings, chapters, home = [], [], None
     for number, config in enumerate(configs):
-        run = TrainedRun.load(config, up)
+        run = TrainedRun.load(config)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
         made.warn_if_unaligned(log)
@@ -113,11 +111,13 @@ def _building(
     textured = bake(fused, colours, made.photos, settings.texel)
     facts = write_visual(folder, textured, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
-    with_splats = write_usd_layers(folder, textured, collider.parts, made.splats, made.frame.metric)
+    classes = made.classes_at(textured.vertices[textured.faces].mean(axis=1))
+    with_splats = write_usd_layers(folder, textured, classes, collider.parts, made.splats, made.frame.metric)
+    write_semantics(folder, classes)
     deviations: Deviations | None = None
     if shell is not None:
         views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]
-        deviations = find_deviations(shell, fused, views, ahead, made.contradicted)
+        deviations = find_deviations(shell, fused, views, ahead, made.contradicted, classes=made.classes)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())

@@ -787,15 +787,15 @@ def test_curves_hold_all_held_out_views(measured):
 
 
 def test_exposures_are_plotted_of_the_runs_that_learned_them(tmp_path):
-    def run(name: str, state: dict) -> Run:
-        folder = tmp_path / name
-        folder.mkdir()
-        torch.save({"step": 1, "pipeline": state, "optimizers": {}, "scalers": {}}, folder / "step-000000001.ckpt")
-        found = SimpleNamespace(variant=SimpleNamespace(name=name, ours=True), trained=True, checkpoints=folder)
-        return cast(Run, found)
+    def run(name: str, measured: dict) -> Run:
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(measured))
+        return cast(Run, SimpleNamespace(variant=SimpleNamespace(name=name), metrics=lambda: path))
 
-    fixed, learned = run("photo-gs", {}), run("shellgs-metric", {"_model.exposures.parameter": torch.randn(5, 3)})
-    assert not exposures([fixed], tmp_path / "none.png")
+    fixed = run("photo-gs", {"exposure_stops": None, "results": {}})
+    learned = run("shellgs-metric", {"exposure_stops": [[0.1, 0.2, 0.3]] * 5, "results": {}})
+    older = run("shellgs", {"results": {}})
+    assert not exposures([fixed, older], tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
-    assert exposures([fixed, learned], tmp_path / "stops.png")
+    assert exposures([fixed, learned, older], tmp_path / "stops.png")
     assert Image.open(tmp_path / "stops.png").size[0] == 4 * 130  # one panel

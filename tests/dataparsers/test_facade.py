@@ -25,7 +25,7 @@ from shellgs_method.datamanager import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
-from shellgs_method.geometry.camera import Camera, upwards
+from shellgs_method.geometry.camera import Camera, image_up
 
 
 def names(outputs: DataparserOutputs) -> list[str]:
@@ -242,7 +242,7 @@ def turn_cameras(scene: Path) -> None:
 def with_heights_as_colours(scene: Path) -> None:
     """Points darker at the top than below, and photographs the other way round."""
     cloud: Any = trimesh.load(scene / "sparse_pc.ply")
-    heights = cloud.vertices @ upwards(view.camera for view in read_views(FacadeDataParserConfig(data=scene)))
+    heights = cloud.vertices @ image_up(view.camera for view in read_views(FacadeDataParserConfig(data=scene)))
     grey = (255 * (heights.max() - heights) / np.ptp(heights)).astype(np.uint8)
     trimesh.PointCloud(cloud.vertices, np.repeat(grey[:, None], 3, axis=1)).export(scene / "sparse_pc.ply")
     for path in (scene / "images").iterdir():

@@ -15,12 +15,14 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.readers import scans
+from shellgs_method.files.clouds import Cloud
+from shellgs_method.files.readers import ply, scans, text_clouds
 from shellgs_method.files.readers.contents import Geometry
-from shellgs_method.files.surfaces import read_geometry
+from shellgs_method.files.surfaces import read_geometry, read_surface
 from shellgs_method.geometry.triangles import area_vectors
 
 NATIONAL = np.array([410_000.0, 5_413_000.0, 250.0])
+TURNED = Rotation.from_euler("z", 90, degrees=True)
 BOX = trimesh.creation.box((2, 2, 2))
 CORNERS, FACES = np.asarray(BOX.vertices, np.float64), np.asarray(BOX.faces, np.int64)
 
@@ -662,6 +664,75 @@ def test_whole_numbers_in_all_columns_are_coordinates(tmp_path: Path, caplog):
     assert not caplog.records
 
 
+@pytest.mark.parametrize("separator", [" ", ","])
+def test_rows_and_columns_of_a_scanner_come_before_x(tmp_path: Path, caplog, separator: str):
+    """As FARO's programs write them."""
+    lines = [separator.join(f"{k % 20} {k // 20} {line}".split()) for k, line in enumerate(LINES)]
+    (tmp_path / "a.xyz").write_text("\n".join(lines))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.xyz").vertices, SURVEYED)
+    assert "its first two columns are taken for the scanner's rows and columns" in caplog.text
+
+
+def test_a_raster_of_whole_metres_with_colours_or_normals_has_no_rows_and_columns(tmp_path: Path, caplog):
+    for rest in ("9 8 7", "0.0 0.6 0.8"):
+        lines = [f"{k % 20} {k // 20} {height:.3f} {rest}" for k, height in enumerate(POINTS[:, 2])]
+        (tmp_path / "a.xyz").write_text("\n".join(lines))
+        read = read_geometry(tmp_path / "a.xyz").vertices
+        np.testing.assert_allclose(read[:, 0], np.arange(300) % 20)
+    assert not caplog.records
+
+
+def test_later_pieces_of_a_text_are_read_like_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(text_clouds, "PIECE", 64)
+    (tmp_path / "a.pts").write_text("\n".join(["300", *LINES]))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.pts").vertices, SURVEYED)
+    cloud = read_surface(tmp_path / "a.pts")
+    assert isinstance(cloud, Cloud)
+    assert len([*cloud]) == 5
+
+
+def scan_of_ptx(points: np.ndarray, matrix: np.ndarray) -> list[str]:
+    """A scan of 10 columns; the matrix is for columns, as everywhere but in PTX."""
+    head = ["10", f"{len(points) // 10}", *(" ".join(map(str, row)) for row in (matrix[:3, 3], *np.eye(3)))]
+    rows = [" ".join(map(repr, row)) for row in matrix.T.tolist()]
+    return [
+        *head,
+        *rows,
+        *(f"{x!r} {y!r} {z!r} 0.5" + " 9 8 7" * (k % 2) for k, (x, y, z) in enumerate(points.tolist())),
+    ]
+
+
+@pytest.mark.parametrize("piece", [7, 1000])
+def test_a_ptx_is_moved_by_its_matrices_and_tells_its_scanners(tmp_path: Path, caplog, monkeypatch, piece: int):
+    monkeypatch.setattr(text_clouds, "PIECE", piece)
+    points, missed = np.round(POINTS.astype(np.float64), 3), np.arange(300) % 5 == 0
+    local = np.where(missed[:, None], 0.0, points)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = TURNED.as_matrix(), NATIONAL
+    lines = [*scan_of_ptx(local[:100], np.eye(4)), *scan_of_ptx(local[100:], matrix)]
+    (tmp_path / "a.ptx").write_text("\r\n".join(lines) + "\r\n")
+    read, placed = read_geometry(tmp_path / "a.ptx"), TURNED.apply(points[100:]) + NATIONAL
+    np.testing.assert_allclose(read.vertices, np.concatenate([points[:100], placed])[~missed], atol=1e-9)
+    np.testing.assert_allclose(read.scanners, [NATIONAL])
+    assert "left out 60 of 300 points at 0 0 0, which are misses of the scanner" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda lines: lines[:-3], "its last scan lacks 3 of its points"),
+        (lambda lines: lines[1:], "cannot be read"),
+        (lambda lines: [*lines[:5], *lines[6:]], "a scan does not begin with its size"),
+        (lambda lines: [*lines, "1 2 3 0.5"], "cannot be read"),
+        (lambda lines: ["-10", *lines[1:]], "a scan does not begin with its size"),
+    ],
+)
+def test_a_damaged_ptx_is_refused(tmp_path: Path, change: Callable[[list[str]], list[str]], words: str):
+    (tmp_path / "a.ptx").write_text("\n".join(change(scan_of_ptx(POINTS.astype(np.float64), np.eye(4)))))
+    with pytest.raises(SceneError, match=words):
+        read_geometry(tmp_path / "a.ptx")
+
+
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
@@ -704,6 +775,42 @@ def test_one_point_at_the_origin_is_kept_among_others(tmp_path: Path, origin: np
     assert len(read_geometry(tmp_path / "a.xyz").vertices) == kept
 
 
+@pytest.mark.parametrize("order", ["<", ">", None])
+@pytest.mark.parametrize("piece", [7, 1 << 20])
+def test_points_of_a_ply_come_in_pieces_with_their_normals(tmp_path: Path, monkeypatch, order: str | None, piece: int):
+    monkeypatch.setattr(ply, "PIECE", piece)
+    monkeypatch.setattr(ply, "_TEXT", 50 * piece)
+    normals = np.roll(POINTS, 1, axis=1)
+    form = {"<": "binary_little_endian", ">": "binary_big_endian", None: "ascii"}[order]
+    header = ["ply", f"format {form} 1.0", "element camera 2", "property int id", "element vertex 300"]
+    columns = ["x", "y", "z", "red", "nx", "ny", "nz"]
+    kinds = ["float" if name != "red" else "uchar" for name in columns]
+    header += [*(f"property {kind} {name}" for kind, name in zip(kinds, columns, strict=True)), "element face 0"]
+    header += ["property list uchar int vertex_indices", "end_header\n"]
+    if order is None:
+        rows = [
+            "7",
+            "8",
+            *(
+                f"{' '.join(map(repr, p))} 9 {' '.join(map(repr, n))}"
+                for p, n in zip(POINTS.tolist(), normals.tolist(), strict=True)
+            ),
+        ]
+        data = "\n".join(rows).encode()
+    else:
+        table = np.empty(300, [("p", f"{order}f4", 3), ("red", "u1"), ("n", f"{order}f4", 3)])
+        table["p"], table["n"] = POINTS, normals
+        data = np.array([7, 8], f"{order}i4").tobytes() + table.tobytes()
+    (tmp_path / "a.ply").write_bytes("\n".join(header).encode() + data)
+    cloud = read_surface(tmp_path / "a.ply")
+    assert isinstance(cloud, Cloud)
+    pieces = [*cloud]
+    assert (len(pieces) > 1) == (piece == 7)
+    np.testing.assert_array_equal(np.concatenate([piece.positions for piece in pieces]), POINTS.astype(np.float64))
+    found = [piece.normals for piece in pieces if piece.normals is not None]
+    np.testing.assert_array_equal(np.concatenate(found), normals.astype(np.float64))
+
+
 # LAS and E57
 
 
@@ -716,9 +823,6 @@ def save_e57(path: Path, *parts: dict[str, Any]) -> Path:
             data = {f"cartesian{axis}": np.ascontiguousarray(points[:, k]) for k, axis in enumerate("XYZ")}
             file.write_scan_raw(data | more, **part)
     return path
-
-
-TURNED = Rotation.from_euler("z", 90, degrees=True)
 
 
 def test_misses_of_an_e57_are_left_out_before_its_pose_moves_them(tmp_path: Path, caplog):

@@ -13,6 +13,7 @@ from PIL import Image
 from training_runs import data_of, model_of, render, trainer_of
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.compare.measure import measure
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.gaussians.exposures import Exposures
 from shellgs_method.occlusion.exposure import exposed
@@ -179,3 +180,9 @@ def test_the_log_has_their_spread(trained):
     model.eval()
     stops = log_gains(trained).mean(axis=1) / STOPS
     assert float(metrics["exposure_stops"]) == pytest.approx(stops.std(), rel=1e-4)
+
+
+def test_a_measured_run_has_them_in_stops(trained):
+    trained.config.save_config()
+    measured = measure(trained.config.get_base_dir() / "config.yml")
+    np.testing.assert_allclose(measured["exposure_stops"], log_gains(trained) / STOPS, rtol=1e-5)

@@ -26,17 +26,17 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.photographs import View, to_camera
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.files.undistortion import undistort
-from shellgs_method.geometry.axes import facade_axes
+from shellgs_method.geometry.axes import facade_axes, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
 from shellgs_method.geometry.precision import mesh_step
 from shellgs_method.geometry.similarity import fit_similarity, transformed
 from shellgs_method.registration import proposal
 from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
+from shellgs_method.registration.orientations import scene_axes
 from shellgs_method.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.registration.positions import SurveyedPositions, align_positions, read_positions
 from shellgs_method.registration.proposal import Candidate
-from shellgs_method.registration.proposal import _main_wall as main_wall
 from shellgs_method.registration.refinement import refine
 from shellgs_method.registration.repetition import scan_shifts
 from shellgs_method.registration.report import shell_edges, write_report
@@ -213,12 +213,38 @@ def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface
     assert error(surface, found, survey_from_scene) < 0.02
 
 
-def test_a_proposal_is_right_for_a_shell_tilted_in_its_file(mesh, surface, views, points, survey_from_scene):
-    turned = displaced(0.0, 50.0, 0.0, seed=7)
-    askew = ShellMesh(transformed(mesh.vertices, turned), mesh.faces)
+def turned(axis: str) -> np.ndarray:
+    """The motion that turns the shell so that an axis of its file, or none, is up."""
+    if axis == "none":
+        return displaced(0.0, 50.0, 0.0, seed=7)
+    motion = np.eye(4)
+    motion[:3, :3] = turn(np.eye(3)[2], np.eye(3)["xyz".index(axis)])
+    return motion
+
+
+@pytest.mark.parametrize("axis", ["x", "none"])
+def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
+    motion = turned(axis)
+    askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
     alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
-    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ turned)
+    found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ motion)
     assert error(surface, found, survey_from_scene) < 0.02
+
+
+@pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
+def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
+    motion = turned(axis)
+    alignment = Alignment(TRUTH @ np.linalg.inv(motion), "shell/facade.obj").seen_by(views)
+    assert alignment.up is not None
+    cosine = alignment.up @ motion[:3, :3] @ [0.0, 0, 1]
+    assert np.degrees(np.arccos(min(cosine, 1.0))) <= within
+    path = tmp_path / "alignment.json"
+    alignment.save(path)
+    assert Alignment.load(path) == alignment
+    older = json.loads(path.read_text())
+    del older["up"]
+    path.write_text(json.dumps(older))
+    np.testing.assert_array_equal(Alignment.load(path).up, alignment.up)
 
 
 def test_the_main_wall_is_the_same_in_each_run():
@@ -227,15 +253,15 @@ def test_the_main_wall_is_the_same_in_each_run():
     wall = np.stack([random.uniform(0, 20, 3000), random.normal(0, 0.25, 3000), random.uniform(0, 8, 3000)], axis=1)
     ground = np.stack([random.uniform(0, 20, 2500), random.uniform(-9, 0, 2500), random.normal(0, 0.02, 2500)], axis=1)
     cameras, up = np.array([[5.0, -10, 2], [15, -10, 2]]), np.array([0.0, 0, 1])
-    found = [main_wall(np.concatenate([ground, wall]), cameras, up) for _ in range(20)]
-    assert len({cloud.axes.tobytes() for cloud in found}) == 1
-    assert np.degrees(np.arccos(-found[0].axes[2, 1])) < 1
+    found = [scene_axes(np.concatenate([ground, wall]), cameras, up)[0] for _ in range(20)]
+    assert len({axes.tobytes() for axes in found}) == 1
+    assert np.degrees(np.arccos(-found[0][2, 1])) < 1
 
 
 def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh, views, points, monkeypatch):
     """As a shell in millimetres gives, if taken for one in metres."""
     unsupported = [Candidate(np.eye(4), score=0.0)]
-    monkeypatch.setattr(proposal, "_upwards", lambda *_: [])
+    monkeypatch.setattr(proposal, "shell_axes", lambda *_: [])
     monkeypatch.setattr(proposal, "_refined", lambda *_: unsupported)
     with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
         place_by_guess(mesh, views, points, "shell/facade.glb", 1.0)

@@ -18,9 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.frame import Frame
+from shellgs_method.geometry.axes import likely_up
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.building import moved_into
 from shellgs_method.sim.collision.collider import Collider, leaks, make_collider, standing_before, thickness
 from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
@@ -30,7 +33,6 @@ from shellgs_method.sim.collision.planes import find_planes
 from shellgs_method.sim.deviations import find_deviations
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo, bake
-from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import RECESS, Layout, building, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk
@@ -217,7 +219,7 @@ def metric_frame(up: str = "z") -> tuple[Frame, np.ndarray]:
         offset = turned[:3, :3] @ offset
     shift = np.eye(4)
     shift[:3, 3] = offset
-    return Frame("shell", to_scene @ shift, offset, True, "y" if up == "y" else "z"), points - offset
+    return Frame("shell", to_scene @ shift, offset, True, np.eye(3)[1 if up == "y" else 2]), points - offset
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
@@ -245,9 +247,11 @@ def test_national_coordinates_are_recovered():
 
 def test_a_scene_without_a_shell_is_turned_upright():
     points = transformed(shell(LAYOUT).vertices, SCENE_FROM_BUILDING)
-    made, _ = sim_frame(Frame("scene", np.eye(4), np.zeros(3), False, "z"), points, cameras_of_scene())
+    made, _ = sim_frame(
+        Frame("scene", np.eye(4), np.zeros(3), False, likely_up(cameras_of_scene())), points, cameras_of_scene()
+    )
     up = np.linalg.inv(made.to_scene)[:3, :3] @ SCENE_FROM_BUILDING[:3, :3] @ [0, 0, 1]
-    assert up[2] / np.linalg.norm(up) > np.cos(np.radians(25))  # cameras look up or down a little
+    assert up[2] / np.linalg.norm(up) > np.cos(np.radians(3))
     assert not made.metric
 
 
@@ -415,10 +419,24 @@ def test_a_deviation_has_the_right_position_and_size():
     found = find_deviations(flat, built, [("a.jpg", frontal(-1.0)), ("b.jpg", frontal(0.6))], 0.05)
     assert [region.what for region in found.regions] == ["before"]
     (region,) = found.regions
+    assert region.part == "other"
     assert region.area == pytest.approx(0.4, rel=0.35)
     assert region.distance == pytest.approx(0.12, abs=1e-3)
     assert np.linalg.norm(np.subtract(region.centre, [0.6, 0, 1.25])) < 0.12
     assert region.photograph == "b.jpg"
+
+
+def test_a_deviation_is_of_the_class_of_the_shell_there():
+    flat, built = shell_and_bump()
+    left = flat.centres[:, 0] < np.where(np.abs(flat.normals[:, 1]) > 0.5, flat.centres[:, 2] - 1, 0)
+    classes = np.where(left, SurfaceClass.WALL, SurfaceClass.WINDOW).astype(np.uint8)
+    found = find_deviations(flat, built, [("b.jpg", frontal(0.6))], 0.05, classes=classes)
+    front = np.flatnonzero(flat.normals[:, 1] < -0.5)
+    assert len({*classes[front]}) == 2
+    hit = flat.cast(
+        np.array([[region.centre[0], -1, region.centre[2]] for region in found.regions]), np.array([0.0, 1, 0])
+    )
+    assert [region.part for region in found.regions] == [SurfaceClass(classes[k]).word for k in hit.triangle]
 
 
 def test_the_memory_of_deviations_does_not_grow_with_the_photographs():

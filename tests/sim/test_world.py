@@ -14,15 +14,21 @@ import torch
 import trimesh
 import yourdfpy
 from PIL import Image
+from scenes import cast
 from training_runs import trainer_of
 
+from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import Splats
 from shellgs_method.files.usd import import_pxr
+from shellgs_method.geometry.axes import turn
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import outward
+from shellgs_method.shell import Alignment, load_shell
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, make_collider
 from shellgs_method.sim.collision.parts import Part
@@ -36,9 +42,8 @@ from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
 from shellgs_method.sim.trials.engine import beams, compiled, import_mujoco, lidar, load, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
-from shellgs_method.sim.winding import outward
 from shellgs_method.synthetic.building import Layout, shell
-from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
+from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk as stroll
 
 LAYOUT = Layout(bays=2, storeys=1)
@@ -77,7 +82,8 @@ def write_building(folder: Path, collider: Collider, name: str = "facade", place
     write_parts(folder / place, collider.parts)
     look = painted(collider.surface)
     write_visual(folder / place, look, 30)
-    write_usd_layers(folder / place, look, collider.parts, some_splats(), metric)
+    classes = np.where(look.vertices[look.faces].mean(axis=1)[:, 2] > 3, SurfaceClass.WALL, SurfaceClass.DOOR)
+    write_usd_layers(folder / place, look, classes.astype(np.uint8), collider.parts, some_splats(), metric)
     return Building(name, place, len(collider.parts))
 
 
@@ -247,6 +253,20 @@ def test_the_compliance_checker_finds_faults(tmp_path):
     assert compliance_errors(stage)
 
 
+def test_the_usd_labels_each_triangle_once(world):
+    stage = import_pxr("sim").Usd.Stage.Open(str(world / "usd" / "visual.usdc"))
+    labels = {}
+    for name in ("wall", "door"):
+        subset = stage.GetPrimAtPath(f"/visual/mesh/{name}")
+        assert list(subset.GetAttribute("semantics:labels:class").Get()) == [name]
+        labels[name] = np.array(subset.GetAttribute("indices").Get())
+    mesh = import_pxr("sim").UsdGeom.Mesh(stage.GetPrimAtPath("/visual/mesh"))
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    heights = np.array(mesh.GetPointsAttr().Get())[faces].mean(axis=1)[:, 2]
+    np.testing.assert_array_equal(labels["wall"], np.flatnonzero(heights > 3))
+    np.testing.assert_array_equal(labels["door"], np.flatnonzero(heights <= 3))
+
+
 def test_usd_colliders_are_the_parts(world, collider):
     pxr = import_pxr("sim")
     stage = pxr.Usd.Stage.Open(str(world / "facade.usda"))
@@ -350,7 +370,7 @@ def test_the_command_writes_the_whole_folder(config, tmp_path, quick, capsys):
     assert "nan" not in page
 
 
-@pytest.mark.parametrize("words", ["run.yml out --parts 8", "--parts 8 run.yml out", "run.yml other.yml out --up z"])
+@pytest.mark.parametrize("words", ["run.yml out --parts 8", "--parts 8 run.yml out", "run.yml other.yml out --voxel 1"])
 def test_options_stand_before_the_runs_or_after_the_folder(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["shellgs", "sim", *words.split()])
@@ -362,6 +382,29 @@ def joined_file(out: Path) -> tuple[np.ndarray, np.ndarray]:
     meshes = [trimesh.load_mesh(path) for path in sorted((out / "collision").glob("*.obj"))]
     mesh: Any = trimesh.util.concatenate(meshes)
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+@pytest.mark.parametrize("up", [[0, 1, 0], [-1, 0, 0]])
+def test_the_world_stands_whichever_axis_of_the_shell_is_up(scene, tmp_path, up):
+    """From an obj, which does not say what is up in it."""
+    upright = load_shell(scene / "shell" / "facade.ply")
+    motion = np.eye(4)
+    motion[:3, :3] = turn(np.array([0.0, 0, 1]), np.array(up, float))
+    vertices = transformed(upright.vertices - upright.centre, motion)
+    trimesh.Trimesh(vertices, upright.faces, process=False).export(scene / "shell" / "turned.obj", digits=9)
+    motion[:3, 3] = -motion[:3, :3] @ upright.centre
+    matrix = SCENE_FROM_BUILDING @ np.linalg.inv(motion @ SHELL_FROM_BUILDING)
+    cast(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment(matrix, "shell/turned.obj"))
+    trainer = trainer_of(scene, tmp_path / "run", "shellgs_metric", iterations=2)
+    trainer.train()
+    trainer.save_checkpoint(2)
+    trainer.config.save_config()
+    built = Reconstruction.of(TrainedRun.load(trainer.base_dir / "config.yml"), SMALL.faces, None, None, None)
+    assert built.shell is not None
+    heights = built.shell.vertices[:, 2]
+    assert np.ptp(heights) == pytest.approx(np.ptp(upright.vertices[:, 2]), abs=1e-3)
+    assert heights.min() == pytest.approx(0, abs=0.05)
+    assert built.eyes[:, 2].min() > 0.5
 
 
 def test_a_run_without_a_shell_reports_its_frame(config, monkeypatch):

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int, Int64, Shaped
+from jaxtyping import Bool, Float64, Int, Int64, Shaped, UInt8
 
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.readers.points import NO_POINTS
+from shellgs_method.geometry.polygons import triangulated
+from shellgs_method.geometry.surface_classes import NO_CLASSES, classes_of
 
 NO_FACES = np.empty((0, 3), np.int64)
-NO_POINTS = np.empty((0, 3))
 
 
 @dataclass(frozen=True)
@@ -23,11 +26,19 @@ class Geometry:
         vertices: vertices of the mesh, or points of the cloud.
         faces: three vertex indices per triangle; empty for a point cloud.
         scanners: scanner positions, if the file has them.
+        classes: :class:`~shellgs_method.geometry.surface_classes.SurfaceClass` of each triangle; OTHER if not given.
+        drawn: whether it is a model, whose coordinates may all be round, and not a measurement, which was rounded then.
     """
 
     vertices: Float64[np.ndarray, "V 3"]
     faces: Int64[np.ndarray, "F 3"] = field(default_factory=NO_FACES.copy)
     scanners: Float64[np.ndarray, "S 3"] = field(default_factory=NO_POINTS.copy)
+    classes: UInt8[np.ndarray, " F"] = field(default_factory=NO_CLASSES.copy)
+    drawn: bool = False
+
+    def __post_init__(self) -> None:
+        """Fill in the classes."""
+        object.__setattr__(self, "classes", classes_of(self.faces, self.classes))
 
 
 def splats(path: Path) -> SceneError:
@@ -49,6 +60,12 @@ def left_out(path: Path, count: int, total: int, what: str) -> None:
         notice(f"{path}: left out {count} of {total} {what}.")
 
 
+def say_left_out(path: Path, counts: Mapping[str, int]) -> None:
+    """Tell what a reader of building models leaves out, by kind: it is not seen from outside, or not read."""
+    if some := [f"{count} {kind}" for kind, count in sorted(counts.items()) if count]:
+        notice(f"{path}: left out what is no outside of a building: {', '.join(some)}.")
+
+
 def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
     """The numbers of a text that holds nothing else.
 
@@ -63,56 +80,24 @@ def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
 def polygon_triangles(
     vertices: Float64[np.ndarray, "V 3"], sizes: Int[np.ndarray, " P"], corners: Int[np.ndarray, " C"], path: Path
 ) -> Int64[np.ndarray, "F 3"]:
-    """Cut polygons into triangles: convex ones into fans, the others by their ears.
+    """Cut polygons without holes into triangles, in the polygons' planes.
 
     Args:
         vertices: positions.
         sizes: number of corners of each polygon; those of fewer than 3 are left out, with a warning.
         corners: vertex indices of all polygons, one after another; they may be out of range, here.
-        path: the file, for the warning.
+        path: the file, for the warnings.
     """
-    sizes = sizes.astype(np.int64)
-    faces, starts = [NO_FACES], np.cumsum(sizes) - sizes
-    for size in np.unique(sizes[sizes >= 3]).tolist():
-        polygons = corners[starts[sizes == size][:, None] + np.arange(size)].astype(np.int64)
-        fans = np.stack([np.stack([polygons[:, 0], polygons[:, k], polygons[:, k + 1]], 1) for k in range(1, size - 1)])
-        if size > 3 and polygons.min() >= 0 and polygons.max() < len(vertices):
-            a, b, c = (vertices[fans[..., k]] for k in range(3))
-            turns = np.cross(b - a, c - a)
-            concave = (np.einsum("kpc,pc->kp", turns, turns.sum(axis=0)) < 0).any(axis=0)
-            faces += [polygon[_ears(vertices[polygon])] for polygon in polygons[concave]]
-            fans = fans[:, ~concave]
-        faces.append(fans.transpose(1, 0, 2).reshape(-1, 3))
+    cut = triangulated(vertices, sizes, corners)
     left_out(path, int((sizes < 3).sum()), len(sizes), "faces, which have fewer than 3 corners")
-    return np.concatenate(faces)
+    say_missed(path, len(cut.missed), len(sizes))
+    return cut.faces
 
 
-def _ears(polygon: Float64[np.ndarray, "N 3"]) -> Int64[np.ndarray, "N-2 3"]:
-    """Triangles of a plane polygon without holes, as indices of its corners, by clipping ears (Meisters 1975)."""
-    local = polygon - polygon[0]
-    normal = np.cross(local, np.roll(local, -1, axis=0)).sum(axis=0)
-    across = np.delete(np.arange(3), np.abs(normal).argmax())
-    flat = local[:, across]
-
-    def turn(a: np.ndarray | int, b: np.ndarray | int, c: np.ndarray | int) -> np.ndarray:
-        u, v = flat[b] - flat[a], flat[c] - flat[a]
-        return (u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]) * orientation
-
-    def is_ear(a: int, b: int, c: int) -> bool:
-        return not ((turn(a, b, left) > 0) & (turn(b, c, left) > 0) & (turn(c, a, left) > 0)).any()
-
-    around = np.roll(flat, -1, axis=0)
-    orientation = np.sign((flat[:, 0] * around[:, 1] - flat[:, 1] * around[:, 0]).sum())
-    left, triangles = np.arange(len(polygon)), []
-    while len(left) > 2:
-        corners = np.stack([np.roll(left, 1), left, np.roll(left, -1)], axis=1)
-        turns = turn(*corners.T)
-        straight = np.flatnonzero(turns == 0)  # what is cut off there has no area
-        ears = (k for k in np.flatnonzero(turns > 0) if is_ear(*corners[k]))
-        cut = straight[0] if len(straight) else next(ears, 0)
-        triangles.append(corners[cut])
-        left = np.delete(left, cut)
-    return np.array(triangles)
+def say_missed(path: Path, count: int, total: int) -> None:
+    """Warn of polygons that cross themselves, whose triangles may cover too much or too little."""
+    if count:
+        notice(f"{path}: {count} of {total} faces cross themselves or have no area: their triangles may be wrong.")
 
 
 def strip_triangles(

@@ -2,39 +2,46 @@
 
 from __future__ import annotations
 
-import io
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import notice
-from shellgs_method.files.readers.contents import Geometry
+from shellgs_method.files.readers.points import PIECE, Points
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
+_NORMAL = ("normal_x", "normal_y", "normal_z")
 _IDENTITY = [0.0, 0, 0, 1, 0, 0, 0]
 _MOST_EXPANDED = 100  # LZF expands a byte to at most 88
 
 
 @dataclass(frozen=True)
-class _Axis:
+class _Column:
     """A coordinate: its type, the bytes before it in a point, and the number of numbers before it."""
 
     kind: np.dtype
     start: int
-    column: int
+    number: int
 
 
-def read_pcd(path: Path) -> Geometry:
+def read_pcd(path: Path) -> Iterator[Points]:
     """Read the points of a PCD; those that are NaN too, which organised clouds have for pixels without a point.
 
     Raises:
         Exception: it is damaged; of any kind.
     """
-    data = path.read_bytes()
-    fields, body = _header(data)
+    with path.open("rb") as file:
+        fields = _header(file)
+        yield from _points(file, fields, path)
+
+
+def _points(file: IO[bytes], fields: dict[str, list[str]], path: Path) -> Iterator[Points]:
     names = fields.get("FIELDS") or fields["COLUMNS"]
     kinds = [_KINDS[kind.upper()] + size for kind, size in zip(fields["TYPE"], fields["SIZE"], strict=True)]
     counts = [int(count) for count in fields.get("COUNT", ["1"] * len(names))]
@@ -43,53 +50,65 @@ def read_pcd(path: Path) -> Geometry:
     sizes = [np.dtype(kind).itemsize * count for kind, count in zip(kinds, counts, strict=True)]
     if missing := [name for name in "xyz" if name not in names]:
         raise ValueError(f"it has no field {missing[0]}")
-    where = [names.index(name) for name in "xyz"]
-    axes = [_Axis(np.dtype("<" + kinds[k]), sum(sizes[:k]), sum(counts[:k])) for k in where]
+    has_normals = all(name in names for name in _NORMAL)
+    where = [names.index(name) for name in ("x", "y", "z", *(_NORMAL if has_normals else ()))]
+    columns = [_Column(np.dtype("<" + kinds[k]), sum(sizes[:k]), sum(counts[:k])) for k in where]
     points = int(fields["POINTS"][0]) if "POINTS" in fields else int(fields["WIDTH"][0]) * int(fields["HEIGHT"][0])
     if [float(value) for value in fields.get("VIEWPOINT", _IDENTITY)] != _IDENTITY:
         notice(f"{path}: its VIEWPOINT is not applied: the points are taken for those of one frame.")
-    form = fields["DATA"][0].lower()
-    read = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}[form]
-    return Geometry(read(data[body:], axes, points, sizes))
+    read = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}[fields["DATA"][0].lower()]
+    for table in read(file, columns, points, sizes):
+        yield Points(table[:, :3], table[:, 3:] if has_normals else None)
 
 
-def _header(data: bytes) -> tuple[dict[str, list[str]], int]:
-    """The words of each line of the header, by the first, and the bytes before the data."""
-    fields, at = {}, 0
-    for line in io.BytesIO(data[: 1 << 16]):
-        at += len(line)
+def _header(file: IO[bytes]) -> dict[str, list[str]]:
+    """The words of each line of the header, by the first; the data follow."""
+    fields = {}
+    while (line := file.readline(1 << 16)) and file.tell() < 1 << 16:
         words = line.decode("latin-1").partition("#")[0].split()
         if words:
             fields[words[0].upper()] = words[1:]
         if words[:1] == ["DATA"]:
-            return fields, at
+            return fields
     raise ValueError("it does not begin with the header of a PCD")
 
 
-def _text(data: bytes, axes: list[_Axis], points: int, sizes: list[int]) -> Float64[np.ndarray, "N 3"]:
-    there = np.loadtxt(io.BytesIO(data), usecols=[axis.column for axis in axes], ndmin=2, comments="#")
-    if len(there) != points:
-        raise ValueError(f"it holds {len(there)} of {points} points")
-    return there
+_Tables = Iterator[Float64[np.ndarray, "N C"]]
 
 
-def _binary(data: bytes, axes: list[_Axis], points: int, sizes: list[int]) -> Float64[np.ndarray, "N 3"]:
+def _text(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]) -> _Tables:
+    read, used = 0, [column.number for column in columns]
+    lines = (line for line in file if line.strip())
+    while some := list(islice(lines, PIECE)):
+        table = np.loadtxt(some, usecols=used, ndmin=2, comments="#")
+        read += len(table)
+        yield table
+    if read != points:
+        raise ValueError(f"it holds {read} of {points} points")
+
+
+def _binary(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]) -> _Tables:
     each = sum(sizes)
-    if points * each > len(data):
-        raise ValueError(f"it holds {len(data) // each} of {points} points")
-    return _stacked([np.ndarray((points,), axis.kind, data, axis.start, (each,)) for axis in axes])
+    there = (Path(file.name).stat().st_size - file.tell()) // each
+    if not 0 <= points <= there:
+        raise ValueError(f"it holds {there} of {points} points")
+    for start in range(0, points, PIECE):
+        count = min(PIECE, points - start)
+        data = file.read(count * each)
+        yield _stacked([np.ndarray((count,), column.kind, data, column.start, (each,)) for column in columns])
 
 
-def _compressed(data: bytes, axes: list[_Axis], points: int, sizes: list[int]) -> Float64[np.ndarray, "N 3"]:
+def _compressed(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]) -> _Tables:
     """All values of a field together, then those of the next."""
+    data = file.read()
     packed, size = struct.unpack_from("<II", data)
     if size != points * sum(sizes) or packed > len(data) - 8 or size > _MOST_EXPANDED * packed:
         raise ValueError(f"it holds {packed} bytes for {points} points of {sum(sizes)} bytes")
     values = _expanded(data[8 : 8 + packed], size)
-    return _stacked([np.frombuffer(values, axis.kind, points, axis.start * points) for axis in axes])
+    yield _stacked([np.frombuffer(values, column.kind, points, column.start * points) for column in columns])
 
 
-def _stacked(columns: list[np.ndarray]) -> Float64[np.ndarray, "N 3"]:
+def _stacked(columns: list[np.ndarray]) -> Float64[np.ndarray, "N C"]:
     with np.errstate(invalid="ignore"):  # a NaN that signals
         return np.stack(columns, axis=1).astype(np.float64)
 

@@ -20,10 +20,13 @@ from shellgs_method.files.readers.contents import (
     splats,
     strip_triangles,
 )
+from shellgs_method.files.readers.points import PIECE, Points
 
 _KNOWN = ("vertex", "face", "tristrips", "edge", "range_grid", "material", "camera")
 _SPLAT = ({"opacity", "scale_0", "rot_0"}, {"packed_position", "packed_rotation"})
+_NORMAL = ("nx", "ny", "nz")
 _STRIP_END = -1
+_TEXT = 1 << 25  # bytes of text read at once
 
 
 def read_ply(path: Path) -> Geometry:
@@ -56,6 +59,67 @@ def read_ply(path: Path) -> Geometry:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     return Geometry(vertices, np.concatenate(faces))
+
+
+def ply_points(path: Path) -> Iterator[Points] | None:
+    """Read the points of a PLY piece by piece; None if it holds something else, or points with lists.
+
+    Raises:
+        Exception: it is damaged; of any kind.
+    """
+    header = read_ply_header(path)
+    there = [element for element in header.elements if element.count]
+    names = [element.name for element in there]
+    columns = [prop.name for element in there for prop in element.properties if element.name == "vertex"]
+    lists = any(prop.counted for element in there for prop in element.properties)
+    if "vertex" not in names or {"face", "tristrips", "edge"} & {*names} or lists or not {*"xyz"} <= {*columns}:
+        return None
+    if any(splat <= {*columns} for splat in _SPLAT):
+        return None
+    for element in there:
+        if element.name not in _KNOWN:
+            left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
+    at = names.index("vertex")
+    used = [columns.index(name) for name in ("x", "y", "z", *(_NORMAL if {*_NORMAL} <= {*columns} else ()))]
+    if header.order is None:
+        numbers = [element.count * len(element.properties) for element in there]
+        tables = _text_tables(path, header.length, sum(numbers[:at]), there[at].count, len(columns), sum(numbers))
+        return (_of_columns([table[:, k] for k in used]) for table in tables)
+    rows = [np.dtype([(f"{k}", header.order + p.type) for k, p in enumerate(e.properties)]) for e in there]
+    before = sum(row.itemsize * element.count for row, element in zip(rows[:at], there, strict=False))
+    tables = _binary_tables(path, header.length + before, rows[at], there[at].count)
+    return (_of_columns([table[f"{k}"] for k in used]) for table in tables)
+
+
+def _of_columns(columns: list[np.ndarray]) -> Points:
+    values = np.stack(columns, axis=1).astype(np.float64)
+    return Points(values[:, :3], values[:, 3:] if len(columns) > 3 else None)
+
+
+def _binary_tables(path: Path, start: int, kinds: np.dtype, rows: int) -> Iterator[np.ndarray]:
+    with path.open("rb") as file:
+        file.seek(start)
+        for done in range(0, rows, PIECE):
+            yield np.frombuffer(file.read(min(PIECE, rows - done) * kinds.itemsize), kinds)
+
+
+def _text_tables(path: Path, start: int, skipped: int, rows: int, width: int, total: int) -> Iterator[np.ndarray]:
+    """Rows of numbers, which need not be lines of their own, after those that are skipped."""
+    read, left, wanted = 0, np.empty(0), rows * width
+    with path.open("rb") as file:
+        file.seek(start)
+        while lines := file.readlines(_TEXT):
+            numbers = numbers_in(b"".join(lines).decode("latin-1"))
+            here = slice(max(0, skipped - read), max(0, skipped + wanted - read))
+            read += len(numbers)
+            left = np.concatenate([left, numbers[here]])
+            table = left[: len(left) - len(left) % width].reshape(-1, width)
+            left = left[table.size :]
+            if len(table):
+                yield table
+    if read != total:
+        what = "fewer numbers than" if read < total else f"{read - total} numbers more than"
+        raise ValueError(f"it holds {what} its header claims")
 
 
 def _corners(columns: dict[str, _Column]) -> _Column:

@@ -1,7 +1,7 @@
 """Read LAS, LAZ and E57: a script that runs in its own process, which a damaged file may end.
 
-It writes one line of json on standard output, with the numbers of points, scanners and what is left out, or the error;
-then the points and the positions of the scanners as doubles.
+It writes pieces on standard output: a line of json with the numbers of points and scanners, then the points and the
+positions of the scanners as doubles. The last line says how many points were left out and why, or what went wrong.
 """
 
 from __future__ import annotations
@@ -9,69 +9,70 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections import Counter
+from collections.abc import Iterator
 
 import numpy as np
 
+PIECE = 1_000_000
 NOISE = (7, 18)
 """Classes of LAS: low and high noise."""
-Read = tuple[np.ndarray, np.ndarray, dict[str, int]]
-"""Points, scanner positions, and how many points were left out, by which they are and why."""
+NO_POINTS = np.empty((0, 3))
+Piece = tuple[np.ndarray, np.ndarray]
+"""Points, and scanner positions."""
 
 
-def read_las(path: str) -> Read:
+def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
     """Read the points that are neither withheld nor classified as noise."""
     import laspy
 
-    pieces, no_scanners = [np.empty((0, 3))], np.empty((0, 3))
-    read = withheld = noise = 0
+    read = 0
     with laspy.open(path) as file:  # in chunks: points that a damaged file only claims to hold take no memory
-        for piece in file.chunk_iterator(1_000_000):
-            dropped = np.array(piece.withheld).astype(bool)
-            noisy = np.isin(np.array(piece.classification), NOISE) & ~dropped
+        for piece in file.chunk_iterator(PIECE):
+            withheld = np.array(piece.withheld).astype(bool)
+            noisy = np.isin(np.array(piece.classification), NOISE) & ~withheld
             points = np.stack([np.array(piece[axis]) for axis in "xyz"], axis=1)
-            pieces.append(points[~(dropped | noisy)])
-            read, withheld, noise = read + len(points), withheld + int(dropped.sum()), noise + int(noisy.sum())
+            dropped = withheld | noisy
+            yield points[~dropped] if dropped.any() else points, NO_POINTS
+            read += len(points)
+            left_out["points, which are withheld"] += int(withheld.sum())
+            left_out["points, which are classified as noise"] += int(noisy.sum())
         claimed = file.header.point_count
     if read != claimed:
         raise ValueError(f"it holds {read} of {claimed} points")
-    return (
-        np.concatenate(pieces),
-        no_scanners,
-        {"points, which are withheld": withheld, "points, which are classified as noise": noise},
-    )
 
 
-def read_e57(path: str) -> Read:
+def read_e57(path: str, left_out: Counter[str]) -> Iterator[Piece]:
     """Read the valid points of all scans, each moved by its pose; a scan without one tells nothing of its scanner."""
     import pye57
     from pye57.utils import convert_spherical_to_cartesian
 
     file = pye57.E57(path)
-    pieces: list[np.ndarray] = [np.empty((0, 3))]
-    scanners: list[np.ndarray] = [np.empty((0, 3))]
-    invalid = misses = 0
     for index in range(file.scan_count):
         header = file.get_header(index)
-        scan = file.read_scan(index, ignore_missing_fields=True, transform=False)  # without points flagged as invalid
-        if "cartesianX" in scan:
-            points = np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
-        else:
-            spherical = [scan[f"spherical{name}"] for name in ("Range", "Azimuth", "Elevation")]
-            points = convert_spherical_to_cartesian(np.stack(spherical, axis=1))
-        missed = (points == 0).all(axis=1)  # at the scanner itself
-        invalid, misses = invalid + header.point_count - len(points), misses + int(missed.sum())
         rotation, translation = _pose(header)
-        pieces.append(points[~missed] @ rotation.T + translation)
         if translation.any() or not np.array_equal(rotation, np.eye(3)):
-            scanners.append(translation[None])
-    left_out = {
-        "points, which are flagged as invalid": invalid,
-        "points at 0 0 0, which are misses of the scanner": misses,
-    }
-    return np.concatenate(pieces), np.concatenate(scanners), left_out
+            yield NO_POINTS, translation[None]
+        kind = "cartesian" if "cartesianX" in header.point_fields else "spherical"
+        axes = [kind + axis for axis in ("XYZ" if kind == "cartesian" else ("Range", "Azimuth", "Elevation"))]
+        flag = kind + "InvalidState"
+        fields = [*axes, flag] if flag in header.point_fields else axes
+        columns, buffers = file.make_buffers(fields, min(PIECE, max(1, header.point_count)))
+        reader = header.points.reader(buffers)
+        while count := reader.read():
+            points = np.stack([columns[axis][:count] for axis in axes], axis=1)
+            if flag in fields:
+                points = points[columns[flag][:count] == 0]
+            if kind == "spherical":
+                points = convert_spherical_to_cartesian(points)
+            missed = (points == 0).all(axis=1)  # at the scanner itself
+            left_out["points, which are flagged as invalid"] += count - len(points)
+            left_out["points at 0 0 0, which are misses of the scanner"] += int(missed.sum())
+            yield points[~missed] @ rotation.T + translation, NO_POINTS
+        reader.close()  # only one may be open
 
 
-def _pose(header) -> tuple[np.ndarray, np.ndarray]:
+def _pose(header) -> Piece:
     """Rotation matrix and translation of a scan; the identity where they are not set."""
     if not header.has_pose():
         return np.eye(3), np.zeros(3)
@@ -82,16 +83,19 @@ def _pose(header) -> tuple[np.ndarray, np.ndarray]:
 def _main(path: str) -> None:
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries may print
+    left_out: Counter[str] = Counter()
     try:
-        points, scanners, left_out = (read_e57 if path.lower().endswith(".e57") else read_las)(path)
+        for points, scanners in (read_e57 if path.lower().endswith(".e57") else read_las)(path, left_out):
+            output.write(json.dumps({"points": len(points), "scanners": len(scanners)}).encode() + b"\n")
+            for array in (points, scanners):
+                output.write(np.ascontiguousarray(array, "<f8").data)
+    except BrokenPipeError:  # the points are not wanted any more
+        os._exit(1)
     except Exception as error:  # of any kind, for a damaged file
         words = (str(error).strip() or type(error).__name__).splitlines()[0]  # pye57 appends where in its sources
         output.write(json.dumps({"error": words}).encode() + b"\n")
-        return
-    about = {"points": len(points), "scanners": len(scanners), "left_out": left_out}
-    output.write(json.dumps(about).encode() + b"\n")
-    for array in (points, scanners):
-        output.write(np.ascontiguousarray(array, "<f8").data)
+    else:
+        output.write(json.dumps({"left_out": left_out}).encode() + b"\n")
     output.close()
 
 

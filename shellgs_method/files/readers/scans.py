@@ -6,19 +6,24 @@ import json
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from shellgs_method.files.headers import check_las
-from shellgs_method.files.readers.contents import NO_FACES, Geometry, left_out
+from shellgs_method.files.readers.contents import left_out
+from shellgs_method.files.readers.points import Points
 from shellgs_method.machine.extras import import_extra
 
 _SCRIPT = Path(__file__).with_name("scan_script.py")  # run as a file, to import none of the package's libraries
 
 
-def read_las(path: Path) -> Geometry:
+def read_las(path: Path) -> Iterator[Points]:
     """Read a LAS or LAZ file.
 
     Raises:
@@ -29,10 +34,10 @@ def read_las(path: Path) -> Geometry:
     if path.suffix.lower() == ".laz":  # laspy would not say which of its backends to install
         import_extra("lazrs", "lazrs", "las", f"the shell {path}")
     check_las(path)
-    return _read(path)
+    yield from _read(path)
 
 
-def read_e57(path: Path) -> Geometry:
+def read_e57(path: Path) -> Iterator[Points]:
     """Read an E57 file, in the frame of its scans' poses.
 
     Raises:
@@ -40,27 +45,46 @@ def read_e57(path: Path) -> Geometry:
         ValueError: the file is damaged.
     """
     import_extra("pye57", "pye57", "e57", f"the shell {path}")
-    return _read(path)
+    yield from _read(path)
 
 
-def _read(path: Path) -> Geometry:
-    done = subprocess.run([sys.executable, _SCRIPT, path.absolute()], capture_output=True, check=False)
-    head, _, data = done.stdout.partition(b"\n")
-    if not head or done.returncode:
-        raise ValueError(f"its reader ended {_ending(done)}")
-    about = json.loads(head)
+def _read(path: Path) -> Iterator[Points]:
+    """Take the pieces that the script hands over, which reads on meanwhile."""
+    command, read, about = [sys.executable, _SCRIPT, path.absolute()], 0, {}
+    with tempfile.TemporaryFile() as messages:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=messages, bufsize=1 << 20) as process:
+            assert process.stdout is not None
+            while "points" in (about := _line(process.stdout)):
+                points, scanners = (_rows(process.stdout, about[what]) for what in ("points", "scanners"))
+                if points is None or scanners is None:
+                    break
+                read += len(points)
+                yield Points(points, scanners=scanners)
+        messages.seek(0)
+        said = messages.read()
     if "error" in about:
         raise ValueError(about["error"])
-    rows = np.frombuffer(data, "<f8").reshape(-1, 3)
-    points, scanners = rows[: about["points"]], rows[about["points"] :]
-    total = len(points) + sum(about["left_out"].values())
+    if "left_out" not in about:
+        raise ValueError(f"its reader ended {_ending(process.returncode, said)}")
+    total = read + sum(about["left_out"].values())
     for what, count in about["left_out"].items():
         left_out(path, count, total, what)
-    return Geometry(points, NO_FACES, scanners)
 
 
-def _ending(done: subprocess.CompletedProcess[bytes]) -> str:
+def _line(stream: IO[bytes]) -> dict[str, Any]:
+    """The next line of json; an empty object at the end, whose last line may be cut off."""
+    line = stream.readline()
+    return json.loads(line) if line.endswith(b"\n") else {}
+
+
+def _rows(stream: IO[bytes], count: int) -> Float64[np.ndarray, "N 3"] | None:
+    """The next points; None if there are fewer."""
+    data = stream.read(24 * count)
+    return np.frombuffer(data, "<f8").reshape(-1, 3) if len(data) == 24 * count else None
+
+
+def _ending(code: int, messages: bytes) -> str:
     with suppress(ValueError):
-        return f"by {signal.Signals(-done.returncode).name}"
-    lines = done.stderr.decode(errors="replace").split("\n")
+        return f"by {signal.Signals(-code).name}"
+    lines = messages.decode(errors="replace").split("\n")
     return f"with {next((line.strip() for line in reversed(lines) if line.strip()), 'no message')!r}"

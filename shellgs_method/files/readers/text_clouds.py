@@ -1,4 +1,4 @@
-"""Read point clouds of text: columns with or without a header, a number of points, and separators."""
+"""Read point clouds of text: columns with or without a header, a number of points, and separators; and PTX."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from typing import TextIO
 import numpy as np
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.readers.contents import NO_POINTS, Geometry
+from shellgs_method.files.readers.contents import left_out
+from shellgs_method.files.readers.points import NO_POINTS, PIECE, Points
 
 _COMMENTS = ("#", "//")
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -22,11 +23,12 @@ _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _WHOLE = re.compile(r"[-+]?\d+")
 
 
-def read_text_cloud(path: Path) -> Geometry:
+def read_text_cloud(path: Path) -> Iterator[Points]:
     """Read X, Y and Z of each line: the first three columns, or those that a header names so, also in a comment.
 
     Columns are separated by spaces, tabs, commas or semicolons. A line with one number counts the points after it.
-    Where the first column numbers or names the points, X is the second.
+    Where the first column numbers or names the points, X is the second; where two are a scanner's rows and columns, as
+    FARO's programs write them, the third.
 
     Raises:
         SceneError: the first lines are no such columns.
@@ -39,7 +41,7 @@ def read_text_cloud(path: Path) -> Geometry:
         lines = _Lines(file)
         first = list(islice(lines, _SAMPLE))
         if not first:
-            return Geometry(NO_POINTS)
+            return
         separator = _separator(first, path)
         rows = [_split(line, separator) for line in first]
         named = not any(map(_is_number, rows[0]))
@@ -51,10 +53,44 @@ def read_text_cloud(path: Path) -> Geometry:
         else:
             columns = _columns(rows, first[0], path)
         data = chain(first[1:] if named else first, lines)
-        points = np.loadtxt(data, usecols=columns, comments=None, ndmin=2, delimiter=separator, quotechar='"')
-    if lines.claimed and lines.claimed != len(points):
-        raise ValueError(f"it holds {len(points)} of {lines.claimed} points")
-    return Geometry(points)
+        read = 0
+        while some := list(islice(data, PIECE)):
+            points = np.loadtxt(some, usecols=columns, comments=None, ndmin=2, delimiter=separator, quotechar='"')
+            read += len(points)
+            yield Points(points)
+    if lines.claimed and lines.claimed != read:
+        raise ValueError(f"it holds {read} of {lines.claimed} points")
+
+
+def read_ptx(path: Path) -> Iterator[Points]:
+    """Read a PTX: scans one after another, each with its size, its scanner's place, a matrix for row vectors, and a
+    line for each ray, which is 0 0 0 where it hit nothing.
+
+    Points are moved by their scan's matrix. As in E57, a scan that is not moved tells nothing of its scanner.
+
+    Raises:
+        ValueError: it is damaged, or cut off.
+    """
+    misses = total = 0
+    with path.open(encoding="utf-8", errors="replace") as file:
+        lines = (line for line in file if line.strip())
+        while size := next(lines, ""):
+            rays = int(size) * int(next(lines, ""))
+            rows = [np.array(line.split(), np.float64) for line in islice(lines, 8)]
+            if rays < 0 or [len(row) for row in rows] != [3] * 4 + [4] * 4:
+                raise ValueError("a scan does not begin with its size, the scanner's place and axes, and a 4x4 matrix")
+            matrix = np.stack(rows[4:])
+            if not np.array_equal(matrix, np.eye(4)):
+                yield Points(NO_POINTS, scanners=matrix[3:, :3])
+            total += rays
+            while rays:
+                if not (some := list(islice(lines, min(rays, PIECE)))):
+                    raise ValueError(f"its last scan lacks {rays} of its points")
+                points = np.loadtxt(some, usecols=(0, 1, 2), ndmin=2)
+                hits = points.any(axis=1)
+                yield Points(points[hits] @ matrix[:3, :3] + matrix[3, :3])
+                rays, misses = rays - len(some), misses + int((~hits).sum())
+    left_out(path, misses, total, "points at 0 0 0, which are misses of the scanner")
 
 
 class _Lines:
@@ -134,21 +170,33 @@ def _named(rows: list[list[str]], line: str, path: Path) -> list[int]:
 
 
 def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
-    """The first three columns, or those after one that numbers or names the points."""
+    """The first three columns, or those after one that numbers or names the points, or after a row and a column."""
     width = min(len(row) for row in rows)
-    numeric = [all(_is_number(row[k]) for row in rows) for k in range(min(width, 4))]
-    if width >= 4 and all(numeric[1:]):
-        whole = [all(_WHOLE.fullmatch(row[k]) for row in rows) for k in range(4)]
+    numeric = [all(_is_number(row[k]) for row in rows) for k in range(min(width, 5))]
+    whole = [numeric[k] and all(_WHOLE.fullmatch(row[k]) for row in rows) for k in range(len(numeric))]
+    if width >= 4 and all(numeric[1:4]):
         varies = len({row[0] for row in rows}) > 1
-        if not numeric[0] or (varies and whole[0] and not any(whole[1:])):
+        if not numeric[0] or (varies and whole[0] and not any(whole[1:4])):
             notice(f"{path}: its first column ({rows[0][0]}) is taken for the points' numbers, and X for the second.")
             return [1, 2, 3]
+    if all(whole[:2]) and all(numeric) and len(numeric) == 5 and not any(whole[2:]) and _is_raster(rows):
+        notice(f"{path}: its first two columns are taken for the scanner's rows and columns, and X for the third.")
+        return [2, 3, 4]
     if width < 3 or not all(numeric[:3]):
         raise SceneError(
             f"the shell {path} cannot be read: it begins with {_shown(line)} where X, Y and Z are expected: export "
             "it with these in each line, after a line that names the columns, if they are not the first three"
         )
     return [0, 1, 2]
+
+
+def _is_raster(rows: list[list[str]]) -> bool:
+    """Whether the first two columns step through the pixels of a scan, not through heights that have normals."""
+    pixels = np.array([row[:2] for row in rows], np.float64)
+    along = (np.diff(pixels, axis=0) == 0).any(axis=1)
+    normals = [np.array(row[3:6], np.float64) for row in rows if len(row) >= 6 and all(map(_is_number, row[3:6]))]
+    unit = len(normals) > 0 and np.allclose(np.linalg.norm(normals, axis=1), 1, atol=0.01)
+    return bool(pixels.min() >= 0 and (len(rows) == 1 or along.mean() > 0.9) and not unit)
 
 
 def _shown(line: str) -> str:

@@ -14,11 +14,11 @@ from scipy.sparse.csgraph import connected_components
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.winding import spread
 from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
 from shellgs_method.sim.collision.parts import Part, joined, prism
 from shellgs_method.sim.collision.patches import convex_patches
 from shellgs_method.sim.collision.planes import Plane, find_planes, grid_in, polygons_of
-from shellgs_method.sim.winding import spread
 
 THICKNESS = 0.3
 """Depth of parts behind a surface in metres, unless the building is known to be thinner."""

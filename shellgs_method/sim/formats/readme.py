@@ -22,6 +22,8 @@ scene's cameras (`to_scene`) and to national coordinates (`to_national`), whose 
 | `{folder}collision/part_*.obj` | {parts} convex parts, which are their own convex hulls |
 | `{folder}visual.obj`, `.mtl`, `.png` | the visual mesh, with a texture from the photographs |
 | `{folder}visual.glb` | the same for browsers; y-up, as glTF requires |
+| `{folder}semantics.json` | the class (wall, window, …) of each face of `visual.obj`, if the shell has them; in \
+the USD, labels of its parts |
 | `{folder}splats.ply` | the Gaussians |
 | `{folder}deviations.ply`, `.json` | the shell: red where the building is in front of it, blue behind, grey unseen |
 | `report.html`, `metrics.json` | the accuracy of all this, and images |

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from shellgs_method.export.splats import Splats
 from shellgs_method.files.usd import add_mesh, import_pxr, make_collider, new_stage
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.world import Building
 from shellgs_method.sim.look.texture import TexturedMesh
@@ -21,12 +23,20 @@ LAYERS = "usd"
 """Folder of the binary layers that ``facade.usda`` refers to, beside the building's other files."""
 
 
-def write_usd_layers(folder: Path, mesh: TexturedMesh, parts: Sequence[Part], splats: Splats, metric: bool) -> bool:
+def write_usd_layers(
+    folder: Path,
+    mesh: TexturedMesh,
+    classes: UInt8[np.ndarray, " F"],
+    parts: Sequence[Part],
+    splats: Splats,
+    metric: bool,
+) -> bool:
     """Write visual mesh, colliders and splats of a building, each as a layer.
 
     Args:
         folder: folder of the building; the layers are in its folder ``usd``.
         mesh: visual mesh, with one texture coordinate for each vertex.
+        classes: class of each of its triangles.
         parts: convex parts.
         splats: Gaussians in the frame of the mesh.
         metric: whether the frame's unit is the metre; otherwise it is unknown.
@@ -37,7 +47,7 @@ def write_usd_layers(folder: Path, mesh: TexturedMesh, parts: Sequence[Part], sp
     pxr = import_pxr("sim")
     (folder / LAYERS).mkdir(exist_ok=True)
     with new_stage(pxr, folder / LAYERS / "visual.usdc", "z", metric) as stage:
-        _visual(pxr, stage, mesh)
+        _visual(pxr, stage, mesh, classes)
     with new_stage(pxr, folder / LAYERS / "collision.usdc", "z", metric) as stage:
         _colliders(pxr, stage, parts)
     if not hasattr(pxr.UsdVol, "ParticleField3DGaussianSplat"):
@@ -95,7 +105,7 @@ def _refer(pxr: SimpleNamespace, stage, prim, building: Building, child: str) ->
     made.GetReferences().AddReference(f"./{building.path(f'{LAYERS}/{child}.usdc')}")
 
 
-def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh) -> None:
+def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"]) -> None:
     pxr.UsdGeom.Xform.Define(stage, "/visual")
     prim = add_mesh(pxr, stage, "/visual/mesh", mesh.vertices, mesh.faces)
     prim.CreateDoubleSidedAttr(True)
@@ -117,6 +127,17 @@ def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh) -> None:
     surface.CreateInput("diffuseColor", pxr.Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", pxr.Sdf.ValueTypeNames.Token))
     pxr.UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
+    if classes.any():
+        _label(pxr, prim, classes)
+
+
+def _label(pxr: SimpleNamespace, mesh: Any, classes: UInt8[np.ndarray, " F"]) -> None:
+    """Partition a mesh by class, each part with a semantic label."""
+    for each in map(SurfaceClass, np.unique(classes)):
+        faces = pxr.Vt.IntArray.FromNumpy(np.flatnonzero(classes == each).astype(np.int32))
+        kinds = pxr.UsdGeom.Tokens.face, faces, "semantics", pxr.UsdGeom.Tokens.partition
+        subset = pxr.UsdGeom.Subset.CreateGeomSubset(mesh, each.word, *kinds)
+        pxr.UsdSemantics.LabelsAPI.Apply(subset.GetPrim(), "class").CreateLabelsAttr([each.word])
 
 
 def _shader(pxr: SimpleNamespace, stage, path: str, kind: str):

@@ -11,11 +11,13 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from shellgs_method.export.meshes import Y_UP
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.sim.look.texture import TexturedMesh
 
 TEXTURE = "visual.png"
+
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Turns z-up coordinates into y-up ones."""
 
 
 def write_visual(folder: Path, mesh: TexturedMesh, megabytes: float) -> dict:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Shaped
 
 from shellgs_method.geometry.triangles import Triangles
 
@@ -29,6 +29,6 @@ def outward(
     return Triangles(surface.vertices, np.where(votes[:, None] < 0, surface.faces[:, ::-1], surface.faces)), seen
 
 
-def spread(eyes: Float64[np.ndarray, "E 3"], count: int) -> Float64[np.ndarray, "C 3"]:
+def spread(eyes: Shaped[np.ndarray, "E *shape"], count: int) -> Shaped[np.ndarray, "C *shape"]:
     """At most ``count`` of the eyes, evenly spaced in their order."""
     return eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]

@@ -1,0 +1,46 @@
+"""`shellgs elevation`: orthographic images of the walls of a trained run."""
+
+from __future__ import annotations
+
+from math import inf
+from pathlib import Path
+from typing import Optional
+
+from shellgs_method.commands.common import RunConfig, console
+from shellgs_method.errors import SceneError
+
+
+def elevation(
+    config: RunConfig,
+    output: Optional[Path] = None,
+    pixel: Optional[float] = None,
+) -> None:
+    """Draw the walls of a trained run to scale: colours, depth, and deviations from the shell.
+
+    There is an elevation for each direction that the photographed walls face: an image and maps of distances in metres
+    with world files, and a PDF to print. A json says where each lies in the shell's frame.
+
+    Args:
+        config: The run's config.yml.
+        output: Folder. If not set: elevation beside the config.
+        pixel: Size of a pixel in metres. If not set: that of the photographs' on the facade.
+    """
+    from shellgs_method.export.elevation import MARGIN, draw, walls_of, write_elevation
+    from shellgs_method.export.runs import TrainedRun
+    from shellgs_method.geometry.triangles import Triangles
+    from shellgs_method.machine.progress import track
+
+    if pixel is not None and not 0 < pixel < inf:
+        raise SceneError("--pixel must be above 0")
+    output, run = output or config.with_name("elevation"), TrainedRun.load(config)
+    walls, mesh = walls_of(run), run.surface(MARGIN)
+    surface, pixel, facts = Triangles(mesh.vertices, mesh.faces), pixel or run.resolution(run.box(MARGIN)) or 0.01, {}
+    for number, wall in enumerate(track(walls, "Drawing wall", len(walls)), 1):
+        name = f"wall-{number}"
+        write_elevation(output, name, draw(run, wall, surface, pixel))
+        right, upwards, out = wall.axes.tolist()
+        corner = [wall.low[0], wall.high[1], wall.plane] @ wall.axes
+        facts[name] = {"upper_left": corner.tolist(), "right": right, "up": upwards, "out": out, "pixel": pixel}
+        width, height = wall.size[:2]
+        console.print(f"{output / name}.pdf: {width:.2f} x {height:.2f} m, {1000 * pixel:.3g} mm a pixel.")
+    run.frame.describe(output / "walls.json", facts)

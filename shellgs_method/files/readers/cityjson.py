@@ -1,0 +1,123 @@
+"""Read CityJSON 1 and 2, and CityJSONSeq: all geometries that have surfaces, and instances of templates."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.readers.city import CityObject, Polygon, outside, ring_of
+from shellgs_method.files.readers.contents import Geometry
+
+_DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
+"""Lists of lists around a geometry's surfaces."""
+_LINES = ("MultiPoint", "MultiLineString")
+
+
+def read_cityjson(path: Path) -> Geometry:
+    """Read what is seen from outside of the objects of a CityJSON, or of all lines of a CityJSONSeq, in its units.
+
+    Raises:
+        SceneError: it is no CityJSON, of an unknown version, or nothing is seen of it.
+        Exception: it is damaged; of any kind.
+    """
+    text = path.read_text("utf-8-sig")
+    try:
+        documents = [json.loads(text)]
+    except json.JSONDecodeError:
+        documents = [json.loads(line) for line in text.splitlines() if line.strip()]
+        if len(documents) < 2:
+            raise
+    first = documents[0]
+    if not isinstance(first, dict) or first.get("type") != "CityJSON":
+        raise SceneError(f"the shell {path} is json, but no CityJSON: export it as CityJSON, CityGML, IFC or a mesh")
+    if not str(first.get("version", "")).startswith(("1.", "2.")):
+        raise SceneError(f"the shell {path} is CityJSON {first.get('version')}: upgrade it to 2.0 (cjio … upgrade)")
+    missing: Counter[str] = Counter()
+    objects = [each for document in documents for each in _Document(document, first, missing).objects()]
+    return outside(objects, path, missing)
+
+
+class _Document:
+    """A CityJSON, or a feature of a CityJSONSeq, whose transform and templates are in the first line.
+
+    Args:
+        document: its json.
+        first: the json of the file's first line.
+        missing: counts what is not read.
+    """
+
+    def __init__(self, document: dict[str, Any], first: dict[str, Any], missing: Counter[str]) -> None:
+        self.json, self.missing = document, missing
+        self.vertices = np.array(document.get("vertices", []), np.float64).reshape(-1, 3)
+        if transform := first.get("transform"):
+            self.vertices = self.vertices * np.array(transform["scale"]) + np.array(transform["translate"])
+        templates = first.get("geometry-templates", {})
+        self.templates = templates.get("templates", [])
+        self.template_vertices = np.array(templates.get("vertices-templates", []), np.float64).reshape(-1, 3)
+
+    def objects(self) -> Iterator[CityObject]:
+        """The objects that are no part of another, with their parts."""
+        made = {name: self._object(fields) for name, fields in self.json.get("CityObjects", {}).items()}
+        for name, fields in self.json.get("CityObjects", {}).items():
+            above = [parent for parent in fields.get("parents", []) if parent in made and parent != name]
+            if above:
+                made[above[0]].parts.append(made[name])
+            else:
+                yield made[name]
+
+    def _object(self, fields: dict[str, Any]) -> CityObject:
+        made = CityObject(str(fields["type"]))
+        for geometry in fields.get("geometry", []):
+            polygons = list(self._polygons(geometry))
+            if polygons:
+                made.levels.setdefault(self._level(geometry), []).extend(polygons)
+        return made
+
+    def _level(self, geometry: dict[str, Any]) -> float:
+        if "template" in geometry:
+            geometry = self.templates[geometry["template"]]
+        return float(geometry.get("lod", 0))
+
+    def _polygons(self, geometry: dict[str, Any]) -> Iterator[Polygon]:
+        if geometry["type"] != "GeometryInstance":
+            yield from self._placed(geometry, self.vertices)
+            return
+        matrix = np.array(geometry["transformationMatrix"], np.float64).reshape(4, 4)
+        (at,) = geometry["boundaries"]
+        moved = self.template_vertices @ matrix[:3, :3].T + matrix[:3, 3] + _at(self.vertices, [at])[0]
+        yield from self._placed(self.templates[geometry["template"]], moved)
+
+    def _placed(self, geometry: dict[str, Any], vertices: Float64[np.ndarray, "V 3"]) -> Iterator[Polygon]:
+        kind = geometry["type"]
+        if kind not in _DEPTHS:
+            self.missing[kind] += kind not in _LINES  # which have no surface in any level of detail
+            return
+        semantics = geometry.get("semantics") or {}
+        surfaces, values = semantics.get("surfaces", []), semantics.get("values")
+        yield from _flattened(geometry["boundaries"], values, _DEPTHS[kind], vertices, surfaces)
+
+
+def _flattened(
+    boundaries: list, values: list | None, depth: int, vertices: np.ndarray, surfaces: list[dict[str, Any]]
+) -> Iterator[Polygon]:
+    """The polygons of nested lists, with the types of their surfaces, whose indices are nested alike."""
+    for k, boundary in enumerate(boundaries):
+        value = values[k] if values is not None and k < len(values) else None
+        if depth:
+            yield from _flattened(boundary, value, depth - 1, vertices, surfaces)
+        elif boundary:
+            surface = "" if value is None else str(surfaces[value]["type"]).lstrip("+")
+            yield Polygon([ring_of(_at(vertices, ring)) for ring in boundary], surface)
+
+
+def _at(vertices: Float64[np.ndarray, "V 3"], indices: list[int]) -> Float64[np.ndarray, "N 3"]:
+    if indices and not 0 <= min(indices) <= max(indices) < len(vertices):
+        raise ValueError(f"it has vertex indices outside its {len(vertices)} vertices")
+    return vertices[np.array(indices, np.int64)]

@@ -1,0 +1,201 @@
+"""Read IFC, 2x3 and 4: what of a building is seen from outside, in metres and the coordinates of its map, if given."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.readers.contents import NO_FACES, NO_POINTS, Geometry, say_left_out
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass
+from shellgs_method.machine.extras import import_extra
+
+_END = b"END-ISO-10303-21"
+_CLASSES = {
+    "IfcWindow": SurfaceClass.WINDOW,
+    "IfcDoor": SurfaceClass.DOOR,
+    "IfcWall": SurfaceClass.WALL,
+    "IfcCurtainWall": SurfaceClass.WALL,
+    "IfcRoof": SurfaceClass.ROOF,
+    **dict.fromkeys(("IfcSite", "IfcGeographicElement", "IfcPavement", "IfcKerb", "IfcCourse"), SurfaceClass.GROUND),
+}
+_PREDEFINED = {
+    ("IfcSlab", "ROOF"): SurfaceClass.ROOF,
+    ("IfcSlab", "BASESLAB"): SurfaceClass.GROUND,
+    ("IfcCovering", "ROOFING"): SurfaceClass.ROOF,
+    ("IfcCovering", "CLADDING"): SurfaceClass.WALL,
+}
+_SEEN = (
+    *("IfcBuildingElement", "IfcBuiltElement", "IfcBuildingElementPart", "IfcElementAssembly", "IfcSite"),
+    *("IfcGeographicElement", "IfcCivilElement"),
+)
+_UNSEEN = {
+    "IfcCovering": ("CEILING", "FLOORING", "SKIRTINGBOARD", "INSULATION", "MEMBRANE", "SLEEVING", "WRAPPING"),
+    "IfcBuildingElementProxy": ("PROVISIONFORVOID", "PROVISIONFORSPACE"),
+    "IfcGeographicElement": ("VEGETATION", "SOIL_BORING_POINT"),
+}
+_GLASS = 0.3
+"""Transparency from which a part of anything but a door is a window: the glazing of a curtain wall, for example."""
+
+
+_PROJECTION = 0.01
+"""Largest difference of a map's scale from 1."""
+_FOOT = 0.3048
+
+
+def read_ifc(path: Path) -> Geometry:
+    """Read walls, windows, doors, roofs, slabs, stairs, railings, terrain and the like, with their openings cut.
+
+    Spaces, openings, furniture, installations and what is only inside are left out, with a notice.
+
+    Raises:
+        SceneError: ifcopenshell is not installed, or nothing is seen of the building.
+        Exception: the file is damaged; of any kind.
+    """
+    import_extra("ifcopenshell", "ifcopenshell", "bim", f"the shell {path}")
+    import ifcopenshell
+    import ifcopenshell.geom
+    import ifcopenshell.util.element
+
+    if path.suffix.lower() == ".ifc" and _END not in path.read_bytes()[-1000:]:
+        raise ValueError("it does not end as an IFC does")
+    ifcopenshell.get_log()  # which empties it
+    model: Any = ifcopenshell.open(str(path))
+    products = [each for each in model.by_type("IfcProduct") if each.Representation]
+    classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
+    say_left_out(path, Counter(each.is_a() for each in products if classes[each.id()] is None))
+    seen = [each for each in products if classes[each.id()] is not None]
+    vertices, faces, kinds = [NO_POINTS], [NO_FACES], [NO_CLASSES]
+    count, made = 0, set[int]()
+    for shape in _shapes(ifcopenshell.geom, model, seen):
+        made.add(shape.id)
+        matrix = np.array(shape.transformation.matrix).reshape(4, 4).T
+        points = transformed(np.array(shape.geometry.verts).reshape(-1, 3), matrix)
+        triangles = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
+        vertices.append(points)
+        faces.append(triangles + count)
+        kinds.append(_with_glass(classes[shape.id], shape.geometry, len(triangles)))
+        count += len(points)
+    failed = [each for each in seen if each.id() not in made and _has_body(each)]
+    if failed:
+        notice(
+            f"{path}: the geometry of {len(failed)} of {len(seen)} parts cannot be made, such as {failed[0].is_a()} "
+            f"{failed[0].GlobalId}."
+        )
+    faults = [line for line in ifcopenshell.get_log().splitlines() if line.startswith("[error]")]
+    if faults:
+        first = re.sub(r"\[.*?\] *", "", faults[0])
+        notice(f"{path}: {len(faults)} of its lines or shapes are faulty and may be missing, such as: {first}.")
+    if not count:
+        raise SceneError(f"the shell {path} has no walls, roofs, windows or other outside of a building")
+    return Geometry(
+        _on_the_map(model, np.concatenate(vertices), path),
+        np.concatenate(faces),
+        classes=np.concatenate(kinds),
+        drawn=True,
+    )
+
+
+def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
+    """The triangulated shapes of products, in metres and their placements, with openings cut; valid until the next."""
+    iterator = geom.iterator(geom.settings(), model, 1, include=products) if products else None
+    if iterator is not None and iterator.initialize():
+        yield iterator.get()
+        while iterator.next():
+            yield iterator.get()
+
+
+def _class_of(product: Any, ifcopenshell: ModuleType) -> SurfaceClass | None:
+    """The class of a product, or else of what it is a part of; None for what is not seen from outside."""
+    names = {name for name in (*_SEEN, *_CLASSES, *_UNSEEN, "IfcSlab") if _is(product, name)}
+    if not names & {*_SEEN}:
+        return None
+    predefined = str(ifcopenshell.util.element.get_predefined_type(product) or "").upper()
+    if any(predefined in _UNSEEN[name] for name in names & _UNSEEN.keys()):
+        return None
+    own = [_PREDEFINED[name, predefined] for name in names if (name, predefined) in _PREDEFINED]
+    own += [_CLASSES[name] for name in names & _CLASSES.keys()]
+    if own:
+        return own[0]
+    whole = ifcopenshell.util.element.get_aggregate(product)
+    above = _class_of(whole, ifcopenshell) if whole is not None and _is(whole, "IfcElement") else None
+    return above or SurfaceClass.OTHER
+
+
+def _is(product: Any, name: str) -> bool:
+    """Whether a product is of a class, which not every version knows."""
+    try:
+        return bool(product.is_a(name))
+    except RuntimeError:
+        return False
+
+
+def _with_glass(own: SurfaceClass | None, shape: Any, count: int) -> UInt8[np.ndarray, " F"]:
+    """Classes of a shape's triangles: panes of whatever is no door are windows."""
+    classes = np.full(count, own, np.uint8)
+    glass = np.array([material.transparency >= _GLASS for material in shape.materials], bool)
+    styles = np.array(shape.material_ids, np.int64)
+    if own != SurfaceClass.DOOR and len(styles) == count and len(glass):
+        classes[(styles >= 0) & glass[styles]] = SurfaceClass.WINDOW
+    return classes
+
+
+def _has_body(product: Any) -> bool:
+    """Whether a product has a solid or a surface, and not only an axis, a footprint, or a box around it."""
+    kinds = {each.RepresentationIdentifier for each in product.Representation.Representations if each.Items}
+    return bool(kinds & {"Body", "Facetation", "Surface"})
+
+
+def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> Float64[np.ndarray, "N 3"]:
+    """Points in the coordinates of the model's map, in metres; as they are, if it has no map conversion.
+
+    Args:
+        model: the model.
+        points: positions in metres, in the model's coordinates.
+        path: the file, for what is said of its units.
+
+    Raises:
+        SceneError: the conversion scales the building.
+    """
+    import ifcopenshell.util.geolocation
+    import ifcopenshell.util.unit
+
+    if ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT") is None:
+        notice(f"{path}: it names no unit of length: its numbers are taken for metres.")
+    known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
+    if known is None:
+        return points
+    unit = ifcopenshell.util.unit.calculate_unit_scale(model)
+    named = (ifcopenshell.util.geolocation.get_crs(model) or {}).get("MapUnit")
+    if named is None:
+        metres = unit / known.scale
+    elif isinstance(named, str):  # in a property set of IFC 2x3
+        metres = _FOOT if "FOOT" in named.upper() or "FEET" in named.upper() else 1.0
+    else:
+        metres = ifcopenshell.util.unit.get_unit_scale(named)
+    scale = known.scale * metres / unit  # near 1: the scale of the map's projection
+    if abs(scale - 1) > _PROJECTION and known.scale == 1:
+        notice(
+            f"{path}: its map conversion leaves out the scale of {unit / metres:g} between its units: it is applied."
+        )
+        scale = 1.0
+    if abs(scale - 1) > _PROJECTION:
+        raise SceneError(
+            f"the shell {path} is scaled by {scale:g} in its map conversion: correct its Scale, which should be "
+            f"{unit / metres:g} for units of {unit:g} m and a map in {metres:g} m"
+        )
+    origin = ifcopenshell.util.geolocation.get_wcs(model)
+    if origin is not None:
+        points = transformed(points, np.linalg.inv(origin * np.array([[1, 1, 1, unit]] * 3 + [[1, 1, 1, 1]])))
+    x, y = np.array([known.xaa, known.xao]) / np.hypot(known.xaa, known.xao)
+    turn = np.array([[x, -y, 0], [y, x, 0], [0, 0, 1]])
+    factors = scale * np.array([known.factor_x, known.factor_y, known.factor_z])
+    return (points * factors) @ turn.T + metres * np.array([known.e, known.n, known.h])

@@ -1,0 +1,66 @@
+"""Hashes of files, which are kept for large ones."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from shellgs_method.files import atomic
+
+
+@pytest.fixture
+def scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that counts as large and as unchanged for long."""
+    monkeypatch.setenv("SHELLGS_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(atomic, "_LARGE", 0)
+    monkeypatch.setattr(atomic, "_SETTLED", -1e18)
+    (tmp_path / "scan.laz").write_bytes(b"points")
+    return tmp_path / "scan.laz"
+
+
+def unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atomic, "_hashed", lambda path: pytest.fail(f"{path} is read"))
+
+
+def test_a_large_file_is_hashed_once(scan: Path, monkeypatch: pytest.MonkeyPatch):
+    expected = hashlib.sha256(b"points").hexdigest()
+    assert atomic.content_hash(scan) == expected
+    unread(monkeypatch)
+    assert atomic.content_hash(scan) == expected
+
+
+@pytest.mark.parametrize("keep_times", [False, True])
+def test_a_changed_file_is_hashed_again(scan: Path, keep_times: bool):
+    before, stat = atomic.content_hash(scan), scan.stat()
+    scan.write_bytes(b"Points")  # as long as before
+    if keep_times:
+        os.utime(scan, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert atomic.content_hash(scan) == hashlib.sha256(b"Points").hexdigest() != before
+
+
+def test_a_touched_file_is_hashed_again(scan: Path, monkeypatch: pytest.MonkeyPatch):
+    expected = atomic.content_hash(scan)
+    os.utime(scan, (1, 1))
+    read: list[Path] = []
+    monkeypatch.setattr(atomic, "_hashed", lambda path: read.append(path) or expected)
+    assert atomic.content_hash(scan) == expected
+    assert read == [scan]
+
+
+def test_a_file_just_written_is_hashed_each_time(scan: Path, monkeypatch: pytest.MonkeyPatch):
+    """It may be written again within one step of the file system's clock."""
+    monkeypatch.setattr(atomic, "_SETTLED", 2_000_000_000)
+    atomic.content_hash(scan)
+    assert not list(scan.parent.glob("cache/hashes/*"))
+
+
+@pytest.mark.parametrize("damage", [b"", b"[]", b'{"state": 1}'])
+def test_a_damaged_cache_is_made_again(scan: Path, damage: bytes):
+    expected = atomic.content_hash(scan)
+    (kept,) = scan.parent.glob("cache/hashes/*.json")
+    kept.write_bytes(damage)
+    assert atomic.content_hash(scan) == expected
+    assert expected.encode() in kept.read_bytes()

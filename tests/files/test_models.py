@@ -1,0 +1,476 @@
+"""Building models as shells: every kind of geometry is cast as an independent caster sees its polygons."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import building_models as made
+import numpy as np
+import pytest
+from building_models import NATIONAL, Face, cameras_around, cast_polygons, house, moved
+from scenes import cast
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.errors import SceneError
+from shellgs_method.evaluation.panels import supervision_panel
+from shellgs_method.files.cue_maps import CueMaps
+from shellgs_method.files.photographs import View
+from shellgs_method.files.surfaces import read_geometry
+from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.shell import Alignment, ShellCaster, load_shell
+from shellgs_method.synthetic.frames import UNITS_PER_METRE
+
+PHOTOGRAPH = Path(__file__).parents[2] / "docs/picture.jpg"
+
+
+def assert_cast_as(path: Path, faces: Sequence[Face], views: int = 2) -> None:
+    """Points to a millimetre of their planes, and classes, in all views around the model but at edges of polygons."""
+    mesh = load_shell(path)
+    scene_from_model, cameras = cameras_around(made.bounds(faces), views)
+    caster = ShellCaster(mesh, scene_from_model)
+    kinds = np.array([*(face.kind for face in faces), SurfaceClass.OTHER])
+    there = wrong = 0
+    for scene, model in cameras:
+        cue, seen = caster.cast(scene), cast_polygons(faces, model)
+        hit = seen.face >= 0
+        off = np.abs(cue.depth / UNITS_PER_METRE - np.where(hit, seen.depth, 0)) * seen.facing
+        wrong += int(((hit != cue.mask) | (off > 1e-3) | (cue.classes != kinds[seen.face])).sum())
+        there += int(hit.sum())
+    assert there > 1000
+    assert wrong <= 2e-4 * there  # rays along an edge
+
+
+# CityJSON
+
+
+@pytest.mark.parametrize("kind", ["MultiSurface", "CompositeSurface", "Solid", "MultiSolid", "CompositeSolid"])
+def test_each_geometry_of_a_cityjson_is_cast_to_a_millimetre(tmp_path: Path, kind: str):
+    path = made.save_json(tmp_path / "a.city.json", made.cityjson(house(), kind))
+    assert_cast_as(path, moved(house()))
+
+
+def as_instance(faces: Sequence[Face]) -> dict[str, Any]:
+    """The house as a template, turned by 90 degrees and moved."""
+    document = made.cityjson(faces)
+    (geometry,) = document["CityObjects"]["a"]["geometry"]
+    document["geometry-templates"] = {
+        "templates": [geometry],
+        "vertices-templates": [[coordinate / 1000 for coordinate in vertex] for vertex in document["vertices"]],
+    }
+    matrix = [0, -1, 0, 2, 1, 0, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1]
+    instance = {"type": "GeometryInstance", "template": 0, "boundaries": [0], "transformationMatrix": matrix}
+    document["CityObjects"]["a"]["geometry"] = [instance]
+    document["vertices"] = [[10_000, 20_000, 0]]
+    return document
+
+
+def test_an_instance_of_a_template_is_turned_and_moved(tmp_path: Path):
+    turned = [Face([ring[:, [1, 0, 2]] * [-1, 1, 1] + [2, 0, 0.5] for ring in f.rings], f.surface) for f in house()]
+    expected = moved(turned, NATIONAL + np.array([10, 20, 0]))
+    assert_cast_as(made.save_json(tmp_path / "a.json", as_instance(house())), expected)
+
+
+def test_the_features_of_a_cityjsonseq_have_vertices_of_their_own(tmp_path: Path):
+    other = [Face([ring + np.array([20, 0, 0]) for ring in face.rings], face.surface) for face in house()]
+    first, second = made.cityjson(house()), made.cityjson(other, name="b")
+    header = {**first, "CityObjects": {}, "vertices": []}
+    lines = [
+        header,
+        *({"type": "CityJSONFeature", **{k: d[k] for k in ("CityObjects", "vertices")}} for d in (first, second)),
+    ]
+    (tmp_path / "a.city.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    assert_cast_as(tmp_path / "a.city.jsonl", moved([*house(), *other]))
+
+
+def test_the_highest_level_of_detail_is_read_and_said(tmp_path: Path, caplog):
+    document = made.cityjson(house())
+    low = {"type": "MultiSurface", "lod": "1.2", "boundaries": [[[0, 1, 2]]]}
+    document["CityObjects"]["a"]["geometry"].append(low)
+    read = read_geometry(made.save_json(tmp_path / "a.json", document))
+    assert SurfaceClass.OTHER not in read.classes
+    assert "the highest level of detail of each object is read: LoD 3 of 1" in caplog.text
+
+
+def test_a_whole_is_not_read_beside_its_parts_of_more_detail(tmp_path: Path):
+    document = made.cityjson(house())
+    part = {**document["CityObjects"].pop("a"), "type": "BuildingPart", "parents": ["whole"]}
+    box = {"type": "MultiSurface", "lod": "1", "boundaries": [[[0, 1, 2]]]}
+    document["CityObjects"] |= {"whole": {"type": "Building", "geometry": [box], "children": ["a"]}, "a": part}
+    assert_cast_as(made.save_json(tmp_path / "a.json", document), moved(house()))
+
+
+def test_what_is_no_outside_is_left_out_and_counted(tmp_path: Path, caplog):
+    document = made.cityjson(house())
+    tree = {"type": "MultiSurface", "lod": "3", "boundaries": [[[0, 1, 2]]]}
+    document["CityObjects"] |= {"t": {"type": "SolitaryVegetationObject", "geometry": [tree]}}
+    (geometry,) = document["CityObjects"]["a"]["geometry"]
+    geometry["semantics"]["surfaces"][5]["type"] = "ClosureSurface"  # the glazed window
+    assert_cast_as(made.save_json(tmp_path / "a.json", document), [f for f in moved(house()) if f.surface != "Window"])
+    assert "left out what is no outside of a building: 1 ClosureSurface, 1 SolitaryVegetationObject" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.update(type="FeatureCollection"), "is json, but no CityJSON"),
+        (lambda d: d.update(version="0.9"), "is CityJSON 0.9: upgrade it"),
+        (lambda d: d["vertices"].pop(), "vertex indices outside its"),
+        (lambda d: d["transform"].update(scale=[1e-8, 1e-8, 1e-3], translate=[139.7, 35.6, 0]), "in degrees"),
+        (lambda d: d["CityObjects"]["a"].update(type="Road"), "has no surface of a building"),
+        (lambda d: d["CityObjects"]["a"]["geometry"][0].update(boundaries=3), "may be cut off or damaged"),
+    ],
+)
+def test_a_cityjson_that_cannot_be_used_is_refused(tmp_path: Path, change: Callable, words: str):
+    document = made.cityjson(house())
+    change(document)
+    with pytest.raises(SceneError, match=words):
+        read_geometry(made.save_json(tmp_path / "a.json", document))
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_swapped_axes_are_told_by_roofs_that_face_down(tmp_path: Path, caplog, swapped: bool):
+    axes = [1, 0, 2] if swapped else [0, 1, 2]
+    faces = [Face([ring[:, axes] for ring in face.rings], face.surface) for face in house()]
+    ground = Face([faces[-1].rings[0][::-1]], "GroundSurface")  # as seen from below
+    read_geometry(made.save_json(tmp_path / "a.json", made.cityjson([*faces[:-1], ground])))
+    assert ("northing before easting" in caplog.text) == swapped
+
+
+def test_an_ifc_in_a_zip_and_one_without_a_unit_are_read(tmp_path: Path, caplog):
+    file = made.ifc_house(unit=1.0)
+    file.project.UnitsInContext = None
+    with zipfile.ZipFile(tmp_path / "a.ifczip", "w") as archive:
+        archive.write(file.save(tmp_path / "a.ifc"), "a.ifc")
+    assert_cast_as(tmp_path / "a.ifczip", made.ifc_house_faces())
+    assert "names no unit of length" in caplog.text
+
+
+# CityGML
+
+
+def save(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
+@pytest.mark.parametrize("positions", ["posList", "pos", "coordinates"])
+def test_each_version_of_citygml_is_cast_to_a_millimetre(tmp_path: Path, version: str, positions: str):
+    faces = moved(house())
+    text = made.citygml(made.surfaces_gml(faces, version, positions=positions), version)
+    assert_cast_as(save(tmp_path / "a.gml", text), faces)
+
+
+def test_a_solid_that_links_to_the_surfaces_adds_nothing(tmp_path: Path):
+    faces = moved(house())
+    surfaces = [made.surfaces_gml([face], "2.0", name=f"p{k}") for k, face in enumerate(faces[:-1])]
+    surfaces.append(made.surfaces_gml(faces[-1:], "2.0"))  # which the solid has again, from another corner
+    links = "".join(f'<gml:surfaceMember xlink:href="#p{k}"/>' for k in range(len(faces) - 1))
+    again = made.polygon_gml([np.roll(faces[-1].rings[0], 1, axis=0)])
+    shell = f"<gml:CompositeSurface>{links}<gml:surfaceMember>{again}</gml:surfaceMember></gml:CompositeSurface>"
+    solid = f"<bldg:lod3Solid><gml:Solid><gml:exterior>{shell}</gml:exterior></gml:Solid></bldg:lod3Solid>"
+    read = read_geometry(save(tmp_path / "a.gml", made.citygml(solid + "".join(surfaces))))
+    alone = read_geometry(save(tmp_path / "b.gml", made.citygml("".join(surfaces))))
+    assert SurfaceClass.OTHER not in read.classes
+    assert len(read.faces) == len(alone.faces)
+
+
+def test_a_link_to_nothing_and_one_to_itself_end_in_words(tmp_path: Path, caplog):
+    surfaces = made.surfaces_gml(moved(house()), "2.0")
+    member = '<gml:CompositeSurface gml:id="c"><gml:surfaceMember xlink:href="#{}"/></gml:CompositeSurface>'
+    dangling = f"<bldg:lod3MultiSurface>{member.format('nothing')}</bldg:lod3MultiSurface>"
+    read_geometry(save(tmp_path / "a.gml", made.citygml(surfaces + dangling)))
+    assert "1 link to what is not in the file" in caplog.text
+    with pytest.raises(SceneError, match="its geometry links to itself"):
+        read_geometry(save(tmp_path / "b.gml", made.citygml(surfaces + dangling.replace("#nothing", "#c"))))
+
+
+def test_footprints_are_left_out_whatever_their_dimension(tmp_path: Path, caplog):
+    ring = "<gml:exterior><gml:LinearRing><gml:posList>0 0 1 0 1 1 0 0</gml:posList></gml:LinearRing></gml:exterior>"
+    member = f"<gml:surfaceMember><gml:Polygon>{ring}</gml:Polygon></gml:surfaceMember>"
+    foot = f"<bldg:lod0FootPrint><gml:MultiSurface>{member}</gml:MultiSurface></bldg:lod0FootPrint>"
+    faces = moved(house())
+    assert_cast_as(save(tmp_path / "a.gml", made.citygml(foot + made.surfaces_gml(faces, "2.0"))), faces)
+    assert "1 footprint (LoD 0)" in caplog.text
+
+
+def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplog):
+    faces = moved(house())
+    inside = moved(house(), NATIONAL + np.array([0, 0, -1.0]))
+    room = made.surfaces_gml(inside, "2.0", lod=4).replace("WallSurface", "InteriorWallSurface")
+    body = f"<bldg:interiorRoom><bldg:Room>{room}</bldg:Room></bldg:interiorRoom>"
+    text = made.citygml(made.surfaces_gml(faces, "2.0", lod=4) + body)
+    assert_cast_as(save(tmp_path / "a.gml", text), faces)
+    assert "1 Room" in caplog.text
+
+
+def test_terrain_is_ground(tmp_path: Path):
+    corners = np.array([[0, 0, 0], [40, 0, 1], [40, 30, 2], [0, 30, 0.5]]) + NATIONAL
+    faces = [Face([corners[[0, 1, 2]]], "GroundSurface"), Face([corners[[0, 2, 3]]], "GroundSurface")]
+    patches = "".join(made.polygon_gml(face.rings).replace("gml:Polygon", "gml:Triangle") for face in faces)
+    tin = f"<gml:TriangulatedSurface><gml:trianglePatches>{patches}</gml:trianglePatches></gml:TriangulatedSurface>"
+    relief = f"<dem:TINRelief><dem:lod>2</dem:lod><dem:tin>{tin}</dem:tin></dem:TINRelief>"
+    relief = f"<dem:reliefComponent>{relief}</dem:reliefComponent>"
+    assert_cast_as(save(tmp_path / "a.gml", made.citygml(relief, kind="dem:ReliefFeature")), faces)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_implicit_geometry_is_placed_or_counted(tmp_path: Path, caplog, elsewhere: bool):
+    faces = [face for face in house() if face.surface == "WallSurface"]
+    here = f"<core:relativeGMLGeometry>{made.multi_surface(faces)}</core:relativeGMLGeometry>"
+    template = "<core:libraryObject>balcony.obj</core:libraryObject>" if elsewhere else here
+    matrix = "<core:transformationMatrix>0 -2 0 2 1 0 0 0 0 0 1 0.5 0 0 0 1</core:transformationMatrix>"
+    at = " ".join(map(repr, NATIONAL.tolist()))
+    point = f"<core:referencePoint><gml:Point><gml:pos>{at}</gml:pos></gml:Point></core:referencePoint>"
+    implicit = f"<core:ImplicitGeometry>{matrix}{template}{point}</core:ImplicitGeometry>"
+    part = f"<bldg:lod3ImplicitRepresentation>{implicit}</bldg:lod3ImplicitRepresentation>"
+    installation = f"<bldg:BuildingInstallation>{part}</bldg:BuildingInstallation>"
+    body = f"<bldg:outerBuildingInstallation>{installation}</bldg:outerBuildingInstallation>"
+    beside = made.surfaces_gml(moved(house(), NATIONAL + np.array([30, 0, 0])), "2.0")
+    read = read_geometry(save(tmp_path / "a.gml", made.citygml(body + beside)))
+    installed = read.vertices[read.faces[read.classes == SurfaceClass.OTHER]].reshape(-1, 3)
+    if elsewhere:
+        assert len(installed) == 0
+        assert "1 implicit geometry in another file" in caplog.text
+    else:
+        np.testing.assert_allclose(installed.min(0), NATIONAL + np.array([2 - 2 * 4, 0, 0.5]))
+        np.testing.assert_allclose(installed.max(0), NATIONAL + np.array([2, 6, 3.5]))
+
+
+BOMB = '<!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: text[: len(text) // 2], "may be cut off or damaged"),
+        (lambda text: BOMB + text, "it declares a document type"),
+        (lambda text: text.replace("CityModel", "FeatureCollection"), "is XML, but no CityGML"),
+        (lambda text: text.replace("410000.0 ", "", 1), "no positions of 3 coordinates"),
+        (lambda text: text.replace("bldg:Building", "veg:PlantCover"), "has no surface of a building"),
+    ],
+)
+def test_a_citygml_that_cannot_be_used_is_refused(tmp_path: Path, change: Callable, words: str):
+    text = made.citygml(made.surfaces_gml(moved(house()), "2.0"))
+    with pytest.raises(SceneError, match=words):
+        read_geometry(save(tmp_path / "a.gml", change(text)))
+
+
+def test_curved_polygons_are_counted(tmp_path: Path, caplog):
+    arc = "<gml:Arc><gml:posList>0 0 0 1 1 0 2 0 0</gml:posList></gml:Arc>"
+    for name in ("segments", "Curve", "curveMember", "Ring", "exterior", "Polygon", "surfaceMember", "MultiSurface"):
+        arc = f"<gml:{name}>{arc}</gml:{name}>"
+    surface = f"<bldg:lod3MultiSurface>{arc}</bldg:lod3MultiSurface>"
+    faces = moved(house())
+    assert_cast_as(save(tmp_path / "a.gml", made.citygml(made.surfaces_gml(faces, "2.0") + surface)), faces)
+    assert "1 polygon with curved sides" in caplog.text
+
+
+def test_a_window_drawn_on_a_wall_is_a_window(tmp_path: Path):
+    wall = Face([made.rectangle((0, 6), (0, 0), (0, 3))], "WallSurface")
+    window = Face([made.rectangle((1, 2), (0, 0), (1, 2))], "Window")
+    path = made.save_json(tmp_path / "a.json", made.cityjson([wall, window]))
+    holed = Face([*wall.rings, *window.rings], "WallSurface")
+    assert_cast_as(path, moved([holed, window]), views=6)
+
+
+# IFC
+
+
+def turned(faces: Sequence[Face], degrees: float, shift: np.ndarray) -> list[Face]:
+    turn = Rotation.from_euler("z", degrees, degrees=True)
+    return [Face([turn.apply(ring) + shift for ring in face.rings], face.surface) for face in faces]
+
+
+@pytest.mark.parametrize("schema", ["IFC2X3", "IFC4", "IFC4X3"])
+@pytest.mark.parametrize("unit", [1.0, 0.001, 0.3048])
+def test_an_ifc_is_cast_to_a_millimetre_with_its_openings_as_they_are(tmp_path: Path, caplog, schema: str, unit: float):
+    path = made.ifc_house(schema=schema, unit=unit, site=NATIONAL).save(tmp_path / "a.ifc")
+    assert_cast_as(path, moved(made.ifc_house_faces()))
+    assert "1 IfcFurnishingElement, 3 IfcOpeningElement, 1 IfcSpace" in caplog.text
+
+
+SCALES = [(0.001, 0.001, None), (0.001, 0.001, 1.0), (1.0, 1.0, None), (0.001, 1.0, 1.0), (1.0, 0.9996, 1.0)]
+
+
+@pytest.mark.parametrize(("unit", "scale", "map_unit"), SCALES)
+def test_the_map_conversion_of_an_ifc_is_applied(
+    tmp_path: Path, caplog, unit: float, scale: float, map_unit: float | None
+):
+    file = made.ifc_house(unit=unit)
+    crs = file.add("IfcProjectedCRS", "EPSG:25832")
+    if map_unit:
+        crs.MapUnit = file.add("IfcSIUnit", UnitType="LENGTHUNIT", Name="METRE")
+    x, y = np.cos(np.radians(30)), np.sin(np.radians(30))
+    file.add("IfcMapConversion", file.context, crs, *NATIONAL.tolist(), x, y, scale)
+    shrunk = scale if unit == 1 else 1
+    faces = [Face([ring * shrunk for ring in face.rings], face.surface) for face in made.ifc_house_faces()]
+    assert_cast_as(file.save(tmp_path / "a.ifc"), turned(faces, 30, NATIONAL))
+    assert ("leaves out the scale" in caplog.text) == (unit != 1 and scale == 1)
+
+
+def test_the_map_conversion_of_an_ifc_2x3_is_in_property_sets(tmp_path: Path):
+    file = made.ifc_house(schema="IFC2X3", unit=1.0)
+    values = {"Eastings": NATIONAL[0], "Northings": NATIONAL[1], "OrthogonalHeight": NATIONAL[2]}
+    properties = [
+        file.add("IfcPropertySingleValue", name, None, file.add("IfcReal", float(value)))
+        for name, value in values.items()
+    ]
+    owned = file.add("IfcPropertySet", file.new(), None, "ePSet_MapConversion", None, properties)
+    file.add("IfcRelDefinesByProperties", file.new(), None, None, None, [file.project], owned)
+    assert_cast_as(file.save(tmp_path / "a.ifc"), moved(made.ifc_house_faces()))
+
+
+def test_a_map_conversion_that_scales_the_building_is_refused(tmp_path: Path):
+    file = made.ifc_house(unit=1.0)
+    crs = file.add("IfcProjectedCRS", "EPSG:25832", MapUnit=file.add("IfcSIUnit", UnitType="LENGTHUNIT", Name="METRE"))
+    file.add("IfcMapConversion", file.context, crs, *NATIONAL.tolist(), 1.0, 0.0, 0.5)
+    with pytest.raises(
+        SceneError, match=r"is scaled by 0.5 in its map conversion: correct its Scale, which should be 1"
+    ):
+        read_geometry(file.save(tmp_path / "a.ifc"))
+
+
+def test_parts_are_of_the_class_of_their_whole_and_their_glass_is_window(tmp_path: Path):
+    file = made.Ifc()
+    roof = file.add("IfcRoof", file.new(), ObjectPlacement=file.place((0, 0, 0)))
+    file.aggregate(roof, file.block("IfcPlate", (0, 0, 3), (6, 4, 3.1)))
+    curtain = file.add("IfcCurtainWall", file.new(), ObjectPlacement=file.place((0, 0, 0)))
+    file.aggregate(
+        curtain,
+        file.block("IfcMember", (0, 0, 0), (0.1, 0.1, 3)),
+        file.block("IfcPlate", (0.1, 0, 0), (6, 0.05, 3), glass=True),
+    )
+    file.block("IfcRailing", (0, -1, 0), (6, -0.9, 1))
+    file.block("IfcDoor", (7, 0, 0), (8, 0.1, 2), glass=True)
+    read = read_geometry(file.save(tmp_path / "a.ifc"))
+    kinds = (SurfaceClass.ROOF, SurfaceClass.WALL, SurfaceClass.WINDOW, SurfaceClass.OTHER, SurfaceClass.DOOR)
+    assert [int((read.classes == kind).sum()) for kind in kinds] == [12] * 5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: text[: len(text) // 2], "does not end as an IFC does"),
+        (lambda text: "no step\n" + text[-200:], "may be cut off or damaged"),
+        (lambda text: re.sub("IFC(WALL|WINDOW|DOOR|SLAB)\\(", "IFCFURNISHINGELEMENT(", text), "has no walls, roofs"),
+    ],
+)
+def test_an_ifc_that_cannot_be_used_is_refused(tmp_path: Path, change: Callable, words: str):
+    path = made.ifc_house().save(tmp_path / "a.ifc")
+    path.write_text(change(path.read_text()))
+    with pytest.raises(SceneError, match=words):
+        read_geometry(path)
+
+
+def test_faults_of_an_ifc_are_said(tmp_path: Path, caplog):
+    path = made.ifc_house().save(tmp_path / "a.ifc")
+    read_geometry(path)
+    assert "faulty" not in caplog.text
+    text = path.read_text()
+    wall = re.search(r"=IFCWALL\(.*?,(#\d+),(#\d+),", text)
+    assert wall
+    path.write_text(text.replace(f"{wall[2]}=", "#9999="))  # the shape that the wall refers to
+    assert SurfaceClass.WALL not in read_geometry(path).classes
+    assert (
+        f"1 of its lines or shapes are faulty and may be missing, such as: Instance reference {wall[2]}" in caplog.text
+    )
+
+
+# All the way
+
+
+def test_the_classes_of_a_model_reach_its_maps_and_the_panel(tmp_path: Path):
+    faces = moved(house())
+    (tmp_path / "shell").mkdir()
+    made.save_json(tmp_path / "shell" / "a.json", made.cityjson(house()))
+    scene_from_model, cameras = cameras_around(made.bounds(faces), 2)
+    views = [View(f"images/{k}.jpg", PHOTOGRAPH, placed.scene) for k, placed in enumerate(cameras)]
+    cast(tmp_path, views, Alignment(scene_from_model, "shell/a.json"))
+    cue = CueMaps.open(tmp_path, "shell").require(views[0].name, views[0].camera)
+    expected = ShellCaster(load_shell(tmp_path / "shell" / "a.json"), scene_from_model).cast(views[0].camera)
+    assert cue.classes is not None
+    assert expected.classes is not None
+    np.testing.assert_array_equal(cue.classes, expected.classes)
+    figure = supervision_panel(np.zeros((48, 64, 3), np.uint8), cue)
+    legend = figure.axes[4].get_legend()
+    assert legend is not None
+    assert {"wall", "window"} <= {text.get_text() for text in legend.get_texts()}
+
+
+# Models as people have them
+
+MODELS = Path(os.environ.get("SHELLGS_DATA", Path(__file__).parents[3] / "shared" / "data")) / "models"
+
+
+def faces_of_cityjson(path: Path) -> list[Face]:
+    document = json.loads(path.read_text())
+    scale, origin = (np.array(document["transform"][name]) for name in ("scale", "translate"))
+    vertices = np.array(document["vertices"]) * scale + origin
+    return [
+        Face([vertices[ring] for ring in polygon], geometry["semantics"]["surfaces"][value]["type"])
+        for each in document["CityObjects"].values()
+        for geometry in each["geometry"]
+        for polygon, value in zip(geometry["boundaries"], geometry["semantics"]["values"], strict=True)
+    ]
+
+
+def faces_of_citygml(path: Path) -> list[Face]:
+    found: list[Face] = []
+
+    def walk(element: ElementTree.Element, surface: str) -> None:
+        name = element.tag.rpartition("}")[2]
+        if re.fullmatch("(Wall|Roof|Ground)Surface|Window|Door", name):
+            surface = name
+        if name in ("Polygon", "Triangle"):
+            rings = [
+                np.array(each.text.split(), float).reshape(-1, 3)[:-1]
+                for each in element.iter()
+                if each.tag.endswith("posList") and each.text
+            ]
+            found.append(Face(rings, surface))
+        for child in element:
+            walk(child, surface)
+
+    walk(ElementTree.parse(path).getroot(), "GroundSurface")
+    return found
+
+
+def faces_of_ifc(path: Path) -> list[Face]:
+    """Triangles of its outside, each product by itself, in world coordinates."""
+    import ifcopenshell.geom
+
+    model: Any = ifcopenshell.open(str(path))
+    settings: Any = ifcopenshell.geom.settings()
+    settings.set("use-world-coords", True)
+    kinds = {"IfcWall": "WallSurface", "IfcPlate": "Window", "IfcMember": "WallSurface", "IfcWindow": "Window"}
+    kinds |= {"IfcDoor": "Door", "IfcSlab": "OtherSurface", "IfcRoof": "RoofSurface"}
+    faces = []
+    for kind, surface in kinds.items():
+        for product in model.by_type(kind):
+            shape: Any = ifcopenshell.geom.create_shape(settings, product)
+            corners = np.array(shape.geometry.verts).reshape(-1, 3)[np.array(shape.geometry.faces).reshape(-1, 3)]
+            faces += [Face([triangle], surface) for triangle in corners]
+    return faces
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not MODELS.is_dir(), reason=f"no models in {MODELS}; set SHELLGS_DATA")
+@pytest.mark.parametrize(
+    ("name", "faces_of", "views"),
+    [
+        ("rotterdam_subset.json", faces_of_cityjson, 8),
+        ("Building_LOD3-EPSG25832.gml", faces_of_citygml, 8),
+        ("Ifc4_SampleHouse.ifc", faces_of_ifc, 2),
+    ],
+)
+def test_models_of_others_are_cast_to_a_millimetre(name: str, faces_of: Callable, views: int):
+    faces = [face for face in faces_of(MODELS / name) if len(face.rings[0]) > 2]
+    assert_cast_as(MODELS / name, faces, views)
