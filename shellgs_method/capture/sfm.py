@@ -28,11 +28,17 @@ _CALIBRATED = "SIMPLE_PINHOLE"  # model of cameras whose focal length is known, 
 _BRIDGES = 16  # views of a model that are matched with those of another, if there are two
 _MIN_JOINING = 30  # matches of points that join two models
 _RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
-_MIN_OPENCV = 10  # photographs needed to calibrate OPENCV's four distortion coefficients
+_MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 
 
 def extract(
-    database: str, photographs: str, lenses: list[dict], rigs: list[list[dict]], masks: str | None, sift: dict
+    database: str,
+    photographs: str,
+    lenses: list[dict],
+    rigs: list[list[dict]],
+    masks: str | None,
+    sift: dict,
+    camera_model: str,
 ) -> None:
     """Extract features of all photographs that have none yet; each lens is one camera.
 
@@ -45,13 +51,15 @@ def extract(
         masks: folder of masks, ``<name>.png``, black where no features are wanted.
         sift: maximum image size, number of features, and first octave for photographs of 1000 pixels and more: 0 skips
             the doubled image, which smaller photographs need.
+        camera_model: COLMAP's name of the model of lenses with enough photographs to calibrate it.
     """
     for lens in lenses:
         options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
         options.sift.max_num_features = sift["max_num_features"]
         options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= 1000 else -1
         reader = pycolmap.ImageReaderOptions(
-            camera_model="OPENCV" if len(lens["names"]) >= _MIN_OPENCV else "SIMPLE_RADIAL", mask_path=masks or ""
+            camera_model=camera_model if len(lens["names"]) >= _MIN_CALIBRATED else "SIMPLE_RADIAL",
+            mask_path=masks or "",
         )
         if lens["focal"]:
             width, height = lens["size"]

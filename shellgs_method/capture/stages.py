@@ -237,6 +237,7 @@ class _Capture:
             rigs=[face_rig()] if faces else [],
             masks=str(self.work.folder / "masks") if self.masked else None,
             sift=_SIFT[self.config.quality],
+            camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
         )
         _tidy(database)
         return database
