@@ -13,7 +13,7 @@ GRID = 64
 """Cells along either side of a photograph, whose mean colours are compared, smoothed over 3 x 3 of them."""
 NEIGHBOURS = 16
 """Nearest photographs that one is compared with."""
-FACTOR, FLOOR = 2.0, 0.03
+FACTOR, FLOOR = 2.0, 0.05
 """A cell's residual is an outlier above FACTOR · (FLOOR + the others' residual), of colours in [0, 1]."""
 HIDDEN = 1.1
 """Depth of a point, relative to what is rendered of another view there, above which it is hidden from it."""
