@@ -24,6 +24,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.measure import measure
 from shellgs_method.files.atomic import unfinished
 from shellgs_method.files.photographs import read_image
+from shellgs_method.files.transfer import linear_of, srgb
 from shellgs_method.synthetic.appearance import developed, exposed
 from shellgs_method.synthetic.scene import Facade, FacadeConfig, _generators, settings_of
 
@@ -119,10 +120,8 @@ def write_in_changing_light(scene: Path, target: Path) -> None:
 
 def _changed(image: ndarray, gain: Float64[ndarray, " 3"]) -> ndarray:
     """A photograph under a gain before its sRGB curve, clipping and 8 bits."""
-    x = image / 255
-    linear = gain * np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-    stored = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clip(0) ** (1 / 2.4) - 0.055)
-    return (255 * stored.clip(0, 1)).round().astype(np.uint8)
+    stored = srgb((gain * linear_of(image / 255)).clip(0, 1))
+    return (255 * stored).round().astype(np.uint8)
 
 
 def _metrics(

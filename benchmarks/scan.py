@@ -90,7 +90,7 @@ def write_laz(path: Path, points: int) -> None:
     import laspy
 
     header = laspy.LasHeader(point_format=3, version="1.4")
-    header.offsets, header.scales = ORIGIN, [1e-3] * 3
+    header.offsets, header.scales = ORIGIN, np.full(3, 1e-3)
     with laspy.open(path, mode="w", header=header) as file:
         for places, grey in street(points):
             record = laspy.ScaleAwarePointRecord.zeros(len(places), header=header)

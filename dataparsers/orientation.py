@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import Image
 
 from shellgs_method.errors import notice
+from shellgs_method.files.exif import orientation_of
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
 from shellgs_method.geometry.camera import image_up, in_view
@@ -72,11 +73,9 @@ def _orientation(photograph: Path) -> int:
 
 @cache
 def _orientation_of(photograph: Path, _changed: int) -> int:
-    """EXIF orientation, by the header; 1, upright, where there is none or the file is damaged."""
+    """EXIF orientation, by the header; 1, upright, where the file is damaged."""
     with suppress(Exception), Image.open(photograph) as image:
-        if image.format != "PNG" or "exif" in image.info:  # else a PNG would be decoded to look behind its pixels
-            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-            return orientation if orientation in range(1, 9) else 1
+        return orientation_of(image)
     return 1
 
 

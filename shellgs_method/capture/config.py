@@ -9,7 +9,8 @@ from typing import Literal, Optional
 from shellgs_method.errors import SceneError
 
 Matching = Literal["auto", "sequential", "exhaustive"]
-Cameras = Literal["auto", "single", "folder", "image"]
+Cameras = Literal["auto", "single", "folder", "rig", "image"]
+CameraType = Literal["auto", "perspective", "equirectangular"]
 
 LEAST_SHARE, LEAST_REGISTERED = 0.6, 3
 """Smallest share and number of photographs that must be registered."""
@@ -29,8 +30,12 @@ class CaptureConfig:
     """Number of next photographs to match each with, and of others that see the same, if sequential. Reduce it if
     identical windows are confused."""
     cameras: Cameras = "auto"
-    """Photographs that share a camera: all (single), those of a folder, or none (image). If auto: those with the same
-    size, lens and zoom."""
+    """Photographs that share a camera: all (single), those of a folder, those of a folder whose camera is mounted with
+    those of the others, which took the photographs of the same name at once (rig), or none (image). If auto: those with
+    the same size, lens and zoom."""
+    camera_type: CameraType = "auto"
+    """Photographs are ordinary ones (perspective), or panoramas of 360° cameras (equirectangular), which are cut into
+    ordinary ones. If auto: panoramas are those that say so in their metadata, or else go around by their pixels."""
     quality: Literal["fast", "high"] = "fast"
     """Image size for features: 1600 pixels (fast), or 3200 and the doubled image (high), several times slower."""
     masks: Optional[Path] = None

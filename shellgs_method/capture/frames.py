@@ -17,16 +17,17 @@ from PIL import Image
 from rich.progress import Progress
 from scipy.ndimage import laplace, median_filter, uniform_filter1d
 
-from shellgs_method.capture.hdr import Transfer, tone_mapped
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.transfer import HDR, Transfer, tone_mapped
 
 FRAMES_PER_SECOND = 5
 """Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
 STEP = 0.05
 """Motion of the picture from one frame to the next, in widths: ten frames on, half of the picture is still in view."""
+PANORAMAS_PER_SECOND = 2
+"""Rate of 360° videos: at walking pace 70 cm, as they see far to the sides."""
 
 _PICTURES = Disposition.attached_pic | Disposition.timed_thumbnails | Disposition.still_image
-_HDR: dict[int, Transfer] = {16: "PQ", 18: "HLG"}  # transfer characteristics (ITU-T H.273)
 _NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
 _SMALL = 128  # pixels, the width at which motion is measured
 _PACE = 0.2  # seconds between the frames that motion is measured between: pixels, not fractions of one
@@ -42,7 +43,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         SceneError: the file cannot be read as a video, or holds no frame.
     """
     with _opened(video) as (container, stream):
-        transfer = _hdr(video, stream)
+        transfer, is_around = _hdr(video, stream), stream.width == 2 * stream.height
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         sharpnesses, times, marks, shifts, before = [], [], [], [], None
         for frame in container.decode(stream):
@@ -60,6 +61,8 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
             raise SceneError(f"{video} holds no frames: is it a complete video?")
     since = np.array(times) - min(times)
     moved = np.interp(times, marks, travelled(np.array(shifts)))
+    if is_around:  # the picture of a panorama moves to all sides at once
+        moved = PANORAMAS_PER_SECOND * STEP * since
     chosen = sharpest(np.array(sharpnesses), *stretches(moved, since, count))
     task = progress.add_task("keeping the sharpest", total=len(chosen))
     with _opened(video) as (container, stream):
@@ -68,6 +71,12 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
                 image = _upright(frame, transfer)
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
                 progress.advance(task)
+
+
+def first_frame(video: Path) -> av.VideoFrame | None:
+    """The first frame of a video, if it has one."""
+    with _opened(video) as (container, stream):
+        return next(container.decode(stream), None)
 
 
 def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
@@ -162,7 +171,7 @@ def _main_stream(video: Path, streams: Sequence[VideoStream]) -> VideoStream:
 
 
 def _hdr(video: Path, stream: VideoStream) -> Transfer | None:
-    transfer = _HDR.get(stream.codec_context.color_trc)
+    transfer = HDR.get(stream.codec_context.color_trc)
     if transfer:
         notice(
             f"{video} is HDR ({transfer}), and its frames are tone-mapped to the colours of a photograph: bright walls "

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
@@ -16,6 +17,7 @@ from PIL import ExifTags, Image, ImageOps
 from shellgs_method.capture.config import Cameras
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.paths import (
     CAPTURED,
     DEVELOP,
@@ -27,7 +29,7 @@ from shellgs_method.files.paths import (
     tell_of_masks,
 )
 
-VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv"}
+VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
 """Suffixes of videos, in lower case."""
 _LENS_TAGS = (
     ExifTags.Base.Make,
@@ -87,10 +89,10 @@ def add_photograph(source: Path, target: Path) -> None:
     image = read_image(source)
     with Image.open(source) as stored:
         is_plain = stored.mode in ("L", "RGB") and not stored.has_transparency_data
-        is_usable = stored.format == wanted and is_plain and _orientation(stored) == 1
+        is_usable = stored.format == wanted and is_plain and orientation_of(image) == 1
     if not is_usable:
         upright = ImageOps.exif_transpose(without_hidden(image)).convert("RGB")
-        upright.save(target, wanted, quality=95, subsampling=0, exif=upright.getexif())
+        upright.save(target, wanted, quality=95, subsampling=0, exif=exif_of(upright))
         return
     try:
         os.link(source.resolve(), target)
@@ -104,12 +106,12 @@ def keep_exposure(source: Path, undistorted: Path) -> None:
     COLMAP's undistortion keeps the last one alone.
     """
     with Image.open(source) as stored:
-        known = stored.getexif().get_ifd(ExifTags.IFD.Exif)
-    exposure = {tag: known[tag] for tag in _EXPOSURE_TAGS if tag in known}
+        known = tags_of(stored)
+    exposure: dict[int, Any] = {tag: known[tag] for tag in _EXPOSURE_TAGS if tag in known}
     if not exposure:
         return
     with Image.open(undistorted) as image:
-        exif, is_jpeg = image.getexif(), image.format == "JPEG"
+        exif, is_jpeg = exif_of(image), image.format == "JPEG"
     exif.get_ifd(ExifTags.IFD.Exif).update(exposure)
     content, segment = undistorted.read_bytes(), exif.tobytes()
     with atomic_write(undistorted) as file:
@@ -156,7 +158,7 @@ def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) ->
     from shellgs_method.files.photographs import read_image, read_mask
 
     with Image.open(source) as stored, Image.open(photograph) as upright:
-        stored_size, upright_size, exif = stored.size, upright.size, stored.getexif()
+        stored_size, upright_size, exif = stored.size, upright.size, exif_of(stored)
         transparent = stored.has_transparency_data
     kept = np.ones(upright_size[::-1], bool)
     if mask is not None:
@@ -208,10 +210,12 @@ class Lens:
     Attributes:
         size: width and height in pixels.
         names: names of the photographs.
+        focal: focal length in pixels of a pinhole camera with its centre in the middle; None if it is to be calibrated.
     """
 
     size: tuple[int, int]
     names: list[str]
+    focal: float | None = None
 
 
 def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[Lens]:
@@ -223,12 +227,12 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
     groups: dict[tuple, Lens] = {}
     for name in names:
         with Image.open(folder / name) as image:
-            size, exif = image.size, image.getexif()
-        tags = dict(exif) | exif.get_ifd(ExifTags.IFD.Exif)
+            size, tags = image.size, tags_of(image)
         key = {
             "auto": (size, *(str(tags.get(tag)) for tag in _LENS_TAGS)),
             "single": (),
             "folder": (name.rpartition("/")[0],),
+            "rig": (name.partition("/")[0],),
             "image": (name,),
         }[cameras]
         lens = groups.setdefault(key, Lens(size, []))
@@ -239,7 +243,3 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
             )
         lens.names.append(name)
     return list(groups.values())
-
-
-def _orientation(image: Image.Image) -> int:
-    return image.getexif().get(ExifTags.Base.Orientation, 1)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
 from shellgs_method.capture.pairs import Pair, choose_matching, image_pairs
+from shellgs_method.capture.panoramas import (
+    FACES,
+    add_faces,
+    add_mask_faces,
+    face_lenses,
+    face_pairs,
+    face_rig,
+    face_size,
+    find_panoramas,
+    is_face,
+    says_panorama,
+    video_says_panorama,
+)
 from shellgs_method.capture.photographs import (
     add_mask,
     add_photograph,
@@ -28,6 +42,7 @@ from shellgs_method.capture.photographs import (
     keep_exposure,
 )
 from shellgs_method.capture.process import run_step
+from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
 from shellgs_method.capture.work import Work, listing
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
@@ -121,7 +136,8 @@ class _Capture:
         self.transparent = [] if self.is_video else [n for n, path in self.photographs.items() if has_alpha(path)]
         self.masked = [name for name in self.photographs if name in self.masks or name in self.transparent]
         # Keys of all that each stage depends on; a stage depends on all earlier ones.
-        self.photographs_key = fingerprint(listing(self.photographs), config.frames if self.is_video else None)
+        frames = config.frames if self.is_video else None
+        self.photographs_key = fingerprint(listing(self.photographs), frames, config.camera_type)
         alpha = [self.transparent] if self.transparent else []
         self.masks_key = fingerprint(self.photographs_key, listing(self.masks), *alpha)
         self.features_key = fingerprint(self.masks_key, config.cameras, config.quality)
@@ -151,6 +167,7 @@ class _Capture:
 
     def _photographs(self) -> None:
         if not self.work.has("photographs", self.photographs_key):
+            said = self._said_to_be_panoramas()
             with self.work.making("photographs", self.photographs_key) as folder:
                 if self.is_video:
                     from shellgs_method.capture.frames import extract_frames
@@ -159,19 +176,56 @@ class _Capture:
                 else:
                     for name, path in self.progress.track(self.photographs.items(), description="reading photographs"):
                         add_photograph(path, folder / name)
+                self._cut_panoramas(folder, said)
         self.folder = self.work.folder / "photographs"
-        self.names = sorted(p.relative_to(self.folder).as_posix() for p in self.folder.rglob("*") if p.is_file())
+        self.names = _files(self.folder)
         if len(self.names) < LEAST_REGISTERED:
             raise SceneError(f"a scene needs at least {LEAST_REGISTERED} photographs, not {len(self.names)}")
         if self.masked and not self.work.has("masks", self.masks_key):
             with self.work.making("masks", self.masks_key) as folder:
                 for name in self.progress.track(self.masked, description="reading masks"):
-                    add_mask(self.masks.get(name), self.photographs[name], self.folder / name, folder / f"{name}.png")
+                    source, target = self.photographs[name], folder / f"{name}.png"
+                    is_whole = (self.folder / name).exists()
+                    add_mask(self.masks.get(name), source, self.folder / name if is_whole else source, target)
+                    if not is_whole:
+                        add_mask_faces(target, folder, name, self.folder)
+
+    def _said_to_be_panoramas(self) -> set[str]:
+        """Names of the sources that are panoramas, by the user's word or by their metadata."""
+        if self.config.camera_type != "auto":
+            return set(self.photographs) if self.config.camera_type == "equirectangular" else set()
+        says = video_says_panorama if self.is_video else says_panorama
+        return {name for name, path in self.photographs.items() if says(path)}
+
+    def _cut_panoramas(self, folder: Path, said: set[str]) -> None:
+        """Cut the panoramas among the photographs into those of their faces."""
+        if self.config.camera_type == "perspective":
+            return
+        names = _files(folder)
+        panoramas = find_panoramas(folder, names, names if self.is_video and said else said)
+        size = face_size(folder, panoramas)
+        for name in self.progress.track(panoramas, description="cutting panoramas"):
+            add_faces(folder / name, folder, name, size)
+            (folder / name).unlink()
+        if panoramas:
+            notice(
+                f"{len(panoramas)} panoramas of 360° are cut into {len(FACES)} photographs each, of {size}x{size} "
+                "pixels; none looks down, where who holds the camera is."
+            )
 
     def _features(self) -> Path:
         """Extract features; return the database."""
         database = self.work.growing("features", self.features_key) / "database.db"
-        lenses = group_by_lens(self.folder, self.names, self.config.cameras)
+        faces = [name for name in self.names if is_face(name)]
+        ordinary = [name for name in self.names if not is_face(name)]
+        if self.config.cameras == "rig" and faces:
+            raise SceneError(
+                "--cameras rig is for ordinary photographs, and panoramas are among these: capture them apart"
+            )
+        if self.config.cameras == "auto":
+            tell_of_a_rig(ordinary)
+        self.rig = folders(ordinary) if self.config.cameras == "rig" else []
+        lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
         self._step(
             "extract",
             "finding features",
@@ -180,8 +234,10 @@ class _Capture:
             database=str(database),
             photographs=str(self.folder),
             lenses=[asdict(lens) for lens in lenses],
+            rigs=[face_rig()] if faces else [],
             masks=str(self.work.folder / "masks") if self.masked else None,
             sift=_SIFT[self.config.quality],
+            camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
         )
         _tidy(database)
         return database
@@ -189,8 +245,13 @@ class _Capture:
     def _model(self, database: Path) -> None:
         if self.work.has("model", self.model_key):
             return
-        matching = choose_matching(self.config.matching, len(self.names), self.is_video)
-        pairs = image_pairs(self.names, matching, self.config.overlap)
+        shots = taken_at_once(self.names, self.rig or FACES)
+        matching = choose_matching(self.config.matching, len(shots), self.is_video)
+        turned = matching == "exhaustive"
+        near = image_pairs(list(shots), matching, self.config.overlap)
+        pairs = [pair for a, b in near for pair in face_pairs(shots[a], shots[b], turned=turned)]
+        if self.rig:
+            pairs += [pair for shot in shots.values() for pair in combinations(shot, 2)]
         apart, models = [], None
         if matching == "sequential":
             apart, models = self._close_loops(database, pairs)
@@ -201,6 +262,8 @@ class _Capture:
                 models = self._reconstruct(database, folder, "finding cameras")
             else:
                 shutil.copytree(self.work.folder / "coarse", folder, dirs_exist_ok=True)
+            if self.rig and models:
+                models = self._mounted(database, folder)
             found = {"photographs": self.names, "models": models, "apart": apart, "flat_pairs": _flat_pairs(database)}
             (folder / "models.json").write_text(json.dumps(found))
 
@@ -244,6 +307,28 @@ class _Capture:
         arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
         has_parallax = _flat_pairs(database) <= _NO_PARALLAX
         return self._step("reconstruct", description, len(self.names), None, **arguments, has_parallax=has_parallax)
+
+    def _mounted(self, database: Path, folder: Path) -> list[dict[str, Any]]:
+        """Find the cameras of a rig again, together, from those in a folder, which they replace.
+
+        Raises:
+            SceneError: the cameras are not mounted together.
+        """
+        with self.work.making("rig", self.model_key) as copied:
+            copy = copied / database.name  # a resumed capture begins without the rig
+            with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
+                source.backup(target)
+            where = {"database": str(copy), "photographs": str(self.folder), "model": str(folder)}
+            found = self._step("mount", "finding the rig", len(self.names), None, prefixes=self.rig, **where)
+        self.work.drop("rig")
+        if "loose" in found:
+            prefix, turned, moved = found["loose"]
+            how = f"turned by {turned:.1f}° and moved by {moved:.1f} steps" if moved else "never found together"
+            raise SceneError(
+                f"the cameras of {self.rig[0]} and {prefix} are not mounted together, or photographs of the same name "
+                f"were not taken at once: against each other, they are {how}. Try --cameras folder"
+            )
+        return found["models"]
 
     def _largest_model(self, found: dict[str, Any]) -> Summary:
         """Summary of the largest model.
@@ -335,6 +420,11 @@ class _Capture:
         return run_step(
             step, arguments, log=log, progress=self.progress, description=description, total=total, count=count
         )
+
+
+def _files(folder: Path) -> list[str]:
+    """Names of the files in a folder and below."""
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
 def _rows(database: Path, table: str) -> int:

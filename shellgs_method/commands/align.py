@@ -41,7 +41,7 @@ def align(
 
     Args:
         scene: Scene folder.
-        shell: Mesh or point cloud of the shell.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy).
         picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
         positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
@@ -77,10 +77,12 @@ def align(
         refined,
         seen_again,
         unbent,
+        up_in_words,
     )
     from shellgs_method.registration.frames import ShellPlace
     from shellgs_method.registration.report import write_report
     from shellgs_method.registration.sfm_frame import check_points
+    from shellgs_method.registration.units import unit_doubted
     from shellgs_method.registration.validation import validate
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
     from shellgs_method.shell.cast import renew_error
@@ -144,11 +146,14 @@ def align(
                 placement = seen_again(placement, views, picks)
                 after = validate(mesh, placement.alignment, views, points, placement.correspondences)
                 validation = after.after(adjustment, validation)
+        validated = validation.validated(views)
+        told = [up_in_words(validated), unit_doubted(replace(validation, alignment=validated), mesh, views)]
+        placement = replace(placement, history=[*placement.history, *filter(None, told)])
         write_report(scene / REPORT, mesh, validation, placement.history)
         if validation.verdict != "refused":
             if candidate.is_dir():
                 replace_folder(scene / ADJUSTED, candidate)
-            validation.validated(views).save(target)
+            validated.save(target)
             renew_error(scene)
     finally:
         shutil.rmtree(candidate, ignore_errors=True)

@@ -38,7 +38,7 @@ def cast(
 
     Args:
         scene: Scene folder.
-        shell: Mesh or point cloud of the shell, with --matrix. If not set: the one in scene/shell/alignment.json.
+        shell: Mesh, model or point cloud of the shell, with --matrix. If not set: that of scene/shell/alignment.json.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.

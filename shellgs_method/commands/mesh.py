@@ -26,7 +26,7 @@ def mesh(
         config: The run's config.yml.
         output: Mesh: ply, obj, glb, or usd, usda, usdc (a static collider). If not set: mesh.ply beside the config.
         voxel: Voxel size in metres, at least half of what the photographs resolve. If not set: the size of a pixel on
-            the facade.
+            the facade, in the median of the photographs, however long the facade is.
         faces: Number of triangles that the mesh is decimated to.
         margin: Distance from the shell, in metres, beyond which geometry is left out.
     """

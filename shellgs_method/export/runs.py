@@ -25,7 +25,7 @@ from shellgs_method.geometry.axes import likely_up
 from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.geometry.tsdf import DepthView, fuse
+from shellgs_method.geometry.tsdf import DepthView, fuse, least_voxel
 from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
 from shellgs_method.occlusion.exposure import Sightings, log_gains
@@ -132,12 +132,14 @@ class TrainedRun:
 
         In the frame's unit; 0 if no view shows enough points.
         """
+        return min(self.footprints(box), default=0.0)
+
+    def footprints(self, box: Box) -> list[float]:
+        """A pixel's size at the SfM points inside a box, in each view that shows enough, in the frame's unit."""
         points = self.sfm_points[box.contains(self.sfm_points)]
         cameras = [self.frame.camera(view.camera) for dataset in self.datasets for view in dataset.views]
         depths = [(in_view(camera, points)[2], float(camera.K[0, 0])) for camera in cameras]
-        return min(
-            (float(np.median(depth)) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY), default=0.0
-        )
+        return [float(np.median(depth)) / focal for depth, focal in depths if len(depth) >= RESOLVED_BY]
 
     def surface(
         self, margin: float, voxel: float | None = None, views: Iterable[DepthView] | None = None
@@ -155,6 +157,8 @@ class TrainedRun:
                 f"voxels of {voxel:g}{unit} are finer than the photographs resolve, whose pixels are {resolved:.2g}"
                 f"{unit} on the facade: give a --voxel of at least half of that, or leave it out"
             )
+        if voxel is None and (pixels := self.footprints(box)):
+            voxel = max(float(np.median(pixels)), least_voxel(box))
         return self.facade(fuse(self.views() if views is None else views, box, voxel), margin)
 
     def facade(self, mesh: trimesh.Trimesh, margin: float) -> trimesh.Trimesh:

@@ -15,11 +15,13 @@ from shellgs_method.files.readers.contents import left_out
 from shellgs_method.files.readers.points import NO_POINTS, Points
 from shellgs_method.geometry.voxels import Cells, VoxelMeans
 from shellgs_method.machine.open3d import reason
+from shellgs_method.machine.progress import tell
 
 MOST = 1_000_000
 """Voxels of a cloud, for which a mesher takes a minute and one gigabyte."""
 _ACROSS = 1500  # voxels along the extent of a cloud that is first looked at: 2 cm of 30 m
 _SAMPLE = 200_000
+_LARGE = 1 << 28  # bytes, of which reading takes long enough to be said
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,8 @@ class Cloud:
         return merged(self)
 
     def __iter__(self) -> Iterator[Points]:
+        if self.path.is_file() and self.path.stat().st_size > _LARGE:
+            tell(f"Reading {self.path.name}")
         total, missed = 0, 0
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         try:

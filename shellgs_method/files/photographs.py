@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8, UInt16
+from pi_heif import open_heif
 from PIL import ExifTags, Image, ImageOps
 
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.exif import exif_of, tags_of
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
+from shellgs_method.files.transfer import HDR, tone_mapped
 from shellgs_method.files.undistortion import undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
@@ -98,16 +101,25 @@ def read_image(path: Path) -> Image.Image:
         SceneError: the image cannot be read, or holds floating-point numbers.
     """
     with opened(path) as image:
-        exif = _exif(image)
-        if image.info.get("nclx_profile", {}).get("transfer_characteristics") in (16, 18):  # of ITU-T H.273
+        exif = exif_of(image)
+        if transfer := HDR.get(image.info.get("nclx_profile", {}).get("transfer_characteristics")):
             notice(
-                f"{path.parent} holds HDR photographs (PQ or HLG), with flat colours here: better export them as SDR."
+                f"{path.parent} holds HDR photographs ({transfer}), which are tone-mapped: bright walls lose contrast; "
+                "record or export them as SDR if you can."
             )
+            image = Image.fromarray(tone_mapped(_wide(path), transfer))
         if image.mode.startswith("I"):  # 16 bits
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
     image.info["exif"] = exif.tobytes()
     return image
+
+
+def _wide(path: Path) -> UInt16[np.ndarray, "H W 3"]:
+    """Full-range colours of a HEIF photograph with all its bits, of which Pillow has eight."""
+    stored = open_heif(path, convert_hdr_to_8bit=False)
+    codes = np.array(stored)[..., :3]  # a copy: the memory is the file's
+    return codes if codes.dtype == np.uint16 else codes.astype(np.uint16) * 257
 
 
 def read_mask(path: Path) -> Image.Image:
@@ -117,7 +129,7 @@ def read_mask(path: Path) -> Image.Image:
         SceneError: the image cannot be read, or is not black and white.
     """
     with opened(path) as image:
-        exif = _exif(image)
+        exif = exif_of(image)
         mask = Image.fromarray(np.where(kept_pixels(image, path), 255, 0).astype(np.uint8))
     mask.info["exif"] = exif.tobytes()
     return mask
@@ -135,18 +147,10 @@ def exif_log_gains(paths: Sequence[Path]) -> Float64[np.ndarray, " V"]:
     return np.nan_to_num(found - np.nanmean(found)) if np.isfinite(found).any() else np.zeros(len(paths))
 
 
-def _exif(image: Image.Image) -> Image.Exif:
-    """EXIF data of an image; none where they are damaged."""
-    try:
-        return image.getexif()
-    except (SyntaxError, ValueError, OSError):
-        return Image.Exif()
-
-
 def _exif_log_gain(path: Path) -> float:
     """NaN where a photograph does not say it."""
     with opened(path, whole=False) as image:
-        tags = _exif(image).get_ifd(ExifTags.IFD.Exif)
+        tags = tags_of(image)
     try:
         seconds, aperture = float(tags[ExifTags.Base.ExposureTime]), float(tags[ExifTags.Base.FNumber])
         gain = seconds * float(np.ravel(tags[ExifTags.Base.ISOSpeedRatings])[0]) / aperture**2

@@ -42,7 +42,7 @@ def upwards(
         level = np.where(np.abs(right @ up) <= np.abs(top @ up), 1.0, 0.0)[:, None]
         across, along = level * right + (1 - level) * top, level * top + (1 - level) * right
         fits = np.abs(across @ up) < _ROLLED
-        if fits.mean() < 0.6:
+        if fits.mean() < 0.7:
             return None
         across, above = across[fits], (along[fits] @ up)[:, None]
         along = np.where(np.abs(above) > _DOWN, np.sign(above) * along[fits], up)
@@ -50,13 +50,14 @@ def upwards(
         spread = across.T @ across / len(across)
         up = np.linalg.solve(spread + (_ROLL / _PITCH) ** 2 * np.eye(3), along.mean(axis=0))
         up /= np.linalg.norm(up)
+    rolled = float(np.sqrt(np.mean((across @ up) ** 2)))
     sign = (top @ up).mean()
     if abs(sign) < _DOWN:  # they look straight down, if anywhere
         sign = -(ahead @ up).mean()
-        if abs(sign) < 0.5 or np.linalg.eigvalsh(spread)[1] < _ROLLED**2:
+        if abs(sign) < 0.5 or rolled > 2 * _ROLL or np.linalg.eigvalsh(spread)[1] < _ROLLED**2:
             return None
     up = np.sign(sign) * up
-    roll = max(_ROLL, 1.5 * np.sqrt(np.mean((across @ up) ** 2)))
+    roll = max(_ROLL, 1.5 * rolled)
     for axis in axes:
         axis = axis / np.linalg.norm(axis)
         if axis @ up > np.cos(np.arcsin(_PITCH)) and np.sqrt(np.mean((across @ axis) ** 2)) < roll:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Iterable, Iterator
+from itertools import chain, pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,8 +25,14 @@ TRUNCATION = 6.0
 """Truncation distance in voxels; less leaves holes, more rounds off reveals."""
 MIN_VIEWS = 2
 """Minimum number of views that see a voxel."""
+FINEST = 1000
+"""Voxels along the second longest side of a box: a street has those of its houses, however long it is."""
 SPECK = 100.0
 """Minimum area of a connected component, in faces of a voxel; smaller ones are floaters."""
+
+
+_BLOCK = 8  # voxels along a side of a block, which is stored if a surface is near
+_TILE = 160  # blocks along a tile
 
 
 class DepthView(NamedTuple):
@@ -39,34 +48,46 @@ class DepthView(NamedTuple):
 def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> trimesh.Trimesh:
     """Fuse views into a coloured mesh of the surface inside a box.
 
+    A long box is fused in tiles of one lattice, whose meshes meet without a seam, so that memory is that of a tile; the
+    views are kept on disk meanwhile.
+
     Open3D's ``VoxelBlockGrid`` has float32 coordinates, so the box must be near the frame's origin. (The older
     ``ScalableTSDFVolume`` of Open3D 0.20 silently returns nothing.)
 
     Args:
         views: rendered views, taken one at a time.
         box: box around the surface.
-        voxel: voxel size; if None, a pixel's size on the surface in the first view that sees the box, but at least a
-            thousandth of the box. It is stored in the mesh's ``metadata``.
+        voxel: voxel size; if None, a pixel's size on the surface in the first view that sees the box, but at least
+            :func:`least_voxel`. It is stored in the mesh's ``metadata``.
 
     Raises:
         SceneError: no surface is left in the box, or the voxel size is not positive.
     """
     if voxel is not None and not voxel > 0:
         raise SceneError(f"a voxel cannot be {voxel} long: give a --voxel above 0")
-    grid, seen = None, 0
-    for view in views:
-        inside = _inside(view, box)
-        if not inside.any():
-            continue
-        if grid is None:
-            pixel = (view.depth[..., 0][inside].median() / view.camera.K[0, 0]).item()
-            voxel = voxel or max(pixel, box.size / 1000)
-            grid = _voxel_grid(voxel)
-        _integrate(grid, view, inside)
-        seen += 1
-    if grid is None or voxel is None:
+    shown = _inside(views, box)
+    if (first := next(shown, None)) is None:
         raise SceneError("there is no mesh: no view renders an opaque surface inside the facade's box")
-    mesh = _extract(grid, min(MIN_VIEWS, seen))
+    if voxel is None:
+        pixel = (first.depth[first.depth > 0].median() / first.camera.K[0, 0]).item()
+        voxel = max(pixel, least_voxel(box))
+    axis, bounds = _tiles(box, voxel)
+    with tempfile.TemporaryDirectory() as folder:
+        kept = _Kept(Path(folder)) if len(bounds) > 2 else None
+        parts, taken = [], chain([first], shown)
+        for low, high in pairwise(bounds):
+            grid, seen = _voxel_grid(voxel), 0
+            for view in taken:
+                _integrate(grid, view, axis, low, high)
+                seen += 1
+                if kept and low == bounds[0]:
+                    kept.add(view)
+            if grid.hashmap().size():
+                mesh = _extract(grid, min(MIN_VIEWS, seen))
+                middle = mesh.triangles_center[:, axis] / (_BLOCK * voxel) if len(mesh.faces) else np.empty(0)
+                parts.append((mesh, (middle >= low) & (middle < high)))
+            taken = kept or ()
+    mesh = _joined(parts)
     mesh.update_faces(_without_specks(mesh, SPECK * voxel**2))
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) == 0:
@@ -76,6 +97,11 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
         )
     mesh.metadata["voxel"] = voxel
     return mesh
+
+
+def least_voxel(box: Box) -> float:
+    """Size of the smallest voxels that are worth their memory."""
+    return float(np.sort(box.high - box.low)[1]) / FINEST
 
 
 def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
@@ -106,12 +132,41 @@ def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
     )
 
 
-def _inside(view: DepthView, box: Box) -> Bool[np.ndarray, "H W"]:
-    """Mask of the pixels whose depth lies in the box."""
-    camera = view.camera.to(torch.float64)
-    to_world = torch.linalg.inv(camera.viewmat)
-    points = (view.depth.double() * camera.rays()) @ to_world[:3, :3].T + to_world[:3, 3]
-    return (view.depth[..., 0] > 0).numpy() & box.contains(points.numpy())
+def _inside(views: Iterable[DepthView], box: Box) -> Iterator[DepthView]:
+    """The views that show something in the box, with depth there alone."""
+    for view in views:
+        camera = view.camera.to(torch.float64)
+        to_world = torch.linalg.inv(camera.viewmat)
+        points = (view.depth.double() * camera.rays()) @ to_world[:3, :3].T + to_world[:3, 3]
+        inside = (view.depth[..., 0] > 0) & torch.from_numpy(box.contains(points.numpy()))
+        if inside.any():
+            yield view._replace(depth=view.depth.where(inside[..., None], 0.0))
+
+
+def _tiles(box: Box, voxel: float) -> tuple[int, list[float]]:
+    """The axis of the lattice along which the box is cut, and the blocks at which tiles begin and end."""
+    corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3) @ box.axes
+    low, high = corners.min(axis=0) / (_BLOCK * voxel), corners.max(axis=0) / (_BLOCK * voxel)
+    axis = int((high - low).argmax())
+    count = max(1, round(float(high[axis] - low[axis]) / _TILE))
+    cuts = np.floor(np.linspace(low[axis], high[axis], count + 1)[1:-1]).tolist()
+    return axis, [-np.inf, *cuts, np.inf]
+
+
+class _Kept:
+    """Views on disk."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.cameras = folder, []
+
+    def add(self, view: DepthView) -> None:
+        np.save(self.folder / f"{len(self.cameras)}.npy", torch.cat([view.depth, view.rgb], dim=-1).float().numpy())
+        self.cameras.append(view.camera)
+
+    def __iter__(self) -> Iterator[DepthView]:
+        for number, camera in enumerate(self.cameras):
+            pixels = torch.from_numpy(np.load(self.folder / f"{number}.npy"))
+            yield DepthView(pixels[..., :1], pixels[..., 1:], camera)
 
 
 def _voxel_grid(voxel: float):
@@ -121,23 +176,27 @@ def _voxel_grid(voxel: float):
         attr_dtypes=(o3d.core.float32,) * 3,
         attr_channels=((1,), (1,), (3,)),
         voxel_size=voxel,
-        block_resolution=8,
+        block_resolution=_BLOCK,
         block_count=10_000,
     )
 
 
-def _integrate(grid, view: DepthView, inside: Bool[np.ndarray, "H W"]) -> None:
-    """Add one view. Open3D truncates projections to pixels, so its pixel centres are at 0.5, as ours are."""
+def _integrate(grid, view: DepthView, axis: int, low: float, high: float) -> None:
+    """Add one view to the blocks of a tile, and to the first ones beyond it, which its last triangles reach.
+
+    Open3D truncates projections to pixels, so its pixel centres are at 0.5, as ours are.
+    """
     o3d = import_open3d()
-    kept = np.where(inside[..., None], view.depth.numpy(), 0).astype(np.float32)
     depth, colour = (
         o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(image, dtype=np.float32)))
-        for image in (kept, view.rgb.numpy())
+        for image in (view.depth.numpy(), view.rgb.numpy())
     )
     K, viewmat = (o3d.core.Tensor(matrix.double().numpy()) for matrix in (view.camera.K, view.camera.viewmat))
-    unit, far = 1.0, 2 * float(kept.max())
-    blocks = grid.compute_unique_block_coordinates(depth, K, viewmat, unit, far, TRUNCATION)
-    grid.integrate(blocks, depth, colour, K, K, viewmat, unit, far, TRUNCATION)
+    unit, far = 1.0, 2 * float(view.depth.max())
+    blocks = grid.compute_unique_block_coordinates(depth, K, viewmat, unit, far, TRUNCATION).numpy()
+    blocks = blocks[(blocks[:, axis] >= low) & (blocks[:, axis] <= high)]
+    if len(blocks):
+        grid.integrate(o3d.core.Tensor(blocks), depth, colour, K, K, viewmat, unit, far, TRUNCATION)
 
 
 def _extract(grid, views: int) -> trimesh.Trimesh:
@@ -154,6 +213,23 @@ def _extract(grid, views: int) -> trimesh.Trimesh:
     vertices, faces = surface.vertex.positions.numpy().astype(np.float64), surface.triangle.indices.numpy()
     vertices, faces, colours = _in_order(vertices, faces, colours)
     return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+
+
+def _joined(parts: list[tuple[trimesh.Trimesh, Bool[np.ndarray, " F"]]]) -> trimesh.Trimesh:
+    """The chosen faces of meshes in one, whose vertices on the cuts are the same numbers in both neighbours."""
+    import trimesh
+
+    if len(parts) == 1:
+        return parts[0][0]
+    vertices, faces, colours, count = [], [], [], 0
+    for mesh, chosen in parts:
+        vertices.append(mesh.vertices)
+        faces.append(mesh.faces[chosen] + count)
+        colours.append(np.asarray(mesh.visual.vertex_colors)[:, :3])  # pyright: ignore
+        count += len(mesh.vertices)
+    places, first, index = np.unique(np.concatenate(vertices), axis=0, return_index=True, return_inverse=True)
+    shades = np.concatenate(colours)[first]
+    return trimesh.Trimesh(places, index[np.concatenate(faces)], vertex_colors=shades, process=False)
 
 
 def _in_order(

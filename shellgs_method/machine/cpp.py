@@ -21,7 +21,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from shellgs_method.errors import notice
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.machine import system
 from shellgs_method.machine.cache import cache_folder
 from shellgs_method.machine.progress import tell
@@ -36,18 +36,25 @@ _FLAGS = (
 )
 _LIBRARY = ("-fPIC", "-shared", "-mcpu=native" if sys.platform == "darwin" else "-march=native")
 
+_SWITCH = {"0": False, "no": False, "off": False, "false": False, "1": True, "yes": True, "on": True, "true": True}
 _count = itertools.count(1)
-_failures: list[str] = []
 
 
 def compiles() -> bool:
-    """Whether there is a C++ compiler that can be used, and compiling is not switched off."""
-    return os.environ.get("SHELLGS_COMPILE") != "0" and compiler_works()
+    """Whether there is a C++ compiler that can be used, and compiling is not switched off.
+
+    Raises:
+        SceneError: ``SHELLGS_COMPILE`` says neither that it is nor that it is not.
+    """
+    switch = os.environ.get("SHELLGS_COMPILE") or "1"
+    if switch.lower() not in _SWITCH:
+        raise SceneError(f"SHELLGS_COMPILE is {switch!r}: set it to 0, which switches compiling off, or to 1")
+    return _SWITCH[switch.lower()] and compiler_works()
 
 
 @functools.cache
 def load_library(source: str) -> ctypes.CDLL | None:
-    """Compile C++, unless that was done on this machine before, and load it; None, said once, where that fails.
+    """Compile C++, unless that was done on this machine before, and load it; None, which is told, where that fails.
 
     Of several processes that need the same library, one compiles it, and the others wait.
     """
@@ -57,23 +64,28 @@ def load_library(source: str) -> ctypes.CDLL | None:
         key = hashlib.sha256("\n".join([source, compiler, *_FLAGS, *_LIBRARY, _processor()]).encode()).hexdigest()[:24]
         library = cache_folder() / f"{key}.so"
         library.parent.mkdir(parents=True, exist_ok=True)
-        for _ in range(2):
-            if not library.exists():
-                with FileLock(library.with_suffix(".lock")):
-                    if not library.exists():
-                        _compile(compiler, source, library)
-            with suppress(OSError):
-                return ctypes.CDLL(str(library))
-            library.unlink()  # a damaged copy
-        raise OSError(f"{library} cannot be loaded")
+        if not _is_whole(library):
+            with FileLock(library.with_suffix(".lock")):
+                if not _is_whole(library):
+                    _compile(compiler, source, library)
+        return ctypes.CDLL(str(library))
     except OSError as error:
-        if not _failures:
-            notice(
-                f"Some or all of rasterizer and losses run without C++ kernels, several times slower: {error}. "
-                f"They are kept in {cache_folder()}; the environment variable SHELLGS_CACHE names another folder."
-            )
-        _failures.append(str(error))
+        notice(
+            f"Some or all of rasterizer and losses run without C++ kernels, several times slower: {error}. "
+            f"They are kept in {cache_folder()}; the environment variable SHELLGS_CACHE names another folder."
+        )
         return None
+
+
+def _is_whole(library: Path) -> bool:
+    """Whether a library is there as it was compiled: loading one that is cut off ends the process."""
+    with suppress(FileNotFoundError):
+        return _digest_of(library).read_bytes() == hashlib.sha256(library.read_bytes()).digest()
+    return False
+
+
+def _digest_of(library: Path) -> Path:
+    return library.with_suffix(".sha256")
 
 
 def _compile(compiler: str, source: str, library: Path) -> None:
@@ -86,6 +98,9 @@ def _compile(compiler: str, source: str, library: Path) -> None:
             command = [*shlex.split(compiler), *_FLAGS, *options, *_LIBRARY, str(code), "-o", str(made)]
             result = subprocess.run(command, capture_output=True, text=True, check=False)
             if result.returncode == 0 and made.exists():
+                digest = _digest_of(made)
+                digest.write_bytes(hashlib.sha256(made.read_bytes()).digest())
+                os.replace(digest, _digest_of(library))
                 os.replace(made, library)
                 return
     lines = result.stderr.strip().splitlines()

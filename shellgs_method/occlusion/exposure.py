@@ -18,10 +18,11 @@ from scipy.sparse import csr_array
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from shellgs_method.files.transfer import OFFSET, POWER
 from shellgs_method.geometry.camera import Camera
 
-BLACK, POWER = -0.055, 1 / 2.4
-"""sRGB's curve above its toe, x = 1.055 l^(1/2.4) - 0.055 (IEC 61966-2-1)."""
+BLACK = -OFFSET
+"""Colour about which a gain is a scale."""
 UNCLIPPED = (0.04, 0.97)
 """Colours that say what a gain is: darker ones are in the curve's toe, brighter ones may be clipped."""
 MAX_PROJECTIONS = 400_000

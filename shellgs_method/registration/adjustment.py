@@ -7,15 +7,16 @@ observations and a wrong distortion. The shell's walls are where they are.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import ColmapCamera, ColmapImage, Model, parameters_of
+from shellgs_method.geometry.axes import facade_axes
 from shellgs_method.geometry.distortion import PARAMETERS
 from shellgs_method.geometry.similarity import fit_similarity, scale_of, transformed
 from shellgs_method.machine.progress import track
@@ -26,32 +27,40 @@ from shellgs_method.registration.bundle import (
     Planes,
     Positions,
     adjust,
+    covariances,
     deviations,
     intersected,
     reprojection_errors,
-    scatter,
 )
+from shellgs_method.registration.picks import PickedPoint
+from shellgs_method.registration.refinement import motions, similarity_by
 from shellgs_method.shell.surface import ShellSurface
 
 REACH = 0.3
 """Metres from the shell within which points may be on it before the adjustment: the drift of a walk past a house."""
-GATE = 0.03
-"""The same in the last rounds: frames, sills and railings, which a scan lacks, are farther from its planes."""
+GATE = 0.05
+"""The same in the last rounds: most frames, sills and railings, which a scan lacks, are farther from its planes."""
 HELD_OUT = 0.1
 """Share of the tracks that are left out of the adjustment, and checked."""
 STRAIGHT = 0.95
 """Distance of the points held out from the shell, relative to the one before, above which cameras were not bent."""
 _FINEST = 0.005
 """Metres: smallest noise of a shell. No scan of a building is better, and no building is its model."""
+_PATCH = 1.0
+"""Metres: how far the errors of a shell are alike, so that all points in a patch of this size count as one."""
+_PICKED = 0.02
+"""Metres: standard deviation of a pick, on the shell and in photographs."""
 _RANGE = 0.05
 """Largest change of focal lengths, relative, and of distortion coefficients."""
 _OUTLYING = 4.0
 """Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of a video's are: of edges
 that slide along others, and of repeated windows. Structure from motion without a robust loss is bent by them."""
 _VIEWS = 3  # observations that are not wrong, which a track needs: nothing checks two
-_ROBUST, _GATES, _ROUNDS, _STEPS = 4, 7, 18, 3
-_LOOSE = 1.0  # metres: a prior that keeps what nothing determines, such as where cameras are along a bare wall
+_ROBUST, _GATES, _ROUNDS, _STEPS, _SHIFTS = 4, 7, 24, 3, 10
+_LOOSE = 0.3  # metres: a prior that keeps what nothing determines, such as where cameras are along a bare wall
 _STILL = 5e-4  # metres that cameras move by in a round, from which they stand still
+_WEAK = 0.01  # singular value, relative to the largest, below which a motion of all stays: noise would determine it
+_EXPECTATIONS = 50
 _FEW = 50  # points on the shell that determine nothing
 _SHARED = 10  # photographs of a lens from which on its distortion is found
 
@@ -74,6 +83,34 @@ class HeldOut:
     def were_straight(self) -> bool:
         """Whether the points are no closer to the shell than before."""
         return not self.metres[1] < STRAIGHT * self.metres[0]
+
+
+@dataclass(frozen=True)
+class _Marks:
+    """Picks as the last points of a bundle: where they are seen, and where they are on the shell."""
+
+    seen: Observations
+    planes: Planes
+
+    @classmethod
+    def of(
+        cls, picks: Sequence[PickedPoint], surface: ShellSurface, start: Bundle, seen: Observations, called: list[str]
+    ) -> _Marks:
+        """The marks of a bundle, whose last points are the picks as they were triangulated."""
+        first = len(start.points) - len(picks)
+        views = [called.index(view) for pick in picks for view in pick.views]
+        points = np.repeat(np.arange(first, len(start.points)), [len(pick.views) for pick in picks])
+        of = replace(seen, views=np.array(views, np.int64), points=points, pixels=np.zeros((len(points), 2)))
+        pixels, _ = reprojection_errors(start, replace(of, weights=np.ones(len(points))))
+        places = transformed(np.array([pick.shell for pick in picks]).reshape(-1, 3), surface.survey_from_shell)
+        planes = Planes(
+            np.repeat(np.arange(first, len(start.points)), 3),
+            np.tile(np.eye(3), (len(picks), 1)),
+            np.repeat(places, 3, axis=0),
+            np.ones(3 * len(picks)),
+            _PICKED,
+        )
+        return cls(replace(of, pixels=pixels, weights=np.ones(len(points))), planes)
 
 
 @dataclass(frozen=True)
@@ -110,12 +147,13 @@ def adjusted(
     names: Mapping[int, str],
     known: Mapping[str, Float64[np.ndarray, " 3"]] | None = None,
     sigma: float = 0.03,
+    picks: Sequence[PickedPoint] = (),
 ) -> Adjustment:
     """Adjust cameras, lenses and points of a model to the shell.
 
     First without the shell, leaving out observations that are outliers by Tukey's biweight. Then points within a gate
-    of the shell are drawn onto the planes of their closest triangles, with Tukey's loss and the noise of the shell,
-    which is estimated from the data. The gate shrinks from :data:`REACH` to :data:`GATE`.
+    of the shell are drawn onto the planes of their closest triangles, each by the probability that it lies on it
+    (:func:`inliers`). The gate shrinks from :data:`REACH` to :data:`GATE`.
 
     The pinhole lens of undistorted photographs becomes one that distorts (OPENCV), since a distortion that was found
     wrong has left a rest in them, which bends cameras.
@@ -127,6 +165,7 @@ def adjusted(
         names: name of each photograph, by its number in the model.
         known: known camera centres in the survey frame, by the photograph's name.
         sigma: standard deviation of these along each axis, in metres.
+        picks: points known on the shell, as triangulated from these cameras.
 
     Raises:
         SceneError: the model has no tracks, its cameras cannot be adjusted, or too few points are on the shell.
@@ -142,10 +181,13 @@ def adjusted(
         np.stack([priors[name] for name in called]),
         np.array([sigma if name in (known or {}) else _LOOSE for name in called]),
     )
-    bundle, objective = _drawn_to(surface, seen.of_points(fitted), positions, start)
+    picked = transformed(np.array([pick.scene for pick in picks]).reshape(-1, 3), survey_from_scene)
+    marked = replace(start, points=np.concatenate([start.points, picked]))
+    marks = _Marks.of(picks, surface, marked, seen, called)
+    bundle, objective = _drawn_to(surface, seen.of_points(fitted), positions, marked, marks)
     spread = deviations(objective, bundle)
     whole = Objective(seen, objective.pixel)
-    final = intersected(whole, bundle)
+    final = intersected(whole, replace(bundle, points=bundle.points[: len(start.points)]))
     jump = np.linalg.norm(final.points - start.points, axis=1)
     on = surface.distance(final.points) < GATE
     on &= jump < 3 * np.median(jump[on])  # wrong observations throw points far off before they are left out
@@ -170,11 +212,11 @@ def adjusted(
 
 
 def _drawn_to(
-    surface: ShellSurface, seen: Observations, positions: Positions, bundle: Bundle
+    surface: ShellSurface, seen: Observations, positions: Positions, bundle: Bundle, marks: _Marks
 ) -> tuple[Bundle, Objective]:
     """Rounds of leaving out wrong observations, looking for the closest planes and adjusting to them."""
     seen = seen.of_points(np.bincount(seen.points, minlength=len(bundle.points)) >= _VIEWS)
-    objective = Objective(seen, _noise_of_pixels(bundle, seen), positions=positions)
+    objective = Objective(seen, _noise_of_pixels(bundle, seen), positions=positions, planes=marks.planes)
     gates = [*np.full(_ROBUST, np.inf), *np.geomspace(REACH, GATE, _GATES)]
     gates += [GATE] * (_ROUNDS - len(gates))
     damping = 1e-4
@@ -182,11 +224,12 @@ def _drawn_to(
         # Points are triangulated again: those drawn to the shell say nothing of its noise, nor where they belong.
         free = intersected(objective, bundle, steps=5)
         pixel = _noise_of_pixels(free, seen)
-        objective = replace(objective, observations=_trusted(free, seen, pixel), pixel=pixel)
-        if gate < np.inf:
-            objective = replace(objective, planes=_planes(surface, objective, free, gate))
+        observations = _trusted(free, seen, pixel).joined(marks.seen)
+        objective = replace(objective, observations=observations, pixel=pixel)
+        free, planes = _placed(surface, objective, free, gate, marks)
+        objective = replace(objective, planes=planes)
         before = bundle.centres
-        bundle, damping = adjust(objective, replace(bundle, points=free.points), _STEPS, damping, 1e-6)
+        bundle, damping = adjust(objective, free, _STEPS, damping, 1e-6)
         if gate == GATE and np.linalg.norm(bundle.centres - before, axis=1).max() < _STILL:
             break
     return bundle, objective
@@ -201,24 +244,108 @@ def _trusted(bundle: Bundle, seen: Observations, pixel: float) -> Observations:
     return replace(seen, weights=weights * sound[seen.points])
 
 
-def _planes(surface: ShellSurface, objective: Objective, bundle: Bundle, gate: float) -> Planes:
+def _placed(
+    surface: ShellSurface, objective: Objective, bundle: Bundle, gate: float, marks: _Marks
+) -> tuple[Bundle, Planes]:
+    """The bundle moved as a whole to where it fits the shell, picks and positions; and the planes of its points.
+
+    The probabilities of points change with every motion, which the adjustment of all cameras would follow slowly.
+    """
+    covariance, known = covariances(objective, bundle), objective.positions
+    tracks = np.setdiff1d(objective.observations.points[objective.observations.weights > 0], marks.planes.points)
+    planes = marks.planes
+    for _ in range(_SHIFTS):
+        if gate < np.inf:
+            planes = _planes(surface, bundle, tracks, covariance, gate).joined(marks.planes)
+        normals, of = planes.normals, bundle.points[planes.points]
+        axes = np.tile(np.eye(3), (len(known.views), 1))
+        arms = np.concatenate([of, np.repeat(bundle.centres[known.views], 3, axis=0)])
+        centre, radius = bundle.centres.mean(axis=0), float(bundle.centres.std() + 1.0)
+        distance = np.concatenate(
+            [
+                np.einsum("kd,kd->k", normals, of - planes.feet),
+                (bundle.centres[known.views] - known.centres).reshape(-1),
+            ]
+        )
+        variance = np.concatenate(
+            [
+                np.einsum("ki,kij,kj->k", normals, covariance[planes.points], normals)
+                + planes.sigma**2 / np.maximum(planes.weights, 1e-9),
+                np.repeat(known.sigma**2, 3),
+            ]
+        )
+        J = motions(arms - centre, np.concatenate([normals, axes]), radius) / np.sqrt(variance)[:, None]
+        update = np.linalg.lstsq(J, -distance / np.sqrt(variance), rcond=_WEAK)[0]
+        bundle = _carried(bundle, similarity_by(update, centre, radius))
+        if np.abs(update).max() < _STILL / 5:
+            break
+    return bundle, planes
+
+
+def _carried(bundle: Bundle, similarity: Float64[np.ndarray, "4 4"]) -> Bundle:
+    """The bundle moved as a whole."""
+    turn = similarity[:3, :3] / scale_of(similarity)
+    return replace(
+        bundle,
+        rotations=bundle.rotations @ turn.T,
+        centres=transformed(bundle.centres, similarity),
+        points=transformed(bundle.points, similarity),
+    )
+
+
+def _planes(
+    surface: ShellSurface, bundle: Bundle, tracks: Int64[np.ndarray, " T"], covariance: np.ndarray, gate: float
+) -> Planes:
     """The planes of the points within a gate of the shell."""
-    closest = surface.closest(bundle.points)
-    offset = bundle.points - closest.point
-    seen = np.bincount(objective.observations.points, objective.observations.weights, len(offset)) > 0
-    near = np.flatnonzero(seen & (np.linalg.norm(offset, axis=1) < gate))
+    closest = surface.closest(bundle.points[tracks])
+    offset = bundle.points[tracks] - closest.point
+    close = np.linalg.norm(offset, axis=1) < gate
+    near = tracks[close]
     if len(near) < _FEW:
         raise SceneError(
             f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to tell how "
             "cameras are bent"
         )
-    normals = surface.normals[closest.triangle]
-    distance = np.einsum("nd,nd->n", normals, offset)[near]
-    deviation = scatter(objective, bundle, normals)[near]
-    sharp = deviation <= np.median(deviation)
-    variance = (1.4826 * np.median(np.abs(distance[sharp]))) ** 2 - np.median(deviation[sharp]) ** 2
-    sigma = float(np.sqrt(max(variance, _FINEST**2)))
-    return Planes(near, normals[near], closest.point[near].astype(np.float64), sigma, gate)
+    feet, normals = closest.point[close].astype(np.float64), surface.normals[closest.triangle[close]]
+    deviation = np.sqrt(np.einsum("ki,kij,kj->k", normals, covariance[near], normals))
+    axes = facade_axes(normals, -bundle.rotations[:, 1].mean(axis=0))
+    facing = (normals @ np.concatenate([axes, -axes]).T).argmax(axis=1)
+    probability, sigma = inliers(np.einsum("nd,nd->n", normals, offset[close]), deviation, facing, gate)
+    cells = np.column_stack([np.floor(feet / _PATCH).astype(np.int64), facing])
+    _, patch = np.unique(cells, axis=0, return_inverse=True)
+    crowd = np.bincount(patch.ravel(), probability)[patch.ravel()]
+    return Planes(near, normals, feet, probability / np.maximum(crowd, 1.0), sigma)
+
+
+def inliers(
+    distance: Float64[np.ndarray, " N"],
+    deviation: Float64[np.ndarray, " N"],
+    facing: Int64[np.ndarray, " N"],
+    gate: float,
+) -> tuple[Float64[np.ndarray, " N"], float]:
+    """Probability of each point to be of the shell, and the noise of the shell in metres.
+
+    Expectation maximisation (Dempster, Laird and Rubin 1977) of a mixture: distances of the shell's points are normal,
+    those of others (frames, sills, railings) equally frequent up to the gate. Each side of the building has its own
+    share of the shell's points: before reveals there are hardly any but those of frames.
+
+    Args:
+        distance: distance of each point from its plane, in metres.
+        deviation: standard deviation of that by triangulation.
+        facing: the side of the building that it is on.
+        gate: largest distance.
+    """
+    share, sigma = np.full(facing.max() + 1, 0.5), gate / 4
+    count = np.maximum(np.bincount(facing), 1)
+    for _ in range(_EXPECTATIONS):
+        variance = sigma**2 + deviation**2
+        of_shell = share[facing] * np.exp(-0.5 * distance**2 / variance) / np.sqrt(2 * np.pi * variance)
+        probability = of_shell / (of_shell + (1 - share[facing]) / (2 * gate) + 1e-12)
+        share = np.bincount(facing, probability) / count
+        by_shell = sigma**2 / variance  # of a distance, the part that is the shell's
+        noise = probability @ ((by_shell * distance) ** 2 + by_shell * deviation**2) / max(probability.sum(), 1e-12)
+        sigma = max(float(np.sqrt(noise)), _FINEST)
+    return probability, sigma
 
 
 def _noise_of_pixels(bundle: Bundle, seen: Observations) -> float:

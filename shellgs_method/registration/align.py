@@ -14,7 +14,8 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.colmap import read_model, read_points
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import ADJUSTED, SceneLayout
-from shellgs_method.geometry.axes import facade_axes, likely_up
+from shellgs_method.files.surfaces import usual_up
+from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
@@ -141,7 +142,7 @@ def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
 def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[Placement, Adjustment | None]:
     """Adjust the cameras of a scene to the shell; return the placement, and None if they are left as is.
 
-    Surveyed camera positions that the placement was found by are priors.
+    Picks and surveyed camera positions that the placement was found by are priors.
 
     Args:
         placement: the shell's place, found with the cameras as they are.
@@ -159,11 +160,13 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     alignment = placement.alignment
     surface = ShellSurface(mesh, alignment.metres_per_shell_unit)
     start = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene)
-    surveyed = [point for point in placement.correspondences if point.is_used and not isinstance(point, PickedPoint)]
+    used = [point for point in placement.correspondences if point.is_used]
+    picks = [point for point in used if isinstance(point, PickedPoint)]
+    surveyed = [point for point in used if not isinstance(point, PickedPoint)]
     _, names = read_points(layout.data, folder, layout.images_path)
     known = {point.name: transformed(point.shell, surface.survey_from_shell) for point in surveyed}
     scatter = max(_RTK, float(np.median([point.residual for point in surveyed]))) if surveyed else _RTK
-    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter)
+    adjustment = adjusted(surface, read_model(layout.data / folder), start, names, known, scatter, picks)
     if adjustment.shifted > _ELSEWHERE:
         raise SceneError(
             f"the cameras cannot be adjusted: the shell stands {adjustment.shifted:.2f} m from where it fits, which is "
@@ -224,6 +227,14 @@ def place_by_guess(
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)
+
+
+def up_in_words(alignment: Alignment) -> str:
+    """What is up in the shell's file, by the cameras."""
+    if alignment.up is None:
+        usual = name_of(usual_up(alignment.shell))
+        return f"The cameras do not tell which way is up: it is taken to be {usual} of the shell's file."
+    return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
 
 
 def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints) -> str | None:

@@ -70,6 +70,11 @@ class Observations:
         chosen_of = {name: getattr(self, name)[kept] for name in ("views", "points", "pixels", "weights")}
         return replace(self, **chosen_of)
 
+    def joined(self, other: Observations) -> Observations:
+        """These and the other observations, by the same cameras."""
+        names = ("views", "points", "pixels", "weights")
+        return replace(self, **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names})
+
 
 @dataclass(frozen=True)
 class Planes:
@@ -79,15 +84,26 @@ class Planes:
         points: indices of the points.
         normals: unit normal of the plane of each.
         feet: a point of the plane of each.
+        weights: how much each plane counts.
         sigma: standard deviation of a point's distance from its plane.
-        gate: distance from which a plane says nothing about its point.
     """
 
     points: Int64[np.ndarray, " K"] = field(default_factory=lambda: np.empty(0, np.int64))
     normals: Float64[np.ndarray, "K 3"] = field(default_factory=lambda: np.empty((0, 3)))
     feet: Float64[np.ndarray, "K 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    weights: Float64[np.ndarray, " K"] = field(default_factory=lambda: np.empty(0))
     sigma: float = 1.0
-    gate: float = 1.0
+
+    def joined(self, other: Planes) -> Planes:
+        """These and the other planes, by the standard deviation of these."""
+        weights = other.weights * (self.sigma / other.sigma) ** 2
+        return Planes(
+            np.concatenate([self.points, other.points]),
+            np.concatenate([self.normals, other.normals]),
+            np.concatenate([self.feet, other.feet]),
+            np.concatenate([self.weights, weights]),
+            self.sigma,
+        )
 
 
 @dataclass(frozen=True)
@@ -107,13 +123,13 @@ class Positions:
 
 @dataclass(frozen=True)
 class Objective:
-    """Half the sum of squared errors by their standard deviations, all but those of positions robust.
+    """Half the sum of squared errors by their standard deviations, reprojection errors with Cauchy's loss.
 
     Attributes:
-        observations: reprojection errors, with Cauchy's loss.
+        observations: reprojection errors.
         pixel: standard deviation of a pixel's coordinate.
         cauchy: scale of the loss, in standard deviations.
-        planes: distances of points from planes, with Tukey's loss, which is flat beyond the gate.
+        planes: distances of points from planes.
         positions: distances of cameras from known positions.
     """
 
@@ -138,6 +154,30 @@ class _Linearised:
     Hxx: np.ndarray
     gc: np.ndarray
     gx: np.ndarray
+
+
+@dataclass
+class _Reprojection:
+    """Errors by their standard deviation, weights and costs of observations, and derivatives of the errors.
+
+    Errors and derivatives of points behind their camera are 0.
+    """
+
+    error: np.ndarray
+    weight: np.ndarray
+    cost: np.ndarray
+    inside: np.ndarray
+    by_inside: np.ndarray
+    by_lens: np.ndarray
+
+    @classmethod
+    def of(cls, objective: Objective, bundle: Bundle) -> _Reprojection:
+        seen, scale = objective.observations, objective.cauchy**2
+        error, front, inside, by_inside, by_lens = _project(bundle, seen)
+        error, by_inside, by_lens = (each / objective.pixel for each in (error, by_inside, by_lens))
+        squared = (error**2).sum(axis=1)
+        weight = np.where(front, seen.weights / (1 + squared / scale), 0.0)
+        return cls(error, weight, 0.5 * scale * seen.weights * np.log1p(squared / scale), inside, by_inside, by_lens)
 
 
 def reprojection_errors(
@@ -168,30 +208,24 @@ def _project(bundle: Bundle, seen: Observations) -> tuple[np.ndarray, ...]:
 
 def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) -> _Linearised:
     seen, planes, known = objective.observations, objective.planes, objective.positions
-    error, front, inside, by_inside, by_lens = _project(bundle, seen)
-    error = error / objective.pixel
-    scale = objective.cauchy**2
-    squared = (error**2).sum(axis=1)
-    weight = np.where(front, seen.weights / (1 + squared / scale), 0.0)
+    at = _Reprojection.of(objective, bundle)
     distance = np.einsum("kj,kj->k", planes.normals, bundle.points[planes.points] - planes.feet)
-    inlying = np.clip(1 - (distance / planes.gate) ** 2, 0, None)
+    stiffness = planes.weights / planes.sigma**2
     away = bundle.centres[known.views] - known.centres
-    cost = 0.5 * scale * (seen.weights * np.log1p(squared / scale)).sum()
-    cost += (planes.gate / planes.sigma) ** 2 / 6 * (1 - inlying**3).sum()
-    cost += 0.5 * ((away / known.sigma[:, None]) ** 2).sum()
+    cost = at.cost.sum() + 0.5 * (stiffness * distance**2).sum() + 0.5 * ((away / known.sigma[:, None]) ** 2).sum()
     if not derivatives:
         empty = np.empty(0)
         return _Linearised(float(cost), empty, sparse.csr_matrix((0, 0)), empty, empty, empty)
 
-    root = np.sqrt(weight)
-    by_inside = by_inside * (root / objective.pixel)[:, None, None]
+    root = np.sqrt(at.weight)[:, None, None]
+    by_inside = at.by_inside * root
     by_point = by_inside @ bundle.rotations[seen.views]
     # Turning the camera by the vector w moves a point x in its frame by w x x.
-    by_turn = np.cross(inside[:, None], by_inside)
+    by_turn = np.cross(at.inside[:, None], by_inside)
     lens = seen.lens_of[seen.views]
-    by_lens = np.einsum("mij,mjp->mip", by_lens * (root / objective.pixel)[:, None, None], seen.free[lens])
+    by_lens = np.einsum("mij,mjp->mip", at.by_lens * root, seen.free[lens])
     by_pose = np.concatenate([by_turn, -by_point], axis=2)
-    error = error * root[:, None]
+    error = at.error[..., None] * root
 
     cameras, count = len(bundle.centres), len(bundle.points)
     width = seen.free.shape[2]
@@ -208,10 +242,8 @@ def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) 
     mixed = _blocks(of_view, by_pose, by_lens)
     Hcc[pose[:, :, None], focal[seen.lens_of][:, None]] = mixed
     Hcc[focal[seen.lens_of][:, :, None], pose[:, None]] = mixed.transpose(0, 2, 1)
-    gc = np.concatenate(
-        [_blocks(of_view, by_pose, error[..., None]).ravel(), _blocks(of_lens, by_lens, error[..., None]).ravel()]
-    )
-    gx = _blocks(of_point, by_point, error[..., None])[..., 0]
+    gc = np.concatenate([_blocks(of_view, by_pose, error).ravel(), _blocks(of_lens, by_lens, error).ravel()])
+    gx = _blocks(of_point, by_point, error)[..., 0]
     Hxx = _blocks(of_point, by_point, by_point)
     Hcx = sparse.csr_matrix(
         sparse.vstack(
@@ -222,7 +254,6 @@ def _linearised(objective: Objective, bundle: Bundle, derivatives: bool = True) 
         )
     )
 
-    stiffness = inlying**2 / planes.sigma**2
     np.add.at(Hxx, planes.points, stiffness[:, None, None] * planes.normals[:, :, None] * planes.normals[:, None])
     np.add.at(gx, planes.points, (stiffness * distance)[:, None] * planes.normals)
     diagonal = 6 * known.views[:, None] + np.arange(3, 6)
@@ -337,20 +368,16 @@ def intersected(objective: Objective, bundle: Bundle, steps: int = 20) -> Bundle
 
 def _of_points(objective: Objective, bundle: Bundle) -> tuple[np.ndarray, np.ndarray]:
     """Hessian and gradient of the reprojection errors by each point."""
-    seen = objective.observations
-    error, front, _, by_inside, _ = _project(bundle, seen)
-    squared = (error**2).sum(axis=1) / objective.pixel**2
-    weight = np.where(front, seen.weights / (1 + squared / objective.cauchy**2), 0.0) / objective.pixel**2
-    by_point = by_inside @ bundle.rotations[seen.views]
+    seen, at = objective.observations, _Reprojection.of(objective, bundle)
+    by_point = at.by_inside @ bundle.rotations[seen.views]
     summed = _sum_by(seen.points, len(bundle.points))
-    weighed = weight[:, None, None] * by_point
-    return _blocks(summed, weighed, by_point), _blocks(summed, weighed, error[..., None])[..., 0]
+    weighed = at.weight[:, None, None] * by_point
+    return _blocks(summed, weighed, by_point), _blocks(summed, weighed, at.error[..., None])[..., 0]
 
 
-def scatter(objective: Objective, bundle: Bundle, normals: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    """Standard deviation of each triangulated point along a direction, the cameras being exact."""
-    Hxx, _ = _of_points(objective, bundle)
-    return np.sqrt(np.einsum("ni,nij,nj->n", normals, np.linalg.inv(_damped(Hxx, 0.0)), normals))
+def covariances(objective: Objective, bundle: Bundle) -> Float64[np.ndarray, "N 3 3"]:
+    """Covariance of each triangulated point, the cameras being exact."""
+    return np.linalg.inv(_damped(_of_points(objective, bundle)[0], 0.0))
 
 
 def _sum_by(index: np.ndarray, count: int) -> sparse.csr_matrix:
@@ -367,10 +394,8 @@ def _damped(blocks: np.ndarray, damping: float | np.ndarray) -> np.ndarray:
 
 def _point_costs(objective: Objective, bundle: Bundle) -> np.ndarray:
     """Costs of the reprojection errors of each point."""
-    error, _ = reprojection_errors(bundle, objective.observations)
-    scale = (objective.cauchy * objective.pixel) ** 2
-    costs = objective.observations.weights * np.log1p((error**2).sum(axis=1) / scale)
-    return np.bincount(objective.observations.points, costs, len(bundle.points))
+    cost = _Reprojection.of(objective, bundle).cost
+    return np.bincount(objective.observations.points, cost, len(bundle.points))
 
 
 def deviations(objective: Objective, bundle: Bundle) -> Float64[np.ndarray, " V"]:

@@ -62,11 +62,13 @@ class PickedPoint(Correspondence):
         reprojection: largest reprojection error of the triangulated point, in pixels.
         worst_view: name of the view with that error.
         is_sharp: whether the picked pixels agree on one point.
+        views: names of the views that it was picked in.
     """
 
     reprojection: float
     worst_view: str
     is_sharp: bool
+    views: tuple[str, ...]
 
 
 def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
@@ -166,6 +168,7 @@ def align_picks(
             reprojection[k],
             worst_view[k],
             bool(sharp[k]),
+            tuple(pick.pixels),
         )
         for k, pick in enumerate(picks)
     ]

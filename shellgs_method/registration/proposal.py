@@ -31,15 +31,16 @@ from shellgs_method.shell.surface import ShellSurface
 AMBIGUOUS = 0.90
 """Share of the best score from which another candidate is reported as a rival."""
 _SAMPLES = 20_000  # points of the shell's surface
-_FEW, _MANY = 800, 4000  # SfM points that candidates are refined with, at first and in the end
 _CELLS = 20_000  # of the shell's grid
-_SCALE_STEP = 1.07
+_SCALE_STEP = 1.06
 _LARGEST = 2_000_000  # cells of a grid that the shell is shifted in
 _PEAKS = 3  # shifts kept per orientation and scale
 _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with points
 # Candidates that are measured and refined, and tolerances relative to the distance: errors of SfM points grow with it,
 # and what a smaller scale brings nearer to the shell fits no better.
-_MEASURED, _REFINED, _POLISHED = 1000, 40, 8
+_MEASURED, _POLISHED = 1000, 8
+_ROUNDS = ((250, 250, 1, 2, 10), (60, 800, 3, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
+_MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
 _DIFFERENT_FROM_AFAR = 0.01
@@ -90,16 +91,20 @@ def propose(
         replace(start, score=sight.agreement(surface, start.survey_from_scene, _ROUGH))
         for start in track(starts, "Measuring candidates", len(starts))
     ]
-    few, many = (np.random.default_rng(0).permutation(near)[:count] for count in (_FEW, _MANY))
-    starts = _distinct(starts, spread, _REFINED, 2 * search.cell)
-    found = []
-    for start in track(starts, "Refining candidates", len(starts)):
-        found += _refined(surface, few, sight, start, 2 * search.cell, _COARSE, 16)
-    found = _distinct(found, spread, _POLISHED, _DIFFERENT)
+    shuffled = np.random.default_rng(0).permutation(near)
+    for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
+        starts = _distinct(starts, spread, count, apart * search.cell)
+        starts = [
+            refined
+            for start in track(starts, f"Refining candidates, round {number}", len(starts))
+            for refined in _refined(surface, shuffled[:few], sight, start, reach * search.cell, _COARSE, steps)
+        ]
+    different = max([_DIFFERENT, *(_DIFFERENT_FROM_AFAR * sight.distance(s.survey_from_scene) for s in starts[:1])])
+    starts = _distinct(starts, spread, _POLISHED, different)
     polished = []
-    for start in track(found, "Refining the best", len(found)):
+    for start in track(starts, "Refining the best", len(starts)):
         reach = 2 * _COARSE * sight.distance(start.survey_from_scene)
-        polished += _refined(surface, many, sight, start, reach, _FIT, 30)
+        polished += _refined(surface, shuffled[:_MANY], sight, start, reach, _FIT, 30)
     polished = [candidate for candidate in polished if candidate.score > 0]
     if not polished:
         size = float(np.ptp(surface.vertices, axis=0).max())
@@ -107,7 +112,6 @@ def propose(
             f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
             "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"
         )
-    different = max(_DIFFERENT, _DIFFERENT_FROM_AFAR * sight.distance(polished[0].survey_from_scene))
     best, *others = _distinct(polished, spread, _POLISHED, different)
     return [best, *(replace(other, displacement=_displacement(best, other, spread)) for other in others)]
 

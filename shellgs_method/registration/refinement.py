@@ -144,19 +144,36 @@ def _solve(
     centre = np.average(points, axis=0, weights=weight)
     arm = points - centre
     radius = float(np.sqrt(np.average((arm**2).sum(axis=1), weights=weight)))
-    # Shift, rotation and scale are all in metres at that radius, so that their strengths can be compared.
-    scale = (np.einsum("nd,nd->n", normal, arm) - relative * distance)[:, None]
-    J = np.concatenate([normal, np.cross(arm, normal) / radius, scale / radius], axis=1)
+    J = motions(arm, normal, radius)
+    J[:, 6] -= relative * distance / radius
     strengths, directions = np.linalg.eigh(J.T @ (weight[:, None] * J) / weight.sum())
     evidence = Evidence(directions.T[::-1], np.maximum(strengths[::-1], 0.0), centre, radius, int(used.sum()))
     gradient = evidence.directions @ (J.T @ (weight * distance) / weight.sum())
     known = ~evidence.weak
     update = -(gradient[known] / evidence.strengths[known]) @ evidence.directions[known]
-    return evidence, _similarity(update, centre, radius), used
+    return evidence, similarity_by(update, centre, radius), used
 
 
-def _similarity(update: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """4x4 matrix of (shift, rotation, scale) about a centre."""
+def motions(
+    arm: Float64[np.ndarray, "N 3"], normal: Float64[np.ndarray, "N 3"], radius: float
+) -> Float64[np.ndarray, "N 7"]:
+    """Derivatives, by (shift, rotation, scale), of distances from planes with these normals.
+
+    All seven are in metres at the radius, so that their strengths can be compared.
+
+    Args:
+        arm: the points, from the centre of rotation and scale.
+        normal: normals of the planes.
+        radius: typical length of an arm.
+    """
+    scale = np.einsum("nd,nd->n", normal, arm)[:, None]
+    return np.concatenate([normal, np.cross(arm, normal) / radius, scale / radius], axis=1)
+
+
+def similarity_by(
+    update: Float64[np.ndarray, " 7"], centre: Float64[np.ndarray, " 3"], radius: float
+) -> Float64[np.ndarray, "4 4"]:
+    """The similarity of (shift, rotation, scale) about a centre, in the units of :func:`motions`."""
     matrix = np.eye(4)
     matrix[:3, :3] = np.exp(update[6] / radius) * Rotation.from_rotvec(update[3:6] / radius).as_matrix()
     matrix[:3, 3] = centre + update[:3] - matrix[:3, :3] @ centre

@@ -69,9 +69,9 @@ LIMITS = {
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
     "agreement": Limit(
-        0.5, 0.35, "a shell elsewhere shows walls where photographs show none, and hides what they show"
+        0.65, 0.55, "a shell elsewhere shows walls where photographs show none, and hides what they show"
     ),
-    "elsewhere": Limit(RIVALRY, 0.97, "where the shell stands as well elsewhere, neither place is proved"),
+    "elsewhere": Limit(0.8, 0.93, "where the shell stands as well elsewhere, neither place is proved"),
     "step": Limit(FINE, COARSEST, f"an error of half a step does not average out; {REMEDY}"),
     "check": Limit(0.10, 0.50, "careful picks are accurate to 3 to 5 cm"),
     "bent_pixels": Limit(1.05, 1.2, "points that were not adjusted to fit worse if cameras are bent"),

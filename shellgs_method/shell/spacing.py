@@ -160,11 +160,12 @@ def as_seen(cloud: Cloud, sights: Sights | None, spacing: float | None, metres_p
     if _expected(whole, seen, wanted) > _FULL and sights and not sights.blind.all():
         within = sights.cells(whole.points, 4 * whole.voxel, wanted)
         seen = within.contains(whole.points)
-        share = whole.counts[seen].sum() / whole.counts.sum()
-        notice(f"{cloud.path}: {1 - share:.0%} of its points are where no camera looks, or far away, and not meshed.")
     crowded = _expected(whole, seen, wanted) > _FULL
     voxel = max(wanted, whole.voxel * np.sqrt(seen.sum() / _FULL)) if crowded else wanted
     fine = whole if crowded and voxel >= whole.voxel else merged(cloud, voxel, whole.origin, within)
+    if within and fine is not whole:
+        unseen = whole.counts[~seen].sum() / whole.counts.sum()
+        notice(f"{cloud.path}: {unseen:.0%} of its points are where no camera looks, or far away, and not meshed.")
     if fine.voxel > 1.05 * wanted:
         why = "what the cameras resolve" if spacing is None else "asked for"
         notice(

@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.frames import extract_frames, sharpest, shift, stretches, travelled
-from shellgs_method.capture.hdr import tone_mapped
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
     add_mask,
@@ -37,6 +36,7 @@ from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import exif_log_gains, has_alpha, load_mask, load_photograph, read_image
+from shellgs_method.files.transfer import linear_of, srgb, tone_mapped
 from shellgs_method.synthetic import FacadeConfig, write_scene
 
 QUIET = Progress(disable=True)
@@ -217,14 +217,28 @@ def test_an_hdr_video_is_tone_mapped_and_this_is_told(tmp_path, caplog, characte
         assert np.asarray(frame).mean() == pytest.approx({"HLG": 233, "PQ": 255, None: 191}[name], abs=3)
 
 
-def test_the_flat_colours_of_hdr_photographs_are_told(tmp_path, caplog):
-    sdr, hlg = b"colrnclx\0\x01\0\x0d", b"colrnclx\0\x09\0\x12"  # primaries and transfer
-    assert sdr in PHONE.read_bytes()
-    (tmp_path / "hlg.heic").write_bytes(PHONE.read_bytes().replace(sdr, hlg))
+def test_an_hdr_photograph_is_tone_mapped_and_this_is_told(caplog):
     read_image(PHONE)
     assert "HDR" not in caplog.text
-    read_image(tmp_path / "hlg.heic")
-    assert "holds HDR photographs" in caplog.text
+    pixels = np.asarray(read_image(PHONE.with_name("hlg.heic"))).astype(int)
+    assert "holds HDR photographs (HLG), which are tone-mapped" in caplog.text
+    codes = np.array([[0.38] * 3, [0.75] * 3, [0.9] * 3, [0.5, 0.2, 0.2]])  # of its four patches, in 10 bits
+    expected = tone_mapped(np.rint(65535 * codes[None]).astype(np.uint16), "HLG")[0].astype(int)
+    np.testing.assert_allclose(pixels[16, 8::16], expected, atol=2)
+
+
+def test_8_bits_of_an_hdr_photograph_are_tone_mapped_too(tmp_path):
+    sdr, hlg = b"colrnclx\0\x01\0\x0d", b"colrnclx\0\x09\0\x12"  # primaries and transfer
+    (tmp_path / "hlg.heic").write_bytes(PHONE.read_bytes().replace(sdr, hlg))
+    plain, mapped = (np.asarray(read_image(path)) for path in (PHONE, tmp_path / "hlg.heic"))
+    wide = plain.astype(np.uint16) * 257
+    np.testing.assert_allclose(mapped.astype(int), tone_mapped(wide, "HLG").astype(int), atol=1)
+
+
+def test_the_curve_of_srgb_and_its_inverse_agree():
+    stored = np.arange(256) / 255
+    np.testing.assert_allclose(srgb(linear_of(stored)), stored, atol=1e-7)
+    assert linear_of(np.array([0.5]))[0] == pytest.approx(0.21404114, abs=1e-7)  # IEC 61966-2-1
 
 
 @pytest.mark.parametrize("content", [b"", b"this is no video" * 100])
@@ -694,6 +708,42 @@ def test_the_light_of_a_photograph_is_that_of_its_exif_data(tmp_path):
     gains = exif_log_gains([tmp_path / f"{name}.jpg" for name in cases])
     np.testing.assert_allclose(gains / np.log(2), [-1, 1, 0, 0], atol=1e-6)
     np.testing.assert_array_equal(exif_log_gains([tmp_path / "none.jpg"]), [0])
+
+
+def rows(database: Path, query: str) -> list[tuple]:
+    with closing(sqlite3.connect(database)) as connection:
+        return sorted(connection.execute(query).fetchall(), key=repr)
+
+
+def test_features_that_were_stopped_before_the_first_photograph_are_found_as_if_they_were_not(tmp_path):
+    """COLMAP writes a camera, and its rig, when it has read the first photograph: seconds before its features."""
+    (tmp_path / "photographs").mkdir()
+    for name in ("0.png", "1.png", "2.png"):
+        photograph(200, 150, seed=int(name[0])).save(tmp_path / "photographs" / name)
+    lenses = [{"size": [200, 150], "names": names, "focal": None} for names in (["0.png", "1.png"], ["2.png"])]
+    sift = {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}
+
+    def extract(database: Path, count: int) -> None:
+        job = {"photographs": str(tmp_path / "photographs"), "masks": None, "rigs": [], "sift": sift}
+        job |= {"database": str(database), "lenses": lenses[:count]}
+        run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
+
+    whole, stopped = tmp_path / "whole.db", tmp_path / "stopped.db"
+    for kept in (0, 1):  # lenses that were finished
+        whole.unlink(missing_ok=True)
+        stopped.unlink(missing_ok=True)
+        extract(whole, 2)
+        extract(stopped, kept + 1)
+        with closing(sqlite3.connect(stopped)) as connection, connection:
+            of_last = f"(SELECT image_id FROM images WHERE camera_id = {kept + 1})"
+            for table in ("keypoints", "descriptors"):
+                connection.execute(f"DELETE FROM {table} WHERE image_id IN {of_last}")
+            connection.execute(f"DELETE FROM frame_data WHERE data_id IN {of_last}")
+            connection.execute("DELETE FROM frames WHERE frame_id NOT IN (SELECT frame_id FROM frame_data)")
+            connection.execute(f"DELETE FROM images WHERE camera_id = {kept + 1}")
+        extract(stopped, 2)
+        for query in ("SELECT * FROM cameras", "SELECT * FROM rigs", "SELECT name, camera_id FROM images"):
+            assert rows(stopped, query) == rows(whole, query)
 
 
 @pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of, trainer_of
 
@@ -18,6 +19,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.frame import Frame, scene_frame, shell_frame
 from shellgs_method.export.meshes import write_mesh
 from shellgs_method.export.runs import TrainedRun, mesh_errors
+from shellgs_method.geometry import tsdf
 from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
@@ -52,6 +54,43 @@ def view_of_sphere(camera: Camera, radius: float = 1.5) -> DepthView:
 @pytest.fixture(scope="module")
 def sphere() -> trimesh.Trimesh:
     return fuse((view_of_sphere(camera_at(angle)) for angle in np.linspace(-0.6, 0.6, 7)), ROOM, 0.05)
+
+
+def test_tiles_of_one_lattice_meet_without_a_seam(sphere, monkeypatch):
+    """The mesh of many tiles has the triangles of that of one."""
+    monkeypatch.setattr(tsdf, "_TILE", 2)
+    assert len(tsdf._tiles(ROOM, 0.05)[1]) == 9
+    tiled = fuse((view_of_sphere(camera_at(angle)) for angle in np.linspace(-0.6, 0.6, 7)), ROOM, 0.05)
+    assert len(tiled.faces) == len(sphere.faces)
+    assert len(tiled.vertices) == len(sphere.vertices)
+    assert KDTree(tiled.triangles_center).query(sphere.triangles_center)[0].max() < 1e-6
+    assert tiled.area == pytest.approx(sphere.area)
+
+
+def view_of_street(x: float) -> DepthView:
+    """Depth of the wall z = 0.1 sin(x), from 5 before it, by fixed-point iteration along the rays."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, 3] = torch.tensor([-x, 0, 5])
+    camera = Camera(viewmat, K, 96, 64)
+    rays = camera.rays()
+    depth = torch.full((64, 96), 5.0, dtype=torch.float64)
+    for _ in range(30):
+        depth = 5 + 0.1 * torch.sin(x + depth * rays[..., 0])
+    return DepthView(depth[..., None].float(), torch.ones(64, 96, 3), camera)
+
+
+def test_a_long_street_is_meshed_as_finely_as_a_house_of_it(monkeypatch):
+    monkeypatch.setattr(tsdf, "_TILE", 60)
+    street, house = (Box(np.eye(3), np.array([-2.0, -1, -1]), np.array([end, 1.0, 1])) for end in (58.0, 6.0))
+    views = [view_of_street(x) for x in np.arange(0, 57, 1.0)]
+    whole, part = fuse(views, street), fuse(views, house)
+    assert whole.metadata["voxel"] == pytest.approx(part.metadata["voxel"])
+    assert len(tsdf._tiles(street, whole.metadata["voxel"])[1]) == 3
+    errors = [np.abs(mesh.vertices[:, 2] - 0.1 * np.sin(mesh.vertices[:, 0])) for mesh in (whole, part)]
+    assert np.quantile(errors[0], 0.95) == pytest.approx(np.quantile(errors[1], 0.95), rel=0.2)
+    assert np.quantile(errors[0], 0.95) < 0.02
+    here = whole.vertices[whole.vertices[:, 0] < 5]
+    assert KDTree(here).query(part.vertices[part.vertices[:, 0] < 4.9])[0].max() < 1e-5
 
 
 def test_views_of_a_sphere_fuse_to_a_sphere(sphere):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -133,6 +134,24 @@ def test_a_cityjson_that_cannot_be_used_is_refused(tmp_path: Path, change: Calla
         read_geometry(made.save_json(tmp_path / "a.json", document))
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_swapped_axes_are_told_by_roofs_that_face_down(tmp_path: Path, caplog, swapped: bool):
+    axes = [1, 0, 2] if swapped else [0, 1, 2]
+    faces = [Face([ring[:, axes] for ring in face.rings], face.surface) for face in house()]
+    ground = Face([faces[-1].rings[0][::-1]], "GroundSurface")  # as seen from below
+    read_geometry(made.save_json(tmp_path / "a.json", made.cityjson([*faces[:-1], ground])))
+    assert ("northing before easting" in caplog.text) == swapped
+
+
+def test_an_ifc_in_a_zip_and_one_without_a_unit_are_read(tmp_path: Path, caplog):
+    file = made.ifc_house(unit=1.0)
+    file.project.UnitsInContext = None
+    with zipfile.ZipFile(tmp_path / "a.ifczip", "w") as archive:
+        archive.write(file.save(tmp_path / "a.ifc"), "a.ifc")
+    assert_cast_as(tmp_path / "a.ifczip", made.ifc_house_faces())
+    assert "names no unit of length" in caplog.text
+
+
 # CityGML
 
 
@@ -171,6 +190,25 @@ def test_a_link_to_nothing_and_one_to_itself_end_in_words(tmp_path: Path, caplog
     assert "1 link to what is not in the file" in caplog.text
     with pytest.raises(SceneError, match="its geometry links to itself"):
         read_geometry(save(tmp_path / "b.gml", made.citygml(surfaces + dangling.replace("#nothing", "#c"))))
+
+
+def test_footprints_are_left_out_whatever_their_dimension(tmp_path: Path, caplog):
+    ring = "<gml:exterior><gml:LinearRing><gml:posList>0 0 1 0 1 1 0 0</gml:posList></gml:LinearRing></gml:exterior>"
+    member = f"<gml:surfaceMember><gml:Polygon>{ring}</gml:Polygon></gml:surfaceMember>"
+    foot = f"<bldg:lod0FootPrint><gml:MultiSurface>{member}</gml:MultiSurface></bldg:lod0FootPrint>"
+    faces = moved(house())
+    assert_cast_as(save(tmp_path / "a.gml", made.citygml(foot + made.surfaces_gml(faces, "2.0"))), faces)
+    assert "1 footprint (LoD 0)" in caplog.text
+
+
+def test_rooms_of_the_highest_level_of_detail_are_left_out(tmp_path: Path, caplog):
+    faces = moved(house())
+    inside = moved(house(), NATIONAL + np.array([0, 0, -1.0]))
+    room = made.surfaces_gml(inside, "2.0", lod=4).replace("WallSurface", "InteriorWallSurface")
+    body = f"<bldg:interiorRoom><bldg:Room>{room}</bldg:Room></bldg:interiorRoom>"
+    text = made.citygml(made.surfaces_gml(faces, "2.0", lod=4) + body)
+    assert_cast_as(save(tmp_path / "a.gml", text), faces)
+    assert "1 Room" in caplog.text
 
 
 def test_terrain_is_ground(tmp_path: Path):
@@ -330,6 +368,20 @@ def test_an_ifc_that_cannot_be_used_is_refused(tmp_path: Path, change: Callable,
     path.write_text(change(path.read_text()))
     with pytest.raises(SceneError, match=words):
         read_geometry(path)
+
+
+def test_faults_of_an_ifc_are_said(tmp_path: Path, caplog):
+    path = made.ifc_house().save(tmp_path / "a.ifc")
+    read_geometry(path)
+    assert "faulty" not in caplog.text
+    text = path.read_text()
+    wall = re.search(r"=IFCWALL\(.*?,(#\d+),(#\d+),", text)
+    assert wall
+    path.write_text(text.replace(f"{wall[2]}=", "#9999="))  # the shape that the wall refers to
+    assert SurfaceClass.WALL not in read_geometry(path).classes
+    assert (
+        f"1 of its lines or shapes are faulty and may be missing, such as: Instance reference {wall[2]}" in caplog.text
+    )
 
 
 # All the way

@@ -13,6 +13,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from torch import Tensor
 
+from shellgs_method.errors import SceneError
 from shellgs_method.machine import cpp, system
 from shellgs_method.machine.elementwise import dot, elementwise
 from shellgs_method.machine.symbols import Symbol
@@ -122,7 +123,6 @@ def test_of_two_processes_one_compiles_and_the_other_waits(compiler, tmp_path, m
 def test_a_folder_that_cannot_be_written_is_said_and_compiles_nothing(compiler, tmp_path, monkeypatch, caplog):
     (file := tmp_path / "file").write_text("")
     monkeypatch.setenv("SHELLGS_CACHE", str(file))
-    monkeypatch.setattr(cpp, "_failures", [])
     assert cpp.load_library('extern "C" int eight() { return 8; }\n') is None
     (record,) = caplog.records
     assert str(file) in record.getMessage()
@@ -133,7 +133,6 @@ def test_without_a_compiler_torch_serves_and_says_so(monkeypatch, caplog):
     monkeypatch.setenv("CXX", "no-such-compiler")
     cpp.compiler_works.cache_clear()
     cpp.load_library.cache_clear()
-    monkeypatch.setattr(cpp, "_failures", [])
     total, _ = elementwise(mixed, torch.ones(20, 3), torch.ones(20, 3), torch.ones(1))
     cpp.compiler_works.cache_clear()
     cpp.load_library.cache_clear()
@@ -142,13 +141,28 @@ def test_without_a_compiler_torch_serves_and_says_so(monkeypatch, caplog):
     assert "no C++ compiler" in record.getMessage()
 
 
-def test_a_damaged_library_is_made_again(compiler, tmp_path, monkeypatch):
+@pytest.mark.parametrize("left", [0, 0.5, 0.99, None], ids=["empty", "half", "cut off", "one byte changed"])
+def test_a_damaged_library_is_made_again(compiler, tmp_path, monkeypatch, left):
     monkeypatch.setenv("SHELLGS_CACHE", str(tmp_path / "a folder"))
     command = [sys.executable, "-c", COMPILE.format(6)]
     subprocess.run(command, check=True, capture_output=True)
     (library,) = (tmp_path / "a folder").glob("*.so")
-    library.write_bytes(b"")
+    whole = library.read_bytes()
+    damaged = whole[:-1] + bytes([whole[-1] ^ 1]) if left is None else whole[: int(left * len(whole))]
+    library.write_bytes(damaged)
     assert subprocess.run(command, check=True, capture_output=True, text=True).stdout.endswith("6\n")
+
+
+@pytest.mark.parametrize(("said", "meant"), [("off", False), ("No", False), ("false", False), ("", True), ("ON", True)])
+def test_compiling_is_switched_by_any_usual_word(compiler, monkeypatch, said, meant):
+    monkeypatch.setenv("SHELLGS_COMPILE", said)
+    assert cpp.compiles() == meant
+
+
+def test_an_unknown_word_for_compiling_is_refused(monkeypatch):
+    monkeypatch.setenv("SHELLGS_COMPILE", "nope")
+    with pytest.raises(SceneError, match="SHELLGS_COMPILE is 'nope': set it to 0"):
+        cpp.compiles()
 
 
 def test_a_compiler_may_have_arguments(compiler, tmp_path, monkeypatch):

@@ -25,6 +25,7 @@ from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 from shellgs_method.occlusion import check as checking
 from shellgs_method.occlusion.check import _at_mean_exposure, _exposed, _gains, _told_apart
@@ -323,6 +324,26 @@ def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
         assert (found.beyond == ((wall > 0) & ~inside)).mean() > 0.99
         assert not (found.occluder | found.moved)[sky].any()
         assert found.occluder.mean() < 0.01
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_where_the_model_has_windows_only_they_show_what_is_behind(tmp_path: Path, known: bool):
+    """A wall with a mirror, whose left half is a window in the shell's model."""
+    wall, normal = np.full((HEIGHT, WIDTH), WALL, np.float32), np.zeros((HEIGHT, WIDTH, 3), np.float16)
+    shell, views, windows = CueMaps.create(tmp_path, "shell", command="cast"), [], []
+    for index, (view, _) in enumerate(street(CAMERAS, mirror=1 / 0.6)):
+        name = f"{index}.png"
+        Image.fromarray(view.image.numpy()).save(tmp_path / name)
+        views.append(View(name, tmp_path / name, view.camera))
+        x = (view.camera.position.numpy() + WALL * view.camera.rays().numpy())[..., 0]
+        windows.append((x > -1.5) & (x < 0))
+        classes = np.where(windows[-1], SurfaceClass.WINDOW, SurfaceClass.WALL).astype(np.uint8) if known else None
+        shell.write(name, CueMap(wall, normal, wall > 0, classes), view.camera)
+    check_views(tmp_path, views, [])
+    name, camera = views[MIDDLE].name, views[MIDDLE].camera
+    found = Findings.of(CueMaps.open(tmp_path, "checked").require(name, camera), shell.require(name, camera)).behind
+    assert found[windows[MIDDLE]].mean() > 0.5
+    assert found[~windows[MIDDLE]].any() != known
 
 
 def test_a_checked_map_says_what_a_pixel_shows():

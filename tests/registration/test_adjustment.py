@@ -28,12 +28,14 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import ADJUSTED, ScenePaths
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.similarity import fit_similarity, transformed
-from shellgs_method.registration.adjustment import Adjustment, adjusted
+from shellgs_method.registration.adjustment import Adjustment, adjusted, inliers
+from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh
 from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.synthetic.building import Layout, shell
 from shellgs_method.synthetic.path import walk
 
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
 VIEWS, WIDTH, HEIGHT, NOISE = 24, 640, 480, 0.3
 CAMERAS = walk(15.0, VIEWS, WIDTH, HEIGHT, np.random.default_rng(0))
 CENTRES = np.stack([camera.position.numpy() for camera in CAMERAS])
@@ -173,10 +175,10 @@ def test_the_scene_keeps_its_frame(surface: ShellSurface, bent: Model):
     assert np.linalg.norm(common[:3, 3]) < 0.1
 
 
-def test_cameras_that_are_straight_move_by_less_than_their_deviation(surface: ShellSurface, model: Model):
+def test_cameras_that_are_straight_move_by_what_their_deviation_allows(surface: ShellSurface, model: Model):
     found = adjusted(surface, model, surface.survey_from_shell, NAMES)
     moved, deviations = (np.array(list(by.values())) for by in (found.moved, found.deviations))
-    assert np.median(moved) < np.median(deviations)
+    assert np.median(moved) < 2 * np.median(deviations)  # their errors are alike: a lens and a place are shared
     assert found.held_out.were_straight
 
 
@@ -184,6 +186,43 @@ def test_surveyed_positions_draw_cameras_to_them(surface: ShellSurface, bent: Mo
     known = dict(zip(NAMES.values(), transformed(CENTRES, surface.survey_from_shell), strict=True))
     found = adjusted(surface, bent, surface.survey_from_shell, NAMES, known, 0.001)
     assert error(surface, found).max() < 0.003
+
+
+def test_points_are_told_from_those_beside_the_shell():
+    """A wall with few other points, and reveals with hardly any but those of frames, all on one side of them."""
+    random = np.random.default_rng(0)
+    of_shell, deviation = np.repeat([True, False, True, False], [800, 200, 40, 300]), random.uniform(0.003, 0.02, 1340)
+    facing = np.repeat([0, 1], [1000, 340])
+    distance = np.where(of_shell, random.normal(0, np.hypot(0.01, deviation)), random.uniform(-0.01, 0.1, 1340))
+    probability, sigma = inliers(distance, deviation, facing, 0.1)
+    assert sigma == pytest.approx(0.01, rel=0.2)
+    shares = [probability[facing == side].mean() for side in (0, 1)]
+    assert shares[0] == pytest.approx(0.8, abs=0.1)
+    assert shares[1] == pytest.approx(40 / 340, abs=0.15)
+    close = np.abs(distance) < 0.01
+    assert probability[close & (facing == 0)].mean() > 0.2 + probability[close & (facing == 1)].mean()
+
+
+def test_picks_say_where_along_a_bare_wall_it_is(surface: ShellSurface, model: Model):
+    """The wall's points say nothing of a shift along it, and picks with 1 cm of noise do, as their number allows."""
+    wall = ShellSurface(ShellMesh(np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]]), FACES))
+    on_wall = np.abs(model.points.positions[:, 1]) < 0.01
+    kept, points = np.flatnonzero(on_wall), model.points
+    observers, keypoints = ([of[k] for k in kept] for of in (points.observers, points.keypoints))
+    bare = Points(points.positions[kept], points.colours[kept], observers, keypoints, points.ids[kept])
+    model = replace(model, points=bare)
+    survey_from_scene = wall.survey_from_shell.copy()
+    survey_from_scene[0, 3] += 0.1
+    random = np.random.default_rng(0)
+    picked = [point for point in bare.positions[::20] if 2 < point[0] < 13][:16]
+    picks = []
+    for number, place in enumerate(picked):
+        seen = tuple(NAMES[k + 1] for k, camera in enumerate(CAMERAS) if len(in_view(camera, place[None])[1]))[::3]
+        shell = place + random.normal(0, 0.01, 3)
+        picks.append(PickedPoint(str(number), shell, place, False, True, 0.1, 0.1, 0.1, seen[0], True, seen))
+    with_picks, without = (error(wall, adjusted(wall, model, survey_from_scene, NAMES, picks=p)) for p in (picks, []))
+    assert without.mean() > 0.05
+    assert with_picks.mean() < 0.02
 
 
 def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
@@ -221,6 +260,14 @@ def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: S
     view = read_views(layout)[0]
     with pytest.raises(SceneError, match="map"):
         CueMaps.open(tmp_path, "shell").require(view.name, view.camera.shrunk(64))
+
+
+def test_a_scene_of_transforms_is_refused_in_a_sentence(scene: Path):
+    before = (scene / ALIGNMENT).read_bytes()
+    with pytest.raises(SceneError, match=r"transforms\.json has no tracks, which a COLMAP model has"):
+        align(scene, bundle_adjust=True)
+    assert (scene / ALIGNMENT).read_bytes() == before
+    assert not (scene / ADJUSTED).exists()
 
 
 @pytest.mark.parametrize("wrong", ["30 cm", "2 degrees", "another building"])

@@ -73,9 +73,9 @@ def disturbed(bundle: Bundle, size: float = 0.05) -> Bundle:
 
 
 def with_all_terms(bundle: Bundle, seen: Observations) -> Objective:
-    """Reprojection errors, points on a plane, some of them far from it, and two known positions."""
-    wall = np.arange(20)
-    planes = Planes(wall, np.tile([0.0, 0, 1], (20, 1)), np.zeros((20, 3)), sigma=0.05, gate=0.25)
+    """Reprojection errors, points on a plane, which count differently, and two known positions."""
+    wall, weights = np.arange(20), np.linspace(0, 1, 20)
+    planes = Planes(wall, np.tile([0.0, 0, 1], (20, 1)), np.zeros((20, 3)), weights, sigma=0.05)
     return Objective(
         seen, 0.5, planes=planes, positions=Positions(np.array([0, 3]), bundle.centres[[0, 3]], np.array([0.01, 0.02]))
     )
@@ -131,18 +131,17 @@ def test_the_minimum_is_that_of_scipy():
     objective = with_all_terms(bundle, seen)
 
     def residuals(step: np.ndarray) -> np.ndarray:
-        """Smooth roots of the robust terms, whose sum of squares is twice the cost."""
+        """Smooth roots of the robust term and the others, whose sum of squares is twice the cost."""
         at = moved(bundle, seen, step)
         error = reprojection_errors(at, seen)[0] / objective.pixel
         squared = np.maximum((error**2).sum(axis=1, keepdims=True), 1e-12) / objective.cauchy**2
         cauchy = error * np.sqrt(np.log1p(squared) / squared)
         planes = objective.planes
         distance = np.einsum("kj,kj->k", planes.normals, at.points[planes.points] - planes.feet)
-        risen = (1 - np.clip(1 - (distance / planes.gate) ** 2, 0, None) ** 3) / 3
-        tukey = np.sign(distance) * planes.gate / planes.sigma * np.sqrt(risen)
+        off = distance * np.sqrt(planes.weights) / planes.sigma
         known = objective.positions
         away = (at.centres[known.views] - known.centres) / known.sigma[:, None]
-        return np.concatenate([cauchy.ravel(), tukey, away.ravel()])
+        return np.concatenate([cauchy.ravel(), off, away.ravel()])
 
     found, _ = adjust(objective, disturbed(bundle, 0.02), steps=200, converged=1e-15)
     reference = least_squares(residuals, np.zeros(6 * 5 + 4 + 90), x_scale="jac", max_nfev=40)
@@ -193,7 +192,7 @@ def test_what_nothing_determines_stays():
     bundle, seen = problem(points=60)
     bundle = replace(bundle, points=bundle.points * [1, 1, 0])
     exact = replace(seen, pixels=seen.pixels + reprojection_errors(bundle, seen)[0])
-    wall = Planes(np.arange(60), np.tile([0.0, 0, 1], (60, 1)), np.tile([0.0, 0, 0.1], (60, 1)), 0.01, 1.0)
+    wall = Planes(np.arange(60), np.tile([0.0, 0, 1], (60, 1)), np.tile([0.0, 0, 0.1], (60, 1)), np.ones(60), 0.01)
     loose = Positions(np.arange(5), bundle.centres, np.ones(5))
     found, _ = adjust(Objective(exact, 0.5, planes=wall, positions=loose), bundle, steps=100)
     np.testing.assert_allclose(found.points[:, 2], 0.1, atol=1e-4)

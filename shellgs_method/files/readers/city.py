@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.readers.contents import NO_POINTS, Geometry, left_out, say_left_out, say_missed
 from shellgs_method.geometry.polygons import triangulated
 from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.geometry.triangles import area_vectors
 
 _CLASSES = {
     "WallSurface": SurfaceClass.WALL,
@@ -149,12 +150,24 @@ def outside(objects: Iterable[CityObject], path: Path, missing: Counter[str]) ->
     cut = triangulated(vertices, sizes, corners.reshape(-1), holes)
     left_out(path, int((sizes[~holes] < 3).sum()), int((~holes).sum()), "polygons, which have fewer than 3 corners")
     say_missed(path, len(cut.missed), int((~holes).sum()))
-    return Geometry(vertices, cut.faces, classes=np.array(found.classes, np.uint8)[cut.polygon], drawn=True)
+    classes = np.array(found.classes, np.uint8)[cut.polygon]
+    _tell_if_mirrored(area_vectors(vertices, cut.faces)[:, 2], classes, path)
+    return Geometry(vertices, cut.faces, classes=classes, drawn=True)
 
 
 def ring_of(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "M 3"]:
     """A ring's corners without those that repeat the one before, as the last repeats the first."""
     return points[(points != np.roll(points, 1, axis=0)).any(axis=1)] if len(points) > 1 else points
+
+
+def _tell_if_mirrored(upwards: Float64[np.ndarray, " F"], classes: UInt8[np.ndarray, " F"], path: Path) -> None:
+    """Warn of roofs that face down: polygons wind inwards, or the axes are swapped, which no rotation undoes."""
+    known = np.select([classes == SurfaceClass.ROOF, classes == SurfaceClass.GROUND], [upwards, -upwards], 0.0)
+    if known.sum() < -0.5 * np.abs(known).sum():
+        notice(
+            f"{path}: its roofs face down, so that its polygons are wound inwards, which does not matter, or its "
+            "coordinates are northing before easting, which mirrors the building: if it does not align, swap them."
+        )
 
 
 def _refuse_degrees(points: Float64[np.ndarray, "N 3"], path: Path) -> None:

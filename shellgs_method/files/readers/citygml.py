@@ -102,6 +102,8 @@ class _Model:
             raise ValueError("its surfaces are parts of themselves")
         own = [(level, p) for p in feature if (level := self._level_of(p, feature)) is not None]
         taken = {id(p) for _, p in own}
+        footprints = [prop for _, prop in own if _name(prop).rpartition("}")[2].startswith("lod0")]
+        self.missing["footprint (LoD 0)"] += bool(footprints)
         for prop in feature:
             if id(prop) in taken or _name(prop) in ("lod", "appearance", "address"):
                 continue
@@ -117,6 +119,8 @@ class _Model:
                     if part.levels or part.parts:
                         made.parts.append(part)
         for level, prop in own:  # after the surfaces, whose polygons a solid may have again
+            if prop in footprints:
+                continue
             polygons = made.levels.setdefault(level, [])
             polygons += [Polygon(rings, surface) for rings in self._polygons(prop, 0)]
             if not polygons:
@@ -166,13 +170,13 @@ class _Model:
             yield [ring @ matrix[:3, :3].T + matrix[:3, 3] + at for ring in rings]
 
     def _rings(self, polygon: ET.Element) -> list[Float64[np.ndarray, "N 3"]]:
-        """Outline and holes of a polygon; none where a side is curved, or it is flat by having two coordinates."""
+        """Outline and holes of a polygon; none where a side is curved."""
         if any(_name(each) in _CURVED for each in polygon.iter()):
             self.missing["polygon with curved sides"] += 1
             return []
         bounds = [(side, child) for child in polygon if (side := _RINGS.get(_name(child))) is not None]
         found = [ring_of(self._points(child)) for _, child in sorted(bounds, key=lambda bound: bound[0])]
-        return found if not any(side == 0 for side, _ in bounds) or len(found) else []
+        return found
 
     def _points(self, element: ET.Element) -> Float64[np.ndarray, "N 3"]:
         """Positions below an element, in all the ways in which GML writes them."""

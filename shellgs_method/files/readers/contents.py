@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int, Int64, Shaped, UInt8
 
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.readers.points import NO_POINTS
 from shellgs_method.geometry.polygons import triangulated
 from shellgs_method.geometry.surface_classes import NO_CLASSES, classes_of
 
 NO_FACES = np.empty((0, 3), np.int64)
-NO_POINTS = np.empty((0, 3))
 
 
 @dataclass(frozen=True)

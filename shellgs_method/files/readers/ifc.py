@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.readers.contents import NO_FACES, NO_POINTS, Geometry, say_left_out
+from shellgs_method.files.readers.contents import Geometry, say_left_out
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.machine.extras import import_extra
 
 _END = b"END-ISO-10303-21"
@@ -66,42 +68,55 @@ def read_ifc(path: Path) -> Geometry:
 
     if path.suffix.lower() == ".ifc" and _END not in path.read_bytes()[-1000:]:
         raise ValueError("it does not end as an IFC does")
+    ifcopenshell.get_log()  # which empties it
     model: Any = ifcopenshell.open(str(path))
     products = [each for each in model.by_type("IfcProduct") if each.Representation]
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
     say_left_out(path, Counter(each.is_a() for each in products if classes[each.id()] is None))
     seen = [each for each in products if classes[each.id()] is not None]
-    shapes = list(_shapes(ifcopenshell.geom, model, seen))
-    vertices, faces, kinds = [NO_POINTS], [NO_FACES], [NO_CLASSES]
-    count = 0
-    for shape in shapes:
-        matrix = np.array(shape.transformation.matrix).reshape(4, 4).T
-        points = transformed(np.array(shape.geometry.verts).reshape(-1, 3), matrix)
-        triangles = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
-        vertices.append(points)
-        faces.append(triangles + count)
-        kinds.append(_with_glass(classes[shape.id], shape.geometry, len(triangles)))
-        count += len(points)
-    made = {shape.id for shape in shapes}
-    failed = [each for each in seen if each.id() not in made and _has_body(each)]
+    made = [_read(shape, classes[shape.id]) for shape in _shapes(ifcopenshell.geom, model, seen)]
+    made.sort(key=lambda part: part.product)  # threads finish them in any order
+    known = {part.product for part in made}
+    failed = [each for each in seen if each.id() not in known and _has_body(each)]
     if failed:
         notice(
             f"{path}: the geometry of {len(failed)} of {len(seen)} parts cannot be made, such as {failed[0].is_a()} "
             f"{failed[0].GlobalId}."
         )
-    if not count:
+    faults = [line for line in ifcopenshell.get_log().splitlines() if line.startswith("[error]")]
+    if faults:
+        first = re.sub(r"\[.*?\] *", "", faults[0])
+        notice(f"{path}: {len(faults)} of its lines or shapes are faulty and may be missing, such as: {first}.")
+    if not made:
         raise SceneError(f"the shell {path} has no walls, roofs, windows or other outside of a building")
+    starts = np.cumsum([0, *(len(part.vertices) for part in made)])
     return Geometry(
-        _on_the_map(model, np.concatenate(vertices), path),
-        np.concatenate(faces),
-        classes=np.concatenate(kinds),
+        _on_the_map(model, np.concatenate([part.vertices for part in made]), path),
+        np.concatenate([part.faces + start for part, start in zip(made, starts, strict=False)]),
+        classes=np.concatenate([part.classes for part in made]),
         drawn=True,
     )
 
 
+class _Part(NamedTuple):
+    """The triangles of a product, in metres and the model's coordinates."""
+
+    product: int
+    vertices: Float64[np.ndarray, "V 3"]
+    faces: Int64[np.ndarray, "F 3"]
+    classes: UInt8[np.ndarray, " F"]
+
+
+def _read(shape: Any, own: SurfaceClass | None) -> _Part:
+    matrix = np.array(shape.transformation.matrix).reshape(4, 4).T
+    vertices = transformed(np.array(shape.geometry.verts).reshape(-1, 3), matrix)
+    faces = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
+    return _Part(shape.id, vertices, faces, _with_glass(own, shape.geometry, len(faces)))
+
+
 def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
-    """The triangulated shapes of products, in metres and their own placements, with openings cut."""
-    iterator = geom.iterator(geom.settings(), model, 1, include=products) if products else None
+    """The triangulated shapes of products, in metres and their placements, with openings cut; valid until the next."""
+    iterator = geom.iterator(geom.settings(), model, os.cpu_count() or 1, include=products) if products else None
     if iterator is not None and iterator.initialize():
         yield iterator.get()
         while iterator.next():
@@ -163,6 +178,8 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     import ifcopenshell.util.geolocation
     import ifcopenshell.util.unit
 
+    if ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT") is None:
+        notice(f"{path}: it names no unit of length: its numbers are taken for metres.")
     known = ifcopenshell.util.geolocation.get_helmert_transformation_parameters(model)
     if known is None:
         return points

@@ -1,4 +1,4 @@
-"""Tone mapping of HDR video, as phones record it, to the sRGB of photographs.
+"""Transfer functions: sRGB's, and tone mapping of HDR video and photographs, as phones and cameras record them, to it.
 
 One curve for all frames, so that a wall keeps its colour from frame to frame.
 """
@@ -11,6 +11,10 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 Transfer = Literal["HLG", "PQ"]
+HDR: dict[int, Transfer] = {16: "PQ", 18: "HLG"}
+"""Transfer functions of HDR by their codes in files (transfer characteristics of ITU-T H.273)."""
+OFFSET, POWER = 0.055, 1 / 2.4
+"""sRGB's curve above its toe, x = 1.055 l^(1/2.4) - 0.055 (IEC 61966-2-1)."""
 
 _WHITE = 203.0  # nits of diffuse white (ITU-R BT.2408)
 _PEAK = 1000.0  # nits of the display that HLG is graded on (ITU-R BT.2100)
@@ -36,7 +40,17 @@ def tone_mapped(rgb: UInt16[np.ndarray, "H W 3"], transfer: Transfer) -> UInt8[n
     room = 1 - _KNEE
     mapped = np.where(brightest < _KNEE, brightest, 1 - room * np.exp((_KNEE - brightest) / room))
     linear = (light * (mapped / np.maximum(brightest, 1e-9))) @ _BT709_FROM_BT2020.T
-    return np.rint(255 * _srgb(linear.clip(0, 1))).astype(np.uint8)
+    return np.rint(255 * srgb(linear.clip(0, 1))).astype(np.uint8)
+
+
+def srgb(linear: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+    """Colours as sRGB stores them, of linear light in [0, 1]."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, (1 + OFFSET) * linear**POWER - OFFSET)
+
+
+def linear_of(stored: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
+    """Linear light of sRGB's colours in [0, 1]."""
+    return np.where(stored <= 0.04045, stored / 12.92, ((stored + OFFSET) / (1 + OFFSET)) ** (1 / POWER))
 
 
 def _hlg_scene(code: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
@@ -48,7 +62,3 @@ def _pq_nits(code: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 32, 3424 / 4096, 2413 / 128, 2392 / 128
     power = code ** (1 / m2)
     return 10000 * (np.maximum(power - c1, 0) / (c2 - c3 * power)) ** (1 / m1)
-
-
-def _srgb(linear: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)

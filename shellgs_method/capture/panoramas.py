@@ -1,0 +1,248 @@
+"""Panoramas of 360° cameras, which are equirectangular, cut into pinhole photographs: the faces of a rig.
+
+The faces look where those of COLMAP's example ``panorama_sfm.py`` do, without the ones that look down, where the
+operator is: four level ones, and four raised ones between them, for the upper storeys. Each is 90° wide and high, so
+that they overlap, and what the border of one stretches is in the middle of another.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import groupby, product
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Shaped
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.capture.photographs import Lens
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.exif import exif_of
+
+UNSTITCHED = {".insv", ".360"}
+"""Suffixes of what 360° cameras record, in lower case: two circles or an unfolded cube."""
+_EQUIRECTANGULAR, _ONE_EYE = 0, 0  # FFmpeg's AV_SPHERICAL_EQUIRECTANGULAR and AV_STEREO3D_2D
+_OVERLAPPING = 60  # degrees between the directions of faces that share much: those of level and raised neighbours
+_HEADER = 1 << 18  # bytes of a file in which its XMP metadata begin
+_PROJECTION = re.compile(rb"GPano:ProjectionType\s*(?:=\s*[\"']|>)\s*(\w+)")
+_WIDTHS = re.compile(rb"GPano:(?:FullPano|CroppedAreaImage)WidthPixels\s*(?:=\s*[\"']|>)\s*(\d+)")
+# Most that a panorama's first column differs from its last, in differences of neighbouring columns: at most 1.7 in 20
+# rendered panoramas, 3.6 and more in 61 photographs that were cropped to the same shape, 11 in the median.
+_CLOSED = 3.0
+_NOISE = 1.0  # of colours
+_COMPARED = 9  # photographs
+
+
+@dataclass(frozen=True)
+class Face:
+    """A pinhole camera in a panorama, 90° wide and high.
+
+    Attributes:
+        yaw: degrees to the right of the panorama's middle.
+        pitch: degrees upwards.
+    """
+
+    yaw: int
+    pitch: int
+
+    @property
+    def prefix(self) -> str:
+        """Folder of its photographs."""
+        return f"yaw{self.yaw:03d}-pitch{self.pitch:02d}/"
+
+    @property
+    def rotation(self) -> Float64[np.ndarray, "3 3"]:
+        """Rotation from its camera to the panorama's; both x right, y down, z forward."""
+        return Rotation.from_euler("YX", [self.yaw, self.pitch], degrees=True).as_matrix()
+
+    def angle_to(self, other: Face) -> float:
+        """Angle in degrees between the directions that two faces look in."""
+        return float(np.degrees(np.arccos(np.clip(self.rotation[:, 2] @ other.rotation[:, 2], -1, 1))))
+
+
+FACES = {
+    face.prefix: face for face in [Face(y, 0) for y in (0, 90, 180, 270)] + [Face(y, 35) for y in (45, 135, 225, 315)]
+}
+"""By their prefixes. The first is the rig's first camera."""
+
+
+def says_panorama(photograph: Path) -> bool:
+    """Whether XMP metadata (Google's Photo Sphere XMP) say that a photograph is a panorama.
+
+    Raises:
+        SceneError: it is a part of one, or of another projection.
+    """
+    with photograph.open("rb") as file:
+        header = file.read(_HEADER)
+    if (projection := _PROJECTION.search(header)) is None:
+        return False
+    if projection[1].lower() != b"equirectangular" or len(set(_WIDTHS.findall(header))) > 1:
+        raise SceneError(
+            f"{photograph} is a panorama, but not one of 360° by 180° (equirectangular), and no camera fits it: leave "
+            "it out, or export it whole"
+        )
+    return True
+
+
+def video_says_panorama(video: Path) -> bool:
+    """Whether the metadata of a video (spherical video, of either version) say that its frames are panoramas.
+
+    Raises:
+        SceneError: they are of another projection or for two eyes, or the file is one that cameras record before their
+            pictures are stitched.
+    """
+    from shellgs_method.capture.frames import first_frame  # imports PyAV, which photographs do not need
+
+    if video.suffix.lower() in UNSTITCHED:
+        raise SceneError(
+            f"{video} is what a 360° camera recorded, which is not stitched: export it as 360° video "
+            "(equirectangular, mp4) with the camera's program"
+        )
+    frame = first_frame(video)
+    data: Any = frame.side_data if frame else ()
+    # The structures of both begin with an enum.
+    kinds = {each.type.name: int.from_bytes(bytes(each)[:4], sys.byteorder) for each in data}
+    if "SPHERICAL" not in kinds:
+        return False
+    if kinds["SPHERICAL"] != _EQUIRECTANGULAR:
+        raise SceneError(f"{video} is a 360° video, but not equirectangular: export it as that")
+    if kinds.get("STEREO3D", _ONE_EYE) != _ONE_EYE:
+        raise SceneError(f"{video} is a 360° video for two eyes: export it for one (mono)")
+    return True
+
+
+def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) -> list[str]:
+    """Names of the photographs in a folder that are panoramas: by metadata, or else by their pixels, which is told.
+
+    Args:
+        folder: photographs.
+        names: their names.
+        said: those whose metadata say so.
+    """
+    sizes = {name: _size(folder / name) for name in names if name not in said}
+    twice = sorted((name for name, (width, height) in sizes.items() if width == 2 * height), key=sizes.__getitem__)
+    found = set(said)
+    for size, group in groupby(twice, key=sizes.__getitem__):
+        alike = list(group)
+        what = f"{len(alike)} photographs of {size[0]}x{size[1]} pixels, {alike[0]} for example,"
+        if np.median([_seam(folder / name) for name in alike[:: -(-len(alike) // _COMPARED)]]) < _CLOSED:
+            found.update(alike)
+            notice(
+                f"{what} go on at the left where they end at the right: they are taken for panoramas of 360°. If they "
+                "are not: --camera-type perspective."
+            )
+        else:
+            notice(
+                f"{what} are twice as wide as high, but do not go around: they are not taken for panoramas of 360°. If "
+                "they are: --camera-type equirectangular."
+            )
+    return sorted(found)
+
+
+def _size(photograph: Path) -> tuple[int, int]:
+    with Image.open(photograph) as image:
+        return image.size
+
+
+def _seam(photograph: Path) -> float:
+    """How much the first column of an image differs from the last, in differences of neighbouring columns."""
+    with Image.open(photograph) as image:
+        pixels = np.asarray(image.convert("RGB"), np.float32)
+    first, second, before, last = pixels[:, 0], pixels[:, 1], pixels[:, -2], pixels[:, -1]
+    inside = (np.abs(first - second).mean() + np.abs(last - before).mean()) / 2
+    return float(np.abs(first - last).mean() / (inside + _NOISE))
+
+
+def face_size(folder: Path, panoramas: Sequence[str]) -> int:
+    """Width and height in pixels of the faces of the panoramas in a folder; their focal length is half of it.
+
+    One for all, since a camera of a rig has one size. It is COLMAP's: a quarter of the panorama's width.
+    """
+    return max((_size(folder / name)[0] for name in panoramas), default=0) // 4
+
+
+def add_faces(panorama: Path, folder: Path, name: str, size: int, interpolation: int = cv2.INTER_CUBIC) -> None:
+    """Write the faces of a panorama, or of a mask of one, each below the folder of its camera.
+
+    Args:
+        panorama: image file.
+        folder: where to write.
+        name: path of the panorama's photographs in the folders of the faces.
+        size: width and height of a face.
+        interpolation: one of OpenCV's.
+
+    Raises:
+        SceneError: it is not twice as wide as high.
+    """
+    with Image.open(panorama) as image:
+        if image.width != 2 * image.height:
+            raise SceneError(
+                f"{name} is {image.width}x{image.height} pixels, but a panorama of 360° by 180° is twice as wide as "
+                "high: export it whole, for one eye (mono) and as equirectangular"
+            )
+        pixels, exif, kind = np.asarray(image), exif_of(image), image.format
+    for prefix, face in FACES.items():
+        target = folder / prefix / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        image = Image.fromarray(cut(pixels, face, size, interpolation))
+        image.save(target, kind, quality=95, subsampling=0, exif=exif)
+
+
+def add_mask_faces(mask: Path, folder: Path, name: str, photographs: Path) -> None:
+    """Replace the mask of a panorama, whose faces are among the photographs, by masks of these."""
+    size = _size(photographs / next(iter(FACES)) / name)[0]
+    add_faces(mask, folder, f"{name}.png", size, cv2.INTER_NEAREST)
+    mask.unlink()
+
+
+def cut(
+    panorama: Shaped[np.ndarray, "H W *C"], face: Face, size: int, interpolation: int
+) -> Shaped[np.ndarray, "{size} {size} *C"]:
+    """The image of a face of a panorama, which holds longitudes along its width and latitudes along its height."""
+    u, v = _pixels(face, size, panorama.shape[1], panorama.shape[0])
+    return cv2.remap(panorama, u, v, interpolation, borderMode=cv2.BORDER_WRAP)
+
+
+@lru_cache(maxsize=8)  # the faces, which are the same in all panoramas of a size
+def _pixels(
+    face: Face, size: int, width: int, height: int
+) -> tuple[Float32[np.ndarray, "{size} {size}"], Float32[np.ndarray, "{size} {size}"]]:
+    """Columns and rows of a panorama that the pixels of a face show, from the centre of its first pixel."""
+    x = (np.arange(size) + 0.5) / (size / 2) - 1  # at depth 1
+    rays = np.stack([*np.meshgrid(x, x), np.ones((size, size))], axis=-1) @ face.rotation.T
+    longitude = np.arctan2(rays[..., 0], rays[..., 2])
+    latitude = np.arctan2(-rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+    u, v = (longitude / (2 * np.pi) + 0.5) * width - 0.5, (0.5 - latitude / np.pi) * height - 0.5
+    return u.astype(np.float32), v.astype(np.float32)
+
+
+def is_face(name: str) -> bool:
+    """Whether a photograph was cut from a panorama, by its name."""
+    return name.startswith(tuple(FACES))
+
+
+def face_pairs(shot: Sequence[str], other: Sequence[str], *, turned: bool) -> Iterator[tuple[str, str]]:
+    """Pairs of photographs of two shots: all if the camera may have ``turned`` between, else of faces that overlap."""
+    for a, b in product(shot, other):
+        one, two = (FACES.get(name.partition("/")[0] + "/") for name in (a, b))
+        if turned or one is None or two is None or one.angle_to(two) < _OVERLAPPING:
+            yield a, b
+
+
+def face_lenses(folder: Path, names: Sequence[str]) -> list[Lens]:
+    """The cameras of faces, which are calibrated: one for each face, as rigs need."""
+    groups = [[name for name in names if name.startswith(prefix)] for prefix in FACES]
+    return [Lens(size := _size(folder / group[0]), group, focal=size[0] / 2) for group in groups if group]
+
+
+def face_rig() -> list[dict[str, Any]]:
+    """The rig of the faces, for COLMAP: the prefix of each camera's names, and the rotation from the first camera."""
+    first = next(iter(FACES.values())).rotation
+    return [{"prefix": prefix, "rotation": (face.rotation.T @ first).tolist()} for prefix, face in FACES.items()]

@@ -1,0 +1,65 @@
+"""EXIF data that are damaged are none, in every place that reads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+from scenes import photograph
+
+from dataparsers.orientation import _orientation
+from shellgs_method.capture.photographs import add_mask, add_photograph, group_by_lens, keep_exposure
+from shellgs_method.files.exif import exif_of, orientation_of, tags_of
+from shellgs_method.files.photographs import exif_log_gains, read_image, read_mask
+
+
+def exif_data() -> bytes:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Orientation] = "a phone", 6
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    tags[ExifTags.Base.ExposureTime], tags[ExifTags.Base.FNumber], tags[ExifTags.Base.ISOSpeedRatings] = 0.01, 1.8, 200
+    return exif.tobytes()
+
+
+def read_everywhere(path: Path, work: Path) -> None:
+    """Read a file as a photograph and as a mask, in all functions that know EXIF."""
+    copy = work / path.name
+    copy.unlink(missing_ok=True)
+    read_image(path)
+    read_mask(path)
+    _orientation(path)
+    assert np.isfinite(exif_log_gains([path])).all()
+    add_photograph(path, copy)
+    group_by_lens(path.parent, [path.name], "auto")
+    add_mask(path, path, copy, work / "mask.png")
+    keep_exposure(path, copy)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+@pytest.mark.parametrize(
+    "damaged", [b"Exif\0\0", b"Exif\0\0no TIFF", b"Exif\0\0II*\0\xff\xff\xff\x7f", exif_data()[:40]]
+)
+def test_a_photograph_with_damaged_exif_data_is_read_without_them(tmp_path, suffix, damaged):
+    path = tmp_path / f"a.{suffix}"
+    Image.new("RGB", (48, 48), "white").save(path, exif=damaged)
+    (tmp_path / "work").mkdir()
+    read_everywhere(path, tmp_path / "work")
+    with Image.open(path) as image:
+        assert tags_of(image).keys() <= {ExifTags.Base.Make, ExifTags.Base.Orientation, 0x8769}
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_no_damage_of_exif_data_raises_an_error():
+    whole, random = exif_data(), np.random.default_rng(0)
+    for _ in range(500):
+        damaged = bytearray(whole)
+        for at in random.integers(6, len(whole), random.integers(1, 4)):
+            damaged[at] = random.integers(256)
+        image = photograph(8, 8)
+        image.info["exif"] = bytes(damaged)
+        assert orientation_of(image) in range(1, 9)
+        tags_of(image)
+        exif_of(image).tobytes()
