@@ -263,7 +263,7 @@ def _consensus(X: np.ndarray, Y: np.ndarray, tolerance: np.ndarray) -> tuple[pyc
     found = pycolmap.estimate_sim3d_robust(X, Y, options)
     if found is None:
         return None, nobody
-    similarity = found["tgt_from_src"]
+    similarity = found["tgt_from_src"]  # pyright: ignore[reportIndexIssue]  the stub leaves out the dict
     moved = X @ similarity.matrix()[:, :3].T + similarity.matrix()[:, 3]
     return similarity, np.linalg.norm(moved - Y, axis=1) < tolerance
 
