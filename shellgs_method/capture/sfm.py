@@ -338,9 +338,10 @@ def _consensus(X: np.ndarray, Y: np.ndarray, tolerance: np.ndarray) -> tuple[pyc
     if len(X) < _MIN_JOINING:
         return None, nobody
     options = pycolmap.RANSACOptions(max_error=float(np.median(tolerance)), random_seed=SEED, min_inlier_ratio=0.05)
-    similarity = pycolmap.estimate_sim3d_robust(X, Y, options)
-    if similarity is None:
+    found = pycolmap.estimate_sim3d_robust(X, Y, options)
+    if found is None:
         return None, nobody
+    similarity = found["tgt_from_src"]  # pyright: ignore[reportIndexIssue]  the stub leaves out the dict
     moved = X @ similarity.matrix()[:, :3].T + similarity.matrix()[:, 3]
     return similarity, np.linalg.norm(moved - Y, axis=1) < tolerance
 
