@@ -14,7 +14,6 @@ from shellgs_method.geometry.axes import main_direction, wall_axes
 from shellgs_method.geometry.planes import fitted_plane, largest_plane
 
 _WALLS = 5  # planes of the SfM points that are looked at
-_WALL = 0.08  # share of the points that makes a plane a wall
 _FLAT = 0.01  # distance from a plane relative to the points' extent, within which points are on it
 _LINES = 6  # directions of the shell's normals that are looked at
 _ALIKE = np.cos(np.radians(8))
@@ -24,12 +23,12 @@ _HEADINGS = 2  # headings of the shell's walls that are tried for each up, modul
 
 def scene_axes(
     points: Float64[np.ndarray, "N 3"], cameras: Float64[np.ndarray, "V 3"], up: Float64[np.ndarray, " 3"]
-) -> list[Float64[np.ndarray, "3 3"]]:
-    """Right, up and out of the main wall of the SfM points, and of one that is askew to it, as rows.
+) -> Float64[np.ndarray, "3 3"]:
+    """Right, up and out of the main wall of the SfM points, as rows.
 
     Args:
         points: SfM points.
-        cameras: positions of the cameras, which are in front of walls.
+        cameras: positions of the cameras, which are in front of the wall.
         up: approximate up direction of the cameras.
 
     Raises:
@@ -37,23 +36,18 @@ def scene_axes(
     """
     rng = np.random.default_rng(0)
     size = float(np.linalg.norm(np.subtract(*np.percentile(points, [90, 10], axis=0))))
-    found: list[np.ndarray] = []
     left = points
     for _ in range(_WALLS):
         if len(left) < 50:
             break
         members = largest_plane(left, _FLAT * size, rng)
-        if members.sum() < max(20, _WALL * len(points) * bool(found)):
+        if not members.any():
             break
         centre, out = fitted_plane(left[members])
-        left = left[~members]
         if abs(out @ up) < 0.5:
-            axes = wall_axes(out * np.sign((cameras.mean(0) - centre) @ out), up)
-            if all(np.abs(other @ out).max() < _ALIKE for other in found):
-                found.append(axes)
-    if not found:
-        raise SceneError("the SfM points have no upright wall to start from: pick points and use --picks")
-    return found[:2]
+            return wall_axes(out * np.sign((cameras.mean(0) - centre) @ out), up)
+        left = left[~members]
+    raise SceneError("the SfM points have no upright wall to start from: pick points and use --picks")
 
 
 def shell_axes(normals: Float64[np.ndarray, "N 3"]) -> list[Float64[np.ndarray, "3 3"]]:

@@ -39,7 +39,7 @@ _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with
 # Candidates that are measured and refined, and tolerances relative to the distance: errors of SfM points grow with it,
 # and what a smaller scale brings nearer to the shell fits no better.
 _MEASURED, _POLISHED = 1000, 8
-_ROUNDS = ((250, 250, 1, 2, 10), (60, 800, 3, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
+_ROUNDS = ((250, 250, 1, 2, 10), (50, 800, 3, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
 _MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
@@ -82,7 +82,8 @@ def propose(
     near = _most(points.positions)
     sight = Sightlines.of(views, points)
     search = _Search.of(samples, near, sight)
-    turns = [to.T @ axes for axes in scene_axes(near, cameras, scene_up) for to in shell_axes(normals)]
+    axes = scene_axes(near, cameras, scene_up)
+    turns = [to.T @ axes for to in shell_axes(normals)]
     starts: list[Candidate] = []
     for turn in track(turns, "Trying orientations", len(turns)):
         starts += search.placed(turn)
