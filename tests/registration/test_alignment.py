@@ -244,7 +244,9 @@ def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
     older = json.loads(path.read_text())
     del older["up"]
     path.write_text(json.dumps(older))
-    np.testing.assert_array_equal(Alignment.load(path).up, alignment.up)
+    up = Alignment.load(path).up
+    assert up is not None
+    np.testing.assert_array_equal(up, alignment.up)
 
 
 def test_the_main_wall_is_the_same_in_each_run():
