@@ -69,7 +69,7 @@ def test_photographs_rolled_by_any_angle_do_not_tell():
 def test_parallel_cameras_leave_the_pitch_to_an_axis_of_the_file():
     tilted = cameras([0.0] * 12, pitch=20)
     assert 15 < degrees(upwards(tilted), UP) < 25
-    np.testing.assert_allclose(upwards(tilted, [WORLD.apply(axis) for axis in np.eye(3)]), UP)
+    assert degrees(upwards(tilted, [WORLD.apply(axis) for axis in np.eye(3)]), UP) < 1e-6
 
 
 def test_an_axis_that_the_horizons_contradict_is_not_taken():
