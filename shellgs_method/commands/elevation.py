@@ -42,5 +42,6 @@ def elevation(
         corner = [wall.low[0], wall.high[1], wall.plane] @ wall.axes
         facts[name] = {"upper_left": corner.tolist(), "right": right, "up": upwards, "out": out, "pixel": pixel}
         width, height = wall.size[:2]
-        console.print(f"{output / name}.pdf: {width:.2f} x {height:.2f} m, {1000 * pixel:.3g} mm a pixel.")
+        line = f"{output / name}.pdf: {width:.2f} x {height:.2f} m, {1000 * pixel:.3g} mm a pixel."
+        console.print(line, highlight=False, soft_wrap=True)
     run.frame.describe(output / "walls.json", facts)

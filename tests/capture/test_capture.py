@@ -725,6 +725,7 @@ def test_features_that_were_stopped_before_the_first_photograph_are_found_as_if_
 
     def extract(database: Path, count: int) -> None:
         job = {"photographs": str(tmp_path / "photographs"), "masks": None, "rigs": [], "sift": sift}
+        job |= {"camera_model": "OPENCV"}
         job |= {"database": str(database), "lenses": lenses[:count]}
         run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
 

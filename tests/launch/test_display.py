@@ -106,4 +106,4 @@ def test_a_terminal_keeps_no_bars_of_what_has_ended():
         seen = len(output.getvalue())
         time.sleep(0.3)
     assert "scene/shellgs/seed-0" in output.getvalue()[:seen]
-    assert "scene/shellgs/seed-0" not in output.getvalue()[seen:].split("\n")[-1]
+    assert "scene/shellgs/seed-0" not in output.getvalue().split("\x1b[2K")[-1]  # after the last line was erased
