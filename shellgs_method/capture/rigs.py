@@ -29,7 +29,7 @@ def folders(names: Sequence[str]) -> list[str]:
     Raises:
         SceneError: there are not two, or too few photographs have the same name in two of them.
     """
-    prefixes = sorted({name.partition("/")[0] + "/" for name in names if "/" in name})
+    prefixes = _prefixes(names)
     shots = taken_at_once(names, prefixes)
     if sum(len(shot) > 1 for shot in shots.values()) < LEAST_SHOTS:
         raise SceneError(
@@ -41,10 +41,15 @@ def folders(names: Sequence[str]) -> list[str]:
 
 def tell_of_a_rig(names: Sequence[str]) -> None:
     """Tell the user that photographs are named as those of a rig, which may be chance."""
-    prefixes = sorted({name.partition("/")[0] + "/" for name in names if "/" in name})
+    prefixes = _prefixes(names)
     shots = taken_at_once(names, prefixes)
     if len(prefixes) > 1 and len(shots) >= LEAST_SHOTS and all(len(shot) == len(prefixes) for shot in shots.values()):
         notice(
             f"The folders {', '.join(prefix.rstrip('/') for prefix in prefixes)} hold photographs of the same names: "
             "if cameras that are mounted together took those of a name at once, --cameras rig uses this."
         )
+
+
+def _prefixes(names: Sequence[str]) -> list[str]:
+    """The topmost folders of photographs, as what their names begin with."""
+    return sorted({name.partition("/")[0] + "/" for name in names if "/" in name})

@@ -25,7 +25,7 @@ def elevation(
         output: Folder. If not set: elevation beside the config.
         pixel: Size of a pixel in metres. If not set: that of the photographs' on the facade.
     """
-    from shellgs_method.export.elevation import MARGIN, draw, walls_of, write_elevation
+    from shellgs_method.export.elevation import MARGIN, draw, shell_and_walls, write_elevation
     from shellgs_method.export.runs import TrainedRun
     from shellgs_method.geometry.triangles import Triangles
     from shellgs_method.machine.progress import track
@@ -33,11 +33,11 @@ def elevation(
     if pixel is not None and not 0 < pixel < inf:
         raise SceneError("--pixel must be above 0")
     output, run = output or config.with_name("elevation"), TrainedRun.load(config)
-    walls, mesh = walls_of(run), run.surface(MARGIN)
+    (shell, walls), mesh = shell_and_walls(run), run.surface(MARGIN)
     surface, pixel, facts = Triangles(mesh.vertices, mesh.faces), pixel or run.resolution(run.box(MARGIN)) or 0.01, {}
     for number, wall in enumerate(track(walls, "Drawing wall", len(walls)), 1):
         name = f"wall-{number}"
-        write_elevation(output, name, draw(run, wall, surface, pixel))
+        write_elevation(output, name, draw(run, wall, surface, shell, pixel))
         right, upwards, out = wall.axes.tolist()
         corner = [wall.low[0], wall.high[1], wall.plane] @ wall.axes
         facts[name] = {"upper_left": corner.tolist(), "right": right, "up": upwards, "out": out, "pixel": pixel}

@@ -83,8 +83,8 @@ class Elevation:
         return 0.0, width * self.pixel, top - height * self.pixel, top
 
 
-def walls_of(run: TrainedRun) -> list[Wall]:
-    """The walls of a run's shell that its photographs see.
+def shell_and_walls(run: TrainedRun) -> tuple[Triangles, list[Wall]]:
+    """A run's shell, its normals outside, and its walls that photographs see.
 
     Raises:
         SceneError: there is no shell, or no upright surface of it is seen.
@@ -97,16 +97,17 @@ def walls_of(run: TrainedRun) -> list[Wall]:
     walls = find_walls(surface, cameras, run.frame.up)
     if not walls:
         raise SceneError("the photographs see no upright surface of the shell: there is nothing to draw")
-    return [wall.widened(MARGIN) for wall in walls]
+    return surface, [wall.widened(MARGIN) for wall in walls]
 
 
-def draw(run: TrainedRun, wall: Wall, surface: Triangles, pixel: float) -> Elevation:
+def draw(run: TrainedRun, wall: Wall, surface: Triangles, shell: Triangles, pixel: float) -> Elevation:
     """Draw a wall.
 
     Args:
         run: the run.
         wall: the wall, in the run's frame.
         surface: the reconstructed surface in that frame.
+        shell: the shell in that frame.
         pixel: size of a pixel in metres.
 
     Raises:
@@ -118,8 +119,7 @@ def draw(run: TrainedRun, wall: Wall, surface: Triangles, pixel: float) -> Eleva
             f"at {pixel:g} m a pixel an elevation would be {width} x {height} pixels: give a --pixel of at least "
             f"{wall.size[:2].max() / LARGEST:.2g}"
         )
-    shell = run.shell_in_frame
-    heights = [_heights(each, wall, width, height, pixel) for each in (surface, Triangles(shell.vertices, shell.faces))]
+    heights = [_heights(each, wall, width, height, pixel) for each in (surface, shell)]
     ground = float(wall.axes[1] @ run.frame.offset)
     return Elevation(wall, ground, pixel, _render(run, wall, width, height, pixel), *heights)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.geometry.camera import Camera, image_up
+from shellgs_method.geometry.planes import across
 
 _ROLL, _PITCH = np.sin(np.radians(3)), np.sin(np.radians(30))
 """Sines of usual angles by which photographs are rolled, and by which cameras look up or down."""
@@ -93,8 +94,7 @@ def turn(from_: Float64[np.ndarray, " 3"], to: Float64[np.ndarray, " 3"]) -> Flo
     """The smallest rotation of a unit vector to another (Rodrigues)."""
     axis, cosine = np.cross(from_, to), from_ @ to
     if cosine < -1 + 1e-9:
-        other = np.cross(from_, np.eye(3)[np.abs(from_).argmin()])
-        other /= np.linalg.norm(other)
+        other = across(from_)
         return 2 * np.outer(other, other) - np.eye(3)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)

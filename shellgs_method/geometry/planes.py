@@ -61,6 +61,12 @@ def largest_plane(
     return members
 
 
+def across(normal: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+    """A unit vector at right angles to a direction of any length."""
+    vector = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    return vector / np.linalg.norm(vector)
+
+
 def fitted_plane(
     points: Float64[np.ndarray, "N 3"] | Float64[np.ndarray, "N K 3"], weights: Float64[np.ndarray, " N"] | None = None
 ) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:

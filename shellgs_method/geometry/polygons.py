@@ -8,6 +8,8 @@ import mapbox_earcut
 import numpy as np
 from jaxtyping import Bool, Float64, Int, Int64
 
+from shellgs_method.geometry.planes import across
+
 
 class Triangulation(NamedTuple):
     """Polygons as triangles, which wind as their polygons do.
@@ -103,7 +105,5 @@ def _area_vector(ring: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:
 
 def _basis(normal: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "2 3"]:
     """Two unit vectors across a normal, with which it is right-handed."""
-    across = np.eye(3)[np.abs(normal).argmin()]
-    u = np.cross(across, normal)
-    u /= np.linalg.norm(u)
+    u = -across(normal)
     return np.stack([u, np.cross(normal, u)])

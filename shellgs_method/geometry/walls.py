@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float64
 
 from shellgs_method.geometry.axes import main_direction, wall_axes
 from shellgs_method.geometry.camera import Camera, in_view
+from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.geometry.winding import spread
 
 SAMPLES = 20_000
 UPRIGHT = 0.5
@@ -105,7 +105,7 @@ def photographed(
         count: number of cameras to regard, spread over all.
     """
     seen = np.zeros(len(points), bool)
-    for number in spread(np.arange(len(cameras)), count):
+    for number in spread(len(cameras), count):
         eye = cameras[number].position.double().cpu().numpy()
         shown = np.flatnonzero(in_view(cameras[number], points)[0] & ~seen)
         away = eye - points[shown]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64, Shaped
+from jaxtyping import Bool, Float64
 
+from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
 
 
@@ -22,13 +23,8 @@ def outward(
     """
     centres = surface.centres
     votes, seen = np.zeros(len(centres)), np.zeros(len(centres), bool)
-    for eye in spread(eyes, count):
+    for eye in eyes[spread(len(eyes), count)]:
         visible = surface.sees(eye, centres, slack=5e-3)
         votes += visible * np.sign(np.einsum("fc,fc->f", eye - centres, surface.normals))
         seen |= visible
     return Triangles(surface.vertices, np.where(votes[:, None] < 0, surface.faces[:, ::-1], surface.faces)), seen
-
-
-def spread(eyes: Shaped[np.ndarray, "E *shape"], count: int) -> Shaped[np.ndarray, "C *shape"]:
-    """At most ``count`` of the eyes, evenly spaced in their order."""
-    return eyes[np.unique(np.linspace(0, len(eyes) - 1, count).round().astype(int))]

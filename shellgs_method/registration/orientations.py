@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.axes import main_direction, wall_axes
-from shellgs_method.geometry.planes import fitted_plane, largest_plane
+from shellgs_method.geometry.planes import across, fitted_plane, largest_plane
 
 _WALLS = 5  # planes of the SfM points that are looked at
 _FLAT = 0.01  # distance from a plane relative to the points' extent, within which points are on it
@@ -94,8 +94,7 @@ def _aligned(normals: np.ndarray, axes: np.ndarray) -> float:
 
 def _headings(normals: np.ndarray, up: np.ndarray) -> Sequence[np.ndarray]:
     """Directions of the walls, one of each right angle, those of the largest area first."""
-    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    east /= np.linalg.norm(east)
+    east = across(up)
     north = np.cross(up, east)
     upright = normals[np.abs(normals @ up) < _UPRIGHT]
     if len(upright) == 0:

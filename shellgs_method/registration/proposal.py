@@ -21,7 +21,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import positions
-from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.machine.progress import track
 from shellgs_method.registration.orientations import scene_axes, shell_axes
 from shellgs_method.registration.refinement import FINAL_GATE, refine
@@ -218,7 +218,7 @@ def _distinct(candidates: Sequence[Candidate], spread: np.ndarray, count: int, a
     best = sorted(candidates, key=lambda candidate: -candidate.score)
     # Where the shell is in the scene, relative to the size of it there: shells of all scales are compared alike.
     placed = [transformed(spread, np.linalg.inv(candidate.survey_from_scene)) for candidate in best]
-    metres = [np.cbrt(np.linalg.det(candidate.survey_from_scene[:3, :3])) for candidate in best]
+    metres = [scale_of(candidate.survey_from_scene) for candidate in best]
     kept: list[int] = []
     for k in range(len(best)):
         if kept:

@@ -18,6 +18,7 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import Camera, in_view, positions
+from shellgs_method.geometry.spread import spread
 
 UNITS = {
     0.001: "are in millimetres instead of metres",
@@ -150,7 +151,7 @@ class _Sight:
         colours = np.zeros((len(some), 3))
         if points.colours is not None and points.observed is None:  # with tracks, they are of one model
             colours = points.colours[some].astype(np.float64)
-        shown = _spread(views, _PHOTOGRAPHS) if np.ptp(colours, axis=0).max() > 0 else []
+        shown = [views[k] for k in spread(len(views), _PHOTOGRAPHS)] if np.ptp(colours, axis=0).max() > 0 else []
         photographs = [photograph for view in shown for photograph in _small(view)]
         if not may_be_of(colours, [image for _, image in photographs]):
             photographs = []
@@ -214,11 +215,6 @@ def _contrast(colours: np.ndarray) -> float:
     """Deviation of red and blue from green; at least 1, of which compression makes a part."""
     red, green, blue = np.asarray(colours, dtype=np.float64).T
     return max(1.0, float(np.hypot(np.std(red - green), np.std(blue - green))))
-
-
-def _spread(views: Sequence[View], count: int) -> list[View]:
-    """Up to ``count`` views, evenly spread."""
-    return [views[k] for k in np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))]
 
 
 def _small(view: View) -> list[tuple[Camera, np.ndarray]]:

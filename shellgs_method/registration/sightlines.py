@@ -18,6 +18,7 @@ from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import Camera, in_view
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.spread import spread
 from shellgs_method.shell.surface import ShellSurface
 
 _VIEWS, _PER_VIEW = 10, 300
@@ -47,7 +48,7 @@ class Sightlines:
     def of(cls, views: Sequence[View], points: SparsePoints) -> Sightlines:
         """Those of some views, spread evenly, and of some of their points."""
         rng = np.random.default_rng(0)
-        chosen = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _VIEWS).round().astype(int))]
+        chosen = [views[k] for k in spread(len(views), _VIEWS)]
         parts, first = [], 0
         for view in chosen:
             seen = points.positions[points.of(view)]

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.geometry.axes import main_direction
+from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.geometry.winding import spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Front:
         level, facing = surface.normals[triangle] * [1, 1, 0], np.zeros(len(points))
         length = np.linalg.norm(level, axis=1)
         normals = level / np.maximum(length, 1e-9)[:, None]
-        for eye in spread(eyes, 12):
+        for eye in eyes[spread(len(eyes), 12)]:
             away = (eye - points) / np.linalg.norm(eye - points, axis=1, keepdims=True)
             seen = surface.sees(eye, points, 0.01)
             facing += seen * np.einsum("nc,nc->n", away, normals).clip(0)

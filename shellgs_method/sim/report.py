@@ -11,6 +11,7 @@ import numpy as np
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.html import captioned, encoded, img, table, write_page
+from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import Collider, leaks
@@ -182,7 +183,7 @@ def _section(
 def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:
     """Photographs, MuJoCo's renders from the same cameras, and photographs with the edges of the collision geometry."""
     held_out = [k for k, view in enumerate(chapter.made.views) if view.name in chapter.made.held_out]
-    chosen = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, IMAGES).round().astype(int))]
+    chosen = [held_out[k] for k in spread(len(held_out), IMAGES)]
     photos = [shown(chapter.made.photo(k)) for k in chosen]
     try:
         drawn = rendered(world, [photo.camera for photo in photos])

@@ -11,10 +11,9 @@ import torch
 from PIL import Image
 from training_runs import data_of, model_of, trainer_of
 
-from shellgs_method.export.elevation import draw, walls_of
+from shellgs_method.export.elevation import draw, shell_and_walls
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.synthetic.building import Layout
 from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
 
@@ -43,9 +42,8 @@ def shown_at(run: TrainedRun, wall, points: np.ndarray) -> np.ndarray:
 
 
 def test_the_facade_is_one_wall_and_the_shell_is_drawn_in_metres(run):
-    wall = walls_of(run)[0]
-    shell = run.shell_in_frame
-    drawn = draw(run, wall, Triangles(shell.vertices, shell.faces), PIXEL)
+    shell, (wall, *_) = shell_and_walls(run)
+    drawn = draw(run, wall, shell, shell, PIXEL)
     np.testing.assert_allclose(drawn.deviations[np.isfinite(drawn.deviations)], 0, atol=1e-6)
     layout = Layout(6, 3)
     opening = layout.openings[8]
@@ -57,7 +55,7 @@ def test_the_facade_is_one_wall_and_the_shell_is_drawn_in_metres(run):
 
 
 def test_a_gaussian_is_drawn_where_it_is_at_every_distance_before_the_wall(run):
-    wall, model = walls_of(run)[0], run.model
+    (shell, (wall, *_)), model = shell_and_walls(run), run.model
     places = np.array([[3.1, -0.4, 2.2], [14.7, 0.0, 8.3], [9.0, -0.1, 5.0], [0.3, 0.1, 0.4]])
     to_model = np.linalg.inv(run.model_to_scene) @ run.frame.to_scene
     in_frame = transformed(places, SHELL_FROM_BUILDING) - run.frame.offset
@@ -70,8 +68,7 @@ def test_a_gaussian_is_drawn_where_it_is_at_every_distance_before_the_wall(run):
         model.gauss_params["opacities"].data += 5
         model.gauss_params["quats"].data[:, 0] = 1
         model.gauss_params["features_dc"].data -= 1.7  # black
-        shell = run.shell_in_frame
-        drawn = draw(run, wall, Triangles(shell.vertices, shell.faces), PIXEL)
+        drawn = draw(run, wall, shell, shell, PIXEL)
     finally:
         for name, values in kept.items():
             model.gauss_params[name].data = values

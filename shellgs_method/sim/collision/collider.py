@@ -13,8 +13,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from shellgs_method.errors import SceneError
+from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.geometry.winding import spread
 from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
 from shellgs_method.sim.collision.parts import Part, joined, prism
 from shellgs_method.sim.collision.patches import convex_patches
@@ -116,7 +116,7 @@ def standing_before(
     near = np.flatnonzero((shell.signed_distance(fused.centres) > least) & (fused.centres[:, 2] > GROUND))
     places = fused.centres[near]
     seeing, backed = np.zeros(len(near)), np.zeros(len(near))
-    for eye in spread(eyes, count):
+    for eye in eyes[spread(len(eyes), count)]:
         visible = fused.sees(eye, places, 0.02)
         behind = shell.cast(eye, places - eye).triangle
         seeing += visible
