@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def cast(
     scene: Scene,
-    shell: Optional[Path] = None,
+    shell: tuple[Path, ...] = (),
     matrix: Optional[Path] = None,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
@@ -38,7 +38,8 @@ def cast(
 
     Args:
         scene: Scene folder.
-        shell: Mesh, model or point cloud of the shell, with --matrix. If not set: that of scene/shell/alignment.json.
+        shell: Files of the shell, with --matrix: meshes, models or point clouds. If not set: those of
+            scene/shell/alignment.json.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
@@ -56,15 +57,15 @@ def cast(
 
     if max_image_size is not None and max_image_size < 1:
         raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
-    if (shell is None) != (matrix is None):
+    if bool(shell) != bool(matrix):
         raise SceneError("--shell and --matrix go together: give both or neither")
     if matrix is None and (any(global_shift) or metres_per_shell_unit != 1):
         raise SceneError("--global-shift and --metres-per-shell-unit go with --shell and --matrix")
     config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
-    if shell is not None and matrix is not None:
-        name = relative_path(shell, scene)
-        alignment = Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift)
+    if matrix is not None:
+        names = tuple(relative_path(path, scene) for path in shell)
+        alignment = Alignment.from_matrix_file(matrix, names, metres_per_shell_unit, global_shift)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
         if not alignment.cameras.cameras:
@@ -76,7 +77,7 @@ def cast(
         console.print(f"The alignment was validated with another {how}: run `shellgs align {scene}` again.")
     start = time.monotonic()
     placed = PlacedShell.load(scene, views, aligned)
-    if meshing := placed.mesh.meshing:
+    for meshing in placed.mesh.meshing:
         console.print(f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}: {meshing}")
     aligned.record(scene, views)
     summary = cast_views(placed, max_image_size=max_image_size, flags=paths.flags)

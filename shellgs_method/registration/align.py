@@ -91,13 +91,13 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
     if changed := alignment.cameras.changed(views):
         raise SceneError(
             f"{path} was proposed for other cameras than those of {scene}: {changed}; propose again, with "
-            f"`shellgs align {shlex.quote(str(scene))} {shlex.quote(alignment.shell)}`"
+            f"`shellgs align {shlex.quote(str(scene))} {shlex.join(alignment.shells)}`"
         )
     return Placement(alignment)
 
 
 def place_by_picks(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+    path: Path, views: Sequence[View], place: ShellPlace, shells: tuple[str, ...], metres_per_shell_unit: float
 ) -> Placement:
     """Align the shell by a file of picks.
 
@@ -108,12 +108,12 @@ def place_by_picks(
     picks = read_picks(path, views)
     place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
     matrix, picked = align_picks(picks, views, metres_per_shell_unit)
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"picks in {path.name}")
     return Placement(alignment, [_residuals_in_words(picked, "picks")], picked)
 
 
 def place_by_positions(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+    path: Path, views: Sequence[View], place: ShellPlace, shells: tuple[str, ...], metres_per_shell_unit: float
 ) -> Placement:
     """Align the shell by a file of surveyed camera positions.
 
@@ -124,7 +124,7 @@ def place_by_positions(
     surveyed = read_positions(path, views)
     place.check_positions(surveyed.shell, f"the camera positions of {path}")
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"camera positions in {path.name}")
     history = [_residuals_in_words(cameras, "camera positions")]
     if surveyed.unknown:
         history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.unknown)}.")
@@ -208,7 +208,7 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
 
 
 def place_by_guess(
-    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shell: str, metres_per_shell_unit: float
+    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shells: tuple[str, ...], metres_per_shell_unit: float
 ) -> Placement:
     """Propose an alignment by coarse registration; the shell may have any orientation in its file.
 
@@ -225,14 +225,14 @@ def place_by_guess(
     ]
     checks = [agreement_check(best.score), *(rival_check(rival.score / best.score) for rival in rivals[:1])]
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source="proposal")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)
 
 
 def up_in_words(alignment: Alignment) -> str:
     """What is up in the shell's file, by the cameras."""
     if alignment.up is None:
-        usual = name_of(usual_up(alignment.shell))
+        usual = name_of(usual_up(alignment.shells))
         return f"The cameras do not tell which way is up: it is taken to be {usual} of the shell's file."
     return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
 
