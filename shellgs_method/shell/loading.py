@@ -1,4 +1,4 @@
-"""Load the shell's files as one triangle mesh; a point cloud is meshed once, and its mesh is cached."""
+"""Load the shell's files as one triangle mesh; what takes long, clouds and IFC models, is done once and cached."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool
@@ -26,6 +27,10 @@ from shellgs_method.shell.mesh import ShellMesh, joined, without_area
 from shellgs_method.shell.spacing import Sights, as_seen
 
 COMMENT = "comment shellgs "
+_SLOW = (".ifc", ".ifczip")
+"""Suffixes of models whose solids are cut and triangulated, two seconds for each megabyte."""
+_READER = 1
+"""Version of their reader: they are read again if it changes."""
 _FAR = 1e4
 """Times the median distance from the median vertex beyond which a vertex is not the building's, but at the origin of
 national coordinates, for example. It would stretch every box and take most of the area."""
@@ -46,6 +51,7 @@ def load_shell(
     without area; what is dropped is counted. Vertices of no triangle are dropped. A point cloud is merged by
     :func:`~shellgs_method.shell.spacing.as_seen` and meshed by :func:`~shellgs_method.shell.clouds.mesh_cloud`; its
     mesh is cached as ``<cache>/<file name>.<mesher>.ply`` until the cloud changes, or cameras see other parts of it.
+    So is what is read of an IFC model, as ``<cache>/<file name>.npz``.
     Several files are in one frame, and their triangles are one mesh: see :func:`~shellgs_method.shell.mesh.joined`.
 
     Args:
@@ -53,7 +59,7 @@ def load_shell(
             extra ``bim``) or a cloud (ply, pcd, xyz, xyzrgb, pts, ptx, txt, asc, csv, las, laz, e57; the last three
             need the extras ``las`` and ``e57``).
         surfaces: what the files hold, if they were read already.
-        cache: folder for the mesh of a point cloud; None for no cache.
+        cache: folder for what is cached; None for no cache.
         cameras: cameras that see the surface, in the shell's frame and unit. Where they see a large cloud, it is meshed
             as finely as they resolve. They orient the normals of a cloud whose file has no scanner positions.
         mesher: method that meshes a point cloud.
@@ -72,6 +78,8 @@ def load_shell(
         folder = cache / str(k + 1) if cache and path.name in names[:k] else cache  # files of one name do not share it
         cached = folder / f"{path.name}.{mesher}.ply" if folder else None
         surface = surfaces[k] if surfaces else None
+        if surface is None and folder and path.suffix.lower() in _SLOW:
+            surface = _read_model(path, folder / f"{path.name}.npz")
         meshes.append(_load_file(path, surface, cached, cameras, mesher, spacing, metres_per_unit))
     return joined(meshes, paths, metres_per_unit)
 
@@ -125,6 +133,23 @@ def _load_file(
     if cached is not None:
         _write_cached(mesh, cached, path, {"spacing": spacing, "sights": sights.to_json() if sights else []})
     return mesh
+
+
+def _read_model(path: Path, cached: Path) -> Geometry | Cloud:
+    """Read a model, or what was read of it before."""
+    version = f"{_READER} {content_hash(path)}" if path.is_file() else ""
+    try:
+        with np.load(cached, allow_pickle=False) as arrays:
+            if str(arrays["version"]) == version:
+                return Geometry(arrays["vertices"], arrays["faces"], classes=arrays["classes"], drawn=True)
+    except (OSError, KeyError, ValueError, BadZipFile):  # missing or damaged: it is read again
+        pass
+    surface = read_surface(path)
+    if isinstance(surface, Geometry):
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(cached) as file:
+            np.savez(file, version=version, vertices=surface.vertices, faces=surface.faces, classes=surface.classes)
+    return surface
 
 
 def _write_cached(mesh: ShellMesh, cached: Path, source: Path, made_for: dict[str, Any]) -> None:

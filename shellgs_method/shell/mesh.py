@@ -132,6 +132,10 @@ def _check_frame(boxes: Sequence[Float64[np.ndarray, "2 3"]], paths: Sequence[Pa
             f"{paths[k]} stands alone, {gap:.3g} m from {paths[other]}: are the shell's files in the same coordinates? "
             "They are taken to be."
         )
+    if len({path.suffix.lower() in (".glb", ".gltf") for path in paths}) == 2:
+        notice(
+            f"{paths[0]} and others: glTF is y-up by its format, other files rarely are. They are taken as they are."
+        )
     if sizes[largest] > _LARGER * sizes[smallest]:
         notice(
             f"{paths[largest]} is {sizes[largest] / sizes[smallest]:.0f} times as large as {paths[smallest]}: are the "

@@ -172,3 +172,19 @@ def test_picks_may_be_on_any_of_the_files(scene: Path, shellgs):
     found = Alignment.load(scene / ALIGNMENT)
     assert found.shells == ("shell/left.ply", "shell/right.json")
     np.testing.assert_allclose(found.apply(mesh.vertices), true.apply(mesh.vertices), atol=0.02)
+
+
+def test_an_ifc_model_is_read_once(tmp_path: Path, monkeypatch):
+    path = ifc_house().save(tmp_path / "a.ifc")
+    first = load_shell(path, cache=tmp_path)
+    with monkeypatch.context() as patched:
+        patched.delattr("shellgs_method.shell.loading.read_surface")
+        again = load_shell(path, cache=tmp_path)
+    for name in ("vertices", "faces", "classes"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    assert again.step.coarsest == first.step.coarsest
+    (tmp_path / "a.ifc.npz").write_bytes((tmp_path / "a.ifc.npz").read_bytes()[:500])
+    np.testing.assert_array_equal(load_shell(path, cache=tmp_path).vertices, first.vertices)
+    ifc_house(site=[100, 0, 0]).save(path)
+    moved_by = load_shell(path, cache=tmp_path).vertices - first.vertices
+    np.testing.assert_allclose(moved_by, np.broadcast_to([100, 0, 0], moved_by.shape), atol=1e-9)
