@@ -19,7 +19,6 @@ from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.contents import Geometry
-from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.geometry.axes import upwards
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of, transformed
@@ -183,9 +182,8 @@ class Alignment:
             lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
             file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
 
-    def record(self, scene: Path, views: Sequence[View]) -> None:
-        """Write a scene's alignment, bound to the cameras of its views; a file that says the same keeps its verdict."""
-        path = scene / ALIGNMENT
+    def record(self, path: Path, views: Sequence[View]) -> None:
+        """Write a file of the alignment, bound to the cameras of views; one that says the same keeps its verdict."""
         known = Alignment.load(path) if path.is_file() else None
         same = known is not None and not known.cameras.changed(views)
         if known is None or not same or not known.places_like(self):
