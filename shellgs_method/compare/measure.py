@@ -221,13 +221,14 @@ def write_metrics(
     With a file of surveyed ``points``, also what the run's surface says there, ``surveyed``.
     """
     check_output(output)
-    surveyed = read_surveyed(points) if points else None  # refused before anything is measured
     if renders is not None and renders.exists() and not renders.is_dir():
         raise SceneError(f"{renders} is a file: give a folder for the renders")
-    measured = measure(config, half, renders)
-    if surveyed is not None:
+    surveyed = {}
+    if points is not None:  # first: points that cannot be read are refused before anything is measured
         run = TrainedRun.load(config)
-        measured["surveyed"] = at_surveyed(run, run.surface(REACH), surveyed)
+        read = read_surveyed(points, run.shell[0].crs if run.shell else "")
+        surveyed["surveyed"] = at_surveyed(run, run.surface(REACH), read)
+    measured = measure(config, half, renders) | surveyed
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(output) as file:
         file.write(json.dumps(measured, indent=2, default=vars).encode())

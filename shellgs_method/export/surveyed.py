@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.registration.correspondences import are_numbers, read_lines
+from shellgs_method.registration.correspondences import are_numbers, read_lines, to_shell
 
 REACH = 0.5
 """Distance in metres from a surveyed point within which the surface must be for the point to count."""
@@ -40,16 +40,20 @@ class Surveyed:
         return np.abs([distance for distance in self.before.values() if distance is not None])
 
 
-def read_surveyed(path: Path) -> dict[str, Float64[np.ndarray, " 3"]]:
-    """Read surveyed points in the shell's coordinates: a line each, ``name X Y Z`` or ``X Y Z [name]``.
+def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 3"]]:
+    """Read surveyed points: a line each, ``name X Y Z`` or ``X Y Z [name]``.
+
+    They are in the coordinate reference system that a first line without numbers names, or else in that of the shell.
 
     Words are separated by blanks, commas or semicolons; further columns after ``name X Y Z`` are skipped. Points
     without a name are numbered.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: a line cannot be read, two points have the same name, or there are none.
+        SceneError: a line cannot be read, two points have the same name, there are none, or they are in degrees and the
+            shell's system is not known.
     """
+    convert = to_shell(path, "surveyed points", crs)
     points: dict[str, np.ndarray] = {}
     for where, words in read_lines(path, "surveyed points"):
         separator = ";" if any(";" in word for word in words) else ","  # where it is a semicolon, commas are decimal
@@ -65,7 +69,7 @@ def read_surveyed(path: Path) -> dict[str, Float64[np.ndarray, " 3"]]:
         points[name] = np.array(numbers, dtype=np.float64)
     if not points:
         raise SceneError(f"{path} holds no points")
-    return points
+    return dict(zip(points, convert(np.stack([*points.values()])), strict=True))
 
 
 def at_surveyed(

@@ -42,6 +42,7 @@ class Alignment:
         model: COLMAP model of these, relative to the scene's folder, if they were adjusted to the shell; else empty.
         spacing: size in metres of the voxels in which a point cloud is merged; None for what the cameras resolve.
         up: the shell's direction upwards, a unit vector: as the cameras tell if None, where they tell.
+        crs: coordinate reference system of the shell, a code such as EPSG:25832 or WKT; empty if unknown.
 
     Raises:
         SceneError: the matrix is not a similarity, or mirrors, the mesher is unknown, or the spacing is not positive.
@@ -58,6 +59,7 @@ class Alignment:
     model: str = ""
     spacing: float | None = None
     up: Float64[np.ndarray, " 3"] | None = None
+    crs: str = ""
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -225,6 +227,7 @@ class Alignment:
                 model,
                 spacing,
                 up,
+                str(fields.get("crs", "")),
             )
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
