@@ -76,8 +76,8 @@ class FacadePipeline(VanillaPipeline):
         data, gains = self.datamanager, None
         if self.model.config.trust == "photographs" and (names := data.train_dataset.uncompared()):
             logger.warning(
-                "%d of the %d training views were not compared with each other, such as %s, so that the shell counts "
-                "there whatever they show, and trees before it or rooms behind its windows cost image quality: run `%s`.",
+                "%d of the %d training views were not compared with the others, such as %s: the shell counts there, "
+                "whatever they show, and trees before it cost image quality; run `%s`.",
                 len(names),
                 len(data.train_dataset),
                 names[0],
