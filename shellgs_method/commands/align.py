@@ -68,7 +68,7 @@ def align(
     from dataparsers.facade import read_views
     from shellgs_method.files.atomic import replace_folder, unfinished
     from shellgs_method.files.colmap import write_model
-    from shellgs_method.files.crs import given_crs, shared_crs
+    from shellgs_method.files.crs import crs_of, given_crs
     from shellgs_method.files.cue_maps import relative_path
     from shellgs_method.files.scene import ADJUSTED
     from shellgs_method.files.sparse_points import read_sparse_points
@@ -112,7 +112,7 @@ def align(
     views, points = read_views(layout), read_sparse_points(layout)
     check_points(points, views)
     names = tuple(relative_path(path, scene) for path in shell)
-    system = given_crs(crs) if crs else shared_crs(shell)
+    system = given_crs(crs) if crs else crs_of(*shell)
     place = ShellPlace(*shell) if shell and (picks or positions) else None
     if accept:
         placement = place_as_proposed(scene / PROPOSAL, scene, views)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -41,27 +41,26 @@ def name_of(crs: CRS) -> str:
     return ":".join(authority) if authority else crs.to_wkt()
 
 
-def crs_of(path: Path) -> str:
-    """Name of the system that a shell's file, or a ``.prj`` beside it, says it is in; empty if unknown."""
+def crs_of(*paths: Path) -> str:
+    """Name of the system that a shell's files, or a ``.prj`` beside one, say they are in; empty if unknown.
+
+    Raises:
+        SceneError: they are in several.
+    """
+    named = {system: path for path in paths if (system := _crs_of(path))}
+    if len(named) > 1:
+        one, other = list(named)[:2]
+        raise SceneError(f"{named[one]} is in {one} and {named[other]} in {other}: convert one of them")
+    return next(iter(named), "")
+
+
+def _crs_of(path: Path) -> str:
     beside = path.with_suffix(".prj")
     try:
         crs = known_crs(beside.read_text("utf-8-sig")) if beside.is_file() else _written_in(path)
     except Exception:  # each format's reader raises errors of its own; a damaged file is refused where it is read
         return ""
     return name_of(crs) if crs else ""
-
-
-def shared_crs(paths: Sequence[Path]) -> str:
-    """Name of the system that the files of one shell are in; empty if none of them says.
-
-    Raises:
-        SceneError: they say different ones.
-    """
-    named = {crs: path for path in paths if (crs := crs_of(path))}
-    if len(named) > 1:
-        (one, first), (other, second) = [*named.items()][:2]
-        raise SceneError(f"{first} is in {one}, and {second} in {other}: convert the shell's files to one system")
-    return next(iter(named), "")
 
 
 def _written_in(path: Path) -> CRS | None:

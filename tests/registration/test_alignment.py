@@ -1147,7 +1147,7 @@ def test_latitudes_in_place_of_longitudes_are_refused(tmp_path):
 
 def test_a_shell_in_the_frame_of_the_cameras_needs_no_matrix_and_its_system_is_kept(scene, shellgs, tmp_path):
     alignment = Alignment.load(scene / ALIGNMENT)
-    mesh = load_shell(scene / alignment.shells[0])
+    mesh = load_shell(*alignment.files(scene))
     placed = trimesh.Trimesh(alignment.apply(mesh.vertices), mesh.faces, process=False)
     placed.export(tmp_path / "placed.ply")
     told = shellgs("align", scene, tmp_path / "placed.ply", "--same-frame", "--crs", "EPSG:25832",
