@@ -30,7 +30,7 @@ from shellgs_method.registration.align import place_by_guess
 from shellgs_method.registration.validation import validate
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
 
-UPWARDS = {"as it is": None, **{f"{sign}{axis}": k for k, axis in enumerate("xyz") for sign in ("", "-")}}
+UPWARDS = {"as it is": None, **{f"{axis}{sign}": k for k, axis in enumerate("xyz") for sign in ("", "-")}}
 CHANGES = ("none", "feet", "millimetres", "neighbour", "twin", "another")
 """Of a shell: a unit that is not told, one that is; a block beside it, itself beside it; another one in its place."""
 WRONG = 0.01
@@ -43,7 +43,7 @@ class Benchmark:
 
     Attributes:
         scenes: folders.
-        ups: axes that are turned up: "as it is", x, -x, y, -y, z, -z.
+        ups: axes that are turned up, or down: "as it is", x, x-, y, y-, z, z-.
         changes: of the shells.
         seed: of the headings.
         verbose: print what the validation finds.
@@ -79,7 +79,7 @@ class Known:
         axis = UPWARDS[up]
         if axis is None:
             return self
-        target = (-1 if up.startswith("-") else 1) * np.eye(3)["xyz".index(up[-1])]
+        target = (-1 if up.endswith("-") else 1) * np.eye(3)["xyz".index(up[0])]
         present = self.shell_to_scene[:3, :3].T @ scene_up
         turn, _ = Rotation.align_vectors(target[None], present[None] / np.linalg.norm(present))
         turn = Rotation.from_rotvec(rng.uniform(0, 2 * np.pi) * target) * turn
