@@ -40,7 +40,7 @@ _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with
 # and what a smaller scale brings nearer to the shell fits no better.
 _MEASURED, _POLISHED = 1000, 12
 _ROUNDS = ((500, 250, 1, 2, 10), (150, 800, 1, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
-_HOPEFUL = 0.5  # share of the best score from which candidates are refined: rivals that prove a place ambiguous too
+_HOPEFUL = 0.6  # share of the best score from which candidates are refined: rivals that prove a place ambiguous too
 _MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
