@@ -302,7 +302,7 @@ def _checks(measured: Validation) -> Iterator[Check]:
         yield _check("weak", int(evidence.weak.sum()), name, f"{{:.0f}} {words}".strip())
     for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
-        yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.2f}")
+        yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
     if held_out := [p.residual for p in measured.correspondences if p.held_out]:
         yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
 
