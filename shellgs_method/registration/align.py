@@ -80,6 +80,11 @@ def place_as_before(path: Path, views: Sequence[View]) -> Placement:
     return Placement(alignment, [f"It was found for other cameras than these: {changed}."] if changed else [])
 
 
+def place_as_it_is(shells: tuple[str, ...], metres_per_shell_unit: float) -> Placement:
+    """Align a shell that is in the frame and unit of the cameras."""
+    return Placement(Alignment(np.eye(4), shells, metres_per_shell_unit, source="same frame as the cameras"))
+
+
 def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placement:
     """The proposal of a file, which the user accepts.
 
@@ -91,13 +96,18 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
     if changed := alignment.cameras.changed(views):
         raise SceneError(
             f"{path} was proposed for other cameras than those of {scene}: {changed}; propose again, with "
-            f"`shellgs align {shlex.quote(str(scene))} {shlex.quote(alignment.shell)}`"
+            f"`shellgs align {shlex.quote(str(scene))} {shlex.join(alignment.shells)}`"
         )
     return Placement(alignment)
 
 
 def place_by_picks(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+    path: Path,
+    views: Sequence[View],
+    place: ShellPlace,
+    shells: tuple[str, ...],
+    metres_per_shell_unit: float,
+    crs: str,
 ) -> Placement:
     """Align the shell by a file of picks.
 
@@ -105,15 +115,20 @@ def place_by_picks(
         FileNotFoundError: the file does not exist.
         SceneError: the picks cannot be read, triangulated or trusted, or are not in the shell's frame.
     """
-    picks = read_picks(path, views)
+    picks = read_picks(path, views, crs)
     place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
     matrix, picked = align_picks(picks, views, metres_per_shell_unit)
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"picks in {path.name}")
     return Placement(alignment, [_residuals_in_words(picked, "picks")], picked)
 
 
 def place_by_positions(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+    path: Path,
+    views: Sequence[View],
+    place: ShellPlace,
+    shells: tuple[str, ...],
+    metres_per_shell_unit: float,
+    crs: str,
 ) -> Placement:
     """Align the shell by a file of surveyed camera positions.
 
@@ -121,10 +136,10 @@ def place_by_positions(
         FileNotFoundError: the file does not exist.
         SceneError: the positions cannot be read or trusted, or are not in the shell's frame.
     """
-    surveyed = read_positions(path, views)
+    surveyed = read_positions(path, views, crs)
     place.check_positions(surveyed.shell, f"the camera positions of {path}")
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"camera positions in {path.name}")
     history = [_residuals_in_words(cameras, "camera positions")]
     if surveyed.unknown:
         history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.unknown)}.")
@@ -198,17 +213,16 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
     """The placement with the residuals that its correspondences have in other cameras."""
     known = placement.correspondences
     if picks is not None:
-        of_picks = [point for point in known if isinstance(point, PickedPoint)]
-        return replace(
-            placement, correspondences=picked_again(of_picks, read_picks(picks, views), views, placement.alignment)
-        )
+        of_picks, alignment = [point for point in known if isinstance(point, PickedPoint)], placement.alignment
+        again = picked_again(of_picks, read_picks(picks, views, alignment.crs), views, alignment)
+        return replace(placement, correspondences=again)
     centres = {view.name: view.camera.position.double().numpy() for view in views}
     moved = [replace(point, scene=centres[point.name]) for point in known]
     return replace(placement, correspondences=measured_again(moved, placement.alignment))
 
 
 def place_by_guess(
-    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shell: str, metres_per_shell_unit: float
+    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shells: tuple[str, ...], metres_per_shell_unit: float
 ) -> Placement:
     """Propose an alignment by coarse registration; the shell may have any orientation in its file.
 
@@ -225,14 +239,14 @@ def place_by_guess(
     ]
     checks = [agreement_check(best.score), *(rival_check(rival.score / best.score) for rival in rivals[:1])]
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source="proposal")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)
 
 
 def up_in_words(alignment: Alignment) -> str:
     """What is up in the shell's file, by the cameras."""
     if alignment.up is None:
-        usual = name_of(usual_up(alignment.shell))
+        usual = name_of(usual_up(alignment.shells))
         return f"The cameras do not tell which way is up: it is taken to be {usual} of the shell's file."
     return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
 

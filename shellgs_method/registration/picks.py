@@ -3,8 +3,9 @@
 The file is a `gcp_list.txt` in OpenDroneMap's format, which several picking tools write: one line per point and
 photograph, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in the shell's file, x y the pixel (from
 the top left corner of the image). Lines with the same name, or without a name with the same X Y Z, are one point,
-which needs two photographs. A first line without numbers (the projection) and comments after # are skipped; quote image
-names with spaces. Points whose name begins with "check" are not fitted, only measured.
+which needs two photographs. A first line without numbers names the coordinate reference system of X Y Z, if it is not
+the shell's; comments after # are skipped. Quote image names with spaces. Points whose name begins with "check" are not
+fitted, only measured.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from shellgs_method.registration.correspondences import (
     fit_robustly,
     measured_again,
     read_lines,
+    to_shell,
     view_named,
     worst_first,
 )
@@ -71,14 +73,15 @@ class PickedPoint(Correspondence):
     views: tuple[str, ...]
 
 
-def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
-    """Read a file of picks.
+def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
+    """Read a file of picks, in the coordinate reference system that its header names, or else the shell's, ``crs``.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is in degrees, or a line cannot be read, names an image that is not in the scene, or
-            contradicts another line.
+        SceneError: the file is in degrees and the shell's system is not known, or a line cannot be read, names an image
+            that is not in the scene, or contradicts another line.
     """
+    convert = to_shell(path, "picks", crs)
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
     for where, words in read_lines(path, "picks"):
@@ -103,7 +106,8 @@ def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
         pixels[name][view.name] = pixel
     if not shell:
         raise SceneError(f"{path} holds no picks")
-    return [Pick(name, point, pixels[name]) for name, point in shell.items()]
+    points = convert(np.stack([*shell.values()]))
+    return [Pick(name, point, pixels[name]) for name, point in zip(shell, points, strict=True)]
 
 
 def triangulate(

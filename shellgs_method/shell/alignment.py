@@ -19,12 +19,12 @@ from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.contents import Geometry
-from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.geometry.axes import upwards
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
-from shellgs_method.shell.mesh import ShellMesh, load_shell
+from shellgs_method.shell.loading import load_shell
+from shellgs_method.shell.mesh import ShellMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Alignment:
 
     Attributes:
         shell_to_scene: uniform scale, rotation and translation.
-        shell: the shell's file, relative to the scene's folder (or absolute).
+        shells: the shell's files, which share one frame, relative to the scene's folder (or absolute).
         metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
         source: how the alignment was found, for people.
         verdict: verdict of the validation, "good" or "doubtful"; empty if not validated.
@@ -43,13 +43,14 @@ class Alignment:
         model: COLMAP model of these, relative to the scene's folder, if they were adjusted to the shell; else empty.
         spacing: size in metres of the voxels in which a point cloud is merged; None for what the cameras resolve.
         up: the shell's direction upwards, a unit vector: as the cameras tell if None, where they tell.
+        crs: coordinate reference system of the shell, a code such as EPSG:25832 or WKT; empty if unknown.
 
     Raises:
         SceneError: the matrix is not a similarity, or mirrors, the mesher is unknown, or the spacing is not positive.
     """
 
     shell_to_scene: Float64[np.ndarray, "4 4"]
-    shell: str
+    shells: tuple[str, ...]
     metres_per_shell_unit: float = 1.0
     source: str = "matrix"
     verdict: str = ""
@@ -59,6 +60,7 @@ class Alignment:
     model: str = ""
     spacing: float | None = None
     up: Float64[np.ndarray, " 3"] | None = None
+    crs: str = ""
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -69,6 +71,8 @@ class Alignment:
         if not 0 < self.metres_per_shell_unit < np.inf:
             raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
         object.__setattr__(self, "up", self._upwards() if self.up is None else _direction(self.up))
+        if not self.shells:
+            raise SceneError("the alignment names no file of the shell")
         if self.mesher not in get_args(Mesher):
             raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
         if self.spacing is not None and not 0 < self.spacing < np.inf:
@@ -77,6 +81,15 @@ class Alignment:
     def __eq__(self, other: object) -> bool:
         """Compare all fields."""
         return isinstance(other, Alignment) and self._fields() == other._fields()
+
+    @property
+    def named(self) -> str:
+        """The shell's files, for people."""
+        return ", ".join(self.shells)
+
+    def files(self, scene: Path) -> list[Path]:
+        """The shell's files."""
+        return [scene / shell for shell in self.shells]
 
     @property
     def scale(self) -> float:
@@ -118,7 +131,7 @@ class Alignment:
         """Whether both place the same surface identically, however they were found."""
         return (
             np.array_equal(self.shell_to_scene, other.shell_to_scene)
-            and self.shell == other.shell
+            and self.shells == other.shells
             and self.metres_per_shell_unit == other.metres_per_shell_unit
             and self.mesher == other.mesher
             and self.spacing == other.spacing
@@ -132,7 +145,7 @@ class Alignment:
         """
         if changed := self.cameras.changed(views):
             raise SceneError(
-                f"the alignment of {self.shell} was found for other cameras than those of {scene}: {changed}; run "
+                f"the alignment of {self.named} was found for other cameras than those of {scene}: {changed}; run "
                 f"`shellgs align {shlex.quote(str(scene))}` to validate it with these, or align the shell to them again"
             )
 
@@ -143,21 +156,21 @@ class Alignment:
             return self
         return replace(self, mesher=mesher, spacing=spacing, verdict="", metrics={})
 
-    def load_shell(self, scene: Path, views: Sequence[View], surface: Geometry | Cloud | None = None) -> ShellMesh:
+    def load_shell(self, scene: Path, views: Sequence[View], surfaces: Sequence[Geometry | Cloud] = ()) -> ShellMesh:
         """Load the shell's mesh, in its own frame; the mesh of a point cloud is cached in ``scene/shell``.
 
         Args:
             scene: the scene's folder.
             views: photographs of the shell, whose cameras say where and how finely a point cloud is meshed.
-            surface: what the shell's file holds, if it was read already.
+            surfaces: what the shell's files hold, if they were read already.
 
         Raises:
             FileNotFoundError: the shell is missing.
             SceneError: the shell cannot be used, or its coordinates were rounded by decimetres.
         """
         return load_shell(
-            scene / self.shell,
-            surface=surface,
+            *self.files(scene),
+            surfaces=surfaces,
             cache=scene / "shell",
             cameras=[self._in_shell(view.camera) for view in views],
             mesher=self.mesher,
@@ -183,9 +196,8 @@ class Alignment:
             lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
             file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
 
-    def record(self, scene: Path, views: Sequence[View]) -> None:
-        """Write a scene's alignment, bound to the cameras of its views; a file that says the same keeps its verdict."""
-        path = scene / ALIGNMENT
+    def record(self, path: Path, views: Sequence[View]) -> None:
+        """Write a file of the alignment, bound to the cameras of views; one that says the same keeps its verdict."""
         known = Alignment.load(path) if path.is_file() else None
         same = known is not None and not known.cameras.changed(views)
         if known is None or not same or not known.places_like(self):
@@ -217,7 +229,7 @@ class Alignment:
             up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)  # older files lack it
             return cls(
                 matrix,
-                str(fields["shell"]),
+                (shells,) if isinstance(shells := fields["shell"], str) else tuple(map(str, shells)),
                 float(unit),
                 str(source),
                 verdict,
@@ -227,6 +239,7 @@ class Alignment:
                 model,
                 spacing,
                 up,
+                str(fields.get("crs", "")),
             )
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
@@ -239,7 +252,7 @@ class Alignment:
     def from_matrix_file(
         cls,
         path: Path,
-        shell: str,
+        shells: tuple[str, ...],
         metres_per_shell_unit: float = 1.0,
         global_shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Alignment:
@@ -247,7 +260,7 @@ class Alignment:
 
         Args:
             path: the file.
-            shell: the shell's file, relative to the scene's folder (or absolute).
+            shells: the shell's files, relative to the scene's folder (or absolute).
             metres_per_shell_unit: 1 for a shell in metres.
             global_shift: CloudCompare's "global shift", which it adds to a cloud's coordinates on loading, so that its
                 matrices apply to the shifted coordinates.
@@ -261,14 +274,17 @@ class Alignment:
         shift = np.eye(4)
         shift[:3, 3] = global_shift
         try:
-            return cls(_read_matrix(path) @ shift, shell, metres_per_shell_unit, source=f"matrix file {path.name}")
+            return cls(_read_matrix(path) @ shift, shells, metres_per_shell_unit, source=f"matrix file {path.name}")
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
 
     def _fields(self) -> dict:
+        fields = dict(vars(self))
+        matrix, shells = fields.pop("shell_to_scene"), fields.pop("shells")
         return {
-            **vars(self),
-            "shell_to_scene": self.shell_to_scene.tolist(),
+            "shell_to_scene": matrix.tolist(),
+            "shell": shells[0] if len(shells) == 1 else list(shells),  # one as in older versions
+            **fields,
             "up": None if self.up is None else self.up.tolist(),
             "metrics": dict(self.metrics),
             "cameras": self.cameras.to_json(),

@@ -30,7 +30,9 @@ from shellgs_method.synthetic.building import Layout, building
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 
 ROOM = Box(np.eye(3), np.full(3, -3.0), np.full(3, 3.0))
-FRAME = Frame("shell", np.eye(4), np.array([400_000.0, 5_000_000.0, 0.0]), metric=True, up=np.eye(3)[2])
+FRAME = Frame(
+    "shell", np.eye(4), np.array([400_000.0, 5_000_000.0, 0.0]), metric=True, up=np.eye(3)[2], crs="EPSG:25832"
+)
 K = torch.tensor([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]], dtype=torch.float64)
 
 
@@ -165,7 +167,7 @@ def test_a_camera_in_the_frame_has_the_same_view_with_depth_in_metres():
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 0.0004 * rotation, [3, -1, 2]
     vertices = np.array([[7e6, 2e6, 1e4], [7.01e6, 2e6, 1e4], [7e6, 2.01e6, 2e4]])
-    alignment = Alignment(matrix, "shell.ply", metres_per_shell_unit=0.001)
+    alignment = Alignment(matrix, ("shell.ply",), metres_per_shell_unit=0.001)
     frame = shell_frame(alignment, ShellMesh(vertices, np.array([[0, 1, 2]])))
     np.testing.assert_array_equal(frame.offset, [7000, 2000, 0])
 
@@ -179,7 +181,7 @@ def test_a_camera_in_the_frame_has_the_same_view_with_depth_in_metres():
 
 def test_a_shell_near_its_origin_is_not_shifted():
     mesh = ShellMesh(np.array([[0.0, 0, 0], [30, 0, 0], [0, 0, 20]]), np.array([[0, 1, 2]]))
-    frame = shell_frame(Alignment(np.diag([2.0, 2, 2, 1]), "shell.obj"), mesh)
+    frame = shell_frame(Alignment(np.diag([2.0, 2, 2, 1]), ("shell.obj",)), mesh)
     np.testing.assert_array_equal(frame.offset, 0)
 
 
@@ -193,6 +195,7 @@ def test_a_mesh_file_is_read_back_unchanged(sphere, tmp_path, suffix):
     np.testing.assert_array_equal(read.faces, sphere.faces)
     about = json.loads((tmp_path / "mesh.json").read_text())
     assert about["offset"] == [400_000, 5_000_000, 0]
+    assert about["crs"] == "EPSG:25832"
     assert (about["unit"], about["up"], about["faces"]) == ("metre", "z", len(sphere.faces))
     assert about["up_in_file"] == ("y" if suffix == ".glb" else "z")
 
