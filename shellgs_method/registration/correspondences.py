@@ -142,7 +142,7 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
     except UnicodeDecodeError as error:
         raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
     lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
-    worded = [(where, words) for where, line in lines if (words := _words(line, where))]
+    worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
     if worded and _is_header(header := worded[0][1]):
         if any(piece.lower() in _DEGREES for word in header for piece in re.split("[,;]", word)):
             raise SceneError(f"{path} is in degrees ({' '.join(header)}): convert it to the shell's coordinates")
@@ -150,7 +150,12 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
     yield from worded
 
 
-def _words(line: str, where: str) -> list[str]:
+def words_of(line: str, where: str) -> list[str]:
+    """The words of a line without its comment; see :func:`read_lines`.
+
+    Raises:
+        SceneError: a quote is not closed.
+    """
     words = []
     for word in _WORD.finditer(line):
         if word["bare"] and word["bare"][0] in "\"'":

@@ -1,0 +1,74 @@
+"""`shellgs pick`: points clicked in the scan and in photographs."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Optional
+
+import tyro
+
+from shellgs_method.commands.common import PATHS, Paths, Scene, console
+from shellgs_method.errors import SceneError
+
+
+def pick(
+    scene: Scene,
+    shell: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHELL")],
+    picks: Optional[Path] = None,
+    metres_per_shell_unit: float = 1.0,
+    port: int = 7070,
+    open: bool = False,
+    paths: Paths = PATHS,
+) -> None:
+    """Pick points in the scan and in photographs, side by side in the browser, for `shellgs align --picks`.
+
+    Each click is written to the file of picks. The same command takes it up again.
+
+    Args:
+        scene: Scene folder.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
+        picks: File of picks. If not set: picks.txt in the scene folder.
+        metres_per_shell_unit: Length of the shell's unit in metres.
+        port: Port of the page.
+        open: Open the page in a browser.
+        paths: Paths of the scene's files.
+    """
+    import webbrowser
+
+    import numpy as np
+
+    from dataparsers.facade import read_views
+    from shellgs_method.errors import check_output
+    from shellgs_method.picking.scan import open_scan
+    from shellgs_method.picking.server import PickServer
+    from shellgs_method.picking.session import Session
+    from shellgs_method.registration.frames import ShellPlace
+
+    file = picks or scene / "picks.txt"
+    check_output(file)
+    views = read_views(paths.of(scene))
+    if len(views) < 2:
+        raise SceneError(f"{scene} has {len(views)} photograph, and a point is picked in two or more")
+    session, place = Session(file, views, metres_per_shell_unit), ShellPlace(shell)
+    if session.state.picks:
+        place.check_picks(np.stack([pick.shell for pick in session.state.picks]), f"the picks of {file}")
+    with PickServer(session, open_scan(place), port) as server:
+        console.print(f"Pick in a browser: {server.url} (Ctrl-C or the page's button ends it).", highlight=False)
+        if open:
+            webbrowser.open(server.url)
+        with suppress(KeyboardInterrupt):
+            server.serve_forever()
+    fit = session.said()["fit"]
+    if "problem" in fit:
+        console.print(f"{file}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
+        return
+    unit = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
+    names = [shlex.quote(str(path)) for path in (scene, shell, file)]
+    console.print(
+        f"{fit['used']} of {fit['of']} picks are used; their residual is {fit['rms']:.3f} m (root mean square).\n"
+        f"Next: shellgs align {names[0]} {names[1]} --picks {names[2]}{unit}",
+        highlight=False,
+        soft_wrap=True,
+    )

@@ -1,0 +1,205 @@
+"""A scan to pick points of: drawn thinned, relative to its middle, in single precision; picked exactly, in double."""
+
+from __future__ import annotations
+
+import tempfile
+from abc import ABC, abstractmethod
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt32
+
+from shellgs_method.files.clouds import Cloud
+from shellgs_method.files.readers.contents import Geometry
+from shellgs_method.files.surfaces import usual_up
+from shellgs_method.geometry.axes import main_direction
+from shellgs_method.geometry.nearest import point_tree
+from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.registration.frames import ShellPlace
+from shellgs_method.shell.mesh import load_shell
+
+FACES = 1_000_000
+"""Triangles that a browser draws; a mesh of more is drawn with vertices merged in voxels."""
+DETAIL = 400_000
+"""Points of a cloud that are drawn beside those of the voxels, where one looks closely."""
+_BLOCK = 1 << 14  # points that are skipped at once where a ray passes them by
+_ACROSS = 1024  # voxels along the extent of a mesh that is thinned
+_FRONT = 1 / 3  # of the reach, within which a point hides what is behind it, if the cloud is not sparser
+_SAMPLES = 2000
+_SLOPE = 4.0  # depth over breadth of a surface that is seen in one reach, at most: 76° from facing the ray
+_SEEN = 1e-4  # of the scan's size, by which rays may miss the vertex that they aim at
+
+
+class Blocks:
+    """Points in the order of a file, in blocks: neighbours in a scan mostly are neighbours in its file."""
+
+    def __init__(self, points: Float64[np.ndarray, "N 3"]) -> None:
+        self.points = points
+        blocks = (points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK))
+        bounds = [(block.min(axis=0), block.max(axis=0)) for block in blocks]
+        low, high = np.array(bounds).reshape(-1, 2, 3).transpose(1, 0, 2)
+        self._centres, self._radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
+
+    def near_ray(
+        self, origin: Float64[np.ndarray, " 3"], direction: Float64[np.ndarray, " 3"], reach: float
+    ) -> tuple[Int64[np.ndarray, " M"], Float64[np.ndarray, " M"], Float64[np.ndarray, " M"]]:
+        """Points in a cone around a ray: their indices, distances along it, and tangents of their angles to it.
+
+        Args:
+            origin: where the ray starts.
+            direction: its direction, of length 1.
+            reach: tangent of the cone's half angle.
+        """
+
+        def along_and_off(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            away = points - origin
+            along = away @ direction
+            away -= along[:, None] * direction
+            return along, np.sqrt(np.einsum("nc,nc->n", away, away))
+
+        along, off = along_and_off(self._centres)
+        passed = off - self._radii <= reach * (along + self._radii)
+        found = [(np.empty(0, int), np.empty(0), np.empty(0))]
+        for start in (_BLOCK * np.flatnonzero(passed)).tolist():
+            along, off = along_and_off(self.points[start : start + _BLOCK])
+            near = np.flatnonzero((along > 0) & (off <= reach * along))
+            found.append((start + near, along[near], off[near] / along[near]))
+        index, along, tangent = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return index, along, tangent
+
+    def in_ball(self, centre: Float64[np.ndarray, " 3"], radius: float) -> Float64[np.ndarray, "M 3"]:
+        """All points within a radius of a centre."""
+        touched = np.linalg.norm(self._centres - centre, axis=1) <= self._radii + radius
+        blocks = (self.points[start : start + _BLOCK] for start in (_BLOCK * np.flatnonzero(touched)).tolist())
+        inside = [block[((block - centre) ** 2).sum(axis=1) <= radius**2] for block in blocks]
+        return np.concatenate([np.empty((0, 3)), *inside])
+
+
+class Scan(ABC):
+    """A scan as it is drawn and picked.
+
+    Attributes:
+        middle: point of the shell's frame that is the origin of what is drawn.
+        size: diagonal of the scan, in its unit.
+        points: vertices or points to draw, relative to the middle.
+        faces: triangles between them; none in a cloud.
+        spacing: distance between points of a cloud as they are drawn.
+        up: which way is up, by the rule of the file's format.
+        out: a direction from which much of it is seen.
+    """
+
+    def __init__(
+        self, place: ShellPlace, points: Float64[np.ndarray, "N 3"], faces: UInt32[np.ndarray, "F 3"], spacing: float
+    ) -> None:
+        self.middle, self.size, self.spacing = place.middle, place.size, spacing
+        self.points: Float32[np.ndarray, "N 3"] = (points - self.middle).astype(np.float32)
+        self.faces = faces
+        self.up = usual_up(str(place.path))
+        # Walls that are seen from all sides: level, across the longest extent.
+        level = self.points - self.points.mean(axis=0)
+        level -= (level @ self.up)[:, None] * self.up
+        self.out: Float64[np.ndarray, " 3"] = np.cross(np.linalg.svd(level, full_matrices=False)[2][0], self.up)
+
+    @abstractmethod
+    def pick(
+        self, origin: Float64[np.ndarray, " 3"], direction: Float64[np.ndarray, " 3"], reach: float
+    ) -> Float64[np.ndarray, " 3"] | None:
+        """The point that a ray hits, exactly as it is in the file; None where it hits nothing.
+
+        Args:
+            origin: where the ray starts, relative to :attr:`middle`.
+            direction: its direction, of length 1.
+            reach: tangent of the angle within which points of a cloud, and corners of a mesh, are hit.
+        """
+
+    @abstractmethod
+    def detail(self, centre: Float64[np.ndarray, " 3"], radius: float) -> Float32[np.ndarray, "M 3"]:
+        """Points of a cloud around a centre, :data:`DETAIL` at most, all relative to the middle; none of a mesh."""
+
+
+class MeshScan(Scan):
+    """A mesh, of which points anywhere on triangles are picked, or the vertex beside them."""
+
+    def __init__(self, place: ShellPlace, surface: Geometry) -> None:
+        mesh = load_shell(place.path, surface=surface)
+        super().__init__(place, *thinned(mesh.vertices, mesh.faces), spacing=0.0)
+        self._triangles = Triangles(mesh.vertices - self.middle, mesh.faces)
+        normals = self._triangles.normals[:: max(1, len(mesh.faces) // FACES)]
+        level = normals[np.abs(normals @ self.up) < 0.5]
+        self.out = main_direction(level if len(level) else normals)
+        self._vertices, self._blocks = mesh.vertices, Blocks(self._triangles.vertices)
+
+    def pick(self, origin: np.ndarray, direction: np.ndarray, reach: float) -> np.ndarray | None:
+        """The nearest vertex in reach that nothing hides, else the point on a triangle."""
+        index, _, tangent = self._blocks.near_ray(origin, direction, reach)
+        index = index[np.argsort(tangent, kind="stable")][:1000]
+        if len(index):
+            seen = self._triangles.sees(origin, self._blocks.points[index], slack=_SEEN * self.size)
+            if seen.any():
+                return self._vertices[index[seen][0]]
+        t = float(self._triangles.cast(origin[None], direction[None]).t[0])
+        return origin + t * direction + self.middle if np.isfinite(t) else None
+
+    def detail(self, centre: np.ndarray, radius: float) -> np.ndarray:
+        """Nothing: triangles have all the detail there is."""
+        return np.empty((0, 3), np.float32)
+
+
+class CloudScan(Scan):
+    """A cloud, of which points of the file are picked: they are kept in a temporary file, 24 bytes each."""
+
+    def __init__(self, place: ShellPlace, surface: Cloud) -> None:
+        whole = surface.whole
+        some = np.random.default_rng(0).permutation(whole.points)[:_SAMPLES]
+        # To the fourth neighbour it is as far as to the next on a lattice of this density, in a random cloud too.
+        spacing = np.median(point_tree(whole.points - place.middle).query(some - place.middle, k=5)[0][:, -1])
+        super().__init__(place, whole.points, np.empty((0, 3), np.uint32), min(float(spacing), place.size))
+        if len(whole.scanners):
+            self.out = whole.scanners.mean(axis=0) - self.middle
+        count = 0
+        with tempfile.TemporaryFile() as file:  # the map keeps it
+            for piece in surface:
+                positions = piece.positions[np.isfinite(piece.positions).all(axis=1)]
+                file.write(positions.astype("<f8").tobytes())
+                count += len(positions)
+            file.flush()
+            self._blocks = Blocks(np.memmap(file, "<f8", "r", shape=(count, 3)))
+
+    def pick(self, origin: np.ndarray, direction: np.ndarray, reach: float) -> np.ndarray | None:
+        """Of the points in front, the one nearest to the ray."""
+        index, along, tangent = self._blocks.near_ray(origin + self.middle, direction, reach)
+        if len(index) == 0:
+            return None
+        straight = tangent * along <= np.maximum(_FRONT * reach * along, self.spacing)
+        front = along[straight].min() if straight.any() else along.min()
+        visible = along <= front * (1 + _SLOPE * reach)
+        return np.array(self._blocks.points[index[visible][tangent[visible].argmin()]])
+
+    def detail(self, centre: np.ndarray, radius: float) -> np.ndarray:
+        """Points of the file."""
+        points = self._blocks.in_ball(centre + self.middle, radius)
+        return (points[:: 1 + len(points) // DETAIL] - self.middle).astype(np.float32)
+
+
+def thinned(
+    vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]
+) -> tuple[Float64[np.ndarray, "v 3"], UInt32[np.ndarray, "f 3"]]:
+    """A mesh of at most :data:`FACES` triangles: vertices of a voxel are moved to one of them."""
+    low, voxel = vertices.min(axis=0), np.ptp(vertices, axis=0).max() / _ACROSS
+    points, kept = vertices, faces
+    while len(kept) > FACES:
+        i, j, k = ((vertices - low) / voxel).astype(np.int64).T
+        _, first, cell = np.unique((i << 42) + (j << 21) + k, return_index=True, return_inverse=True)
+        points, kept = vertices[first], cell.reshape(-1)[faces]
+        kept = kept[(kept != np.roll(kept, 1, axis=1)).all(axis=1)]
+        voxel *= 2
+    return points, kept.astype(np.uint32)
+
+
+def open_scan(place: ShellPlace) -> Scan:
+    """The scan of a file.
+
+    Raises:
+        SceneError: it holds no surface.
+    """
+    surface = place.surface
+    return MeshScan(place, surface) if isinstance(surface, Geometry) else CloudScan(place, surface)
