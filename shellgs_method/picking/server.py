@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -43,6 +45,7 @@ class PickServer(ThreadingHTTPServer):
 
     def __init__(self, session: Session, scan: Scan, port: int) -> None:
         self.session, self.scan, self._lock = session, scan, Lock()
+        self._number = time.time_ns()  # in the addresses of images, which browsers keep
         self._photograph = lru_cache(_DECODED)(lambda k: load_upright(session.views[k]))
         try:
             super().__init__(("127.0.0.1", port), _Answers)
@@ -50,12 +53,17 @@ class PickServer(ThreadingHTTPServer):
             raise SceneError(f"port {port} cannot be used, it may be taken: give another with --port") from error
         self.url = f"http://127.0.0.1:{self.server_port}"
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Images that the page no longer waits for are no error."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
+
     def about(self) -> dict[str, Any]:
         """What the page shows and does not change."""
         scan, views = self.scan, self.session.views
         about = {name: getattr(scan, name) for name in ("size", "spacing", "up", "out")}
         photographs = [(view.name, *upright_size(view)) for view in views]
-        return about | {"photographs": photographs, "file": str(self.session.path)}
+        return about | {"photographs": photographs, "server": self._number}
 
     def said(self) -> dict[str, Any]:
         """What the session says, with points placed as the scan is drawn."""
@@ -102,6 +110,12 @@ class _Answers(BaseHTTPRequestHandler):
     server: PickServer
 
     def do_GET(self) -> None:
+        try:
+            self._get()
+        except SceneError as error:
+            self._answer_json({"error": str(error)}, 400)
+
+    def _get(self) -> None:
         url = urlsplit(self.path)
         numbers = {name: float(values[0]) for name, values in parse_qs(url.query).items()}
         scan = self.server.scan
@@ -119,7 +133,8 @@ class _Answers(BaseHTTPRequestHandler):
             centre = np.array([numbers[axis] for axis in "xyz"])
             self._answer(scan.detail(centre, numbers["radius"]).astype("<f4").tobytes())
         elif url.path == "/image":
-            content = self.server.image(int(numbers.pop("number")), **numbers)
+            number, _ = int(numbers.pop("number")), numbers.pop("server", None)
+            content = self.server.image(number, **numbers)
             self._answer(content, "image/jpeg", "max-age=86400")
         else:
             self.send_error(404)
