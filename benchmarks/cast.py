@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.shell import Alignment, PlacedShell, ShellCaster, ShellMesh, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, ShellCaster, ShellMesh, cast_views
 from shellgs_method.synthetic.building import Layout, shell
 
 TO_CAMERA = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from x along the facade, y into it, z up
@@ -78,7 +78,7 @@ def cast_maps(mesh: ShellMesh, views: list[View]) -> float:
         o3d.io.write_triangle_mesh(f"{folder}/shell.ply", o3d.geometry.TriangleMesh(vertices, faces))
         alignment, start = Alignment(np.eye(4), "shell.ply"), time.perf_counter()
         shell = PlacedShell.load(Path(folder), views, alignment)
-        alignment.record(Path(folder), views)
+        alignment.record(Path(folder) / ALIGNMENT, views)
         cast_views(shell)
         return time.perf_counter() - start
 

@@ -179,6 +179,12 @@ class FacadeDataset(InputDataset):
             counts[kind] = sum(record is None or not record.supported for record in records)
         return counts
 
+    def uncompared(self) -> list[str]:
+        """Names of the views whose photograph was not compared with the others on their shell map."""
+        shell, checked = self.cues.get("shell"), self.sets.get("checked")
+        on_shell = [view.name for view in self.views if shell and shell.record(view.name)]
+        return [name for name in on_shell if checked is None or checked.record(name) is None]
+
     def _read(self, maps: CueMaps, view: View) -> CueMap | None:
         return maps.read(view.name, view.camera, any_size=self.any_size)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -27,6 +28,8 @@ from shellgs_method.model import FacadeModel
 from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
 from shellgs_method.runs.host import mend_commands
 from shellgs_method.viewer import ContradictedShell
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -71,6 +74,15 @@ class FacadePipeline(VanillaPipeline):
     def _start(self) -> None:
         """Start from what the photographs say of their exposures, and from seeds at the mean exposure."""
         data, gains = self.datamanager, None
+        if self.model.config.trust == "photographs" and (names := data.train_dataset.uncompared()):
+            logger.warning(
+                "%d of the %d training views were not compared with the others, such as %s: the shell counts there, "
+                "whatever they show, and trees before it cost image quality; run `%s`.",
+                len(names),
+                len(data.train_dataset),
+                names[0],
+                data.train_dataset.cues["shell"].command,
+            )
         if self.model.exposures is not None:
             gains, of_points = data.log_gains()
             self.model.start_exposures(gains, of_points)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.files.photographs import View
-from shellgs_method.shell import Alignment, PlacedShell, cast_views
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.shell.cast import CastSummary
 
 
@@ -84,5 +84,5 @@ def scan(n: int = 12_000, noise: float = 0.004, seed: int = 0) -> np.ndarray:
 def cast(scene: Path, views: list[View], alignment: Alignment, max_image_size: int | None = None) -> CastSummary:
     """Cast a scene's shell by an alignment and record this, as `shellgs cast` does."""
     shell = PlacedShell.load(scene, views, alignment)
-    alignment.record(scene, views)
+    alignment.record(scene / ALIGNMENT, views)
     return cast_views(shell, max_image_size=max_image_size)

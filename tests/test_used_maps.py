@@ -81,6 +81,19 @@ def with_all_maps(scene: Path) -> None:
     CueMaps.open(scene, "shell").remove("images/frame_00003.png")
 
 
+@pytest.mark.parametrize(("method", "warned"), [("shellgs_metric", True), ("shellgs", False)])
+def test_a_run_says_which_photographs_were_not_compared(scene, tmp_path, caplog, method, warned):
+    trainer_of(scene, tmp_path / "before", method)
+    assert ("8 of the 8 training views were not compared" in caplog.text) == warned  # the paper's trusts the shell
+    caplog.clear()
+    cli.cast(scene)
+    trainer_of(scene, tmp_path / "after", method)
+    assert "not compared" not in caplog.text
+    CueMaps.open(scene, "checked").remove("images/frame_00003.png")
+    trainer_of(scene, tmp_path / "partly", method)
+    assert ("1 of the 8 training views were not compared" in caplog.text) == warned
+
+
 @pytest.mark.parametrize("image_type", ["uint8", "float32"])
 @pytest.mark.parametrize("change", [with_all_maps, lambda _: None], ids=["all maps", "shell alone"])
 def test_the_memory_that_photographs_and_maps_take_is_known_before_they_are_read(scene, tmp_path, change, image_type):

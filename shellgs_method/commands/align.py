@@ -29,6 +29,8 @@ def align(
     accept: bool = False,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
+    same_frame: bool = False,
+    crs: Optional[str] = None,
     mesher: Optional[Mesher] = None,
     spacing: Optional[float] = None,
     paths: Paths = PATHS,
@@ -51,6 +53,11 @@ def align(
         accept: Accept the earlier proposal.
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres.
+        same_frame: The shell is in the frame and unit of the cameras: both are of one project of Metashape, RealityScan
+            or OpenDroneMap. Instead of --matrix.
+        crs: Coordinate reference system of the shell, such as EPSG:25832. Picks and positions whose first line names
+            another one, such as EPSG:4326 for degrees, are converted. If not set: as the shell's file says, or a .prj
+            beside it.
         mesher: How a point cloud is meshed, here and wherever the alignment is used: planes (ball pivoting between
             them), bpa (ball pivoting alone) or poisson (for round shapes). If not set: that of the existing alignment,
             else planes.
@@ -61,6 +68,7 @@ def align(
     from dataparsers.facade import read_views
     from shellgs_method.files.atomic import replace_folder, unfinished
     from shellgs_method.files.colmap import write_model
+    from shellgs_method.files.crs import crs_of, given_crs
     from shellgs_method.files.cue_maps import relative_path
     from shellgs_method.files.scene import ADJUSTED
     from shellgs_method.files.sparse_points import read_sparse_points
@@ -70,6 +78,7 @@ def align(
         Placement,
         misplaced,
         place_as_before,
+        place_as_it_is,
         place_as_proposed,
         place_by_guess,
         place_by_picks,
@@ -87,10 +96,11 @@ def align(
     from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
     from shellgs_method.shell.cast import renew_error
 
-    starts = [start for start in (matrix, picks, positions) if start]
+    starts = [start for start in (matrix, picks, positions, same_frame) if start]
     if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
         raise SceneError(
-            "give a shell, alone or with one of --matrix, --picks and --positions, or none to validate what is there"
+            "give a shell, alone or with one of --matrix, --picks, --positions and --same-frame, or none to validate "
+            "what is there"
         )
     if any(global_shift) and matrix is None:
         raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")
@@ -102,6 +112,7 @@ def align(
     views, points = read_views(layout), read_sparse_points(layout)
     check_points(points, views)
     name = relative_path(shell, scene) if shell else ""
+    system = given_crs(crs) if crs else crs_of(shell) if shell else ""
     place = ShellPlace(shell) if shell and (picks or positions) else None
     if accept:
         placement = place_as_proposed(scene / PROPOSAL, scene, views)
@@ -109,15 +120,18 @@ def align(
         placement = place_as_before(scene / ALIGNMENT, views)
     elif matrix:
         placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
+    elif same_frame:
+        placement = place_as_it_is(name, metres_per_shell_unit)
     elif picks and place:
-        placement = place_by_picks(picks, views, place, name, metres_per_shell_unit)
+        placement = place_by_picks(picks, views, place, name, metres_per_shell_unit, system)
     elif positions and place:
-        placement = place_by_positions(positions, views, place, name, metres_per_shell_unit)
+        placement = place_by_positions(positions, views, place, name, metres_per_shell_unit, system)
     else:
         method, unit = mesher or "planes", metres_per_shell_unit
         unaligned = load_shell(shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
         placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
-    placement = replace(placement, alignment=placement.alignment.meshed_by(mesher, spacing))
+    aligned = placement.alignment.meshed_by(mesher, spacing)
+    placement = replace(placement, alignment=replace(aligned, crs=system or aligned.crs))
     mesh = placement.alignment.load_shell(scene, views, place.surface if place else None)
     misplacement = misplaced(placement, mesh, views, points)
     if refine is not None and misplacement:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Optional
 
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 
     from dataparsers.facade import FacadeDataParserConfig
     from shellgs_method.files.photographs import View
+    from shellgs_method.shell import Alignment
 
 
 def cast(
@@ -23,6 +26,7 @@ def cast(
     matrix: Optional[Path] = None,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
+    truth: Optional[Path] = None,
     max_image_size: Optional[int] = None,
     mesher: Optional[Mesher] = None,
     spacing: Optional[float] = None,
@@ -36,13 +40,19 @@ def cast(
     passer-by, is ignored in training. The result is in scene/cues/checked. Occluders that it misses can be painted
     black in scene/shell/masks/<image path>.png. The same command resumes an interrupted cast.
 
+    With --truth, a scan that is held apart from the shell is cast in its stead, into scene/cues/truth: metrics are also
+    against it from then on. Cast the shell first.
+
     Args:
         scene: Scene folder.
         shell: Mesh, model or point cloud of the shell, with --matrix. If not set: that of scene/shell/alignment.json.
-        matrix: File of the 4x4 similarity from the shell's frame to the scene's (text, json or npy).
+        matrix: File of the 4x4 similarity from the shell's (or the truth's) frame to the scene's (text, json or npy).
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
-        max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size.
+        truth: Mesh, model or point cloud of the building to measure against, in the shell's frame and unit, or in its
+            own with --matrix.
+        max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size, or
+            that of the shell's maps with --truth.
         mesher: How a point cloud is meshed: planes (ball pivoting between them), bpa (ball pivoting alone) or poisson
             (for round shapes). If not set: as the alignment was validated; another one leaves it without a verdict.
         spacing: Size in metres of the voxels in which the points of a cloud are merged. If not set: as the alignment
@@ -56,20 +66,27 @@ def cast(
 
     if max_image_size is not None and max_image_size < 1:
         raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
-    if (shell is None) != (matrix is None):
+    surface = truth or shell
+    if truth and shell:
+        raise SceneError("the truth is cast after the shell: give --shell or --truth")
+    if (matrix and not surface) or (shell and not matrix):
         raise SceneError("--shell and --matrix go together: give both or neither")
     if matrix is None and (any(global_shift) or metres_per_shell_unit != 1):
-        raise SceneError("--global-shift and --metres-per-shell-unit go with --shell and --matrix")
+        raise SceneError("--global-shift and --metres-per-shell-unit go with --matrix")
     config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
-    if shell is not None and matrix is not None:
-        name = relative_path(shell, scene)
+    if surface and matrix:
+        name = relative_path(surface, scene)
         alignment = Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
         if not alignment.cameras.cameras:
             unbound = f"{scene / ALIGNMENT} does not say which cameras it was found for"
             console.print(f"{unbound}: `shellgs align {scene}` records them.")
+    if truth:
+        in_place = replace(alignment, shell=relative_path(truth, scene), verdict="", metrics={})
+        _cast_truth(config, in_place.meshed_by(mesher, spacing), max_image_size, _words(truth, matrix) + paths.flags)
+        return
     aligned = alignment.meshed_by(mesher, spacing)
     if aligned != alignment and alignment.verdict:
         how = "mesher" if aligned.mesher != alignment.mesher else "spacing"
@@ -78,7 +95,7 @@ def cast(
     placed = PlacedShell.load(scene, views, aligned)
     if meshing := placed.mesh.meshing:
         console.print(f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}: {meshing}")
-    aligned.record(scene, views)
+    aligned.record(scene / ALIGNMENT, views)
     summary = cast_views(placed, max_image_size=max_image_size, flags=paths.flags)
     seconds = time.monotonic() - start
     console.print(
@@ -89,6 +106,34 @@ def cast(
         _check(scene, config)
     panel = save_panel(CueMaps.open(scene, "shell"), views)
     console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
+
+
+def _cast_truth(config: FacadeDataParserConfig, alignment: Alignment, max_image_size: int | None, flags: str) -> None:
+    """Cast a scan held apart, and print how much of the shell it covers and how far it is from it."""
+    from dataparsers.facade import held_out_names, read_views
+    from shellgs_method.files.cue_maps import CueMaps
+    from shellgs_method.shell import TRUTH, PlacedShell, cast_views
+    from shellgs_method.shell.cast import against_truth
+
+    scene, views, start = config.data, read_views(config), time.monotonic()
+    shell = CueMaps.open(scene, "shell")
+    placed = PlacedShell.load(scene, views, alignment)
+    alignment.record(scene / TRUTH, views)
+    size = max_image_size or shell.manifest.max_image_size
+    summary = cast_views(placed, kind="truth", max_image_size=size, flags=flags)
+    held_out = [view for view in views if view.name in held_out_names(config)]
+    covered, apart = against_truth(scene, held_out)
+    console.print(
+        f"{summary.cast} views cast, {summary.skipped} already there, in {time.monotonic() - start:.1f} s; the truth "
+        f"covers {covered:.0%} of the shell in the {len(held_out)} held-out views, and metrics leave out the rest. "
+        f"In the median, the two are {apart * alignment.metres_per_unit:.3g} m apart there."
+    )
+    console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: what is grey has no truth.")
+
+
+def _words(truth: Path, matrix: Path | None) -> str:
+    """The words of a command that casts the truth again."""
+    return f" --truth {quote(str(truth))}" + (f" --matrix {quote(str(matrix))}" if matrix else "")
 
 
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:

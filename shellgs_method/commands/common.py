@@ -37,4 +37,5 @@ def place(frame: Frame) -> str:
     shift = f" less {' '.join(f'{value:.0f}' for value in frame.offset)}" if frame.offset.any() else ""
     if not frame.metric:
         return f"The scene has no aligned shell: this is the scene's own frame{shift}, in units of unknown size."
-    return f"In metres, in the shell's frame{shift}."
+    system = f", {frame.crs}" if frame.crs and len(frame.crs) < 20 else ""  # not a whole WKT
+    return f"In metres, in the shell's frame{system}{shift}."

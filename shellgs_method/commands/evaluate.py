@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Optional
+from typing import TYPE_CHECKING, Literal, Optional
+
+import numpy as np
+from rich.table import Table
 
 from shellgs_method.commands.common import RunConfig, console
+
+if TYPE_CHECKING:
+    from shellgs_method.export.surveyed import Surveyed
 
 
 def evaluate(
@@ -13,6 +19,7 @@ def evaluate(
     output_path: Path = Path("eval.json"),
     holdout: Optional[Literal["A", "B"]] = None,
     renders: Optional[Path] = None,
+    points: Optional[Path] = None,
 ) -> None:
     """Write all metrics of a trained run, as `ns-eval` does, for any nerfstudio method that renders depth.
 
@@ -21,6 +28,9 @@ def evaluate(
         output_path: Output JSON file.
         holdout: Measure only these vertical bands of the facade, whatever the run held out.
         renders: Folder for the renders of each held-out view, as npz.
+        points: Text file of surveyed points, one per line: name X Y Z in the shell's coordinates. The distances of the
+            surface that `shellgs mesh` would write, at the points and between pairs of them, are printed and added to
+            the output.
     """
     # First, and from here: nerfstudio's registry inspects the call stack 26 times, which takes 1.5 s longer deep in our
     # imports.
@@ -29,6 +39,26 @@ def evaluate(
     from shellgs_method.compare.measure import write_metrics
     from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, rich_table
 
-    metrics = {"run": write_metrics(config, output_path, holdout, renders)}
+    measured = write_metrics(config, output_path, holdout, renders, points)
     for columns in (MAIN_COLUMNS, SURFACE_COLUMNS):
-        console.print(rich_table(metrics, columns))
+        console.print(rich_table({"run": measured["results"]}, columns))
+    if points:
+        _print_surveyed(measured["surveyed"])
+
+
+def _print_surveyed(surveyed: Surveyed) -> None:
+    table = Table("Point", "Surface before it (m)")
+    for name, before in surveyed.before.items():
+        table.add_row(name, "no surface near it" if before is None else f"{before:+.3f}")
+    console.print(table)
+    off = surveyed.distances
+    console.print(
+        f"The surface is {np.median(off):.3f} m from {len(off)} of {len(surveyed.before)} points in the median, "
+        f"{off.max():.3f} m at most."
+    )
+    if pairs := sorted(surveyed.pairs, key=lambda pair: abs(pair[3])):
+        one, other, apart, difference = pairs[-1]
+        console.print(
+            f"Distances between {len(pairs)} pairs of them differ by {abs(pairs[len(pairs) // 2][3]):.3f} m in the "
+            f"median, at most by {abs(difference):.3f} m, from {one} to {other}, {apart:.3f} m apart."
+        )

@@ -18,6 +18,7 @@ def pick(
     shell: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHELL")],
     picks: Optional[Path] = None,
     metres_per_shell_unit: float = 1.0,
+    crs: Optional[str] = None,
     port: int = 7070,
     open: bool = False,
     paths: Paths = PATHS,
@@ -31,6 +32,8 @@ def pick(
         shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
         picks: File of picks. If not set: picks.txt in the scene folder.
         metres_per_shell_unit: Length of the shell's unit in metres.
+        crs: Coordinate reference system of the shell, such as EPSG:25832, to which a file of picks in another one is
+            converted. If not set: as the shell's file says, or a .prj beside it.
         port: Port of the page.
         open: Open the page in a browser.
         paths: Paths of the scene's files.
@@ -41,6 +44,7 @@ def pick(
 
     from dataparsers.facade import read_views
     from shellgs_method.errors import check_output
+    from shellgs_method.files.crs import crs_of, given_crs
     from shellgs_method.picking.scan import open_scan
     from shellgs_method.picking.server import PickServer
     from shellgs_method.picking.session import Session
@@ -51,7 +55,8 @@ def pick(
     views = read_views(paths.of(scene))
     if len(views) < 2:
         raise SceneError(f"{scene} has {len(views)} photograph, and a point is picked in two or more")
-    session, place = Session(file, views, metres_per_shell_unit), ShellPlace(shell)
+    place = ShellPlace(shell)
+    session = Session(file, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(shell))
     if session.state.picks:
         place.check_picks(np.stack([pick.shell for pick in session.state.picks]), f"the picks of {file}")
     with PickServer(session, open_scan(place), port) as server:
@@ -64,11 +69,12 @@ def pick(
     if "problem" in fit:
         console.print(f"{file}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
         return
-    unit = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
+    options = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
+    options += f" --crs {shlex.quote(crs)}" if crs else ""
     names = [shlex.quote(str(path)) for path in (scene, shell, file)]
     console.print(
         f"{fit['used']} of {fit['of']} picks are used; their residual is {fit['rms']:.3f} m (root mean square).\n"
-        f"Next: shellgs align {names[0]} {names[1]} --picks {names[2]}{unit}",
+        f"Next: shellgs align {names[0]} {names[1]} --picks {names[2]}{options}",
         highlight=False,
         soft_wrap=True,
     )

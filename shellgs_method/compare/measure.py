@@ -24,6 +24,8 @@ from shellgs_method.evaluation.holdout import Half
 from shellgs_method.evaluation.pixels import reference_maps
 from shellgs_method.evaluation.regions import REFERENCES, masked_image_errors, reference_errors
 from shellgs_method.evaluation.view import OPAQUE
+from shellgs_method.export.runs import TrainedRun
+from shellgs_method.export.surveyed import REACH, at_surveyed, read_surveyed
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.scene import SceneLayout
@@ -211,13 +213,23 @@ def _snapshot(
     )
 
 
-def write_metrics(config: Path, output: Path, half: Half | None = None, renders: Path | None = None) -> dict:
-    """Write the result of :func:`measure` as ns-eval would, and return the metrics."""
+def write_metrics(
+    config: Path, output: Path, half: Half | None = None, renders: Path | None = None, points: Path | None = None
+) -> dict:
+    """Write the result of :func:`measure` as ns-eval would, and return it.
+
+    With a file of surveyed ``points``, also what the run's surface says there, ``surveyed``.
+    """
     check_output(output)
     if renders is not None and renders.exists() and not renders.is_dir():
         raise SceneError(f"{renders} is a file: give a folder for the renders")
-    measured = measure(config, half, renders)
+    surveyed = {}
+    if points is not None:  # first: points that cannot be read are refused before anything is measured
+        run = TrainedRun.load(config)
+        read = read_surveyed(points, run.shell[0].crs if run.shell else "")
+        surveyed["surveyed"] = at_surveyed(run, run.surface(REACH), read)
+    measured = measure(config, half, renders) | surveyed
     output.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(output) as file:
-        file.write(json.dumps(measured, indent=2).encode())
-    return measured["results"]
+        file.write(json.dumps(measured, indent=2, default=vars).encode())
+    return measured

@@ -47,7 +47,7 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
     * ``seen``: all of it.
     * ``on_shell``, ``off_shell``: on the shell, or where it is absent, does not count or is larger than the building.
     * ``before_shell``: where the truth is nearer than the shell by more than 5 cm (1/200 of its depth where metres are
-      unknown) or, without truth, where photographs show something nearer. These pixels are in neither of the above.
+      unknown) or, where there is no truth, photographs show something nearer. These pixels are in neither of the above.
     """
     if "seen" not in batch:
         return {}
@@ -59,7 +59,7 @@ def regions(batch: dict, metres_per_unit: float | None, device: torch.device) ->
     if "truth_depth" in batch:
         truth = batch["truth_depth"].to(device)
         gap = 0.05 / metres_per_unit if metres_per_unit else shell / 200
-        before = seen & (truth > 0) & (truth < shell - gap)
+        before = seen & torch.where(truth > 0, truth < shell - gap, before)
     on_shell, rest = on_shell & ~beyond(batch, device), seen & ~before
     return {"seen": seen, "on_shell": rest & on_shell, "off_shell": rest & ~on_shell, "before_shell": before}
 

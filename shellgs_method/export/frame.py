@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +32,7 @@ class Frame:
         offset: to add to coordinates to get those of the shell, or of the scene, in this frame's unit.
         metric: whether the unit is the metre; otherwise it is unknown.
         up: the direction upwards, a unit vector.
+        crs: coordinate reference system of the coordinates with the offset, a code or WKT; empty if unknown.
     """
 
     name: Literal["shell", "scene"]
@@ -39,6 +40,7 @@ class Frame:
     offset: Float64[np.ndarray, " 3"]
     metric: bool
     up: Float64[np.ndarray, " 3"]
+    crs: str = field(default="", kw_only=True)
 
     @property
     def scale(self) -> float:
@@ -58,6 +60,7 @@ class Frame:
             "unit": "metre" if self.metric else "unknown",
             "up": name_of(self.up),
             "offset": self.offset.tolist(),
+            **({"crs": self.crs} if self.crs else {}),
             "to_scene": self.to_scene.tolist(),
         }
         with atomic_write(path.with_suffix(".json")) as file:
@@ -71,7 +74,8 @@ def shell_frame(alignment: Alignment, shell: ShellMesh, up: Float64[np.ndarray, 
     offset = np.round(bounds.mean(axis=0), -2) if np.abs(bounds).max() > FAR else np.zeros(3)
     to_shell = np.diag([1 / metres] * 3 + [1.0])
     to_shell[:3, 3] = offset / metres
-    return Frame("shell", alignment.shell_to_scene @ to_shell, offset, metric=True, up=up)
+    crs = alignment.crs if metres == 1 else ""  # one in feet is not that of results in metres
+    return Frame("shell", alignment.shell_to_scene @ to_shell, offset, metric=True, up=up, crs=crs)
 
 
 def scene_frame(up: Float64[np.ndarray, " 3"] = Z, middle: Float64[np.ndarray, " 3"] | None = None) -> Frame:

@@ -20,6 +20,8 @@ MASKS = Path("masks")
 """Default folder of masks, in the scene."""
 ALIGNMENT = Path("shell/alignment.json")
 """File of the shell's alignment, in the scene."""
+TRUTH = Path("shell/truth.json")
+"""File of the alignment of a scan that is held apart as the truth, in the scene."""
 ADJUSTED = Path("colmap/adjusted")
 """Folder of the model whose cameras were adjusted to the shell, in the scene."""
 

@@ -53,6 +53,7 @@ class Session:
         path: the file of picks; what it holds is taken up.
         views: the photographs.
         metres_per_shell_unit: 1 for a scan in metres.
+        crs: coordinate reference system of the scan, to which the file's is converted; empty if unknown.
 
     Attributes:
         state: the points now.
@@ -61,10 +62,10 @@ class Session:
         SceneError: the file cannot be read as picks of these photographs.
     """
 
-    def __init__(self, path: Path, views: Sequence[View], metres_per_shell_unit: float = 1.0) -> None:
+    def __init__(self, path: Path, views: Sequence[View], metres_per_shell_unit: float = 1.0, crs: str = "") -> None:
         self.path, self.views, self._metres = path, views, metres_per_shell_unit
         self._by_name = {view.name: view for view in views}
-        file = PicksFile.read(path, views) if path.exists() else PicksFile()
+        file = PicksFile.read(path, views, crs) if path.exists() else PicksFile()
         self._others = file.others
         # A point that is set aside with one photograph is not left out, but unfinished.
         left_out = frozenset(pick.name for pick in file.aside if len(pick.pixels) > 1)

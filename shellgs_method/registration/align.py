@@ -80,6 +80,11 @@ def place_as_before(path: Path, views: Sequence[View]) -> Placement:
     return Placement(alignment, [f"It was found for other cameras than these: {changed}."] if changed else [])
 
 
+def place_as_it_is(shell: str, metres_per_shell_unit: float) -> Placement:
+    """Align a shell that is in the frame and unit of the cameras."""
+    return Placement(Alignment(np.eye(4), shell, metres_per_shell_unit, source="same frame as the cameras"))
+
+
 def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placement:
     """The proposal of a file, which the user accepts.
 
@@ -97,7 +102,7 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
 
 
 def place_by_picks(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float, crs: str
 ) -> Placement:
     """Align the shell by a file of picks.
 
@@ -105,7 +110,7 @@ def place_by_picks(
         FileNotFoundError: the file does not exist.
         SceneError: the picks cannot be read, triangulated or trusted, or are not in the shell's frame.
     """
-    picks = read_picks(path, views)
+    picks = read_picks(path, views, crs)
     place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
     matrix, picked = align_picks(picks, views, metres_per_shell_unit)
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
@@ -113,7 +118,7 @@ def place_by_picks(
 
 
 def place_by_positions(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float
+    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float, crs: str
 ) -> Placement:
     """Align the shell by a file of surveyed camera positions.
 
@@ -121,7 +126,7 @@ def place_by_positions(
         FileNotFoundError: the file does not exist.
         SceneError: the positions cannot be read or trusted, or are not in the shell's frame.
     """
-    surveyed = read_positions(path, views)
+    surveyed = read_positions(path, views, crs)
     place.check_positions(surveyed.shell, f"the camera positions of {path}")
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
     alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
@@ -198,10 +203,9 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
     """The placement with the residuals that its correspondences have in other cameras."""
     known = placement.correspondences
     if picks is not None:
-        of_picks = [point for point in known if isinstance(point, PickedPoint)]
-        return replace(
-            placement, correspondences=picked_again(of_picks, read_picks(picks, views), views, placement.alignment)
-        )
+        of_picks, alignment = [point for point in known if isinstance(point, PickedPoint)], placement.alignment
+        again = picked_again(of_picks, read_picks(picks, views, alignment.crs), views, alignment)
+        return replace(placement, correspondences=again)
     centres = {view.name: view.camera.position.double().numpy() for view in views}
     moved = [replace(point, scene=centres[point.name]) for point in known]
     return replace(placement, correspondences=measured_again(moved, placement.alignment))

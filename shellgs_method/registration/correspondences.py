@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
@@ -12,8 +12,10 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from pyproj import CRS
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.crs import converter, known_crs
 from shellgs_method.files.paths import captured_name
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.similarity import centred, fit_similarity, transformed
@@ -25,8 +27,7 @@ from photographs) and of RTK positions (2 to 3 cm)."""
 LARGEST = 1e12
 """Largest coordinate, in any unit."""
 _WORD = re.compile(r"""(?P<comment>\#.*)|"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<bare>\S+)""")
-_DEGREES = {"epsg:4326", "epsg:4979", "epsg:4258", "epsg:4269", "+proj=longlat", "+proj=latlong"}
-_DEGREES |= {"lat", "lon", "latitude", "longitude"}
+_LATITUDE, _LONGITUDE = ("lat", "latitude"), ("lon", "long", "longitude")
 _THIN = 0.02  # breadth over length below which points are on one line
 _MAX_TRIPLES = 2000
 
@@ -133,8 +134,45 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is not text, its header says that it is in degrees, or a quote is not closed.
+        SceneError: the file is not text, or a quote is not closed.
     """
+    yield from _split(path, contents)[1]
+
+
+def to_shell(path: Path, contents: str, crs: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
+    """Conversion of a text file's coordinates, whose header may name their system, to the shell's.
+
+    Args:
+        path: the file, as of :func:`read_lines`.
+        contents: name of its contents, for messages.
+        crs: coordinate reference system of the shell; empty if unknown, as if the file's were the same.
+
+    Raises:
+        SceneError: the header says that the file is in degrees, and the shell's system is unknown; while converting,
+            coordinates are outside the shell's system.
+    """
+    header, _ = _split(path, contents)
+    pieces = [piece.lower() for word in header for piece in re.split("[,;]", word)]
+    source = known_crs(" ".join(header))
+    latitude, longitude = ([k for k, piece in enumerate(pieces) if piece in names] for names in (_LATITUDE, _LONGITUDE))
+    if source is None and latitude and longitude:
+        source = CRS.from_epsg(4326)
+    if source is None:
+        return lambda points: points
+    if not crs and source.is_geographic:
+        raise SceneError(
+            f"{path} is in degrees ({' '.join(header)}): say with --crs in which coordinate reference system the "
+            "shell is, such as EPSG:25832, or convert the file to the shell's coordinates"
+        )
+    if not crs:
+        return lambda points: points
+    order = [1, 0, 2] if latitude and longitude and latitude[0] < longitude[0] else [0, 1, 2]
+    convert = converter(source, crs, f"{contents} of {path}")
+    return lambda points: convert(points[:, order])
+
+
+def _split(path: Path, contents: str) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Words of the header of a text file, and its lines as of :func:`read_lines`."""
     if not path.is_file():
         raise FileNotFoundError(f"the file of {contents} {path} does not exist")
     try:
@@ -143,11 +181,7 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
         raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
     lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
     worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
-    if worded and _is_header(header := worded[0][1]):
-        if any(piece.lower() in _DEGREES for word in header for piece in re.split("[,;]", word)):
-            raise SceneError(f"{path} is in degrees ({' '.join(header)}): convert it to the shell's coordinates")
-        del worded[0]
-    yield from worded
+    return (worded[0][1], worded[1:]) if worded and _is_header(worded[0][1]) else ([], worded)
 
 
 def words_of(line: str, where: str) -> list[str]:

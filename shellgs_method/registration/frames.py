@@ -78,8 +78,8 @@ class ShellPlace:
         if in_degrees(points, self.size):
             raise SceneError(
                 f"{called} are in degrees: their first two columns, such as {points[0, 0]:.6g} {points[0, 1]:.6g}, are "
-                f"longitude and latitude; convert them to the coordinates of {self.path}, which are around "
-                f"{_numbers(self.middle)}"
+                f"longitude and latitude; write EPSG:4326 above them and give the system of {self.path} with --crs, or "
+                f"convert them to its coordinates, which are around {_numbers(self.middle)}"
             )
         if self._reaches(points, reach):
             return

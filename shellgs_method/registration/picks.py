@@ -3,15 +3,16 @@
 The file is a `gcp_list.txt` in OpenDroneMap's format, which several picking tools write: one line per point and
 photograph, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in the shell's file, x y the pixel (from
 the top left corner of the image). Lines with the same name, or without a name with the same X Y Z, are one point,
-which needs two photographs. A first line without numbers (the projection) and comments after # are skipped; quote image
-names with spaces. Points whose name begins with "check" are not fitted, only measured. Lines of picks after a # are set
-aside: `shellgs pick` writes them for points that are left out or in one photograph only, and takes them up again.
+which needs two photographs. A first line without numbers names the coordinate reference system of X Y Z, if it is not
+the shell's; comments after # are skipped. Quote image names with spaces. Points whose name begins with "check" are not
+fitted, only measured. Lines of picks after a # are set aside: `shellgs pick` writes them for points that are left out
+or in one photograph only, and takes them up again.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -27,6 +28,7 @@ from shellgs_method.registration.correspondences import (
     fit_robustly,
     measured_again,
     read_lines,
+    to_shell,
     view_named,
     words_of,
     worst_first,
@@ -76,21 +78,26 @@ class PickedPoint(Correspondence):
     views: tuple[str, ...]
 
 
-def read_picks(path: Path, views: Sequence[View]) -> list[Pick]:
-    """Read a file of picks.
+def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
+    """Read a file of picks, in the coordinate reference system that its header names, or else the shell's, ``crs``.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is in degrees, or a line cannot be read, names an image that is not in the scene, or
-            contradicts another line.
+        SceneError: the file is in degrees and the shell's system is not known, or a line cannot be read, names an image
+            that is not in the scene, or contradicts another line.
     """
-    picks = _picks_of(read_lines(path, "picks"), path, views)
+    picks = _picks_of(read_lines(path, "picks"), path, views, to_shell(path, "picks", crs))
     if not picks:
         raise SceneError(f"{path} holds no picks")
     return picks
 
 
-def _picks_of(lines: Iterable[tuple[str, list[str]]], path: Path, views: Sequence[View]) -> list[Pick]:
+def _picks_of(
+    lines: Iterable[tuple[str, list[str]]],
+    path: Path,
+    views: Sequence[View],
+    convert: Callable[[np.ndarray], Float64[np.ndarray, "N 3"]],
+) -> list[Pick]:
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
     for where, words in lines:
@@ -113,7 +120,8 @@ def _picks_of(lines: Iterable[tuple[str, list[str]]], path: Path, views: Sequenc
         if view.name in pixels.setdefault(name, {}):
             raise SceneError(f"{where}: the point {name} is picked twice in {words[5]}")
         pixels[name][view.name] = pixel
-    return [Pick(name, point, pixels[name]) for name, point in shell.items()]
+    points = convert(np.array([*shell.values()]).reshape(-1, 3))
+    return [Pick(name, point, pixels[name]) for name, point in zip(shell, points, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -131,21 +139,23 @@ class PicksFile:
     others: Sequence[str] = _HEAD
 
     @staticmethod
-    def read(path: Path, views: Sequence[View]) -> PicksFile:
-        """Read a file, which may hold no picks yet.
+    def read(path: Path, views: Sequence[View], crs: str = "") -> PicksFile:
+        """Read a file, which may hold no picks yet; the header of another system than ``crs`` goes, as it is converted.
 
         Raises:
             FileNotFoundError: the file does not exist.
             SceneError: as :func:`read_picks`.
         """
-        picks = _picks_of(read_lines(path, "picks"), path, views)
+        convert = to_shell(path, "picks", crs)
+        picks = _picks_of(read_lines(path, "picks"), path, views, convert)
         named, aside, others = {pick.name for pick in picks}, dict[str, Pick](), []
         for line in path.read_text(encoding="utf-8-sig").splitlines():
             after = line.lstrip("# \t")
             try:
-                (pick,) = _picks_of([(str(path), words_of(after, str(path)))], path, views)
-            except SceneError:  # words
-                others.append(line)
+                (pick,) = _picks_of([(str(path), words_of(after, str(path)))], path, views, convert)
+            except SceneError:  # the header, or words
+                if line.startswith("#") or not crs or line.strip() == crs:
+                    others.append(line)
                 continue
             if not line.lstrip().startswith("#"):
                 continue

@@ -2,7 +2,8 @@
 
 The file is a `geo.txt` in OpenDroneMap's format: the coordinate system in a first line without numbers, then one line
 per photograph, ``image X Y Z``; further columns (angles, accuracies) and comments after # are skipped. X Y Z are the
-camera's coordinates in the shell's frame and units, not degrees. Quote image names with spaces.
+camera's coordinates, in the shell's frame and units if the first line names no other system. Quote image names with
+spaces.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from shellgs_method.registration.correspondences import (
     are_numbers,
     fit_robustly,
     read_lines,
+    to_shell,
     view_named,
     worst_first,
 )
@@ -45,13 +47,15 @@ class SurveyedPositions:
     unknown: Sequence[str]
 
 
-def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
-    """Read a file of camera positions.
+def read_positions(path: Path, views: Sequence[View], crs: str = "") -> SurveyedPositions:
+    """Read a file of camera positions, in the coordinate reference system that it names, or else the shell's, ``crs``.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is in degrees, or a line cannot be read or contradicts another.
+        SceneError: the file is in degrees and the shell's system is not known, or a line cannot be read or contradicts
+            another.
     """
+    convert = to_shell(path, "camera positions", crs)
     found: dict[str, tuple[View, list[float]]] = {}
     unknown: list[str] = []
     for where, words in read_lines(path, "camera positions"):
@@ -67,7 +71,7 @@ def read_positions(path: Path, views: Sequence[View]) -> SurveyedPositions:
         else:
             found[view.name] = view, [float(word) for word in words[1:4]]
     shell = np.array([position for _, position in found.values()]).reshape(-1, 3)
-    return SurveyedPositions([view for view, _ in found.values()], shell, unknown)
+    return SurveyedPositions([view for view, _ in found.values()], convert(shell), unknown)
 
 
 def align_positions(

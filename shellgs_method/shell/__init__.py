@@ -1,6 +1,7 @@
 """The facade shell: loaded, meshed, placed in the scene, and cast into each camera."""
 
-from shellgs_method.shell.alignment import ALIGNMENT, Alignment
+from shellgs_method.files.scene import ALIGNMENT, TRUTH
+from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.cast import PlacedShell, cast_views
 from shellgs_method.shell.clouds import Mesher, mesh_cloud
 from shellgs_method.shell.mesh import ShellMesh, load_shell
@@ -9,6 +10,7 @@ from shellgs_method.shell.surface import ShellSurface
 
 __all__ = [
     "ALIGNMENT",
+    "TRUTH",
     "Alignment",
     "Mesher",
     "PlacedShell",

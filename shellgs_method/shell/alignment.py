@@ -19,7 +19,6 @@ from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.photographs import View
 from shellgs_method.files.readers.contents import Geometry
-from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.geometry.axes import upwards
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of, transformed
@@ -43,6 +42,7 @@ class Alignment:
         model: COLMAP model of these, relative to the scene's folder, if they were adjusted to the shell; else empty.
         spacing: size in metres of the voxels in which a point cloud is merged; None for what the cameras resolve.
         up: the shell's direction upwards, a unit vector: as the cameras tell if None, where they tell.
+        crs: coordinate reference system of the shell, a code such as EPSG:25832 or WKT; empty if unknown.
 
     Raises:
         SceneError: the matrix is not a similarity, or mirrors, the mesher is unknown, or the spacing is not positive.
@@ -59,6 +59,7 @@ class Alignment:
     model: str = ""
     spacing: float | None = None
     up: Float64[np.ndarray, " 3"] | None = None
+    crs: str = ""
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -183,9 +184,8 @@ class Alignment:
             lines = (f"{json.dumps(name)}: {json.dumps(v, ensure_ascii=False)}" for name, v in self._fields().items())
             file.write(("{\n " + ",\n ".join(lines) + "\n}\n").encode())
 
-    def record(self, scene: Path, views: Sequence[View]) -> None:
-        """Write a scene's alignment, bound to the cameras of its views; a file that says the same keeps its verdict."""
-        path = scene / ALIGNMENT
+    def record(self, path: Path, views: Sequence[View]) -> None:
+        """Write a file of the alignment, bound to the cameras of views; one that says the same keeps its verdict."""
         known = Alignment.load(path) if path.is_file() else None
         same = known is not None and not known.cameras.changed(views)
         if known is None or not same or not known.places_like(self):
@@ -227,6 +227,7 @@ class Alignment:
                 model,
                 spacing,
                 up,
+                str(fields.get("crs", "")),
             )
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error

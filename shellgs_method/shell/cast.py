@@ -8,23 +8,29 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.cue_maps import CueMap, CueMaps, source_hash
+from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, source_hash
 from shellgs_method.files.photographs import View, load_mask
+from shellgs_method.files.scene import ALIGNMENT, TRUTH
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.precision import FINE, camera_step, refuse_coarse
 from shellgs_method.machine.progress import track
-from shellgs_method.shell.alignment import ALIGNMENT, Alignment
+from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.clouds import VERSION
 from shellgs_method.shell.mesh import ShellMesh
 from shellgs_method.shell.raycast import ShellCaster
 
 log = logging.getLogger(__name__)
 
+ALIGNMENTS = {"shell": ALIGNMENT, "truth": TRUTH}
+"""Files of the alignments of what is cast, in the scene's folder, by the kinds of the maps."""
+NEARER = 0.988
+"""Depth of an occluder as a share of that behind it, at most: what the photographs' comparison tells apart."""
 MASKS = Path("shell/masks")
 """Folder of the shell's masks, in the scene's folder."""
 
@@ -91,19 +97,23 @@ class PlacedShell:
         return cls(scene, views, alignment, mesh, caster)
 
 
-def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: str = "") -> CastSummary:
-    """Cast a shell into its views and store the maps in ``cues/shell`` of its scene.
+def cast_views(
+    shell: PlacedShell, *, kind: Literal["shell", "truth"] = "shell", max_image_size: int | None = None, flags: str = ""
+) -> CastSummary:
+    """Cast a shell, or a scan held apart as the truth, into its views and store the maps in ``cues`` of its scene.
 
-    The maps are bound to ``shell/alignment.json`` of the scene, which must hold the shell's alignment, as
+    The maps are bound to :data:`ALIGNMENTS` of the scene, which must hold the shell's alignment, as
     :meth:`Alignment.record` writes it. Views with an intact map for the same camera, shell and alignment are skipped,
     so that an interrupted run resumes where it stopped.
 
     The shell lacks trees, cars and whatever else stands in front of it: :mod:`shellgs_method.occlusion` finds such
     occluders, and black pixels of ``shell/masks/<image's name>.png`` of the scene, if that file exists, are removed
-    from the view's mask, as are those of the photograph's own mask.
+    from the view's mask, as are those of the photograph's own mask. From the truth's, also what they found to stand in
+    front of it, if the photographs were compared on the shell.
 
     Args:
         shell: the shell in its place.
+        kind: kind of the maps.
         max_image_size: longer side of the photographs to cast for; None for their own size.
         flags: command-line flags that select the same photographs, with a leading blank.
 
@@ -112,15 +122,22 @@ def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: 
         SceneError: its alignment is another one.
     """
     scene, views, meshing = shell.scene, shell.views, shell.mesh.meshing
-    recorded = Alignment.load(scene / ALIGNMENT)
+    path = scene / ALIGNMENTS[kind]
+    recorded = Alignment.load(path)
     if not recorded.places_like(shell.alignment):
-        raise SceneError(f"{scene / ALIGNMENT} has changed since the shell was loaded: run the same command again")
+        raise SceneError(f"{path} has changed since the shell was loaded: run the same command again")
     (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a source of the maps: a mask painted later makes them stale
     maps = CueMaps.create(
         scene,
-        "shell",
+        kind,
         command=_command(max_image_size, recorded if meshing else None) + flags,
-        sources=[scene / recorded.shell, scene / ALIGNMENT, scene / MASKS, *_mask_sources(scene, views)],
+        sources=[
+            scene / recorded.shell,
+            path,
+            *_followed(scene, recorded, kind),
+            scene / MASKS,
+            *_mask_sources(scene, views),
+        ],
         revisions={"mesher": f"{meshing.mesher} {VERSION}"} if meshing else {},
         metres_per_unit=recorded.metres_per_unit,
         max_image_size=max_image_size,
@@ -133,7 +150,8 @@ def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: 
             view = replace(full_size, camera=full_size.camera.shrunk(max_image_size))
             if maps.current(view.name, view.camera):
                 continue
-            cue = _unoccluded(shell.caster.cast(view.camera), view, scene)
+            cue = _unmasked(shell.caster.cast(view.camera), view, scene)
+            cue = _unoccluded(cue, view, scene) if kind == "truth" else cue
             if written:
                 written.result()
             written = writer.submit(maps.write, view.name, cue, view.camera)
@@ -149,12 +167,38 @@ def cast_views(shell: PlacedShell, *, max_image_size: int | None = None, flags: 
     )
 
 
+def against_truth(scene: Path, views: Sequence[View]) -> tuple[float, float]:
+    """Share of the shell's pixels that have a truth, and the median distance between the two there, in scene units.
+
+    Raises:
+        FileNotFoundError: one of the two was not cast.
+    """
+    kinds = [CueMaps.open(scene, kind) for kind in ("shell", "truth")]
+    on_shell, distances = 0, [np.zeros(0)]
+    for view in views:
+        shell, truth = (maps.read(view.name, view.camera, any_size=True) for maps in kinds)
+        if shell is not None and truth is not None:
+            both = shell.mask & truth.mask
+            on_shell += int(shell.mask.sum())
+            distances.append(np.abs(truth.depth - shell.depth)[both])
+    apart = np.concatenate(distances)
+    return len(apart) / max(on_shell, 1), float(np.median(apart)) if len(apart) else np.nan
+
+
 def renew_error(scene: Path) -> None:
     """Give maps cast by a scene's alignment the error that it has now; they stay valid, being bound to its matrix."""
     with suppress(FileNotFoundError, SceneError):  # no maps, or damaged ones, which is reported when they are read
         maps = CueMaps.open(scene, "shell")
         if maps.manifest.sources.get(ALIGNMENT.as_posix()) == source_hash(scene / ALIGNMENT):
             maps.with_error(Alignment.load(scene / ALIGNMENT).error)
+
+
+def _followed(scene: Path, alignment: Alignment, kind: str) -> list[Path]:
+    """The alignment of the shell, if the truth lies in its frame: where the shell moves, so does the truth."""
+    if kind == "shell" or not (scene / ALIGNMENT).is_file():
+        return []
+    shell = Alignment.load(scene / ALIGNMENT)
+    return [scene / ALIGNMENT] if np.array_equal(shell.shell_to_scene, alignment.shell_to_scene) else []
 
 
 def _command(max_image_size: int | None, of_cloud: Alignment | None) -> str:
@@ -169,8 +213,8 @@ def _command(max_image_size: int | None, of_cloud: Alignment | None) -> str:
 
 
 def _mask_sources(scene: Path, views: Sequence[View]) -> list[Path]:
-    """Top-level files or folders of the scene that hold the photographs' masks."""
-    return sorted({scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask})
+    """Top-level files or folders of the scene that hold the masks of the shell and of the photographs."""
+    return [scene / MASKS, *sorted({scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask})]
 
 
 def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
@@ -179,9 +223,23 @@ def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
     return load_mask(view, painted if painted.is_file() else None)
 
 
-def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
+def _unmasked(cue: CueMap, view: View, scene: Path) -> CueMap:
     mask = _load_masks(view, scene)
     return cue if mask is None else replace(cue, mask=cue.mask & mask)
+
+
+def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
+    """Leave out what photographs show to stand in front of a surface, or that moved, where they were compared."""
+    try:
+        maps = [CueMaps.open(scene, kind).read(view.name, view.camera, any_size=True) for kind in ("checked", "shell")]
+    except FileNotFoundError:
+        return cue
+    checked, shell = maps
+    if checked is None or shell is None:
+        return cue
+    found = Findings.of(checked, shell)
+    nearer = found.occluder & (checked.depth < NEARER * cue.depth)
+    return replace(cue, mask=cue.mask & ~nearer & ~found.moved)
 
 
 def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path) -> None:

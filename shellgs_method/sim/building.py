@@ -198,6 +198,8 @@ def moved_into(
     """Replace a frame and the motion into it by those of a world with the same georeference."""
     if not (frame.metric and home.metric):
         raise SceneError(f"{scene} and the scenes before it have no common frame: each needs an aligned shell")
+    if frame.crs and home.crs and frame.crs != home.crs:
+        raise SceneError(f"the shell of {scene} is in {frame.crs}, and that of the first building in {home.crs}")
     between = np.linalg.inv(home.to_national) @ frame.to_national
     away = float(np.linalg.norm(between[:3, 3]))
     if away > MAX_SEPARATION:
@@ -205,4 +207,5 @@ def moved_into(
             f"{scene} is {away / 1000:.0f} km from the first building: are both shells in the same coordinate system?"
         )
     to_scene = frame.to_scene @ np.linalg.inv(between)
-    return SimFrame(frame.name, to_scene, home.offset, True, Z, home.to_national), between @ motion
+    sim = SimFrame(frame.name, to_scene, home.offset, True, Z, home.to_national, crs=home.crs)
+    return sim, between @ motion

@@ -71,5 +71,6 @@ def sim_frame(
         frame.metric,
         Z,
         to_national if frame.metric else np.eye(4),
+        crs=frame.crs,
     )
     return sim, motion

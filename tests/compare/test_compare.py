@@ -41,6 +41,7 @@ from shellgs_method.compare.wandb_report import log_comparison
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import pixels
 from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
+from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import SceneLayout, ScenePaths
 from shellgs_method.geometry.camera import Camera
@@ -692,6 +693,24 @@ def measured(pristine_scene, tmp_path_factory) -> list[Run]:
         trainer.train()
         write_metrics(run.config, run.metrics(), renders=run.renders)
     return runs
+
+
+def test_evaluate_measures_surveyed_points(measured, shellgs, tmp_path):
+    with (tmp_path / "points.txt").open("w") as file:
+        run = TrainedRun.load(measured[1].config)
+        surface = run.surface(0.5)
+        for k in (0, len(surface.vertices) // 2, -1):
+            x, y, z = surface.vertices[k] + run.frame.offset
+            file.write(f"{x:.6f} {y:.6f} {z:.6f}\n")
+    told = shellgs(
+        "evaluate", measured[1].config, "--points", tmp_path / "points.txt", "--output-path", tmp_path / "e.json"
+    )
+    assert "The surface is 0.000 m from 3 of 3 points in the median, 0.000 m at most." in told
+    assert "3 pairs" in told
+    written = json.loads((tmp_path / "e.json").read_text())
+    assert written["surveyed"]["before"] == {name: pytest.approx(0, abs=1e-5) for name in "123"}
+    assert written["results"]["psnr"] == json.loads(measured[1].metrics().read_text())["results"]["psnr"]
+    assert "refused" in shellgs("evaluate", measured[1].config, "--points", tmp_path / "no.txt")
 
 
 def test_our_metrics_are_those_of_ns_eval(measured):

@@ -30,7 +30,9 @@ from shellgs_method.synthetic.building import Layout, building
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 
 ROOM = Box(np.eye(3), np.full(3, -3.0), np.full(3, 3.0))
-FRAME = Frame("shell", np.eye(4), np.array([400_000.0, 5_000_000.0, 0.0]), metric=True, up=np.eye(3)[2])
+FRAME = Frame(
+    "shell", np.eye(4), np.array([400_000.0, 5_000_000.0, 0.0]), metric=True, up=np.eye(3)[2], crs="EPSG:25832"
+)
 K = torch.tensor([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]], dtype=torch.float64)
 
 
@@ -193,6 +195,7 @@ def test_a_mesh_file_is_read_back_unchanged(sphere, tmp_path, suffix):
     np.testing.assert_array_equal(read.faces, sphere.faces)
     about = json.loads((tmp_path / "mesh.json").read_text())
     assert about["offset"] == [400_000, 5_000_000, 0]
+    assert about["crs"] == "EPSG:25832"
     assert (about["unit"], about["up"], about["faces"]) == ("metre", "z", len(sphere.faces))
     assert about["up_in_file"] == ("y" if suffix == ".glb" else "z")
 

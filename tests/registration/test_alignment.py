@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 import torch
 import trimesh
@@ -484,7 +485,7 @@ def test_a_header_of_a_picks_file_is_skipped(rigged, tmp_path, first):
 @pytest.mark.parametrize("header", ["EPSG:4326", "+proj=longlat +datum=WGS84", "lon,lat,z,x,y,image"])
 def test_a_header_of_degrees_is_refused(rigged, tmp_path, header):
     (tmp_path / "picks.txt").write_text(f"{header}\n7.86 46.25 3 4 5 images/1.png a\n")
-    with pytest.raises(SceneError, match=r"picks.txt is in degrees \(.*\): convert it"):
+    with pytest.raises(SceneError, match=r"picks.txt is in degrees \(.*\): say with --crs"):
         read_picks(tmp_path / "picks.txt", rigged[0])
 
 
@@ -608,7 +609,7 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("EPSG:4326", "is in degrees (EPSG:4326): convert it"),
+        ("EPSG:4326", "is in degrees (EPSG:4326): say with --crs"),
         ("#name,lat,lon,alt\nimages/0.png,1,2,3", "line 2: expected the image"),
         ("images/0.png 1,5 2 3", "line 1: expected the image"),
         ("EPSG:25832\nimages/0.png 1 2", "line 2: expected the image, then X Y Z"),
@@ -1102,3 +1103,61 @@ def test_a_report_is_written_even_if_no_camera_sees_the_shell(mesh, views, point
     validation = validate(mesh, Alignment(displaced(1e4, 0, 0, 1) @ TRUTH, "<shell>.ply"), views, points)
     page = write_report(tmp_path / "report", mesh, validation).read_text()
     assert "&lt;shell&gt;.ply: refused" in page
+
+
+def degrees_of(points: np.ndarray) -> np.ndarray:
+    """Longitude, latitude and height of points in UTM 32, by PROJ."""
+    back = pyproj.Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True)
+    return np.stack(back.transform(*np.asarray(points).T), axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [("EPSG:4326", [0, 1, 2]), ("image,latitude,longitude,height", [1, 0, 2]), ("WGS84", [0, 1, 2])],
+)
+def test_positions_in_degrees_are_converted_to_the_system_of_the_shell(tmp_path, header, order):
+    views, truth = rig()[0], np.array([[410000.5, 5413000.25, 251.0], [410003.5, 5413001.25, 252.0]])
+    lines = [
+        f"{view.name} {x:.10f} {y:.10f} {z}"
+        for view, (x, y, z) in zip(views, degrees_of(truth)[:, order], strict=False)
+    ]
+    (tmp_path / "geo.txt").write_text("\n".join([header, *lines]))
+    np.testing.assert_allclose(read_positions(tmp_path / "geo.txt", views, "EPSG:25832").shell, truth, atol=1e-3)
+    # of a compound system, too, whose heights are kept
+    np.testing.assert_allclose(read_positions(tmp_path / "geo.txt", views, "EPSG:5555").shell, truth, atol=1e-3)
+
+
+def test_picks_in_another_zone_are_converted_and_those_in_the_shells_own_are_kept_exactly(rigged, tmp_path):
+    point = np.array([[800000.0, 5413000.25, 251.0]])
+    zone_33 = pyproj.Transformer.from_crs("EPSG:25832", "EPSG:25833", always_xy=True)
+    x, y, z = (float(value[0]) for value in zone_33.transform(*point.T))
+    (tmp_path / "picks.txt").write_text(f"EPSG:25833\n{x:.6f} {y:.6f} {z} 5 6 images/0.png a\n")
+    (pick,) = read_picks(tmp_path / "picks.txt", rigged[0], "EPSG:25832")
+    np.testing.assert_allclose(pick.shell, point[0], atol=1e-4)
+    (pick,) = read_picks(tmp_path / "picks.txt", rigged[0], "EPSG:25833")
+    np.testing.assert_array_equal(pick.shell, [round(x, 6), round(y, 6), z])
+
+
+def test_latitudes_in_place_of_longitudes_are_refused(tmp_path):
+    views = rig()[0]
+    (tmp_path / "geo.txt").write_text(f"EPSG:4326\n{views[0].name} 48.9 190 251\n")
+    with pytest.raises(SceneError, match=r"48.9 190 251 cannot be converted .*: is the longitude first"):
+        read_positions(tmp_path / "geo.txt", views, "EPSG:25832")
+
+
+def test_a_shell_in_the_frame_of_the_cameras_needs_no_matrix_and_its_system_is_kept(scene, shellgs, tmp_path):
+    alignment = Alignment.load(scene / ALIGNMENT)
+    mesh = load_shell(scene / alignment.shell)
+    placed = trimesh.Trimesh(alignment.apply(mesh.vertices), mesh.faces, process=False)
+    placed.export(tmp_path / "placed.ply")
+    told = shellgs("align", scene, tmp_path / "placed.ply", "--same-frame", "--crs", "EPSG:25832",
+                   "--metres-per-shell-unit", alignment.metres_per_unit)  # fmt: skip
+    assert "Verdict: doubtful" in told  # its coordinates are in single precision
+    found = Alignment.load(scene / ALIGNMENT)
+    np.testing.assert_array_equal(found.shell_to_scene, np.eye(4))
+    assert found.crs == "EPSG:25832"
+    shellgs("align", scene)  # validated again
+    assert Alignment.load(scene / ALIGNMENT).crs == "EPSG:25832"
+    elsewhere = trimesh.Trimesh(placed.vertices + 1e5, placed.faces, process=False)
+    elsewhere.export(tmp_path / "elsewhere.ply")
+    assert "a shift" in shellgs("align", scene, tmp_path / "elsewhere.ply", "--same-frame")

@@ -473,7 +473,7 @@ def test_all_maps_are_made_again_for_another_alignment(tmp_path: Path, alignment
 
 def test_maps_are_not_bound_to_another_alignment_than_they_are_cast_by(tmp_path: Path, alignment: Alignment):
     shell = PlacedShell.load(tmp_path, VIEWS, alignment)
-    Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shell).record(tmp_path, VIEWS)
+    Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shell).record(tmp_path / ALIGNMENT, VIEWS)
     with pytest.raises(SceneError, match=r"alignment\.json has changed since the shell was loaded"):
         cast_views(shell)
     assert not (tmp_path / "cues").exists()

@@ -279,6 +279,10 @@ def test_a_second_building_is_moved_into_the_frame_of_the_first():
         moved_into(*far, home, "b")
     with pytest.raises(SceneError, match="no common frame"):
         moved_into(replace(other, metric=False), motion, home, "b")
+    with pytest.raises(
+        SceneError, match="the shell of b is in EPSG:25833, and that of the first building in EPSG:25832"
+    ):
+        moved_into(replace(other, crs="EPSG:25833"), motion, replace(home, crs="EPSG:25832"), "b")
 
 
 def frontal(x: float, distance: float = 4.0, size: int = 120) -> Camera:

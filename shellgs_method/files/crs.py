@@ -1,0 +1,116 @@
+"""Coordinate reference systems: what a file says of its own, and coordinates from one to another (PROJ)."""
+
+from __future__ import annotations
+
+import mmap
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
+
+from shellgs_method.errors import SceneError
+
+_NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
+"""How a system is named; PROJ would find one for nearly any word."""
+_UTM = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
+_IN_FILES = {
+    **dict.fromkeys((".ifc",), re.compile(rb"IFCPROJECTEDCRS\s*\(\s*'([^']+)'", re.IGNORECASE)),
+    **dict.fromkeys((".gml", ".xml", ".citygml"), re.compile(rb"srsName\s*=\s*[\"']([^\"']+)")),
+    **dict.fromkeys((".json", ".jsonl", ".cityjson"), re.compile(rb'"referenceSystem"\s*:\s*"([^"]+)"')),
+}
+
+
+def known_crs(text: str) -> CRS | None:
+    """The system that a text names: a code (EPSG:25832), urn, PROJ string, WKT, or OpenDroneMap's ``WGS84 UTM 32N``."""
+    text = text.strip()
+    if utm := _UTM.fullmatch(text):
+        text = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
+    try:
+        return CRS.from_user_input(text) if _NAMED.match(text) else None
+    except ProjError:
+        return None
+
+
+def name_of(crs: CRS) -> str:
+    """The code of a system, such as EPSG:25832; its WKT if it has none."""
+    authority = crs.to_authority()
+    return ":".join(authority) if authority else crs.to_wkt()
+
+
+def crs_of(path: Path) -> str:
+    """Name of the system that a shell's file, or a ``.prj`` beside it, says it is in; empty if unknown."""
+    beside = path.with_suffix(".prj")
+    try:
+        crs = known_crs(beside.read_text("utf-8-sig")) if beside.is_file() else _written_in(path)
+    except Exception:  # each format's reader raises errors of its own; a damaged file is refused where it is read
+        return ""
+    return name_of(crs) if crs else ""
+
+
+def _written_in(path: Path) -> CRS | None:
+    suffix = path.suffix.lower()
+    if suffix in (".las", ".laz"):
+        import laspy
+
+        with laspy.open(path) as file:
+            return file.header.parse_crs()
+    if suffix == ".e57":
+        from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
+
+        file = libe57.ImageFile(str(path), "r")
+        try:
+            return known_crs(file.root()["coordinateMetadata"].value())
+        finally:
+            file.close()
+    if (pattern := _IN_FILES.get(suffix)) is None:
+        return None
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
+        found = pattern.search(contents)
+        return known_crs(found[1].decode().replace("\\/", "/")) if found else None
+
+
+def given_crs(text: str) -> str:
+    """Name of the system that a user gives.
+
+    Raises:
+        SceneError: it is unknown, or in degrees.
+    """
+    crs = known_crs(text)
+    if crs is None:
+        raise SceneError(f"--crs {text} is no coordinate reference system that PROJ knows: give a code, as EPSG:25832")
+    if crs.is_geographic:
+        raise SceneError(f"--crs {text} is in degrees: give the shell's own system, which must be in metres or feet")
+    return name_of(crs)
+
+
+def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
+    """Conversion of coordinates, x (or longitude) first, from one system to another.
+
+    Args:
+        source: their system.
+        target: name of the system that is wanted.
+        where: what they are, for messages.
+
+    Raises:
+        SceneError: while converting, coordinates outside the target's area.
+    """
+    wanted = CRS.from_user_input(target)
+    if source.to_2d() == wanted.to_2d() and len(source.axis_info) <= len(wanted.axis_info):
+        return lambda points: points
+    transformer = Transformer.from_crs(source, wanted, always_xy=True)
+
+    def convert(points: np.ndarray) -> Float64[np.ndarray, "N 3"]:
+        converted = np.stack(transformer.transform(*points.T), axis=-1)
+        if not np.isfinite(converted).all():
+            first = points[~np.isfinite(converted).all(axis=1)][0]
+            raise SceneError(
+                f"{where}: {' '.join(f'{value:g}' for value in first)} cannot be converted from {source.name} to "
+                f"{wanted.name}: is the longitude first?"
+            )
+        return converted
+
+    return convert

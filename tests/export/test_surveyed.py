@@ -1,0 +1,68 @@
+"""Surveyed points against a reconstructed surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from training_runs import data_of, model_of, trainer_of
+
+from shellgs_method.errors import SceneError
+from shellgs_method.export.runs import TrainedRun
+from shellgs_method.export.surveyed import at_surveyed, read_surveyed
+
+
+@pytest.fixture(scope="module")
+def run(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> TrainedRun:
+    trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("surveyed"), "photo_gs", iterations=1)
+    return TrainedRun(model_of(trainer), data_of(trainer))
+
+
+def test_points_before_and_behind_the_surface_are_measured_in_metres(run):
+    shell = run.shell_in_frame
+    surface = trimesh.Trimesh(shell.vertices, shell.faces, process=False)
+    largest = np.argsort(-surface.area_faces)[:3]
+    centres, out = surface.triangles_center[largest], surface.face_normals[largest]
+    offsets = np.array([0.03, -0.02, 0.9])  # of the points, from the surface
+    metres = run.shell[0].metres_per_shell_unit
+    points = (centres + offsets[:, None] * out + run.frame.offset) / metres
+    found = at_surveyed(run, surface, dict(zip("abc", points, strict=True)))
+    assert found.before == {"a": pytest.approx(-0.03, abs=1e-4), "b": pytest.approx(0.02, abs=1e-4), "c": None}
+    ((one, other, apart, difference),) = found.pairs
+    assert (one, other) == ("a", "b")
+    assert apart == pytest.approx(metres * np.linalg.norm(points[1] - points[0]))
+    assert apart + difference == pytest.approx(np.linalg.norm(centres[1] - centres[0]), abs=1e-4)
+    with pytest.raises(SceneError, match=r"no surveyed point is within 0.5 m.*nearest, c, is 0.9 m off"):
+        at_surveyed(run, surface, {"c": points[2]})
+
+
+@pytest.mark.parametrize(
+    ("text", "points"),
+    [
+        ("# corners\np1 1.5 2 3\np2 4 5 6", {"p1": [1.5, 2, 3], "p2": [4, 5, 6]}),
+        ("Name,X,Y,Z,Code\np1,1.5,2,3,55\n7,4,5,6,55", {"p1": [1.5, 2, 3], "7": [4, 5, 6]}),
+        ("1.5 2 3\n4 5 6\n", {"1": [1.5, 2, 3], "2": [4, 5, 6]}),
+        ("1.5; 2; 3; corner", {"corner": [1.5, 2, 3]}),
+    ],
+)
+def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points):
+    (tmp_path / "points.txt").write_text(text)
+    assert {name: point.tolist() for name, point in read_surveyed(tmp_path / "points.txt").items()} == points
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("p1;1,5;2,0;3,0", "line 1: expected a name and X Y Z"),
+        ("p1 1 2", "line 1: expected a name and X Y Z"),
+        ("p1 1 2 3\np1 4 5 6", "line 2: there is a point p1 already"),
+        ("# nothing", "holds no points"),
+        ("name lat lon height\np1 47.1 8.2 400", "in degrees"),
+    ],
+)
+def test_lists_that_cannot_be_read_are_refused_with_the_line(tmp_path, text, why):
+    (tmp_path / "points.txt").write_text(text)
+    with pytest.raises(SceneError, match=why):
+        read_surveyed(tmp_path / "points.txt")

@@ -1,0 +1,89 @@
+"""Coordinate reference systems of files, and coordinates that are converted from one to another."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import laspy
+import pyproj
+import pytest
+from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.crs import crs_of, given_crs, known_crs, name_of
+
+UTM = "EPSG:25832"
+
+
+def write_las(path: Path) -> None:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_crs(pyproj.CRS.from_epsg(25832))
+    laspy.LasData(header).write(str(path))
+
+
+def write_e57(path: Path) -> None:
+    file = libe57.ImageFile(str(path), "w")
+    file.root().set("coordinateMetadata", libe57.StringNode(file, pyproj.CRS(UTM).to_wkt("WKT1_GDAL")))
+    file.close()
+
+
+def write_text(text: str):
+    return lambda path: path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "system"),
+    [
+        ("a.las", write_las, UTM),
+        ("a.e57", write_e57, UTM),
+        ("a.ifc", write_text("#9=IFCPROJECTEDCRS('EPSG:25832','UTM 32',$,$,$,$,$);"), UTM),
+        ("a.gml", write_text('<gml:Envelope srsName="urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::5783">'), "EPSG:5555"),
+        (
+            "a.json",
+            write_text(json.dumps({"metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"}})),
+            "EPSG:7415",
+        ),
+        ("a.ply", write_text("ply"), ""),
+        ("a.gml", write_text('<gml:Envelope srsName="my own">'), ""),
+        ("a.las", write_text("not one"), ""),
+    ],
+)
+def test_the_system_of_a_file_is_read_where_it_has_one(tmp_path, name, write, system):
+    write(tmp_path / name)
+    assert crs_of(tmp_path / name) == system
+
+
+def test_a_prj_beside_a_file_is_that_of_the_file(tmp_path):
+    (tmp_path / "scan.ply").write_text("ply")
+    (tmp_path / "scan.prj").write_text(pyproj.CRS("EPSG:2056").to_wkt("WKT1_ESRI"))
+    found = known_crs(crs_of(tmp_path / "scan.ply"))
+    assert found is not None
+    assert found.to_epsg(min_confidence=20) == 2056
+
+
+@pytest.mark.parametrize(
+    ("text", "system"),
+    [
+        ("EPSG:25832", UTM),
+        ("WGS84 UTM 32N", "EPSG:32632"),
+        ("WGS84 UTM 7S", "EPSG:32707"),
+        ("urn:ogc:def:crs:EPSG::2056", "EPSG:2056"),
+        ("+proj=longlat", "OGC:CRS84"),
+        ("name", None),
+        ("X Y Z", None),
+        ("height", None),
+    ],
+)
+def test_a_system_is_known_by_its_code_and_no_word_is_taken_for_one(text, system):
+    found = known_crs(text)
+    assert (found and name_of(found)) == system
+
+
+@pytest.mark.parametrize(
+    ("text", "why"), [("UTM32", "PROJ knows: give a code"), ("EPSG:1", "PROJ knows"), ("EPSG:4326", "is in degrees")]
+)
+def test_a_system_that_no_shell_can_be_in_is_refused(text, why):
+    with pytest.raises(SceneError, match=re.escape(why)):
+        given_crs(text)

@@ -1,0 +1,119 @@
+"""A scan that is held apart: cast by `shellgs cast --truth`, and measured against."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dataparsers.facade import FacadeDataParserConfig, read_views
+from shellgs_method.compare.measure import measure_shell
+from shellgs_method.errors import SceneError
+from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
+from shellgs_method.files.photographs import View
+from shellgs_method.files.scene import SceneLayout
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.shell import ALIGNMENT, TRUTH, Alignment
+from shellgs_method.synthetic.geometry import Material
+from shellgs_method.synthetic.scene import UNITS_PER_METRE, Facade, FacadeConfig, scene_camera, settings_of
+
+
+def views_of(scene: Path) -> list[View]:
+    return read_views(FacadeDataParserConfig(data=scene))
+
+
+def map_of(scene: Path, kind: str, view: View) -> CueMap:
+    return CueMaps.open(scene, kind).require(view.name, view.camera)
+
+
+def write_survey(scene: Path, path: Path, *, materials: int = max(Material)) -> Path:
+    """Write the true geometry, up to a material, in the shell's frame."""
+    facade = Facade.build(FacadeConfig(**settings_of(scene)))
+    camera = facade.cameras[0]
+    building_to_scene = np.linalg.inv(scene_camera(camera).viewmat.double().numpy())
+    building_to_scene = building_to_scene @ np.diag([UNITS_PER_METRE] * 3 + [1.0]) @ camera.viewmat.double().numpy()
+    to_shell = np.linalg.inv(Alignment.load(scene / ALIGNMENT).shell_to_scene) @ building_to_scene
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in transformed(facade.mesh.vertices, to_shell)]
+    kept = facade.mesh.triangles[facade.mesh.material <= materials]
+    path.write_text("\n".join(lines + [f"f {a} {b} {c}" for a, b, c in kept + 1]) + "\n")
+    return path
+
+
+def test_a_survey_gives_the_metrics_of_the_exact_truth(scene, shellgs, tmp_path):
+    for view in views_of(scene):  # of the survey, only the building is wanted: the rest is painted black
+        mask = scene / "shell/masks" / f"{view.name}.png"
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(255 * map_of(scene, "truth", view).mask.astype(np.uint8)).save(mask)
+    shellgs("cast", scene, "--no-check")  # the masks are new to the shell, too
+    exact = measure_shell(SceneLayout(data=scene))
+    told = shellgs("cast", scene, "--truth", write_survey(scene, tmp_path / "survey.obj"))
+    assert f"{len(views_of(scene))} views cast" in told
+    measured = measure_shell(SceneLayout(data=scene))
+    assert measured == pytest.approx(exact, abs=5e-4, nan_ok=True)
+
+
+def test_what_photographs_show_before_the_truth_is_left_out_of_it(scene, shellgs, tmp_path):
+    shellgs("cast", scene)
+    shellgs("cast", scene, "--truth", write_survey(scene, tmp_path / "survey.obj", materials=Material.RAILING))
+    left_out = 0
+    for view in views_of(scene):
+        shell, checked, truth = (map_of(scene, kind, view) for kind in ("shell", "checked", "truth"))
+        found = Findings.of(checked, shell)
+        hidden = found.moved | (found.occluder & (checked.depth < 0.988 * truth.depth))
+        left_out += int((hidden & (truth.depth > 0)).sum())
+        assert not truth.mask[hidden].any()
+        assert truth.mask[~hidden & (truth.depth > 0)].mean() > 0.99  # but for what the shell's masks leave out
+    assert left_out > 20
+
+
+def test_it_is_told_how_much_of_the_shell_has_a_truth_and_how_far_apart_they_are(scene, shellgs, tmp_path):
+    alignment = Alignment.load(scene / ALIGNMENT)
+    told = shellgs("cast", scene, "--truth", scene / alignment.shell)
+    assert "covers 100% of the shell" in told
+    assert "0 m apart" in told
+    shifted = alignment.shell_to_scene.copy()
+    shifted[:3, 3] += 0.1 / alignment.metres_per_unit * shifted[:3, 1] / np.linalg.norm(shifted[:3, 1])
+    np.save(tmp_path / "matrix.npy", shifted)
+    told = shellgs("cast", scene, "--truth", scene / alignment.shell, "--matrix", tmp_path / "matrix.npy")
+    assert float(told.split("the two are ")[1].split(" m apart")[0]) > 0.02
+    assert Alignment.load(scene / ALIGNMENT) == alignment
+
+
+def test_a_truth_in_the_frame_of_the_shell_is_stale_once_the_shell_has_moved(scene, shellgs, tmp_path):
+    alignment = Alignment.load(scene / ALIGNMENT)
+    survey = scene / alignment.shell
+    np.save(tmp_path / "matrix.npy", alignment.shell_to_scene + np.diag([1e-6, 1e-6, 1e-6, 0]))
+    moved = alignment.shell_to_scene.copy()
+    moved[0, 3] += 0.01
+
+    def read_after_the_move(*words: object) -> None:
+        shellgs("cast", scene, "--truth", survey, *words)
+        Alignment(moved, alignment.shell).record(scene / ALIGNMENT, views_of(scene))
+        try:
+            map_of(scene, "truth", views_of(scene)[0])
+        finally:
+            alignment.save(scene / ALIGNMENT)
+
+    with pytest.raises(SceneError, match=f"alignment.json has changed since.*cast {scene} .*--truth {survey}"):
+        read_after_the_move()
+    read_after_the_move("--matrix", tmp_path / "matrix.npy")
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["--truth", "no.ply"], "no.ply"),
+        (["--truth", "{shell}", "--shell", "{shell}", "--matrix", "m.npy"], "give --shell or --truth"),
+        (["--truth", "{shell}", "--metres-per-shell-unit", "0.001"], "go with --matrix"),
+    ],
+)
+def test_what_cannot_be_cast_as_truth_is_refused_and_nothing_changes(scene, shellgs, words, why):
+    before = (scene / "cues/truth/manifest.json").read_bytes()
+    shell = scene / Alignment.load(scene / ALIGNMENT).shell
+    said = shellgs("cast", scene, *[word.format(shell=shell) for word in words])
+    assert said.startswith("refused: ")
+    assert why in said
+    assert (scene / "cues/truth/manifest.json").read_bytes() == before
+    assert not (scene / TRUTH).exists()
