@@ -16,7 +16,7 @@ from shellgs_method.errors import SceneError
 def pick(
     scene: Scene,
     shell: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHELL")],
-    picks: Optional[Path] = None,
+    picks: Path = Path("picks.txt"),
     metres_per_shell_unit: float = 1.0,
     crs: Optional[str] = None,
     port: int = 7070,
@@ -30,7 +30,7 @@ def pick(
     Args:
         scene: Scene folder.
         shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
-        picks: File of picks. If not set: picks.txt in the scene folder.
+        picks: File of picks, written and read back.
         metres_per_shell_unit: Length of the shell's unit in metres.
         crs: Coordinate reference system of the shell, such as EPSG:25832, to which a file of picks in another one is
             converted. If not set: as the shell's file says, or a .prj beside it.
@@ -50,28 +50,28 @@ def pick(
     from shellgs_method.picking.session import Session
     from shellgs_method.registration.frames import ShellPlace
 
-    file = picks or scene / "picks.txt"
-    check_output(file)
-    views = read_views(paths.of(scene))
+    check_output(picks)
+    views = read_views(paths.of(scene).unadjusted())
     if len(views) < 2:
         raise SceneError(f"{scene} has {len(views)} photograph, and a point is picked in two or more")
-    place = ShellPlace(shell)
-    session = Session(file, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(shell))
-    if session.state.picks:
-        place.check_picks(np.stack([pick.shell for pick in session.state.picks]), f"the picks of {file}")
-    with PickServer(session, open_scan(place), port) as server:
+    with PickServer(port) as server:
+        place = ShellPlace(shell)
+        session = Session(picks, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(shell))
+        if session.state.picks:
+            place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")
+        scan = open_scan(place)
         console.print(f"Pick in a browser: {server.url} (Ctrl-C or the page's button ends it).", highlight=False)
         if open:
             webbrowser.open(server.url)
         with suppress(KeyboardInterrupt):
-            server.serve_forever()
+            server.serve(session, scan)
     fit = session.said()["fit"]
     if "problem" in fit:
-        console.print(f"{file}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
+        console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
         return
     options = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
     options += f" --crs {shlex.quote(crs)}" if crs else ""
-    names = [shlex.quote(str(path)) for path in (scene, shell, file)]
+    names = [shlex.quote(str(path)) for path in (scene, shell, picks)]
     console.print(
         f"{fit['used']} of {fit['of']} picks are used; their residual is {fit['rms']:.3f} m (root mean square).\n"
         f"Next: shellgs align {names[0]} {names[1]} --picks {names[2]}{options}",

@@ -1,4 +1,4 @@
-"""The page of a picking session and its answers, on this machine alone."""
+"""The page of a picking session and its answers, to this machine alone."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _DECODED = 8  # photographs kept in memory
 
 
 class PickServer(ThreadingHTTPServer):
-    """Serve a session until its user is done.
+    """The page's port on this machine, bound before a scan is read.
 
     Args:
-        session: the points.
-        scan: what they are picked of.
-        port: port of this machine; 0 for a free one.
+        port: number of the port; 0 for a free one.
 
     Attributes:
         url: address of the page.
+        session: the points.
+        scan: what they are picked of.
 
     Raises:
         SceneError: the port is taken.
@@ -42,16 +42,23 @@ class PickServer(ThreadingHTTPServer):
 
     daemon_threads = True
     allow_reuse_address = False
+    session: Session
+    scan: Scan
 
-    def __init__(self, session: Session, scan: Scan, port: int) -> None:
-        self.session, self.scan, self._lock = session, scan, Lock()
+    def __init__(self, port: int) -> None:
+        self._lock = Lock()
+        self._photograph = lru_cache(_DECODED)(lambda k: load_upright(self.session.views[k]))
         self._number = time.time_ns()  # in the addresses of images, which browsers keep
-        self._photograph = lru_cache(_DECODED)(lambda k: load_upright(session.views[k]))
         try:
             super().__init__(("127.0.0.1", port), _Answers)
         except (OSError, OverflowError) as error:
             raise SceneError(f"port {port} cannot be used, it may be taken: give another with --port") from error
         self.url = f"http://127.0.0.1:{self.server_port}"
+
+    def serve(self, session: Session, scan: Scan) -> None:
+        """Answer until the user is done."""
+        self.session, self.scan = session, scan
+        self.serve_forever()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Images that the page no longer waits for are no error."""

@@ -96,8 +96,9 @@ def test_six_corners_clicked_in_three_photographs_align_the_shell(tmp_path: Path
         corners.append(((window.x0, window.x1)[corner % 2], 0.0, (window.z0, window.z1)[corner // 2]))
     corners = transformed(np.array(corners), SHELL_FROM_BUILDING)
     picks, place = tmp_path / "picks.txt", ShellPlace(scene / truth.shell)
-    with PickServer(Session(picks, views), open_scan(place), 0) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
+    session, scan = Session(picks, views), open_scan(place)
+    with PickServer(0) as server:
+        Thread(target=server.serve, args=(session, scan), daemon=True).start()
         page = browser.new_page(viewport=PAGE)
         page.goto(server.url)
         page.wait_for_function("said && photo.image && !waiting")

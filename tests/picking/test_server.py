@@ -53,8 +53,10 @@ def free_port() -> int:
 def server(scene: Path) -> Iterator[PickServer]:
     views = read_views(FacadeDataParserConfig(data=scene))
     place = ShellPlace(scene / Alignment.load(scene / ALIGNMENT).shell)
-    with PickServer(Session(scene / "picks.txt", views), open_scan(place), 0) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
+    session, scan = Session(scene / "picks.txt", views), open_scan(place)
+    with PickServer(0) as server:
+        Thread(target=server.serve, args=(session, scan), daemon=True).start()
+        get(f"{server.url}/about")  # it serves
         yield server
         server.shutdown()
 
@@ -103,7 +105,7 @@ def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callab
 
     thread = Thread(target=user, daemon=True)
     thread.start()
-    said = shellgs("pick", scene, shell, "--port", free_port)
+    said = shellgs("pick", scene, shell, "--picks", scene / "picks.txt", "--port", free_port)
     thread.join()
     assert f"Pick in a browser: {url}" in said
     assert "4 of 4 picks are used; their residual is 0.00" in said
@@ -118,7 +120,9 @@ def test_a_port_that_is_taken_is_refused(server: PickServer, scene: Path, shellg
 
 def test_picks_of_another_frame_are_refused(scene: Path, shellgs: Callable[..., str]):
     (scene / "picks.txt").write_text("1 2 3 4 5 frame_00001.png a\n7 2 3 4 5 frame_00002.png b\n")
-    assert "are not in the frame of the shell" in shellgs("pick", scene, scene / "shell/facade.ply")
+    assert "are not in the frame of the shell" in shellgs(
+        "pick", scene, scene / "shell/facade.ply", "--picks", scene / "picks.txt"
+    )
 
 
 def test_a_step_that_cannot_be_taken_changes_nothing(server: PickServer):
