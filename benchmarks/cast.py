@@ -76,7 +76,7 @@ def cast_maps(mesh: ShellMesh, views: list[View]) -> float:
     with tempfile.TemporaryDirectory() as folder:
         vertices, faces = o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces)
         o3d.io.write_triangle_mesh(f"{folder}/shell.ply", o3d.geometry.TriangleMesh(vertices, faces))
-        alignment, start = Alignment(np.eye(4), "shell.ply"), time.perf_counter()
+        alignment, start = Alignment(np.eye(4), ("shell.ply",)), time.perf_counter()
         shell = PlacedShell.load(Path(folder), views, alignment)
         alignment.record(Path(folder) / ALIGNMENT, views)
         cast_views(shell)

@@ -70,7 +70,7 @@ def write_model(path: Path, level: str, polygons: Polygons) -> None:
 def measure(scene: Path) -> list[str]:
     """Shares of the pixels within 5, 10 and 20 cm of the truth, and of the normals within 10 degrees."""
     alignment, truth = Alignment.load(scene / ALIGNMENT), CueMaps.open(scene, "truth")
-    caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
+    caster = ShellCaster(load_shell(scene / alignment.shells[0]), alignment.shell_to_scene)
     away, turned = [], []
     for view in read_views(FacadeDataParserConfig(data=scene))[::3]:
         true, cue = truth.require(view.name, view.camera), caster.cast(view.camera)

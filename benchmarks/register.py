@@ -63,7 +63,7 @@ class Known:
             (shell,) = (scene / "shell").glob("*_survey.ply")
             return cls(load_shell(shell), np.loadtxt(matrix))
         alignment = Alignment.load(scene / ALIGNMENT)
-        return cls(load_shell(scene / alignment.shell), alignment.shell_to_scene)
+        return cls(load_shell(scene / alignment.shells[0]), alignment.shell_to_scene)
 
     def turned(self, up: str, scene_up: np.ndarray, rng: np.random.Generator) -> Known:
         """The shell with an axis of its file upwards, in coordinates of any offset."""
@@ -103,7 +103,7 @@ def registered(benchmark: Benchmark, console: Console) -> Iterator[list[str]]:
             before = time.process_time()
             error, verdict, score = np.nan, "refused", ""
             try:
-                placement = place_by_guess(shell.mesh, views, points, "shell.ply", 1.0)
+                placement = place_by_guess(shell.mesh, views, points, ("shell.ply",), 1.0)
                 found = time.process_time()
                 error = shell.error(placement.alignment)
                 validation = validate(shell.mesh, placement.alignment, views, points).with_checks(placement.checks)

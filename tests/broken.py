@@ -107,7 +107,7 @@ class Workbench:
         self.views: list[View] = read_views(FacadeDataParserConfig(data=scene))
         self.points: SparsePoints = read_sparse_points(FacadeDataParserConfig(data=scene))
         self.alignment = Alignment.load(scene / ALIGNMENT)
-        self.mesh: ShellMesh = load_shell(scene / self.alignment.shell)
+        self.mesh: ShellMesh = load_shell(scene / self.alignment.shells[0])
         self.colmap = self._colmap()
         self.shells = self._shells()
         self._write_picks()
@@ -304,7 +304,7 @@ def _matrices(bench: Workbench, data: st.DataObject) -> None:
         path.write_text(json.dumps(rows) if path.suffix == ".json" else "\n".join(" ".join(map(repr, r)) for r in rows))
     content = path.read_bytes()
     with bench.holding(path, data.draw(damaged_bytes(content))):
-        bench.validate_and_cast(Alignment.from_matrix_file(path, "shell.ply"))
+        bench.validate_and_cast(Alignment.from_matrix_file(path, ("shell.ply",)))
 
 
 def _picks(bench: Workbench, data: st.DataObject) -> None:

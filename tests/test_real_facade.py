@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no real scenes in {D
 def test_the_cast_shell_agrees_with_the_sfm_points(tmp_path: Path, name: str):
     scene = tmp_path / name
     shutil.copytree(DATA / name, scene, copy_function=os.symlink)
-    shell = f"shell/{SCENES[name]}"
+    shell = (f"shell/{SCENES[name]}",)
     alignment = Alignment.from_matrix_file(scene / "shell" / "shell_to_scene.txt", shell)
     views = read_views(FacadeDataParserConfig(data=scene))[::8]
     cast(scene, views, alignment, max_image_size=384)

@@ -146,7 +146,7 @@ def test_a_scale_of_the_resolution_beyond_its_limits_is_refused(factor):
 def test_a_resampled_map_equals_one_cast_at_that_size(scene, size):
     """On planes to float32's rounding; at edges the nearest pixel is taken."""
     alignment = Alignment.load(scene / ALIGNMENT)
-    caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
+    caster = ShellCaster(load_shell(scene / alignment.shells[0]), alignment.shell_to_scene)
     camera = read_views(FacadeDataParserConfig(data=scene))[4].camera
     wanted = camera.resized(*size)
     resized, expected = resampled(caster.cast(camera), wanted), caster.cast(wanted)

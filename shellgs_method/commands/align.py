@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def align(
     scene: Scene,
-    shell: Annotated[Optional[Path], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL]")] = None,
+    shell: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL ...]")] = (),
     matrix: Optional[Path] = None,
     picks: Optional[Path] = None,
     positions: Optional[Path] = None,
@@ -43,7 +43,7 @@ def align(
 
     Args:
         scene: Scene folder.
-        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates.
         matrix: File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy).
         picks: Text file of picked points, one per line: X Y Z of the shell, x y in the photograph, image, name.
         positions: Text file of RTK camera positions, one per line: image, X Y Z in the shell's coordinates.
@@ -97,42 +97,42 @@ def align(
     from shellgs_method.shell.cast import renew_error
 
     starts = [start for start in (matrix, picks, positions, same_frame) if start]
-    if len(starts) > 1 or (starts and shell is None) or (accept and (shell or starts)):
+    if len(starts) > 1 or (starts and not shell) or (accept and (shell or starts)):
         raise SceneError(
             "give a shell, alone or with one of --matrix, --picks, --positions and --same-frame, or none to validate "
             "what is there"
         )
     if any(global_shift) and matrix is None:
         raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")
-    if metres_per_shell_unit != 1 and shell is None:
+    if metres_per_shell_unit != 1 and not shell:
         raise SceneError("--metres-per-shell-unit belongs to a shell: give the shell and a start, to align it again")
     layout = paths.of(scene)
     if shell or accept or bundle_adjust:
         layout = layout.unadjusted()
     views, points = read_views(layout), read_sparse_points(layout)
     check_points(points, views)
-    name = relative_path(shell, scene) if shell else ""
-    system = given_crs(crs) if crs else crs_of(shell) if shell else ""
-    place = ShellPlace(shell) if shell and (picks or positions) else None
+    names = tuple(relative_path(path, scene) for path in shell)
+    system = given_crs(crs) if crs else crs_of(*shell)
+    place = ShellPlace(*shell) if shell and (picks or positions) else None
     if accept:
         placement = place_as_proposed(scene / PROPOSAL, scene, views)
-    elif shell is None:
+    elif not shell:
         placement = place_as_before(scene / ALIGNMENT, views)
     elif matrix:
-        placement = Placement(Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift))
+        placement = Placement(Alignment.from_matrix_file(matrix, names, metres_per_shell_unit, global_shift))
     elif same_frame:
-        placement = place_as_it_is(name, metres_per_shell_unit)
+        placement = place_as_it_is(names, metres_per_shell_unit)
     elif picks and place:
-        placement = place_by_picks(picks, views, place, name, metres_per_shell_unit, system)
+        placement = place_by_picks(picks, views, place, names, metres_per_shell_unit, system)
     elif positions and place:
-        placement = place_by_positions(positions, views, place, name, metres_per_shell_unit, system)
+        placement = place_by_positions(positions, views, place, names, metres_per_shell_unit, system)
     else:
         method, unit = mesher or "planes", metres_per_shell_unit
-        unaligned = load_shell(shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
-        placement = place_by_guess(unaligned, views, points, name, metres_per_shell_unit)
+        unaligned = load_shell(*shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
+        placement = place_by_guess(unaligned, views, points, names, metres_per_shell_unit)
     aligned = placement.alignment.meshed_by(mesher, spacing)
     placement = replace(placement, alignment=replace(aligned, crs=system or aligned.crs))
-    mesh = placement.alignment.load_shell(scene, views, place.surface if place else None)
+    mesh = placement.alignment.load_shell(scene, views, place.surfaces if place else ())
     misplacement = misplaced(placement, mesh, views, points)
     if refine is not None and misplacement:
         raise SceneError(f"the alignment cannot be refined: {misplacement}")

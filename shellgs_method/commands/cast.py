@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 def cast(
     scene: Scene,
-    shell: Optional[Path] = None,
+    shell: tuple[Path, ...] = (),
     matrix: Optional[Path] = None,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: float = 1.0,
-    truth: Optional[Path] = None,
+    truth: tuple[Path, ...] = (),
     max_image_size: Optional[int] = None,
     mesher: Optional[Mesher] = None,
     spacing: Optional[float] = None,
@@ -45,12 +45,13 @@ def cast(
 
     Args:
         scene: Scene folder.
-        shell: Mesh, model or point cloud of the shell, with --matrix. If not set: that of scene/shell/alignment.json.
+        shell: Files of the shell, with --matrix: meshes, models or point clouds. If not set: those of
+            scene/shell/alignment.json.
         matrix: File of the 4x4 similarity from the shell's (or the truth's) frame to the scene's (text, json or npy).
         global_shift: CloudCompare's global shift, with --matrix.
         metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
-        truth: Mesh, model or point cloud of the building to measure against, in the shell's frame and unit, or in its
-            own with --matrix.
+        truth: Files of the building to measure against, which were held apart: meshes, models or point clouds, in the
+            shell's frame and unit, or in their own with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size, or
             that of the shell's maps with --truth.
         mesher: How a point cloud is meshed: planes (ball pivoting between them), bpa (ball pivoting alone) or poisson
@@ -66,25 +67,25 @@ def cast(
 
     if max_image_size is not None and max_image_size < 1:
         raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
-    surface = truth or shell
+    files = truth or shell
     if truth and shell:
         raise SceneError("the truth is cast after the shell: give --shell or --truth")
-    if (matrix and not surface) or (shell and not matrix):
+    if (matrix and not files) or (shell and not matrix):
         raise SceneError("--shell and --matrix go together: give both or neither")
     if matrix is None and (any(global_shift) or metres_per_shell_unit != 1):
         raise SceneError("--global-shift and --metres-per-shell-unit go with --matrix")
     config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
-    if surface and matrix:
-        name = relative_path(surface, scene)
-        alignment = Alignment.from_matrix_file(matrix, name, metres_per_shell_unit, global_shift)
+    names = tuple(relative_path(path, scene) for path in files)
+    if matrix is not None:
+        alignment = Alignment.from_matrix_file(matrix, names, metres_per_shell_unit, global_shift)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
         if not alignment.cameras.cameras:
             unbound = f"{scene / ALIGNMENT} does not say which cameras it was found for"
             console.print(f"{unbound}: `shellgs align {scene}` records them.")
     if truth:
-        in_place = replace(alignment, shell=relative_path(truth, scene), verdict="", metrics={})
+        in_place = replace(alignment, shells=names, verdict="", metrics={})
         _cast_truth(config, in_place.meshed_by(mesher, spacing), max_image_size, _words(truth, matrix) + paths.flags)
         return
     aligned = alignment.meshed_by(mesher, spacing)
@@ -93,7 +94,7 @@ def cast(
         console.print(f"The alignment was validated with another {how}: run `shellgs align {scene}` again.")
     start = time.monotonic()
     placed = PlacedShell.load(scene, views, aligned)
-    if meshing := placed.mesh.meshing:
+    for meshing in placed.mesh.meshing:
         console.print(f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}: {meshing}")
     aligned.record(scene / ALIGNMENT, views)
     summary = cast_views(placed, max_image_size=max_image_size, flags=paths.flags)
@@ -131,9 +132,11 @@ def _cast_truth(config: FacadeDataParserConfig, alignment: Alignment, max_image_
     console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: what is grey has no truth.")
 
 
-def _words(truth: Path, matrix: Path | None) -> str:
+def _words(truth: Sequence[Path], matrix: Path | None) -> str:
     """The words of a command that casts the truth again."""
-    return f" --truth {quote(str(truth))}" + (f" --matrix {quote(str(matrix))}" if matrix else "")
+    return f" --truth {' '.join(quote(str(path)) for path in truth)}" + (
+        f" --matrix {quote(str(matrix))}" if matrix else ""
+    )
 
 
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:

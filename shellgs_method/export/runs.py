@@ -92,7 +92,7 @@ class TrainedRun:
             cameras = [view.camera for dataset in self.datasets for view in dataset.views]
             return scene_frame(likely_up(cameras), positions(cameras).mean(axis=0))
         alignment, shell = self.shell
-        return shell_frame(alignment, shell, usual_up(alignment.shell) if alignment.up is None else alignment.up)
+        return shell_frame(alignment, shell, usual_up(alignment.shells) if alignment.up is None else alignment.up)
 
     @property
     def shell_in_frame(self) -> ShellMesh:

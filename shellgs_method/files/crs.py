@@ -41,8 +41,20 @@ def name_of(crs: CRS) -> str:
     return ":".join(authority) if authority else crs.to_wkt()
 
 
-def crs_of(path: Path) -> str:
-    """Name of the system that a shell's file, or a ``.prj`` beside it, says it is in; empty if unknown."""
+def crs_of(*paths: Path) -> str:
+    """Name of the system that a shell's files, or a ``.prj`` beside one, say they are in; empty if unknown.
+
+    Raises:
+        SceneError: they are in several.
+    """
+    named = {system: path for path in paths if (system := _crs_of(path))}
+    if len(named) > 1:
+        one, other = list(named)[:2]
+        raise SceneError(f"{named[one]} is in {one} and {named[other]} in {other}: convert one of them")
+    return next(iter(named), "")
+
+
+def _crs_of(path: Path) -> str:
     beside = path.with_suffix(".prj")
     try:
         crs = known_crs(beside.read_text("utf-8-sig")) if beside.is_file() else _written_in(path)

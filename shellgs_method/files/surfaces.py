@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,9 +43,9 @@ SPLATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs")
 """Suffixes of formats that hold Gaussian splats only."""
 
 
-def usual_up(shell: str) -> Float64[np.ndarray, " 3"]:
-    """The direction upwards in a shell's file where cameras do not tell: y in glTF, by that format's rule, else z."""
-    return np.eye(3)[1 if shell.lower().endswith((".glb", ".gltf")) else 2]
+def usual_up(shells: Sequence[str]) -> Float64[np.ndarray, " 3"]:
+    """The direction upwards in a shell's files where cameras do not tell: y in glTF, by that format's rule, else z."""
+    return np.eye(3)[1 if all(shell.lower().endswith((".glb", ".gltf")) for shell in shells) else 2]
 
 
 def read_surface(path: Path) -> Geometry | Cloud:

@@ -80,9 +80,9 @@ def place_as_before(path: Path, views: Sequence[View]) -> Placement:
     return Placement(alignment, [f"It was found for other cameras than these: {changed}."] if changed else [])
 
 
-def place_as_it_is(shell: str, metres_per_shell_unit: float) -> Placement:
+def place_as_it_is(shells: tuple[str, ...], metres_per_shell_unit: float) -> Placement:
     """Align a shell that is in the frame and unit of the cameras."""
-    return Placement(Alignment(np.eye(4), shell, metres_per_shell_unit, source="same frame as the cameras"))
+    return Placement(Alignment(np.eye(4), shells, metres_per_shell_unit, source="same frame as the cameras"))
 
 
 def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placement:
@@ -96,13 +96,18 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
     if changed := alignment.cameras.changed(views):
         raise SceneError(
             f"{path} was proposed for other cameras than those of {scene}: {changed}; propose again, with "
-            f"`shellgs align {shlex.quote(str(scene))} {shlex.quote(alignment.shell)}`"
+            f"`shellgs align {shlex.quote(str(scene))} {shlex.join(alignment.shells)}`"
         )
     return Placement(alignment)
 
 
 def place_by_picks(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float, crs: str
+    path: Path,
+    views: Sequence[View],
+    place: ShellPlace,
+    shells: tuple[str, ...],
+    metres_per_shell_unit: float,
+    crs: str,
 ) -> Placement:
     """Align the shell by a file of picks.
 
@@ -113,12 +118,17 @@ def place_by_picks(
     picks = read_picks(path, views, crs)
     place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
     matrix, picked = align_picks(picks, views, metres_per_shell_unit)
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"picks in {path.name}")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"picks in {path.name}")
     return Placement(alignment, [_residuals_in_words(picked, "picks")], picked)
 
 
 def place_by_positions(
-    path: Path, views: Sequence[View], place: ShellPlace, shell: str, metres_per_shell_unit: float, crs: str
+    path: Path,
+    views: Sequence[View],
+    place: ShellPlace,
+    shells: tuple[str, ...],
+    metres_per_shell_unit: float,
+    crs: str,
 ) -> Placement:
     """Align the shell by a file of surveyed camera positions.
 
@@ -129,7 +139,7 @@ def place_by_positions(
     surveyed = read_positions(path, views, crs)
     place.check_positions(surveyed.shell, f"the camera positions of {path}")
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source=f"camera positions in {path.name}")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"camera positions in {path.name}")
     history = [_residuals_in_words(cameras, "camera positions")]
     if surveyed.unknown:
         history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.unknown)}.")
@@ -212,7 +222,7 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
 
 
 def place_by_guess(
-    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shell: str, metres_per_shell_unit: float
+    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shells: tuple[str, ...], metres_per_shell_unit: float
 ) -> Placement:
     """Propose an alignment by coarse registration; the shell may have any orientation in its file.
 
@@ -229,14 +239,14 @@ def place_by_guess(
     ]
     checks = [agreement_check(best.score), *(rival_check(rival.score / best.score) for rival in rivals[:1])]
     matrix = np.linalg.inv(best.survey_from_scene) @ surface.survey_from_shell
-    alignment = Alignment(matrix, shell, metres_per_shell_unit, source="proposal")
+    alignment = Alignment(matrix, shells, metres_per_shell_unit, source="proposal")
     return Placement(alignment, history, proposed=True, checks=checks)
 
 
 def up_in_words(alignment: Alignment) -> str:
     """What is up in the shell's file, by the cameras."""
     if alignment.up is None:
-        usual = name_of(usual_up(alignment.shell))
+        usual = name_of(usual_up(alignment.shells))
         return f"The cameras do not tell which way is up: it is taken to be {usual} of the shell's file."
     return f"Up is {name_of(alignment.up)} of the shell's file, by the cameras."
 

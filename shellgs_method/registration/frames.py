@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.surfaces import read_surface
 from shellgs_method.geometry.nearest import point_tree
@@ -29,31 +30,27 @@ class ShellPlace:
     """Where a shell is, in its own frame.
 
     Args:
-        path: the shell's file.
+        paths: the shell's files.
 
     Attributes:
-        surface: what the file holds.
+        surfaces: what the files hold.
         middle: centre of the shell.
         size: diagonal of its box.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        SceneError: the file cannot be read.
+        FileNotFoundError: a file does not exist.
+        SceneError: a file cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.surface = surface = read_surface(path)
-        points = surface.vertices if isinstance(surface, Geometry) else surface.whole.points
-        if isinstance(surface, Geometry) and len(surface.faces) and surface.faces.max() < len(points):
-            areas = np.linalg.norm(area_vectors(points, surface.faces), axis=1)
-            if np.isfinite(areas).all() and areas.any():
-                points = sampled(points, surface.faces, areas, _SAMPLES)[0]
+    def __init__(self, *paths: Path) -> None:
+        self.surfaces = [read_surface(path) for path in paths]
+        self.named = ", ".join(map(str, paths))
+        points = np.concatenate([_spread(surface) for surface in self.surfaces])
         points = points[inliers(points)]
         if len(points) == 0:
-            raise SceneError(f"the shell {path} has no points")
-        points = np.random.default_rng(0).permutation(points)[:_SAMPLES]
+            raise SceneError(f"the shell {self.named} has no points")
         low, high = _box(points)
-        self.path, self.middle, self.size = path, (low + high) / 2, float(np.linalg.norm(high - low))
+        self.middle, self.size = (low + high) / 2, float(np.linalg.norm(high - low))
         self._surface = point_tree(points - self.middle)
 
     def check_picks(self, picks: Float64[np.ndarray, "N 3"], called: str) -> None:
@@ -78,8 +75,8 @@ class ShellPlace:
         if in_degrees(points, self.size):
             raise SceneError(
                 f"{called} are in degrees: their first two columns, such as {points[0, 0]:.6g} {points[0, 1]:.6g}, are "
-                f"longitude and latitude; write EPSG:4326 above them and give the system of {self.path} with --crs, or "
-                f"convert them to its coordinates, which are around {_numbers(self.middle)}"
+                f"longitude and latitude; write EPSG:4326 above them and give the system of {self.named} with --crs, "
+                f"or convert them to its coordinates, which are around {_numbers(self.middle)}"
             )
         if self._reaches(points, reach):
             return
@@ -92,7 +89,7 @@ class ShellPlace:
         else:
             why = "neither other axes nor another unit nor a shift explain it"
         raise SceneError(
-            f"{called} are not in the frame of the shell {self.path}, as they are not {where}: they are around "
+            f"{called} are not in the frame of the shell {self.named}, as they are not {where}: they are around "
             f"{_numbers(np.median(points, axis=0))} and {np.linalg.norm(np.ptp(points, axis=0)):.3g} wide, the shell "
             f"around {_numbers(self.middle)} and {self.size:.3g} wide; "
             f"{why}: correct the coordinates"
@@ -124,6 +121,16 @@ def apart(shell: Float64[np.ndarray, "V 3"], seen: Float64[np.ndarray, "N 3"]) -
             "shift (such as CloudCompare's --global-shift) is missing, or has the other sign"
         )
     return None
+
+
+def _spread(surface: Geometry | Cloud) -> Float64[np.ndarray, "N 3"]:
+    """Some points of a surface, evenly spread where its triangles are known."""
+    points = surface.vertices if isinstance(surface, Geometry) else surface.whole.points
+    if isinstance(surface, Geometry) and len(surface.faces) and surface.faces.max() < len(points):
+        areas = np.linalg.norm(area_vectors(points, surface.faces), axis=1)
+        if np.isfinite(areas).all() and areas.any():
+            points = sampled(points, surface.faces, areas, _SAMPLES)[0]
+    return np.random.default_rng(0).permutation(points)[:_SAMPLES]
 
 
 def _box(points: np.ndarray) -> np.ndarray:

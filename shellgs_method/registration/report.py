@@ -93,7 +93,7 @@ def write_report(folder: Path, mesh: ShellMesh, validation: Validation, history:
         "metrics": validation.metrics(),
     }
     _write(folder / "validation.json", (json.dumps(record, indent=1, ensure_ascii=False) + "\n").encode())
-    title = f"Alignment of {validation.alignment.shell}: {validation.verdict}"
+    title = f"Alignment of {validation.alignment.named}: {validation.verdict}"
     body = _body(validation, history, plots, overlays)
     write_page(folder / "index.html", title, body, ".layers:hover img + img { opacity: 0 }")
     return folder / "index.html"

@@ -273,7 +273,7 @@ def steps_in_metres(
 ) -> dict[str, Step]:
     """Steps of all coordinates of an alignment in metres, by what they are of."""
     return {
-        f"the coordinates of {alignment.shell}": mesh.step.scaled(alignment.metres_per_shell_unit),
+        f"the coordinates of {alignment.named}": mesh.step.scaled(alignment.metres_per_shell_unit),
         "the SfM points": points.step.scaled(alignment.metres_per_unit),
         "the cameras": camera_step(view.camera for view in views).scaled(alignment.metres_per_unit),
     }

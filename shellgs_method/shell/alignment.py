@@ -23,7 +23,8 @@ from shellgs_method.geometry.axes import upwards
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.shell.clouds import Mesher
-from shellgs_method.shell.mesh import ShellMesh, load_shell
+from shellgs_method.shell.loading import load_shell
+from shellgs_method.shell.mesh import ShellMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,7 @@ class Alignment:
 
     Attributes:
         shell_to_scene: uniform scale, rotation and translation.
-        shell: the shell's file, relative to the scene's folder (or absolute).
+        shells: the shell's files, which share one frame, relative to the scene's folder (or absolute).
         metres_per_shell_unit: 1 for a shell in metres, 0.001 for one in millimetres.
         source: how the alignment was found, for people.
         verdict: verdict of the validation, "good" or "doubtful"; empty if not validated.
@@ -49,7 +50,7 @@ class Alignment:
     """
 
     shell_to_scene: Float64[np.ndarray, "4 4"]
-    shell: str
+    shells: tuple[str, ...]
     metres_per_shell_unit: float = 1.0
     source: str = "matrix"
     verdict: str = ""
@@ -70,6 +71,8 @@ class Alignment:
         if not 0 < self.metres_per_shell_unit < np.inf:
             raise SceneError(f"the shell's unit cannot be {self.metres_per_shell_unit} metres long")
         object.__setattr__(self, "up", self._upwards() if self.up is None else _direction(self.up))
+        if not self.shells:
+            raise SceneError("the alignment names no file of the shell")
         if self.mesher not in get_args(Mesher):
             raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
         if self.spacing is not None and not 0 < self.spacing < np.inf:
@@ -78,6 +81,15 @@ class Alignment:
     def __eq__(self, other: object) -> bool:
         """Compare all fields."""
         return isinstance(other, Alignment) and self._fields() == other._fields()
+
+    @property
+    def named(self) -> str:
+        """The shell's files, for people."""
+        return ", ".join(self.shells)
+
+    def files(self, scene: Path) -> list[Path]:
+        """The shell's files."""
+        return [scene / shell for shell in self.shells]
 
     @property
     def scale(self) -> float:
@@ -119,7 +131,7 @@ class Alignment:
         """Whether both place the same surface identically, however they were found."""
         return (
             np.array_equal(self.shell_to_scene, other.shell_to_scene)
-            and self.shell == other.shell
+            and self.shells == other.shells
             and self.metres_per_shell_unit == other.metres_per_shell_unit
             and self.mesher == other.mesher
             and self.spacing == other.spacing
@@ -133,7 +145,7 @@ class Alignment:
         """
         if changed := self.cameras.changed(views):
             raise SceneError(
-                f"the alignment of {self.shell} was found for other cameras than those of {scene}: {changed}; run "
+                f"the alignment of {self.named} was found for other cameras than those of {scene}: {changed}; run "
                 f"`shellgs align {shlex.quote(str(scene))}` to validate it with these, or align the shell to them again"
             )
 
@@ -144,21 +156,21 @@ class Alignment:
             return self
         return replace(self, mesher=mesher, spacing=spacing, verdict="", metrics={})
 
-    def load_shell(self, scene: Path, views: Sequence[View], surface: Geometry | Cloud | None = None) -> ShellMesh:
+    def load_shell(self, scene: Path, views: Sequence[View], surfaces: Sequence[Geometry | Cloud] = ()) -> ShellMesh:
         """Load the shell's mesh, in its own frame; the mesh of a point cloud is cached in ``scene/shell``.
 
         Args:
             scene: the scene's folder.
             views: photographs of the shell, whose cameras say where and how finely a point cloud is meshed.
-            surface: what the shell's file holds, if it was read already.
+            surfaces: what the shell's files hold, if they were read already.
 
         Raises:
             FileNotFoundError: the shell is missing.
             SceneError: the shell cannot be used, or its coordinates were rounded by decimetres.
         """
         return load_shell(
-            scene / self.shell,
-            surface=surface,
+            *self.files(scene),
+            surfaces=surfaces,
             cache=scene / "shell",
             cameras=[self._in_shell(view.camera) for view in views],
             mesher=self.mesher,
@@ -217,7 +229,7 @@ class Alignment:
             up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)  # older files lack it
             return cls(
                 matrix,
-                str(fields["shell"]),
+                (shells,) if isinstance(shells := fields["shell"], str) else tuple(map(str, shells)),
                 float(unit),
                 str(source),
                 verdict,
@@ -240,7 +252,7 @@ class Alignment:
     def from_matrix_file(
         cls,
         path: Path,
-        shell: str,
+        shells: tuple[str, ...],
         metres_per_shell_unit: float = 1.0,
         global_shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Alignment:
@@ -248,7 +260,7 @@ class Alignment:
 
         Args:
             path: the file.
-            shell: the shell's file, relative to the scene's folder (or absolute).
+            shells: the shell's files, relative to the scene's folder (or absolute).
             metres_per_shell_unit: 1 for a shell in metres.
             global_shift: CloudCompare's "global shift", which it adds to a cloud's coordinates on loading, so that its
                 matrices apply to the shifted coordinates.
@@ -262,14 +274,17 @@ class Alignment:
         shift = np.eye(4)
         shift[:3, 3] = global_shift
         try:
-            return cls(_read_matrix(path) @ shift, shell, metres_per_shell_unit, source=f"matrix file {path.name}")
+            return cls(_read_matrix(path) @ shift, shells, metres_per_shell_unit, source=f"matrix file {path.name}")
         except ValueError as error:
             raise SceneError(f"{path}: {error}") from error
 
     def _fields(self) -> dict:
+        fields = dict(vars(self))
+        matrix, shells = fields.pop("shell_to_scene"), fields.pop("shells")
         return {
-            **vars(self),
-            "shell_to_scene": self.shell_to_scene.tolist(),
+            "shell_to_scene": matrix.tolist(),
+            "shell": shells[0] if len(shells) == 1 else list(shells),  # one as in older versions
+            **fields,
             "up": None if self.up is None else self.up.tolist(),
             "metrics": dict(self.metrics),
             "cameras": self.cameras.to_json(),

@@ -59,7 +59,7 @@ class PlacedShell:
     Attributes:
         scene: the scene's folder.
         views: the photographs, with full-size cameras.
-        alignment: the shell's file, its similarity to the scene, and the mesher of a point cloud.
+        alignment: the shell's files, their similarity to the scene, and the mesher of a point cloud.
         mesh: the shell in its own frame.
         caster: the shell in the scene's frame.
     """
@@ -80,18 +80,18 @@ class PlacedShell:
                 sees it.
         """
         alignment.check_cameras(scene, views)
-        shell, cameras = scene / alignment.shell, [view.camera for view in views]
+        cameras = [view.camera for view in views]
         mesh = alignment.load_shell(scene, views)
         refuse_coarse(camera_step(cameras).scaled(alignment.metres_per_unit), f"the cameras of {scene}")
         step = mesh.step.scaled(alignment.metres_per_shell_unit)
         if step.coarsest > FINE:
             log.warning(
                 "the coordinates of %s are stored in steps of %s: the maps are up to half of that off",
-                shell,
+                alignment.named,
                 step.in_words(),
             )
         caster = ShellCaster(mesh, alignment.shell_to_scene)
-        _check_placement(caster, cameras, shell)
+        _check_placement(caster, cameras, alignment.named)
         if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):
             raise SceneError(f"the masks of {scene} are black everywhere in every view: white is kept")
         return cls(scene, views, alignment, mesh, caster)
@@ -131,14 +131,8 @@ def cast_views(
         scene,
         kind,
         command=_command(max_image_size, recorded if meshing else None) + flags,
-        sources=[
-            scene / recorded.shell,
-            path,
-            *_followed(scene, recorded, kind),
-            scene / MASKS,
-            *_mask_sources(scene, views),
-        ],
-        revisions={"mesher": f"{meshing.mesher} {VERSION}"} if meshing else {},
+        sources=[*recorded.files(scene), path, *_followed(scene, recorded, kind), *_mask_sources(scene, views)],
+        revisions={"mesher": f"{recorded.mesher} {VERSION}"} if meshing else {},
         metres_per_unit=recorded.metres_per_unit,
         max_image_size=max_image_size,
         error=recorded.error,
@@ -242,7 +236,7 @@ def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
     return replace(cue, mask=cue.mask & ~nearer & ~found.moved)
 
 
-def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: Path) -> None:
+def _check_placement(caster: ShellCaster, cameras: Sequence[Camera], shell: str) -> None:
     """Refuse a shell that no camera sees; warn if its size is out of proportion to the camera path."""
     if not cameras:
         raise SceneError("there are no views to cast the shell into")

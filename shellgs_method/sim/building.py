@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64, Int64, UInt8
 from scipy.ndimage import binary_dilation
 
 from shellgs_method.errors import SceneError
@@ -26,6 +26,7 @@ from shellgs_method.geometry.tsdf import DepthView, decimate
 from shellgs_method.occlusion import shell_verdicts
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.shell import ShellCaster
+from shellgs_method.shell.mesh import NO_SOURCES
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo
 
@@ -47,6 +48,8 @@ class Reconstruction:
         fused: surface fused from the rendered depth, with vertex colours.
         shell: shell of any winding; None if the scene has none.
         classes: class of each of the shell's triangles; empty if there is none.
+        sources: number of the file that each of these is of.
+        files: the shell's files.
         splats: Gaussians.
         views: training and held-out views.
         hidden: for each view, mask of reconstructed objects well in front of the shell: poles, trees, cars.
@@ -59,6 +62,8 @@ class Reconstruction:
     fused: trimesh.Trimesh
     shell: Triangles | None
     classes: UInt8[np.ndarray, " F"]
+    sources: Int64[np.ndarray, " F"]
+    files: Sequence[str]
     splats: Splats
     views: list[View]
     hidden: list[Bool[np.ndarray, "h w"]]
@@ -95,7 +100,9 @@ class Reconstruction:
             frame,
             fused.apply_transform(motion),
             shell,
-            run.shell_in_frame.classes if run.shell else NO_CLASSES,
+            run.shell[1].classes if run.shell else NO_CLASSES,
+            run.shell[1].source if run.shell else NO_SOURCES,
+            run.shell[0].shells if run.shell else (),
             run.splats().transformed(motion),
             views,
             hidden,

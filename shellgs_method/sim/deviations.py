@@ -15,6 +15,7 @@ from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.camera import Camera, in_view
 from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass, classes_of
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.shell.mesh import NO_SOURCES, sources_of
 from shellgs_method.sim.collision.collider import connected
 
 EDGE = 0.15
@@ -40,6 +41,7 @@ class Region:
         centre: centre in the simulation frame.
         photograph: name of the photograph that shows it best.
         part: class of the shell there, such as "window"; "other" if its file knows none.
+        file: the shell's file there.
     """
 
     what: str
@@ -48,6 +50,7 @@ class Region:
     centre: tuple[float, float, float]
     photograph: str
     part: str
+    file: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +87,10 @@ def find_deviations(
     contradicted: Contradicted | None = None,
     least: float = 0.05,
     classes: UInt8[np.ndarray, " S"] = NO_CLASSES,
+    sources: Int64[np.ndarray, " S"] = NO_SOURCES,
+    files: Sequence[str] = ("",),
 ) -> Deviations:
-    """Compare the shell with the reconstruction along its normals; a region is of one class.
+    """Compare the shell with the reconstruction along its normals; a region is of one class and one file.
 
     Args:
         shell: shell, wound so that normals point outside.
@@ -95,9 +100,12 @@ def find_deviations(
         contradicted: distances from the photographs themselves, used instead of the reconstruction where not NaN.
         least: minimum area of a region in square metres.
         classes: class of each of the shell's triangles; OTHER if not given.
+        sources: number of the file that each of the shell's triangles is of; that of the first if not given.
+        files: names of the files.
     """
-    *cut, source = trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20, return_index=True)
-    small, classes = Triangles(*cut), classes_of(shell.faces, classes)[source]
+    *cut, whole = trimesh.remesh.subdivide_to_size(shell.vertices, shell.faces, EDGE, max_iter=20, return_index=True)
+    small, classes = Triangles(*cut), classes_of(shell.faces, classes)[whole]
+    sources = sources_of(shell.faces, sources)[whole]
     centres = small.centres
     best, score = np.full(len(centres), -1), np.zeros(len(centres))
     for number, (_, camera) in enumerate(views):
@@ -119,10 +127,11 @@ def find_deviations(
     regions = []
     names = [name for name, _ in views]
     for what, chosen in (("before", flagged & (distance > 0)), ("behind", flagged & (distance < 0))):
-        for part in map(SurfaceClass, np.unique(classes[chosen])):
-            for group in connected(small.faces, np.flatnonzero(chosen & (classes == part))):
+        for part, file in np.unique(np.stack([classes[chosen], sources[chosen]], axis=1), axis=0).tolist():
+            for group in connected(small.faces, np.flatnonzero(chosen & (classes == part) & (sources == file))):
                 if (area := small.areas[group].sum()) >= least:
-                    regions.append(_region(what, part, float(area), group, centres, distance, best, names))
+                    kind, name = SurfaceClass(part), files[int(file)]
+                    regions.append(_region(what, kind, name, float(area), group, centres, distance, best, names))
     return Deviations(small, distance, flagged, sorted(regions, key=lambda region: -region.area))
 
 
@@ -135,6 +144,7 @@ def along_normals(small: Triangles, places: Float64[np.ndarray, "F 3"], other: T
 def _region(
     what: str,
     part: SurfaceClass,
+    file: str,
     area: float,
     group: Int64[np.ndarray, " G"],
     centres: np.ndarray,
@@ -146,4 +156,4 @@ def _region(
     x, y, z = np.median(centres[group], axis=0).round(3).tolist()
     photograph = names[int(shown.argmax())] if shown.any() else ""
     away = round(float(np.median(distance[group])), 3)
-    return Region(what, round(area, 3), away, (x, y, z), photograph, part.word)
+    return Region(what, round(area, 3), away, (x, y, z), photograph, part.word, file)

@@ -169,7 +169,7 @@ def _section(
         rows = [
             (
                 "missing in the shell" if region.what == "before" else "gone, or deeper",
-                region.part,
+                f"{region.part} of {escape(region.file)}" if len(chapter.made.files) > 1 else region.part,
                 f"{region.area:.2f}",
                 f"{100 * region.distance:+.0f}",
                 " ".join(f"{value:.2f}" for value in region.centre),

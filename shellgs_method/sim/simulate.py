@@ -117,7 +117,8 @@ def _building(
     deviations: Deviations | None = None
     if shell is not None:
         views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]
-        deviations = find_deviations(shell, fused, views, ahead, made.contradicted, classes=made.classes)
+        of = {"classes": made.classes, "sources": made.sources, "files": made.files}
+        deviations = find_deviations(shell, fused, views, ahead, made.contradicted, **of)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())

@@ -208,5 +208,5 @@ def _write_shell(scene: Path, mesh: Mesh, cameras: BoundCameras) -> None:
     path.parent.mkdir(parents=True)
     write_scan(path, mesh)
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
-    alignment = Alignment(matrix, SHELL, source="the synthetic facade's own frames", cameras=cameras)
+    alignment = Alignment(matrix, (SHELL,), source="the synthetic facade's own frames", cameras=cameras)
     alignment.save(scene / ALIGNMENT)

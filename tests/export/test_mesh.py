@@ -167,7 +167,7 @@ def test_a_camera_in_the_frame_has_the_same_view_with_depth_in_metres():
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 0.0004 * rotation, [3, -1, 2]
     vertices = np.array([[7e6, 2e6, 1e4], [7.01e6, 2e6, 1e4], [7e6, 2.01e6, 2e4]])
-    alignment = Alignment(matrix, "shell.ply", metres_per_shell_unit=0.001)
+    alignment = Alignment(matrix, ("shell.ply",), metres_per_shell_unit=0.001)
     frame = shell_frame(alignment, ShellMesh(vertices, np.array([[0, 1, 2]])))
     np.testing.assert_array_equal(frame.offset, [7000, 2000, 0])
 
@@ -181,7 +181,7 @@ def test_a_camera_in_the_frame_has_the_same_view_with_depth_in_metres():
 
 def test_a_shell_near_its_origin_is_not_shifted():
     mesh = ShellMesh(np.array([[0.0, 0, 0], [30, 0, 0], [0, 0, 20]]), np.array([[0, 1, 2]]))
-    frame = shell_frame(Alignment(np.diag([2.0, 2, 2, 1]), "shell.obj"), mesh)
+    frame = shell_frame(Alignment(np.diag([2.0, 2, 2, 1]), ("shell.obj",)), mesh)
     np.testing.assert_array_equal(frame.offset, 0)
 
 

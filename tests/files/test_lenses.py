@@ -59,7 +59,7 @@ def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, mode
     """The depth image cast through the lens itself, undistorted as a photograph, equals the cast depth."""
     view = with_lens(scene, model, coefficients)[4]
     alignment = Alignment.load(scene / ALIGNMENT)
-    caster = ShellCaster(load_shell(scene / alignment.shell), alignment.shell_to_scene)
+    caster = ShellCaster(load_shell(scene / alignment.shells[0]), alignment.shell_to_scene)
     viewmat = view.camera.viewmat.numpy()
     rays = np.empty((HEIGHT, WIDTH, 6), np.float32)
     rays[..., :3] = -viewmat[:3, :3].T @ viewmat[:3, 3] - caster.origin

@@ -301,7 +301,7 @@ def test_cast_leaves_masked_pixels_out_and_notices_changed_masks(scene):
 
 def test_align_validates_with_what_masks_keep(scene):
     alignment = Alignment.load(scene / ALIGNMENT)
-    mesh, config = load_shell(scene / alignment.shell), FacadeDataParserConfig(data=scene)
+    mesh, config = load_shell(scene / alignment.shells[0]), FacadeDataParserConfig(data=scene)
     points = read_sparse_points(config)
     before = validate(mesh, alignment, read_views(config), points)
     paint_all(scene)

@@ -393,7 +393,7 @@ def test_the_classes_of_a_model_reach_its_maps_and_the_panel(tmp_path: Path):
     made.save_json(tmp_path / "shell" / "a.json", made.cityjson(house()))
     scene_from_model, cameras = cameras_around(made.bounds(faces), 2)
     views = [View(f"images/{k}.jpg", PHOTOGRAPH, placed.scene) for k, placed in enumerate(cameras)]
-    cast(tmp_path, views, Alignment(scene_from_model, "shell/a.json"))
+    cast(tmp_path, views, Alignment(scene_from_model, ("shell/a.json",)))
     cue = CueMaps.open(tmp_path, "shell").require(views[0].name, views[0].camera)
     expected = ShellCaster(load_shell(tmp_path / "shell" / "a.json"), scene_from_model).cast(views[0].camera)
     assert cue.classes is not None

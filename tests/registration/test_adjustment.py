@@ -239,7 +239,7 @@ def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
 def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: ShellSurface, bent: Model):
     matrix = write(tmp_path, bent, building(Layout(5, 3)))
     files = {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()}
-    align(tmp_path, tmp_path / "shell.ply", matrix=matrix, refine=0.3, bundle_adjust=True)
+    align(tmp_path, (tmp_path / "shell.ply",), matrix=matrix, refine=0.3, bundle_adjust=True)
     assert Alignment.load(tmp_path / ALIGNMENT).model == ADJUSTED.as_posix()
     layout = ScenePaths().of(tmp_path)
     assert layout.colmap_folder() == ADJUSTED
@@ -280,13 +280,13 @@ def test_a_wrong_shell_does_not_bend_good_cameras(tmp_path: Path, model: Model, 
     mesh = building(Layout(3, 5) if wrong == "another building" else Layout(5, 3))
     matrix = write(tmp_path, model, mesh, shift)
     with suppress(SceneError):  # or says that the cameras are left as they are
-        align(tmp_path, tmp_path / "shell.ply", matrix=matrix, bundle_adjust=True)
+        align(tmp_path, (tmp_path / "shell.ply",), matrix=matrix, bundle_adjust=True)
     assert not (tmp_path / ADJUSTED).exists()
     assert ScenePaths().of(tmp_path).colmap_folder() == Path("colmap/sparse/0")
 
 
 def test_adjusted_cameras_that_are_missing_are_named(tmp_path: Path, model: Model):
     write(tmp_path, model, building(Layout(5, 3)))
-    Alignment(np.eye(4), "shell.ply", model=ADJUSTED.as_posix()).save(tmp_path / ALIGNMENT)
+    Alignment(np.eye(4), ("shell.ply",), model=ADJUSTED.as_posix()).save(tmp_path / ALIGNMENT)
     with pytest.raises(SceneError, match=r"colmap/adjusted, which is missing: align the shell again"):
         ScenePaths().of(tmp_path).colmap_folder()

@@ -114,12 +114,12 @@ def shifted(right: float = 0.0, up: float = 0.0, out: float = 0.0) -> Alignment:
     """The true alignment, with the shell moved by metres."""
     move = np.eye(4)
     move[:3, 3] = AXES @ [right, up, out]
-    return Alignment(TRUTH @ move, "shell/facade.ply")
+    return Alignment(TRUTH @ move, ("shell/facade.ply",))
 
 
 def in_its_own_frame(mesh: ShellMesh, points: SparsePoints) -> tuple[Placement, np.ndarray]:
     """A scene in the shell's national coordinates: the exact placement, and the SfM points."""
-    return Placement(Alignment(np.eye(4), "facade.ply")), transformed(points.positions, np.linalg.inv(TRUTH))
+    return Placement(Alignment(np.eye(4), ("facade.ply",))), transformed(points.positions, np.linalg.inv(TRUTH))
 
 
 # Similarities and refinement
@@ -208,7 +208,7 @@ def test_points_of_something_else_are_refused(surface, survey_from_scene):
 
 
 def test_a_proposal_is_right_if_the_ends_of_the_facade_are_visible(mesh, surface, views, points, survey_from_scene):
-    placement = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0)
+    placement = place_by_guess(mesh, views, points, ("shell/facade.ply",), 1.0)
     found = surface.survey_from_shell @ np.linalg.inv(placement.alignment.shell_to_scene)
     assert placement.proposed
     assert error(surface, found, survey_from_scene) < 0.02
@@ -227,7 +227,7 @@ def turned(axis: str) -> np.ndarray:
 def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, survey_from_scene, axis):
     motion = turned(axis)
     askew = ShellMesh(transformed(mesh.vertices, motion), mesh.faces)
-    alignment = place_by_guess(askew, views, points, "shell/facade.ply", 1.0).alignment
+    alignment = place_by_guess(askew, views, points, ("shell/facade.ply",), 1.0).alignment
     found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ motion)
     assert error(surface, found, survey_from_scene) < 0.02
 
@@ -235,7 +235,7 @@ def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, surve
 @pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
 def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
     motion = turned(axis)
-    alignment = Alignment(TRUTH @ np.linalg.inv(motion), "shell/facade.obj").seen_by(views)
+    alignment = Alignment(TRUTH @ np.linalg.inv(motion), ("shell/facade.obj",)).seen_by(views)
     assert alignment.up is not None
     cosine = alignment.up @ motion[:3, :3] @ [0.0, 0, 1]
     assert np.degrees(np.arccos(min(cosine, 1.0))) <= within
@@ -267,7 +267,7 @@ def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh,
     monkeypatch.setattr(proposal, "shell_axes", lambda *_: [])
     monkeypatch.setattr(proposal, "_refined", lambda *_: unsupported)
     with pytest.raises(SceneError, match=r"taken to be 16\.\d+ m large: .* --metres-per-shell-unit"):
-        place_by_guess(mesh, views, points, "shell/facade.glb", 1.0)
+        place_by_guess(mesh, views, points, ("shell/facade.glb",), 1.0)
 
 
 def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
@@ -283,7 +283,7 @@ def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mes
     building = np.concatenate([wall[~inside], np.repeat(np.array(corners), 10, axis=0)])
     building += random.normal(0, 0.01, building.shape)
     points = SparsePoints(transformed(building, SCENE_FROM_BUILDING))
-    history = place_by_guess(mesh, views, points, "shell/facade.ply", 1.0).history
+    history = place_by_guess(mesh, views, points, ("shell/facade.ply",), 1.0).history
     assert any(sentence.startswith("Ambiguous: an alignment") for sentence in history)
 
 
@@ -705,7 +705,7 @@ def test_the_axes_of_a_facade_are_upright_even_if_the_cameras_look_up():
         (replace(shifted(), metres_per_shell_unit=1000.0), "refused", "units"),
         (replace(shifted(), metres_per_shell_unit=0.001), "refused", "units"),
         (
-            Alignment(TRUTH @ np.diag([1000.0, 1000, 1000, 1]), "shell/facade.ply"),
+            Alignment(TRUTH @ np.diag([1000.0, 1000, 1000, 1]), ("shell/facade.ply",)),
             "refused",
             "Views that see the shell",
         ),
@@ -775,7 +775,7 @@ def test_a_matrix_is_validated_reported_and_written(scene, shellgs):
     unshifted[:3, 3] += unshifted[:3, :3] @ shift  # for coordinates minus the shift, as CloudCompare has them
     (scene / "matrix.txt").write_text("\n".join(" ".join(f"{value:.12f}" for value in row) for row in unshifted))
     (scene / ALIGNMENT).unlink()
-    shell = scene / true.shell
+    shell = scene / true.shells[0]
     output = shellgs("align", scene, shell, "--matrix", scene / "matrix.txt", "--global-shift", *(-shift))
     assert "Verdict: good" in output or "Verdict: doubtful" in output
     written = Alignment.load(scene / ALIGNMENT)
@@ -808,11 +808,11 @@ def test_picks_and_refinement_give_the_alignment_and_residuals(scene, shellgs):
     picks = scene / "picks.txt"
     picks.write_text("\n".join(line for k, line in lines if seen.count(k) >= 4))
     (scene / ALIGNMENT).unlink()
-    output = shellgs("align", scene, scene / true.shell, "--picks", picks, "--refine", 0.3)
+    output = shellgs("align", scene, scene / true.shells[0], "--picks", picks, "--refine", 0.3)
     assert "picks are used" in output
     assert "Refined against" in output
     written = Alignment.load(scene / ALIGNMENT)
-    vertices = load_shell(scene / true.shell).vertices
+    vertices = load_shell(scene / true.shells[0]).vertices
     moved = np.linalg.norm(written.apply(vertices) - true.apply(vertices), axis=1).mean() * true.metres_per_unit
     assert moved < 0.05  # 300 SfM points, some of them on parts missing in the shell: flowers, railings, frames
     assert "Points known in both frames, worst first" in (scene / REPORT / "index.html").read_text()
@@ -827,7 +827,7 @@ def test_camera_positions_give_the_alignment_and_name_missing_photographs(scene,
         lines.append(f"{Path(view.name).name} {' '.join(map(str, position))}")
     (scene / "geo.txt").write_text("\n".join(lines))
     (scene / ALIGNMENT).unlink()
-    output = shellgs("align", scene, scene / true.shell, "--positions", scene / "geo.txt")
+    output = shellgs("align", scene, scene / true.shells[0], "--positions", scene / "geo.txt")
     assert "9 of 10 camera positions are used" in output
     assert "In geo.txt but not in the scene: IMG_0001.jpg" in output
     assert "left out" in output
@@ -841,7 +841,7 @@ def test_a_refused_alignment_does_not_replace_the_saved_one(scene, shellgs):
     before = (scene / ALIGNMENT).read_bytes()
     true = Alignment.load(scene / ALIGNMENT)
     (scene / "off.json").write_text(json.dumps((true.shell_to_scene @ np.diag([1e3, 1e3, 1e3, 1])).tolist()))
-    output = shellgs("align", scene, scene / true.shell, "--matrix", scene / "off.json")
+    output = shellgs("align", scene, scene / true.shells[0], "--matrix", scene / "off.json")
     assert "the alignment is refused" in output
     assert (scene / ALIGNMENT).read_bytes() == before
     assert "Verdict: <b>refused</b>" in (scene / REPORT / "index.html").read_text()
@@ -1000,8 +1000,8 @@ def test_an_alignment_of_an_older_version_is_cast_and_says_so(scene, shellgs):
 def scanned(scene: Path) -> Path:
     """The scene with a point cloud as its shell, sparse enough for fast meshing."""
     alignment = Alignment.load(scene / ALIGNMENT)
-    samples, _ = ShellSurface(load_shell(scene / alignment.shell)).samples(4000)
-    survey = ShellSurface(load_shell(scene / alignment.shell)).survey_from_shell
+    samples, _ = ShellSurface(load_shell(scene / alignment.shells[0])).samples(4000)
+    survey = ShellSurface(load_shell(scene / alignment.shells[0])).survey_from_shell
     np.savetxt(scene / "shell" / "scan.xyz", transformed(samples, np.linalg.inv(survey)), fmt="%.4f")
     np.save(scene / "matrix.npy", alignment.shell_to_scene)
     return scene
@@ -1029,7 +1029,7 @@ def test_a_cloud_is_meshed_again_once_its_cameras_are_known(scanned):
     """A proposal's mesh, made without viewpoints, is not the one that is cast."""
     shell, cache = scanned / "shell" / "scan.xyz", scanned / "shell"
     views = read_views(FacadeDataParserConfig(data=scanned))
-    alignment = Alignment(np.load(scanned / "matrix.npy"), "shell/scan.xyz")
+    alignment = Alignment(np.load(scanned / "matrix.npy"), ("shell/scan.xyz",))
     load_shell(shell, cache=cache)
     guessed = (cache / "scan.xyz.planes.ply").read_bytes()
     alignment.load_shell(scanned, views)
@@ -1085,7 +1085,7 @@ def test_a_global_shift_is_cast(scene, shellgs):
     shift = np.eye(4)
     shift[:3, 3] = [-412_000.0, -5_123_000.0, 0.0]
     np.save(scene / "matrix.npy", true.shell_to_scene @ np.linalg.inv(shift))
-    words = ("--shell", scene / true.shell, "--matrix", scene / "matrix.npy", "--global-shift", *shift[:3, 3])
+    words = ("--shell", scene / true.shells[0], "--matrix", scene / "matrix.npy", "--global-shift", *shift[:3, 3])
     shellgs("cast", scene, *words, "--no-check")
     np.testing.assert_allclose(Alignment.load(scene / ALIGNMENT).shell_to_scene, true.shell_to_scene, atol=1e-6)
 
@@ -1093,14 +1093,14 @@ def test_a_global_shift_is_cast(scene, shellgs):
 def test_an_alignment_without_a_verdict_is_read(tmp_path):
     fields = {"shell_to_scene": np.eye(4).tolist(), "shell": "a.ply", "metres_per_shell_unit": 1.0, "source": "matrix"}
     (tmp_path / "alignment.json").write_text(json.dumps(fields))
-    assert Alignment.load(tmp_path / "alignment.json") == Alignment(np.eye(4), "a.ply")
-    validated = Alignment(np.eye(4), "a.ply", verdict="good", metrics={"bias_m": 0.01, "pull_m": None})
+    assert Alignment.load(tmp_path / "alignment.json") == Alignment(np.eye(4), ("a.ply",))
+    validated = Alignment(np.eye(4), ("a.ply",), verdict="good", metrics={"bias_m": 0.01, "pull_m": None})
     validated.save(tmp_path / "alignment.json")
     assert Alignment.load(tmp_path / "alignment.json") == validated
 
 
 def test_a_report_is_written_even_if_no_camera_sees_the_shell(mesh, views, points, tmp_path):
-    validation = validate(mesh, Alignment(displaced(1e4, 0, 0, 1) @ TRUTH, "<shell>.ply"), views, points)
+    validation = validate(mesh, Alignment(displaced(1e4, 0, 0, 1) @ TRUTH, ("<shell>.ply",)), views, points)
     page = write_report(tmp_path / "report", mesh, validation).read_text()
     assert "&lt;shell&gt;.ply: refused" in page
 
@@ -1147,7 +1147,7 @@ def test_latitudes_in_place_of_longitudes_are_refused(tmp_path):
 
 def test_a_shell_in_the_frame_of_the_cameras_needs_no_matrix_and_its_system_is_kept(scene, shellgs, tmp_path):
     alignment = Alignment.load(scene / ALIGNMENT)
-    mesh = load_shell(scene / alignment.shell)
+    mesh = load_shell(*alignment.files(scene))
     placed = trimesh.Trimesh(alignment.apply(mesh.vertices), mesh.faces, process=False)
     placed.export(tmp_path / "placed.ply")
     told = shellgs("align", scene, tmp_path / "placed.ply", "--same-frame", "--crs", "EPSG:25832",

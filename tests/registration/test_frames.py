@@ -242,6 +242,6 @@ def test_a_matrix_without_its_global_shift_is_refused_with_the_distance(scene, s
     shift = np.eye(4)
     shift[:3, 3] = [412_000.0, 5_123_000.0, 0.0]
     np.save(scene / "matrix.npy", true.shell_to_scene @ shift)
-    refusal = shellgs("align", scene, scene / true.shell, "--matrix", scene / "matrix.npy")
+    refusal = shellgs("align", scene, scene / true.shells[0], "--matrix", scene / "matrix.npy")
     assert "is refused" in refusal
     assert "away from what the cameras see: a shift (such as CloudCompare's --global-shift) is missing" in refusal

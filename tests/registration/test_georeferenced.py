@@ -42,7 +42,7 @@ def moved_to_national_coordinates(scene: Path) -> None:
     alignment = Alignment.load(scene / ALIGNMENT)
     shift = np.eye(4)
     shift[:3, 3] = NATIONAL
-    Alignment(shift @ alignment.shell_to_scene, alignment.shell).save(scene / ALIGNMENT)
+    Alignment(shift @ alignment.shell_to_scene, alignment.shells).save(scene / ALIGNMENT)
 
 
 @pytest.fixture(params=["transforms.json", "COLMAP"])

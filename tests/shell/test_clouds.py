@@ -39,7 +39,8 @@ def camera() -> Camera:
 
 
 def meshed(points: np.ndarray, mesher: Mesher = "planes", viewpoints: np.ndarray = STREET) -> ShellMesh:
-    return ShellMesh(*mesh_cloud(merged([Points(points)]), viewpoints, mesher))
+    vertices, faces, meshing = mesh_cloud(merged([Points(points)]), viewpoints, mesher)
+    return ShellMesh(vertices, faces, (meshing,))
 
 
 def view_of(mesh: ShellMesh, shell_to_scene: np.ndarray | None = None) -> CueMap:
@@ -117,8 +118,8 @@ def test_nan_points_are_dropped_and_counted(caplog: pytest.LogCaptureFixture):
     mesh, clean = meshed(spoilt), meshed(points)
     assert "dropped 6 of 3006 points" in caplog.text
     np.testing.assert_array_equal(mesh.vertices, clean.vertices)
-    assert mesh.meshing is not None
-    assert (mesh.meshing.points, mesh.meshing.dropped) == (3006, 6)
+    assert mesh.meshing
+    assert (mesh.meshing[0].points, mesh.meshing[0].dropped) == (3006, 6)
 
 
 @pytest.mark.parametrize(
@@ -140,13 +141,13 @@ def test_points_without_a_surface_are_refused(points: np.ndarray, words: str):
 def test_the_report_measures_the_points_against_the_mesh():
     points = scan(noise=0.01)
     mesh = meshed(points)
-    assert mesh.meshing is not None
+    assert mesh.meshing
     # The front, two sides and two caps; noise moves the points 0.67 σ away from these in the median.
-    assert mesh.meshing.planes == 5
-    assert mesh.meshing.triangles == len(mesh.faces)
-    assert mesh.meshing.spacing == pytest.approx(np.sqrt(house().area / len(points)), rel=0.15)
-    assert mesh.meshing.meshed > 0.97
-    assert 0.003 < mesh.meshing.median < 0.009
+    assert mesh.meshing[0].planes == 5
+    assert mesh.meshing[0].triangles == len(mesh.faces)
+    assert mesh.meshing[0].spacing == pytest.approx(np.sqrt(house().area / len(points)), rel=0.15)
+    assert mesh.meshing[0].meshed > 0.97
+    assert 0.003 < mesh.meshing[0].median < 0.009
 
 
 # Files
@@ -238,7 +239,7 @@ def cloud(tmp_path: Path) -> Path:
 
 def test_a_cloud_is_meshed_once(cloud: Path, monkeypatch: pytest.MonkeyPatch):
     first = load_shell(cloud, cache=cloud.parent)
-    monkeypatch.delattr("shellgs_method.shell.mesh.mesh_cloud")
+    monkeypatch.delattr("shellgs_method.shell.loading.mesh_cloud")
     again = load_shell(cloud, cache=cloud.parent)
     np.testing.assert_array_equal(again.vertices, first.vertices)
     np.testing.assert_array_equal(again.faces, first.faces)
@@ -278,8 +279,8 @@ def test_another_cloud_of_the_same_name_is_meshed_again(cloud: Path):
     load_shell(cloud, cache=cloud.parent)
     write_open3d(cloud, scan(2000))
     mesh = load_shell(cloud, cache=cloud.parent)
-    assert mesh.meshing is not None
-    assert mesh.meshing.points == 2000
+    assert mesh.meshing
+    assert mesh.meshing[0].points == 2000
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-40], lambda data: b"", lambda data: b"ply\nx\ny\nz\n"])
@@ -293,10 +294,9 @@ def test_a_damaged_cached_mesh_is_made_again(cloud: Path, damage: Callable[[byte
 def test_maps_are_cast_from_a_cloud_and_bound_to_it(cloud: Path, tmp_path: Path):
     to_scene = np.eye(4)
     to_scene[:3, 3] = -GEOREFERENCE
-    alignment, views = Alignment(to_scene, "shell/scan.ply"), [View("images/a.jpg", OPAQUE, camera())]
+    alignment, views = Alignment(to_scene, ("shell/scan.ply",)), [View("images/a.jpg", OPAQUE, camera())]
     cast(tmp_path, views, alignment)
-    meshing = PlacedShell.load(tmp_path, views, alignment).mesh.meshing
-    assert meshing is not None
+    (meshing,) = PlacedShell.load(tmp_path, views, alignment).mesh.meshing
     assert meshing.planes == 5
     cue = CueMaps.open(tmp_path, "shell").read("images/a.jpg", camera())
     assert cue is not None

@@ -276,7 +276,7 @@ def write_doubles(path: Path, vertices: np.ndarray, faces: np.ndarray, form: str
 
 def test_few_digits_of_a_shell_are_said_with_its_maps(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     write_doubles(tmp_path / "shell/few.ply", *surveyed(), form="{:.1f}")
-    cast(tmp_path, VIEWS, Alignment(np.linalg.inv(similarity(1.0, TURN, GEOREFERENCE)), "shell/few.ply"))
+    cast(tmp_path, VIEWS, Alignment(np.linalg.inv(similarity(1.0, TURN, GEOREFERENCE)), ("shell/few.ply",)))
     assert "few.ply are stored in steps of 0.1 x 0.1 x 0.1 m" in caplog.text
 
 
@@ -306,13 +306,13 @@ def test_a_vertex_far_away_moves_no_map():
 
 
 def test_a_saved_alignment_is_loaded_unchanged(tmp_path: Path):
-    alignment = Alignment(similarity(0.3, TURN, GEOREFERENCE), "shell/façade.ply", 0.001, "picks")
+    alignment = Alignment(similarity(0.3, TURN, GEOREFERENCE), ("shell/façade.ply",), 0.001, "picks")
     alignment.save(tmp_path / "alignment.json")
     assert Alignment.load(tmp_path / "alignment.json") == alignment
 
 
 def test_scale_rotation_and_metres_follow_from_the_matrix():
-    alignment = Alignment(similarity(0.3, TURN, GEOREFERENCE), "shell.ply", 0.001)
+    alignment = Alignment(similarity(0.3, TURN, GEOREFERENCE), ("shell.ply",), 0.001)
     assert alignment.scale == pytest.approx(0.3)
     np.testing.assert_allclose(alignment.rotation, TURN, atol=1e-12)
     assert alignment.metres_per_unit == pytest.approx(0.001 / 0.3)  # a millimetre of shell is 0.3 units of the scene
@@ -327,12 +327,14 @@ def test_a_matrix_is_read_from_each_format(tmp_path: Path, suffix: str):
         "json": lambda: path.write_text(json.dumps(matrix.tolist())),
         "npy": lambda: np.save(path, matrix),
     }[suffix]()
-    np.testing.assert_array_equal(Alignment.from_matrix_file(path, "shell.ply").shell_to_scene, matrix)
+    np.testing.assert_array_equal(Alignment.from_matrix_file(path, ("shell.ply",)).shell_to_scene, matrix)
 
 
 def test_a_global_shift_is_applied_before_the_matrix(tmp_path: Path):
     np.savetxt(tmp_path / "matrix.txt", similarity(0.3, TURN, np.array([1.0, 2, 3])))
-    alignment = Alignment.from_matrix_file(tmp_path / "matrix.txt", "shell.ply", global_shift=(-GEOREFERENCE).tolist())
+    alignment = Alignment.from_matrix_file(
+        tmp_path / "matrix.txt", ("shell.ply",), global_shift=(-GEOREFERENCE).tolist()
+    )
     np.testing.assert_allclose(alignment.apply(GEOREFERENCE[None]), [[1, 2, 3]], atol=1e-6)
 
 
@@ -355,7 +357,7 @@ def test_a_matrix_that_is_not_a_similarity_is_refused_with_its_file_name(
 ):
     np.savetxt(tmp_path / "matrix.txt", matrix)
     with pytest.raises(SceneError) as caught:
-        Alignment.from_matrix_file(tmp_path / "matrix.txt", "shell.ply")
+        Alignment.from_matrix_file(tmp_path / "matrix.txt", ("shell.ply",))
     assert str(tmp_path / "matrix.txt") in str(caught.value)
     assert words in str(caught.value)
 
@@ -364,7 +366,7 @@ def test_a_matrix_that_is_not_a_similarity_is_refused_with_its_file_name(
 def test_text_that_is_not_a_4x4_matrix_is_refused_with_its_file_name(tmp_path: Path, text: str):
     (tmp_path / "matrix.txt").write_text(text)
     with pytest.raises(SceneError, match=r"matrix\.txt: this is not a 4x4 matrix"):
-        Alignment.from_matrix_file(tmp_path / "matrix.txt", "shell.ply")
+        Alignment.from_matrix_file(tmp_path / "matrix.txt", ("shell.ply",))
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"shell_to_scene": [[1]], "shell": "a"}', '{"shell_to_scene": 1}'])
@@ -381,7 +383,7 @@ def test_a_missing_alignment_is_refused_with_its_file_name(tmp_path: Path):
 
 def test_a_unit_of_length_0_is_refused():
     with pytest.raises(SceneError, match="0 metres long"):
-        Alignment(np.eye(4), "shell.ply", 0)
+        Alignment(np.eye(4), ("shell.ply",), 0)
 
 
 # Casting all views
@@ -390,7 +392,7 @@ def test_a_unit_of_length_0_is_refused():
 @pytest.fixture
 def alignment(tmp_path: Path) -> Alignment:
     save(tmp_path / "shell" / "box.ply", box())
-    return Alignment(np.eye(4), "shell/box.ply")
+    return Alignment(np.eye(4), ("shell/box.ply",))
 
 
 OPAQUE = Path(__file__).parents[2] / "docs/picture.jpg"
@@ -427,7 +429,7 @@ def test_maps_are_cast_at_the_requested_size(tmp_path: Path, alignment: Alignmen
 
 def test_the_maps_manifest_stores_the_scale_in_metres(tmp_path: Path):
     save(tmp_path / "shell" / "box.ply", ShellMesh(1000 * box().vertices, box().faces))
-    millimetres = Alignment(similarity(0.0005, np.eye(3), np.zeros(3)), "shell/box.ply", metres_per_shell_unit=0.001)
+    millimetres = Alignment(similarity(0.0005, np.eye(3), np.zeros(3)), ("shell/box.ply",), metres_per_shell_unit=0.001)
     cast(tmp_path, [view("images/x.jpg", camera_at([0, 0, -5]))], millimetres)
     assert CueMaps.open(tmp_path, "shell").manifest.metres_per_unit == pytest.approx(2)
 
@@ -464,7 +466,7 @@ def test_a_damaged_map_is_made_again(tmp_path: Path, alignment: Alignment):
 
 def test_all_maps_are_made_again_for_another_alignment(tmp_path: Path, alignment: Alignment):
     cast(tmp_path, VIEWS, alignment)
-    moved = Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shell)
+    moved = Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shells)
     assert cast(tmp_path, VIEWS, moved).cast == 5
     saved = Alignment.load(tmp_path / ALIGNMENT)
     assert saved.places_like(moved)
@@ -473,7 +475,7 @@ def test_all_maps_are_made_again_for_another_alignment(tmp_path: Path, alignment
 
 def test_maps_are_not_bound_to_another_alignment_than_they_are_cast_by(tmp_path: Path, alignment: Alignment):
     shell = PlacedShell.load(tmp_path, VIEWS, alignment)
-    Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shell).record(tmp_path / ALIGNMENT, VIEWS)
+    Alignment(similarity(1, np.eye(3), np.array([0, 0, 0.1])), alignment.shells).record(tmp_path / ALIGNMENT, VIEWS)
     with pytest.raises(SceneError, match=r"alignment\.json has changed since the shell was loaded"):
         cast_views(shell)
     assert not (tmp_path / "cues").exists()
@@ -481,7 +483,9 @@ def test_maps_are_not_bound_to_another_alignment_than_they_are_cast_by(tmp_path:
 
 def test_casting_with_the_same_alignment_keeps_its_file(tmp_path: Path, alignment: Alignment):
     kept = tmp_path / ALIGNMENT
-    kept.write_text(json.dumps({"shell_to_scene": np.eye(4).tolist(), "shell": alignment.shell, "residuals": [1, 2]}))
+    kept.write_text(
+        json.dumps({"shell_to_scene": np.eye(4).tolist(), "shell": alignment.shells[0], "residuals": [1, 2]})
+    )
     cast(tmp_path, VIEWS, alignment)
     assert json.loads(kept.read_text())["residuals"] == [1, 2]
 
@@ -489,7 +493,7 @@ def test_casting_with_the_same_alignment_keeps_its_file(tmp_path: Path, alignmen
 def test_a_shell_that_no_camera_sees_is_refused_before_anything_is_written(tmp_path: Path, alignment: Alignment):
     cast(tmp_path, VIEWS, alignment)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    behind = Alignment(similarity(1, np.eye(3), np.array([0, 0, -50.0])), alignment.shell)
+    behind = Alignment(similarity(1, np.eye(3), np.array([0, 0, -50.0])), alignment.shells)
     with pytest.raises(SceneError, match=r"no camera sees the shell .*box\.ply.*alignment"):
         cast(tmp_path, VIEWS, behind)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
@@ -506,9 +510,9 @@ def test_one_camera_that_sees_the_shell_is_enough(tmp_path: Path, alignment: Ali
 def test_units_off_by_a_factor_of_1000_cause_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: float):
     save(tmp_path / "shell" / "wall.ply", wall())
     views = [view(f"images/{k}.jpg", camera_at([k * 5.0, 0, 0])) for k in range(3)]
-    cast(tmp_path, views, Alignment(np.diag([1.0, 1, 1, 1]), "shell/wall.ply"))
+    cast(tmp_path, views, Alignment(np.diag([1.0, 1, 1, 1]), ("shell/wall.ply",)))
     assert "units" not in caplog.text
-    cast(tmp_path, views, Alignment(np.diag([scale, scale, scale, 1]), "shell/wall.ply"))
+    cast(tmp_path, views, Alignment(np.diag([scale, scale, scale, 1]), ("shell/wall.ply",)))
     assert "check the alignment's scale" in caplog.text
 
 

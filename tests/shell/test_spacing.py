@@ -73,8 +73,8 @@ def test_a_building_in_a_long_file_is_meshed_like_one_by_itself(tmp_path: Path, 
     assert areas(coarse, 7, 13)[1] > 0.3  # which the first reading closes in part
     assert alone.meshing
     assert fine.meshing
-    assert fine.meshing.spacing == pytest.approx(alone.meshing.spacing, rel=0.1)
-    assert fine.meshing.p95 < 1.2 * alone.meshing.p95 + 1e-3
+    assert fine.meshing[0].spacing == pytest.approx(alone.meshing[0].spacing, rel=0.1)
+    assert fine.meshing[0].p95 < 1.2 * alone.meshing[0].p95 + 1e-3
 
 
 def test_what_no_camera_sees_is_not_meshed_which_is_said(tmp_path: Path, few: None, caplog):
@@ -94,8 +94,8 @@ def test_voxels_that_must_be_larger_are_said(tmp_path: Path, few: None, monkeypa
     monkeypatch.setattr(spacing, "_FULL", 600)
     mesh = load_shell(saved(tmp_path / "street.xyz", street()), cameras=CAMERAS)
     assert mesh.meshing
-    assert 0.15 < mesh.meshing.voxel < 0.4
-    assert f"voxels of {mesh.meshing.voxel:.2g} m and not of 0.0" in caplog.text
+    assert 0.15 < mesh.meshing[0].voxel < 0.4
+    assert f"voxels of {mesh.meshing[0].voxel:.2g} m and not of 0.0" in caplog.text
 
 
 @pytest.mark.parametrize("metres_per_unit", [1.0, 0.001])
@@ -103,8 +103,8 @@ def test_a_spacing_is_in_metres(tmp_path: Path, metres_per_unit: float):
     path = saved(tmp_path / "street.xyz", street(0, 20) / metres_per_unit)
     mesh = load_shell(path, spacing=0.25, metres_per_unit=metres_per_unit)
     assert mesh.meshing
-    assert mesh.meshing.voxel * metres_per_unit == pytest.approx(0.25)
-    assert mesh.meshing.spacing * metres_per_unit == pytest.approx(0.25, rel=0.15)
+    assert mesh.meshing[0].voxel * metres_per_unit == pytest.approx(0.25)
+    assert mesh.meshing[0].spacing * metres_per_unit == pytest.approx(0.25, rel=0.15)
 
 
 def test_a_spacing_finer_than_the_cloud_changes_nothing(tmp_path: Path):
@@ -154,4 +154,4 @@ def test_another_spacing_is_meshed_again(tmp_path: Path):
         mesh = load_shell(path, cache=tmp_path, spacing=wanted)
         assert mesh.meshing == load_shell(path, cache=tmp_path, spacing=wanted).meshing
         assert mesh.meshing
-        assert wanted in (None, mesh.meshing.voxel)
+        assert wanted in (None, mesh.meshing[0].voxel)

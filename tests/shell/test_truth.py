@@ -70,27 +70,27 @@ def test_what_photographs_show_before_the_truth_is_left_out_of_it(scene, shellgs
 
 def test_it_is_told_how_much_of_the_shell_has_a_truth_and_how_far_apart_they_are(scene, shellgs, tmp_path):
     alignment = Alignment.load(scene / ALIGNMENT)
-    told = shellgs("cast", scene, "--truth", scene / alignment.shell)
+    told = shellgs("cast", scene, "--truth", alignment.files(scene)[0])
     assert "covers 100% of the shell" in told
     assert "0 m apart" in told
     shifted = alignment.shell_to_scene.copy()
     shifted[:3, 3] += 0.1 / alignment.metres_per_unit * shifted[:3, 1] / np.linalg.norm(shifted[:3, 1])
     np.save(tmp_path / "matrix.npy", shifted)
-    told = shellgs("cast", scene, "--truth", scene / alignment.shell, "--matrix", tmp_path / "matrix.npy")
+    told = shellgs("cast", scene, "--truth", alignment.files(scene)[0], "--matrix", tmp_path / "matrix.npy")
     assert float(told.split("the two are ")[1].split(" m apart")[0]) > 0.02
     assert Alignment.load(scene / ALIGNMENT) == alignment
 
 
 def test_a_truth_in_the_frame_of_the_shell_is_stale_once_the_shell_has_moved(scene, shellgs, tmp_path):
     alignment = Alignment.load(scene / ALIGNMENT)
-    survey = scene / alignment.shell
+    survey = alignment.files(scene)[0]
     np.save(tmp_path / "matrix.npy", alignment.shell_to_scene + np.diag([1e-6, 1e-6, 1e-6, 0]))
     moved = alignment.shell_to_scene.copy()
     moved[0, 3] += 0.01
 
     def read_after_the_move(*words: object) -> None:
         shellgs("cast", scene, "--truth", survey, *words)
-        Alignment(moved, alignment.shell).record(scene / ALIGNMENT, views_of(scene))
+        Alignment(moved, alignment.shells).record(scene / ALIGNMENT, views_of(scene))
         try:
             map_of(scene, "truth", views_of(scene)[0])
         finally:
@@ -111,7 +111,7 @@ def test_a_truth_in_the_frame_of_the_shell_is_stale_once_the_shell_has_moved(sce
 )
 def test_what_cannot_be_cast_as_truth_is_refused_and_nothing_changes(scene, shellgs, words, why):
     before = (scene / "cues/truth/manifest.json").read_bytes()
-    shell = scene / Alignment.load(scene / ALIGNMENT).shell
+    (shell,) = Alignment.load(scene / ALIGNMENT).files(scene)
     said = shellgs("cast", scene, *[word.format(shell=shell) for word in words])
     assert said.startswith("refused: ")
     assert why in said

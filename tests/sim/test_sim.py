@@ -444,6 +444,15 @@ def test_a_deviation_is_of_the_class_of_the_shell_there():
     assert [region.part for region in found.regions] == [SurfaceClass(classes[k]).word for k in hit.triangle]
 
 
+def test_a_deviation_is_of_one_file_of_the_shell():
+    flat, built = shell_and_bump()
+    fine = Triangles(*trimesh.remesh.subdivide_to_size(flat.vertices, flat.faces, 0.2, max_iter=20))
+    sources = (fine.centres[:, 0] > 0.6).astype(np.int64)  # the bump is from 0.2 to 1
+    names = ["left.ply", "right.ifc"]
+    found = find_deviations(fine, built, [("b.jpg", frontal(0.6))], 0.05, sources=sources, files=names)
+    assert {region.file: region.centre[0] > 0.6 for region in found.regions} == {"left.ply": False, "right.ifc": True}
+
+
 def test_the_memory_of_deviations_does_not_grow_with_the_photographs():
     flat, built = shell_and_bump()
     peaks = []

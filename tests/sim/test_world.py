@@ -394,7 +394,7 @@ def test_the_world_stands_whichever_axis_of_the_shell_is_up(scene, tmp_path, up)
     trimesh.Trimesh(vertices, upright.faces, process=False).export(scene / "shell" / "turned.obj", digits=9)
     motion[:3, 3] = -motion[:3, :3] @ upright.centre
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(motion @ SHELL_FROM_BUILDING)
-    cast(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment(matrix, "shell/turned.obj"))
+    cast(scene, read_views(FacadeDataParserConfig(data=scene)), Alignment(matrix, ("shell/turned.obj",)))
     trainer = trainer_of(scene, tmp_path / "run", "shellgs_metric", iterations=2)
     trainer.train()
     trainer.save_checkpoint(2)

@@ -18,7 +18,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.shell import Alignment
-from shellgs_method.shell.mesh import load_shell
+from shellgs_method.shell.loading import load_shell
 from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.synthetic import FacadeConfig, write_scene
 from shellgs_method.synthetic.appearance import rays
@@ -170,7 +170,7 @@ def test_shell_has_less_detail_than_the_building(facade):
 def test_stored_shell_agrees_with_the_truth_on_its_surfaces(scene):
     """Georeferenced file, alignment and cameras against the true maps: most pixels within 0.1 mm."""
     alignment = Alignment.load(scene / "shell" / "alignment.json")
-    mesh = load_shell(scene / alignment.shell)
+    mesh = load_shell(scene / alignment.shells[0])
     assert mesh.bounds.min() > 1e2
     caster, truth = ShellCaster(mesh, alignment.shell_to_scene), CueMaps.open(scene, "truth")
     assert alignment.metres_per_unit == pytest.approx(1 / UNITS_PER_METRE)
