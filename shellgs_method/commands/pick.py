@@ -15,7 +15,7 @@ from shellgs_method.errors import SceneError
 
 def pick(
     scene: Scene,
-    shell: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHELL")],
+    shell: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SHELL ...")],
     picks: Path = Path("picks.txt"),
     metres_per_shell_unit: float = 1.0,
     crs: Optional[str] = None,
@@ -29,7 +29,7 @@ def pick(
 
     Args:
         scene: Scene folder.
-        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates.
         picks: File of picks, written and read back.
         metres_per_shell_unit: Length of the shell's unit in metres.
         crs: Coordinate reference system of the shell, such as EPSG:25832, to which a file of picks in another one is
@@ -45,21 +45,23 @@ def pick(
     from dataparsers.facade import read_views
     from shellgs_method.errors import check_output
     from shellgs_method.files.crs import crs_of, given_crs
-    from shellgs_method.picking.scan import open_scan
+    from shellgs_method.picking.scan import Scan
     from shellgs_method.picking.server import PickServer
     from shellgs_method.picking.session import Session
     from shellgs_method.registration.frames import ShellPlace
 
+    if not shell:
+        raise SceneError(f"name the shell's file: shellgs pick {scene} scan.ply")
     check_output(picks)
     views = read_views(paths.of(scene).unadjusted())
     if len(views) < 2:
         raise SceneError(f"{scene} has {len(views)} photograph, and a point is picked in two or more")
     with PickServer(port) as server:
-        place = ShellPlace(shell)
-        session = Session(picks, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(shell))
+        place = ShellPlace(*shell)
+        session = Session(picks, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(*shell))
         if session.state.picks:
             place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")
-        scan = open_scan(place)
+        scan = Scan(shell, place)
         console.print(f"Pick in a browser: {server.url} (Ctrl-C or the page's button ends it).", highlight=False)
         if open:
             webbrowser.open(server.url)
@@ -71,10 +73,10 @@ def pick(
         return
     options = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
     options += f" --crs {shlex.quote(crs)}" if crs else ""
-    names = [shlex.quote(str(path)) for path in (scene, shell, picks)]
+    files = " ".join(shlex.quote(str(path)) for path in (scene, *shell))
     console.print(
         f"{fit['used']} of {fit['of']} picks are used; their residual is {fit['rms']:.3f} m (root mean square).\n"
-        f"Next: shellgs align {names[0]} {names[1]} --picks {names[2]}{options}",
+        f"Next: shellgs align {files} --picks {shlex.quote(str(picks))}{options}",
         highlight=False,
         soft_wrap=True,
     )

@@ -68,7 +68,7 @@ class PickServer(ThreadingHTTPServer):
     def about(self) -> dict[str, Any]:
         """What the page shows and does not change."""
         scan, views = self.scan, self.session.views
-        about = {name: getattr(scan, name) for name in ("size", "spacing", "up", "out")}
+        about = {"size": scan.size, "up": scan.up, "out": scan.out, "spacing": scan.cloud.spacing if scan.cloud else 0}
         photographs = [(view.name, *upright_size(view)) for view in views]
         return about | {"photographs": photographs, "server": self._number}
 
@@ -132,13 +132,15 @@ class _Answers(BaseHTTPRequestHandler):
             self._answer_json(self.server.about())
         elif url.path == "/said":
             self._answer_json(self.server.said())
-        elif url.path == "/points":
-            self._answer(scan.points.astype("<f4").tobytes())
+        elif url.path == "/vertices":
+            self._answer(scan.mesh.vertices.astype("<f4").tobytes() if scan.mesh else b"")
         elif url.path == "/faces":
-            self._answer(scan.faces.astype("<u4").tobytes())
-        elif url.path == "/detail":
+            self._answer(scan.mesh.faces.astype("<u4").tobytes() if scan.mesh else b"")
+        elif url.path == "/points":
+            self._answer(scan.cloud.points.astype("<f4").tobytes() if scan.cloud else b"")
+        elif url.path == "/detail" and scan.cloud:
             centre = np.array([numbers[axis] for axis in "xyz"])
-            self._answer(scan.detail(centre, numbers["radius"]).astype("<f4").tobytes())
+            self._answer(scan.cloud.detail(centre, numbers["radius"]).astype("<f4").tobytes())
         elif url.path == "/image":
             number, _ = int(numbers.pop("number")), numbers.pop("server", None)
             content = self.server.image(number, **numbers)

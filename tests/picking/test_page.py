@@ -16,7 +16,7 @@ from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.spread import spread
-from shellgs_method.picking.scan import open_scan
+from shellgs_method.picking.scan import Scan
 from shellgs_method.picking.server import PickServer
 from shellgs_method.picking.session import Session
 from shellgs_method.registration.frames import ShellPlace
@@ -89,14 +89,14 @@ def test_six_corners_clicked_in_three_photographs_align_the_shell(tmp_path: Path
     scene = tmp_path / "scene"
     write_scene(scene, FacadeConfig(width=480, height=270, views=24, points=300, supersampling=1))
     truth = Alignment.load(scene / ALIGNMENT)
-    views, vertices = read_views(FacadeDataParserConfig(data=scene)), load_shell(scene / truth.shell).vertices
+    views, vertices = read_views(FacadeDataParserConfig(data=scene)), load_shell(scene / truth.shells[0]).vertices
     windows, corners = Layout(6, 3).openings, []
     for bay, storey, corner in CORNERS:
         window = windows[6 * storey + bay]
         corners.append(((window.x0, window.x1)[corner % 2], 0.0, (window.z0, window.z1)[corner // 2]))
     corners = transformed(np.array(corners), SHELL_FROM_BUILDING)
-    picks, place = tmp_path / "picks.txt", ShellPlace(scene / truth.shell)
-    session, scan = Session(picks, views), open_scan(place)
+    picks, place = tmp_path / "picks.txt", ShellPlace(scene / truth.shells[0])
+    session, scan = Session(picks, views), Scan([scene / truth.shells[0]], place)
     with PickServer(0) as server:
         Thread(target=server.serve, args=(session, scan), daemon=True).start()
         page = browser.new_page(viewport=PAGE)
@@ -118,7 +118,7 @@ def test_six_corners_clicked_in_three_photographs_align_the_shell(tmp_path: Path
     nearest = [np.linalg.norm(vertices - corner, axis=1).argmin() for corner in corners]
     np.testing.assert_array_equal([pick.shell for pick in read], vertices[nearest])  # to the last bit
     assert [len(pick.pixels) for pick in read] == [3] * 6
-    assert "6 of 6 picks are used" in shellgs("align", scene, scene / truth.shell, "--picks", picks)
+    assert "6 of 6 picks are used" in shellgs("align", scene, scene / truth.shells[0], "--picks", picks)
     found = Alignment.load(scene / ALIGNMENT)
     off = np.linalg.norm(found.apply(vertices) - truth.apply(vertices), axis=1) * truth.metres_per_unit
     print(f"the shell is {100 * off.mean():.2f} cm from the truth in the mean, {100 * off.max():.2f} cm at most")

@@ -10,7 +10,7 @@ import trimesh
 from scenes import house, scan
 
 from shellgs_method.picking import scan as module
-from shellgs_method.picking.scan import Blocks, CloudScan, MeshScan, Scan, open_scan, thinned
+from shellgs_method.picking.scan import Blocks, Scan, thinned
 from shellgs_method.registration.frames import ShellPlace
 
 NATIONAL = np.array([412_346.123456789, 5_123_457.987654321, 214.000000001])
@@ -21,8 +21,8 @@ def national(*point: float) -> np.ndarray:
     return NATIONAL + np.array(point)
 
 
-def opened(path: Path) -> Scan:
-    return open_scan(ShellPlace(path))
+def opened(*paths: Path) -> Scan:
+    return Scan(paths, ShellPlace(*paths))
 
 
 def written(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -> Path:
@@ -88,7 +88,6 @@ def test_beside_the_scan_nothing_is_picked(mesh):
 def test_a_point_of_a_cloud_is_picked_as_it_is_in_the_file(tmp_path: Path):
     points = scan(60_000) + NATIONAL
     cloud = opened(written(tmp_path / "cloud.ply", points))
-    assert isinstance(cloud, CloudScan)
     eye = national(0.5, 0.3, -8)
     for at in (national(2, 1, 0), national(-2.5, -1.5, 0), national(-1, 0.8, 0)):
         found = cloud.pick(*aimed(cloud, at, eye), REACH)
@@ -137,7 +136,8 @@ def test_detail_is_of_the_file_and_not_too_much(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(module, "DETAIL", 500)
     points = scan(20_000) + NATIONAL
     cloud = opened(written(tmp_path / "cloud.ply", points))
-    detail = cloud.detail(national(2, 1, 0) - cloud.middle, 0.9)
+    assert cloud.cloud is not None
+    detail = cloud.cloud.detail(national(2, 1, 0) - cloud.middle, 0.9)
     assert 250 < len(detail) <= 500
     inside = np.linalg.norm(points - NATIONAL - [2, 1, 0], axis=1) <= 0.9
     nearest = np.abs(points[inside][:, None] - cloud.middle - detail[None]).max(axis=2).min(axis=0)
@@ -154,7 +154,6 @@ def test_a_mesh_is_drawn_thinned_and_picked_whole(tmp_path: Path, monkeypatch):
     assert {*map(tuple, points.tolist())} <= {*map(tuple, vertices.tolist())}
     assert trimesh.Trimesh(points - NATIONAL, faces).area == pytest.approx(ball.area, rel=0.1)
     scan = opened(written(tmp_path / "ball.ply", vertices, ball.faces))
-    assert isinstance(scan, MeshScan)
     eye = national(0, -20.0, 3)
     found = scan.pick(*aimed(scan, national(1, -4, 2), eye), REACH)
     assert (vertices == found).all(axis=1).any()
@@ -168,3 +167,21 @@ def test_a_scan_is_looked_at_from_its_front(mesh, tmp_path: Path):
     house().export(path)
     assert opened(path).up.tolist() == [0, 1, 0]
     assert abs(opened(path).out[2]) > 0.99
+
+
+def test_of_several_files_the_one_in_front_is_picked(tmp_path: Path):
+    box, wall = house(), np.append(np.random.default_rng(0).uniform(-3, 3, (9000, 2)), np.full((9000, 1), -2.0), axis=1)
+    files = [
+        written(tmp_path / "house.ply", box.vertices + NATIONAL, box.faces),
+        written(tmp_path / "wall.ply", wall + NATIONAL),
+        written(tmp_path / "next.ply", box.vertices + national(20, 0, 0), box.faces),
+    ]
+    both = opened(*files)
+    at = national(2, 0.5, 0)
+    for eye, depth in ((national(2, 0, -1), 0), (national(2, 0, -4), -2)):
+        found = both.pick(*aimed(both, at, eye), 0.05)
+        assert found is not None
+        assert found[2] - NATIONAL[2] == pytest.approx(depth, abs=1e-5)
+    found = both.pick(*aimed(both, national(22, 0.5, 0), national(22, 0, -4)), REACH)
+    assert found is not None
+    np.testing.assert_allclose(found, national(22, 0.5, 0), atol=1e-5)

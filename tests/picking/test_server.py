@@ -20,7 +20,7 @@ from PIL import Image
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import project
-from shellgs_method.picking.scan import open_scan
+from shellgs_method.picking.scan import Scan
 from shellgs_method.picking.server import PickServer
 from shellgs_method.picking.session import Session
 from shellgs_method.registration.frames import ShellPlace
@@ -52,8 +52,8 @@ def free_port() -> int:
 @pytest.fixture
 def server(scene: Path) -> Iterator[PickServer]:
     views = read_views(FacadeDataParserConfig(data=scene))
-    place = ShellPlace(scene / Alignment.load(scene / ALIGNMENT).shell)
-    session, scan = Session(scene / "picks.txt", views), open_scan(place)
+    shell = scene / "shell/facade.ply"
+    session, scan = Session(scene / "picks.txt", views), Scan([shell], ShellPlace(shell))
     with PickServer(0) as server:
         Thread(target=server.serve, args=(session, scan), daemon=True).start()
         get(f"{server.url}/about")  # it serves
@@ -64,8 +64,8 @@ def server(scene: Path) -> Iterator[PickServer]:
 def clicked(url: str, scene: Path, count: int = 4) -> None:
     """Pick vertices of the shell that two views see: by rays in the scan, and where they are in the photographs."""
     alignment, views = Alignment.load(scene / ALIGNMENT), read_views(FacadeDataParserConfig(data=scene))
-    vertices = load_shell(scene / alignment.shell).vertices
-    middle = ShellPlace(scene / alignment.shell).middle
+    vertices = load_shell(scene / "shell/facade.ply").vertices
+    middle = ShellPlace(scene / "shell/facade.ply").middle
     eye = np.linalg.solve(alignment.shell_to_scene, [*views[4].camera.position.tolist(), 1.0])[:3]
     picked: list[np.ndarray] = []
     for vertex in vertices[np.random.default_rng(0).permutation(len(vertices))]:
@@ -91,7 +91,7 @@ def _shows(view: View, point: np.ndarray) -> bool:
 
 
 def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callable[..., str], free_port: int):
-    url, shell = f"http://127.0.0.1:{free_port}", scene / Alignment.load(scene / ALIGNMENT).shell
+    url, shell = f"http://127.0.0.1:{free_port}", scene / "shell/facade.ply"
 
     def user() -> None:
         for _ in range(600):
@@ -139,7 +139,7 @@ def test_a_step_that_cannot_be_taken_changes_nothing(server: PickServer):
 
 def test_the_page_gets_the_scan_relative_to_its_middle(server: PickServer):
     mesh = load_shell(server.session.path.parent / "shell/facade.ply")
-    points = np.frombuffer(get(f"{server.url}/points"), "<f4").reshape(-1, 3)
+    points = np.frombuffer(get(f"{server.url}/vertices"), "<f4").reshape(-1, 3)
     np.testing.assert_allclose(points + server.scan.middle, mesh.vertices, atol=1e-4)
     np.testing.assert_array_equal(np.frombuffer(get(f"{server.url}/faces"), "<u4").reshape(-1, 3), mesh.faces)
 
