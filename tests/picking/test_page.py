@@ -123,3 +123,58 @@ def test_six_corners_clicked_in_three_photographs_align_the_shell(tmp_path: Path
     off = np.linalg.norm(found.apply(vertices) - truth.apply(vertices), axis=1) * truth.metres_per_unit
     print(f"the shell is {100 * off.mean():.2f} cm from the truth in the mean, {100 * off.max():.2f} cm at most")
     assert off.max() < 0.015
+
+
+def test_the_mouse_turns_zooms_sets_removes_and_undoes(scene: Path, browser: Any):
+    views, shell = read_views(FacadeDataParserConfig(data=scene)), scene / "shell/facade.ply"
+    picks = scene / "picks.txt"
+    session, scan = Session(picks, views), Scan([shell], ShellPlace(shell))
+    with PickServer(0) as server:
+        Thread(target=server.serve, args=(session, scan), daemon=True).start()
+        page = browser.new_page(viewport=PAGE)
+        page.on("pageerror", lambda error: pytest.fail(str(error)))
+        page.goto(server.url)
+        page.wait_for_function("said && photo.image && !waiting")
+        hand, mouse = Hand(page, views), page.mouse
+        box = page.locator("#marks").bounding_box()
+        x, y = 0.4 * box["width"], 0.5 * box["height"]
+        under = page.evaluate("([x, y]) => surfaceAt(x, y)", [x, y])
+        eye = page.evaluate("frame().eye")
+        mouse.move(box["x"] + x, box["y"] + y)
+        mouse.wheel(0, -120)
+        page.wait_for_function("!waiting && last.c.eye.join() == frame().eye.join()")
+        nearer = page.evaluate("frame().eye")
+        assert np.linalg.norm(np.subtract(nearer, under)) < 0.9 * np.linalg.norm(np.subtract(eye, under))
+        mouse.down()
+        mouse.move(box["x"] + x + 80, box["y"] + y + 30, steps=4)
+        mouse.up()
+        # What was under the mouse is still there, seen from elsewhere, and nothing was picked.
+        np.testing.assert_allclose(page.evaluate("onScreen", under), [x, y], atol=0.5)
+        assert np.linalg.norm(np.subtract(page.evaluate("frame().eye"), nearer)) > 1
+        assert not hand.said()["points"]
+        ups = []
+        for _ in range(6):
+            page.locator("#up").click()
+            ups.append(page.locator("#up").inner_text().removeprefix("Up: "))
+        assert ups == ["y", "x", "−z", "−y", "−x", "z"]
+        page.wait_for_function("!waiting")
+        vertex = load_shell(shell).vertices[0] - scan.middle
+        hand.click_scan(vertex)
+        assert hand.said()["active"] == "p1"
+        hand.click_photograph(views[2], np.array([20.0, 11.0]))
+        hand.click_photograph(views[5], np.array([30.0, 15.0]))
+        assert hand.said()["points"][0]["pixels"][views[5].name] == pytest.approx([30, 15], abs=0.05)
+        spot = page.locator("#picture").bounding_box()
+        mouse.click(spot["x"] + 200, spot["y"] + 100, button="right")  # removed in the photograph that is open
+        assert list(hand.said()["points"][0]["pixels"]) == [views[2].name]
+        page.locator("#undo").click()
+        assert len(hand.said()["points"][0]["pixels"]) == 2
+        page.get_by_role("button", name="leave out").click()
+        assert hand.said()["points"][0]["left_out"]
+        assert picks.read_text().count("# ") == 3  # the heading, and the point's two lines
+        page.keyboard.press("Control+z")
+        assert not hand.said()["points"][0]["left_out"]
+        page.get_by_role("button", name="×").click()
+        assert not hand.said()["points"]
+        page.close()
+        server.shutdown()
