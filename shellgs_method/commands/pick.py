@@ -53,6 +53,7 @@ def pick(
     if not shell:
         raise SceneError(f"name the shell's file: shellgs pick {scene} scan.ply")
     check_output(picks)
+    picks.parent.mkdir(parents=True, exist_ok=True)
     views = read_views(paths.of(scene).unadjusted())
     if len(views) < 2:
         raise SceneError(f"{scene} has {len(views)} photograph, and a point is picked in two or more")
@@ -67,7 +68,11 @@ def pick(
             webbrowser.open(server.url)
         with suppress(KeyboardInterrupt):
             server.serve(session, scan)
-    fit = session.said()["fit"]
+    said = session.said()
+    for point in said["points"]:
+        if point["problem"] and not point["left_out"]:
+            console.print(f"[yellow]{point['problem']}.", highlight=False, soft_wrap=True)
+    fit = said["fit"]
     if "problem" in fit:
         console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
         return

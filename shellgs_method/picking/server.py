@@ -15,7 +15,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 from PIL import Image
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, explained
 from shellgs_method.files.html import encoded
 from shellgs_method.files.photographs import load_upright, upright_size
 from shellgs_method.picking.scan import Scan
@@ -157,6 +157,8 @@ class _Answers(BaseHTTPRequestHandler):
             self._answer_json(self.server.step(**json.loads(content)))
         except SceneError as error:
             self._answer_json({"error": str(error)}, 400)
+        except OSError as error:  # a full disk: the next step writes all points again
+            self._answer_json({"error": explained(error)}, 400)
 
     def _answer_json(self, content: dict[str, Any], status: int = 200) -> None:
         text = json.dumps(content, default=np.ndarray.tolist)

@@ -192,7 +192,8 @@ class Session:
         """The similarity by :func:`align_picks`, and each point by name; those that are left out are measured."""
         if not picks:
             raise SceneError("0 picks can be trusted, at least 3 are needed (6 or more are better)")
-        called = {f"check {pick.name}" if pick.name in self.state.left_out else pick.name: pick for pick in picks}
+        measured = self.state.left_out  # as check points, under names that no file can hold
+        called = {f"check\n{pick.name}" if pick.name in measured else pick.name: pick for pick in picks}
         renamed = [replace(pick, name=name) for name, pick in called.items()]
         matrix, points = align_picks(renamed, self.views, self._metres)
         return matrix, {called[point.name].name: point for point in points}

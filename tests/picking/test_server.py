@@ -24,6 +24,7 @@ from shellgs_method.picking.scan import Scan
 from shellgs_method.picking.server import PickServer
 from shellgs_method.picking.session import Session
 from shellgs_method.registration.frames import ShellPlace
+from shellgs_method.registration.picks import read_picks
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
 
@@ -163,3 +164,13 @@ def test_the_page_is_whole(server: PickServer):
     page = get(f"{server.url}/").decode()
     assert page.startswith("<!doctype html>")
     assert "://" not in page
+
+
+def test_a_file_that_cannot_be_written_is_said_and_written_at_the_next_step(server: PickServer):
+    path = server.session.path
+    server.session.path = path / "below" / "picks.txt"
+    said = post(server.url, do="add", ray=[[0, 0, 99], [0, 0, -1], 0])
+    assert said["error"].endswith("cannot be used: no such file or directory")
+    server.session.path = path
+    clicked(server.url, path.parent, 3)
+    assert len(read_picks(path, server.session.views)) == 3
