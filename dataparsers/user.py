@@ -16,4 +16,4 @@ def name_the_user() -> None:
     try:
         getpass.getuser()
     except (ImportError, KeyError, OSError):  # by the version of Python
-        os.environ["LOGNAME"] = f"uid_{os.getuid()}"
+        os.environ["LOGNAME"] = f"uid_{os.getuid()}" if hasattr(os, "getuid") else "user"

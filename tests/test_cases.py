@@ -27,7 +27,27 @@ pytestmark = [
 
 WORKS = r"views cast|Verdict: (good|doubtful)|confirm what is green|Printing profiling stats|difference \d"
 """What a command says that went through."""
-CRASH = re.compile(r"Traceback \(most recent|Aborted|Segmentation fault|core dumped|terminate called")
+MOVED = """
+import importlib, importlib.abc, importlib.util, sys
+
+class Moved(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    names = {
+        "dataparsers.cue_maps": "shellgs_method.files.cue_maps",
+        "dataparsers.photograph": "shellgs_method.files.photographs",
+    }
+    def find_spec(self, name, path, target=None):
+        return importlib.util.spec_from_loader(name, self) if name in self.names else None
+    def create_module(self, spec):
+        return importlib.import_module(self.names[spec.name])
+    def exec_module(self, module):
+        pass
+
+sys.meta_path.insert(0, Moved())
+"""
+"""Modules by the names that the cases know them by."""
+CRASH = re.compile(
+    r"Traceback \(most recent|Aborted|Segmentation fault|core dumped|terminate called|ModuleNotFoundError"
+)
 NEAR = 0.005
 """Largest difference in metres, at the 95th percentile, of maps that are the same."""
 MESHED = 0.4
@@ -41,7 +61,7 @@ def refused(why: str) -> str:
 
 RIGHT: dict[str, dict[str, str | float]] = {
     "01-images-txt-without-blank-lines": {"cast": r"10 views cast"},
-    "02-small-first-model": {"": r"sparse/1, the largest, is used.*(\n.*)*2 of 10 photographs"},
+    "02-small-first-model": {"ns-train": WORKS, "": r"sparse/1, the largest, is used.*(\n.*)*2 of 10 photographs"},
     "04-e57-phantom-zeros": {"s-ordinary ": WORKS, "cast": r"left out \d+ of \d+ points"},
     "06-glb-compressed": {
         "draco.glb": refused("KHR_draco_mesh_compression"),
@@ -56,9 +76,9 @@ RIGHT: dict[str, dict[str, str | float]] = {
     },
     "08-gcp-in-degrees": {"ordinary.txt": WORKS, "": refused("in degrees")},
     "09-gcp-text-forms": {
-        r"/(ordinary|bom|tabs|apostrophe|geo-ordinary)\.txt": WORKS,
+        r"/(ordinary|bom|tabs|apostrophe|case|stem|geo-ordinary|geo-case)\.txt": WORKS,
         "utf16": refused("save it as UTF-8"),
-        r"/(case|stem|windows)\.txt": refused("line 1: .* is not a photograph of the scene"),
+        r"/windows\.txt": refused("line 1: .* is not a photograph of the scene"),
         "": refused(r"expected|is not a photograph|name no photograph|photographs?"),
     },
     "10-masks": {
@@ -67,7 +87,8 @@ RIGHT: dict[str, dict[str, str | float]] = {
         "(onlyone|typo)": r"no mask in|views cast",
     },
     "12-heic": {
-        "(allheic|mixed) ": refused("cameras of only 0 of 10 photographs were found"),  # read, and too small for SfM
+        # Read, and too small for SfM, or nearly.
+        "(allheic|mixed) ": r"cameras of only \d of 10 photographs were found|[6-9] of 10 photographs registered",
         "raw": refused("are raw photographs"),
         "videos": refused("there are no photographs"),
     },
@@ -114,11 +135,11 @@ class Outcome:
     @property
     def fault(self) -> str:
         """What is wrong; empty if nothing is."""
+        if CRASH.search(self.text):
+            return "crash"
         if isinstance(self.right, float):
             off = self.difference
             return f"maps are {off} m off" if off is not None and not off <= self.right else ""
-        if CRASH.search(self.text):
-            return "crash"
         return "" if re.search(str(self.right), self.text) else f"does not say {self.right!r}"
 
     @property
@@ -149,7 +170,12 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("case", sorted(path.parent.name for path in CASES.glob("*/run.sh")))
 def test_each_input_works_or_is_refused_by_the_cause(demo, tmp_path, case):
-    environment = os.environ | {"VENV": sys.prefix, "LIMIT": "600"}
+    (tmp_path / "sitecustomize.py").write_text(MOVED)
+    environment = os.environ | {
+        "VENV": sys.prefix,
+        "LIMIT": "600",
+        "EXTRA": f"{tmp_path}:{os.environ.get('EXTRA', '')}",
+    }
     done = subprocess.run(
         ["sh", CASES / case / "run.sh", demo, tmp_path / "work"], env=environment, capture_output=True, text=True
     )

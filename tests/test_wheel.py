@@ -29,7 +29,10 @@ def test_a_wheel_runs_the_demo_outside_the_repository(tmp_path):
     for name in ("method_configs.py", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     pip = (sys.executable, "-m", "pip")
-    run(*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", tmp_path, source, cwd=tmp_path)
+    build = "from setuptools.build_meta import build_sdist; build_sdist('..')"
+    run(sys.executable, "-c", build, cwd=source)
+    (archive,) = tmp_path.glob("shellgs-*.tar.gz")  # the wheel is built from what the source distribution holds
+    run(*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", tmp_path, archive, cwd=tmp_path)
     run(sys.executable, "-m", "venv", "--without-pip", venv, cwd=tmp_path)
     (wheel,) = tmp_path.glob("shellgs-*.whl")
     run(*pip, "--python", venv, "install", "--no-deps", "--no-index", wheel, cwd=tmp_path)

@@ -95,7 +95,8 @@ def cast(
     start = time.monotonic()
     placed = PlacedShell.load(scene, views, aligned)
     for meshing in placed.mesh.meshing:
-        console.print(f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}: {meshing}")
+        where = f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}"
+        console.print(f"{where}: {meshing}", soft_wrap=True)
     aligned.record(scene / ALIGNMENT, views)
     summary = cast_views(placed, max_image_size=max_image_size, flags=paths.flags)
     seconds = time.monotonic() - start

@@ -26,12 +26,7 @@ def sim(
         paths: config.yml of each run, then the output folder.
         settings: Settings.
     """
-    from shellgs_method.machine.extras import import_extra
-    from shellgs_method.sim.trials.engine import import_mujoco
-
-    import_mujoco()
-    for module, package in _PACKAGES.items():  # fail before hours of work
-        import_extra(module, package, "sim", "`shellgs sim`")
+    check_packages()  # fail before hours of work
     from shellgs_method.sim.simulate import simulate
 
     def report(sentence: str) -> None:
@@ -42,3 +37,17 @@ def sim(
     for sentence in metrics["summary"]:
         report(sentence)
     console.print(f"{out / 'README.md'} says how to load it, {out / 'report.html'} how accurate it is.")
+
+
+def check_packages() -> None:
+    """Import what assets are made with.
+
+    Raises:
+        SceneError: a package is not installed.
+    """
+    from shellgs_method.machine.extras import import_extra
+    from shellgs_method.sim.trials.engine import import_mujoco
+
+    import_mujoco()
+    for module, package in _PACKAGES.items():
+        import_extra(module, package, "sim", "`shellgs sim`")

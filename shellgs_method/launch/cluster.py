@@ -201,6 +201,8 @@ def _own_folder() -> Path:
     Raises:
         SceneError: the folder belongs to somebody else, or others can write to it.
     """
+    if not hasattr(os, "getuid"):  # Windows, where each user has a temporary folder of their own
+        return Path(tempfile.gettempdir()) / "shellgs"
     root = Path(tempfile.gettempdir()) / f"shellgs-{os.getuid()}"
     root.mkdir(mode=stat.S_IRWXU, exist_ok=True)
     found = root.lstat()

@@ -10,6 +10,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from shellgs_method.machine.progress import tell_imports
@@ -41,9 +42,14 @@ def _main() -> None:
     for name, *words in commands:
         sys.stdout.write(heading([name, *words]))
         sys.stdout.flush()
-        sys.argv = [str(scripts / name), *words]
+        script = scripts / name
+        sys.argv = [str(script), *words]
         try:
-            runpy.run_path(sys.argv[0], run_name="__main__")
+            if script.is_file():
+                runpy.run_path(sys.argv[0], run_name="__main__")
+            else:  # Windows, whose scripts are programs
+                (entry,) = entry_points(group="console_scripts", name=name)
+                entry.load()()
         except SystemExit as end:
             if end.code:
                 raise

@@ -1,0 +1,118 @@
+"""`shellgs run`: all steps in one command, which goes on where it stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shellgs_method.commands import run as run_command
+from shellgs_method.commands.run import Recipe
+from shellgs_method.shell import ALIGNMENT, Alignment
+
+
+@pytest.fixture
+def inputs(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """A scene with cameras and without an alignment, and in the working folder: photographs, the shell, its matrix."""
+    alignment = Alignment.load(scene / ALIGNMENT)
+    np.savetxt(tmp_path / "matrix.txt", alignment.shell_to_scene, fmt="%.17g")
+    (shell,) = alignment.files(scene)
+    shell.rename(tmp_path / "shell.ply")
+    (scene / ALIGNMENT).unlink()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_command, "open_page", lambda page: print("opened", page))
+    return [scene / "images", Path("shell.ply"), Path("matrix.txt")]
+
+
+@pytest.fixture
+def ends_with_the_cast(monkeypatch: pytest.MonkeyPatch) -> None:
+    def cast(scene, max_image_size):
+        raise SystemExit("cast")
+
+    monkeypatch.setattr(run_command, "cast", cast)
+
+
+def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
+    photographs, shell, matrix = inputs
+    words = ["--matrix", matrix, "--iterations", 3, "--method", "photo-gs", "--max-image-size", 32]
+    told = shellgs("run", photographs, shell, *words, "--accept")
+    assert "5 of 5: mesh" in told
+    mesh = Path("scene-results/mesh.ply")
+    written = mesh.stat().st_mtime_ns
+    assert Path("scene-results/report.html").is_file()
+    again = shellgs("run")
+    assert "1 of 1 runs are already finished" in again
+    assert "0 views cast" in again
+    assert "triangles" not in again  # no second mesh
+    assert mesh.stat().st_mtime_ns == written
+
+
+@pytest.mark.usefixtures("ends_with_the_cast")
+def test_a_proposal_stops_the_run_until_it_is_accepted(inputs, shellgs, monkeypatch):
+    photographs, shell, _ = inputs
+    calls = []
+
+    def align(scene, shell=(), accept=False, **settings):
+        calls.append(accept)
+        if accept:
+            Alignment(np.eye(4), ("shell.ply",), verdict="doubtful").save(scene / ALIGNMENT)
+
+    monkeypatch.setattr(run_command, "align", align)
+    assert "is a proposal: if the images in scene/shell/report/index.html agree" in shellgs("run", photographs, shell)
+    assert "is a proposal" in shellgs("run")
+    assert calls == [False]  # not proposed again
+    assert shellgs("run", "--accept") == "refused: cast"
+    assert shellgs("run") == "refused: cast"
+    assert calls == [False, True]
+
+
+@pytest.mark.usefixtures("ends_with_the_cast")
+def test_a_doubtful_alignment_stops_the_run_and_changed_settings_void_what_was_accepted(inputs, shellgs, monkeypatch):
+    photographs, shell, matrix = inputs
+    calls, align = [], run_command.align
+    monkeypatch.setattr(run_command, "align", lambda *words, **settings: [calls.append(1), align(*words, **settings)])
+    assert "the alignment is doubtful" in shellgs("run", photographs, shell, "--matrix", matrix)
+    assert Alignment.load(Path("scene") / ALIGNMENT).verdict == "doubtful"  # of a fixture so small
+    assert "the alignment is doubtful" in shellgs("run")
+    assert shellgs("run", "--accept") == "refused: cast"
+    assert shellgs("run") == "refused: cast"
+    assert len(calls) == 1
+    far = np.loadtxt(matrix)
+    far[:3, 3] += 0.002 * far[:3, 1] / np.linalg.norm(far[:3, 1])
+    np.savetxt(matrix, far, fmt="%.17g")
+    assert "the alignment is doubtful" in shellgs("run")
+    assert len(calls) == 2
+
+
+def test_settings_are_read_as_they_were_written_wherever_the_folder_is(tmp_path):
+    recipe = Recipe((tmp_path / "walk by.mp4", Path("/elsewhere/scan.ply")), picks=tmp_path / "p#.txt", refine=0.3,
+                    same_frame=True, crs="EPSG:25832", iterations=12)  # fmt: skip
+    recipe.save(tmp_path / "scene.run")
+    assert Recipe.load(tmp_path / "scene.run") == recipe
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    (tmp_path / "scene.run").rename(moved / "scene.run")
+    assert Recipe.load(moved / "scene.run").sources == (moved / "walk by.mp4", Path("/elsewhere/scan.ply"))
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ([], "give a video (or a folder of photographs) and a scan: there is no scene.run to go on with"),
+        (["{photographs}"], "give a video"),
+        (["{photographs}", "no.ply"], "no.ply does not exist"),
+    ],
+)
+def test_a_run_needs_a_video_and_a_scan(inputs, shellgs, words, why):
+    assert why in shellgs("run", *[word.format(photographs=inputs[0]) for word in words])
+    assert not Path("scene.run").exists()
+
+
+@pytest.mark.usefixtures("ends_with_the_cast")
+def test_settings_that_differ_from_the_files_are_refused(inputs, shellgs):
+    photographs, shell, matrix = inputs
+    words = [photographs, shell, "--matrix", matrix]
+    assert shellgs("run", *words, "--accept") == "refused: cast"
+    assert shellgs("run", *words) == "refused: cast"
+    assert "scene.run has another iterations: change it there" in shellgs("run", "--iterations", 5)
