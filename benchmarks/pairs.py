@@ -121,7 +121,7 @@ def _row(truth: Path, scene: Path, config: CaptureConfig, replaced: Steps) -> st
         return found
 
     pixels: list[float] = []
-    for name in ("images", "colmap", "capture/coarse", "capture/model", "capture/undistorted"):
+    for name in ("images", "colmap", "capture/coarse", "capture/joined", "capture/model", "capture/undistorted"):
         shutil.rmtree(scene / name, ignore_errors=True)
     if (database := scene / "capture" / "features" / "database.db").exists():
         with closing(sqlite3.connect(database)) as opened:  # matches are counted anew, features are not

@@ -203,15 +203,16 @@ class _Capture:
             return
         names = _files(folder)
         panoramas = find_panoramas(folder, names, names if self.is_video and said else said)
+        if not panoramas:
+            return
         size = face_size(folder, panoramas)
         for name in self.progress.track(panoramas, description="cutting panoramas"):
             add_faces(folder / name, folder, name, size)
             (folder / name).unlink()
-        if panoramas:
-            notice(
-                f"{len(panoramas)} panoramas of 360° are cut into {len(FACES)} photographs each, of {size}x{size} "
-                "pixels; none looks down, where who holds the camera is."
-            )
+        notice(
+            f"{len(panoramas)} panoramas of 360° are cut into {len(FACES)} photographs each, of {size}x{size} "
+            "pixels; none looks down, where who holds the camera is."
+        )
 
     def _features(self) -> Path:
         """Extract features; return the database."""

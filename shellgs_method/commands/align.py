@@ -134,11 +134,16 @@ def align(
     placement = replace(placement, alignment=replace(aligned, crs=system or aligned.crs))
     mesh = placement.alignment.load_shell(scene, views, place.surfaces if place else ())
     misplacement = misplaced(placement, mesh, views, points)
+    is_adjusted = layout.colmap_folder() == ADJUSTED
+    if refine is not None and is_adjusted:
+        raise SceneError(
+            "--refine would move the shell from where the cameras were adjusted to it onto frames and sills that it "
+            "lacks: give it with --bundle-adjust, which begins with the cameras as they were"
+        )
     if refine is not None and misplacement:
         raise SceneError(f"the alignment cannot be refined: {misplacement}")
     if refine is not None:
         placement = refined(placement, mesh, views, points, refine)
-    is_adjusted = layout.colmap_folder() == ADJUSTED
     placement = replace(
         placement, alignment=replace(placement.alignment, model=ADJUSTED.as_posix() if is_adjusted else "")
     )

@@ -238,9 +238,10 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
     if (proposed or Alignment.load(scene / ALIGNMENT).verdict != "good") and steps.changed("accepted", *inputs):
         open_page(report)
         state = "a proposal" if proposed else "doubtful"
+        files = " ".join(map(str, shell))
         raise SceneError(
             f"the alignment is {state}: if the images in {report} agree, go on with `shellgs run --scene {scene} "
-            f"--accept`; else add --picks to {scene}.run"
+            f"--accept`; else pick points (`shellgs pick {scene} {files}`), and add --picks picks.txt to {scene}.run"
         )
 
 

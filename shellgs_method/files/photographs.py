@@ -13,12 +13,12 @@ from pi_heif import open_heif
 from PIL import ExifTags, Image, ImageOps
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.exif import exif_of, tags_of
+from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
 from shellgs_method.files.transfer import HDR, tone_mapped
-from shellgs_method.files.undistortion import undistort, undistort_pixels
+from shellgs_method.files.undistortion import distort_pixels, undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
 
@@ -86,12 +86,41 @@ def to_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndar
     Raises:
         SceneError: the image cannot be read, or its aspect ratio is not the camera's.
     """
-    width, height = _calibrated_size(view)
-    image = _upright(view, read_image(view.image), view.image)
-    pixels = pixels * [width / image.width, height / image.height]
+    pixels = pixels * _calibrated_per_stored(view)
     if view.lens is None:
         return pixels
     return undistort_pixels(view.lens, pixels, view.camera.K.cpu().double().numpy())
+
+
+def from_camera(view: View, pixels: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+    """Map pixels of the view's undistorted camera to the photograph's file; the inverse of :func:`to_camera`.
+
+    Raises:
+        SceneError: as :func:`to_camera`.
+    """
+    if view.lens is not None:
+        pixels = distort_pixels(view.lens, pixels, view.camera.K.cpu().double().numpy())
+    return pixels / _calibrated_per_stored(view)
+
+
+def upright_size(view: View) -> tuple[int, int]:
+    """Width and height of :func:`load_upright`, by the file's header.
+
+    Raises:
+        SceneError: as :func:`load_upright`.
+    """
+    with opened(view.image, whole=False) as image:
+        is_turned = _is_turned(view, image, view.image) and orientation_of(image) > 4
+        return (image.height, image.width) if is_turned else image.size
+
+
+def load_upright(view: View) -> Image.Image:
+    """The photograph's file as 8-bit RGB, upright, with its distortion: the image whose pixels picks are.
+
+    Raises:
+        SceneError: the image cannot be read, or its aspect ratio is not the camera's.
+    """
+    return without_hidden(_upright(view, read_image(view.image), view.image)).convert("RGB")
 
 
 def read_image(path: Path) -> Image.Image:
@@ -235,15 +264,25 @@ def _calibrated_size(view: View) -> tuple[int, int]:
     return view.calibrated.width, view.calibrated.height
 
 
+def _calibrated_per_stored(view: View) -> Float64[np.ndarray, " 2"]:
+    """Pixels of the calibrated camera per pixel of the file, upright, along x and y."""
+    return np.divide(_calibrated_size(view), upright_size(view))
+
+
 def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:
-    """Apply the EXIF orientation if SfM did, which the shape of its camera shows, or what is known of the view."""
+    """Apply the EXIF orientation if SfM did."""
+    return ImageOps.exif_transpose(image) if _is_turned(view, image, path) else image
+
+
+def _is_turned(view: View, image: Image.Image, path: Path) -> bool:
+    """Whether SfM applied the EXIF orientation, which the shape of its camera shows, or what is known of the view."""
     width, height = _calibrated_size(view)
-    turned = ImageOps.exif_transpose(image)
-    for candidate in (turned, image) if view.turned else (image, turned):
-        aspect = candidate.width / candidate.height
+    for turned in (True, False) if view.turned else (False, True):
+        across, down = image.size[::-1] if turned and orientation_of(image) > 4 else image.size
+        aspect = across / down
         rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which matters in thumbnails
         if abs(width - height * aspect) < max(0.01 * width, rounding):
-            return candidate
+            return turned
     if path != view.image:
         raise SceneError(
             f"the mask {path} is {image.width}x{image.height} pixels, but the camera of {view.name} is "

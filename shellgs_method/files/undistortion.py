@@ -48,3 +48,18 @@ def undistort_pixels(
         coefficients = np.array([k1, k2, p1, p2, k3])
         rays = iterate(pixels[:, None], calibrated, coefficients, R=np.eye(3), P=np.eye(3), criteria=precise)
     return rays[:, 0] @ K[:2, :2].T + K[:2, 2]
+
+
+def distort_pixels(
+    lens: Lens, pixels: Float64[np.ndarray, "N 2"], K: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "N 2"]:
+    """Pixels of the pinhole camera with intrinsics ``K`` in the distorted image; undoes :func:`undistort_pixels`."""
+    import cv2
+
+    k1, k2, k3, k4, p1, p2 = lens.distortion
+    calibrated, rays = lens.K.double().numpy(), (pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+    if lens.fisheye:
+        bent = cv2.fisheye.distortPoints(rays[:, None], np.eye(3), np.array([k1, k2, k3, k4]))[:, 0]
+        return bent @ calibrated[:2, :2].T + calibrated[:2, 2]
+    points = np.append(rays, np.ones((len(rays), 1)), axis=1)
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), calibrated, np.array([k1, k2, p1, p2, k3]))[0][:, 0]

@@ -180,11 +180,16 @@ def _split(path: Path, contents: str) -> tuple[list[str], list[tuple[str, list[s
     except UnicodeDecodeError as error:
         raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
     lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
-    worded = [(where, words) for where, line in lines if (words := _words(line, where))]
+    worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
     return (worded[0][1], worded[1:]) if worded and _is_header(worded[0][1]) else ([], worded)
 
 
-def _words(line: str, where: str) -> list[str]:
+def words_of(line: str, where: str) -> list[str]:
+    """The words of a line without its comment; see :func:`read_lines`.
+
+    Raises:
+        SceneError: a quote is not closed.
+    """
     words = []
     for word in _WORD.finditer(line):
         if word["bare"] and word["bare"][0] in "\"'":

@@ -5,12 +5,14 @@ photograph, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in 
 the top left corner of the image). Lines with the same name, or without a name with the same X Y Z, are one point,
 which needs two photographs. A first line without numbers names the coordinate reference system of X Y Z, if it is not
 the shell's; comments after # are skipped. Quote image names with spaces. Points whose name begins with "check" are not
-fitted, only measured.
+fitted, only measured. Lines of picks after a # are set aside: `shellgs pick` writes them for points that are left out
+or in one photograph only, and takes them up again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -18,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.photographs import View, to_camera
 from shellgs_method.registration.correspondences import (
     Correspondence,
@@ -27,10 +30,12 @@ from shellgs_method.registration.correspondences import (
     read_lines,
     to_shell,
     view_named,
+    words_of,
     worst_first,
 )
 from shellgs_method.shell.alignment import Alignment
 
+_HEAD = ("# X Y Z of the shell   x y in the photograph   image   name",)
 MAX_REPROJECTION = 4.0
 """Largest distance of a picked pixel from the triangulated point, in pixels of a photograph 1000 pixels wide."""
 _MIN_ANGLE = 1.0  # degrees between two rays, for a point to have a depth
@@ -81,10 +86,21 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
         SceneError: the file is in degrees and the shell's system is not known, or a line cannot be read, names an image
             that is not in the scene, or contradicts another line.
     """
-    convert = to_shell(path, "picks", crs)
+    picks = _picks_of(read_lines(path, "picks"), path, views, to_shell(path, "picks", crs))
+    if not picks:
+        raise SceneError(f"{path} holds no picks")
+    return picks
+
+
+def _picks_of(
+    lines: Iterable[tuple[str, list[str]]],
+    path: Path,
+    views: Sequence[View],
+    convert: Callable[[np.ndarray], Float64[np.ndarray, "N 3"]],
+) -> list[Pick]:
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
-    for where, words in read_lines(path, "picks"):
+    for where, words in lines:
         if len(words) < 6 or not are_numbers(words[:5]):
             raise SceneError(
                 f"{where}: expected X Y Z of the shell, x y in the photograph, the image, a name, separated by spaces"
@@ -104,10 +120,71 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
         if view.name in pixels.setdefault(name, {}):
             raise SceneError(f"{where}: the point {name} is picked twice in {words[5]}")
         pixels[name][view.name] = pixel
-    if not shell:
-        raise SceneError(f"{path} holds no picks")
-    points = convert(np.stack([*shell.values()]))
+    points = convert(np.array([*shell.values()]).reshape(-1, 3))
     return [Pick(name, point, pixels[name]) for name, point in zip(shell, points, strict=True)]
+
+
+@dataclass(frozen=True)
+class PicksFile:
+    """All that a file of picks holds.
+
+    Attributes:
+        picks: what an alignment takes.
+        aside: points whose lines are after a #.
+        others: the other lines, such as the projection and comments.
+    """
+
+    picks: Sequence[Pick] = ()
+    aside: Sequence[Pick] = ()
+    others: Sequence[str] = _HEAD
+
+    @staticmethod
+    def read(path: Path, views: Sequence[View], crs: str = "") -> PicksFile:
+        """Read a file, which may hold no picks yet; the header of another system than ``crs`` goes, as it is converted.
+
+        Raises:
+            FileNotFoundError: the file does not exist.
+            SceneError: as :func:`read_picks`.
+        """
+        convert = to_shell(path, "picks", crs)
+        picks = _picks_of(read_lines(path, "picks"), path, views, convert)
+        named, aside, others = {pick.name for pick in picks}, dict[str, Pick](), []
+        for line in path.read_text(encoding="utf-8-sig").splitlines():
+            after = line.lstrip("# \t")
+            try:
+                (pick,) = _picks_of([(str(path), words_of(after, str(path)))], path, views, convert)
+            except SceneError:  # the header, or words
+                if line.startswith("#") or not crs or line.strip() == crs:
+                    others.append(line)
+                continue
+            if not line.lstrip().startswith("#"):
+                continue
+            earlier = aside.setdefault(pick.name, pick)
+            if pick.name in named or not np.array_equal(earlier.shell, pick.shell):
+                others.append(line)
+            else:
+                aside[pick.name] = replace(earlier, pixels={**earlier.pixels, **pick.pixels})
+        aside = [pick for name, pick in aside.items() if name not in named]
+        return PicksFile(picks, aside, [line for line in others if line.strip()])
+
+    def write(self, path: Path, views: Sequence[View]) -> None:
+        """Write the file, whose coordinates :func:`read_picks` reads as they are, to the last bit."""
+        files = [view.image.name for view in views]
+        called = {view.name: view.image.name if files.count(view.image.name) == 1 else view.name for view in views}
+        lines = list(self.others)
+        for mark, picks in (("", self.picks), ("# ", self.aside)):
+            for pick in picks:
+                shell = " ".join(map(repr, pick.shell.tolist()))
+                for name, (x, y) in pick.pixels.items():
+                    lines.append(f"{mark}{shell}   {x:.2f} {y:.2f}   {_quoted(called[name])}   {_quoted(pick.name)}")
+        with atomic_write(path) as file:
+            file.write("\n".join([*lines, ""]).encode())
+
+
+def _quoted(word: str) -> str:
+    if not re.search("[\\s#\"']", word):
+        return word
+    return f"'{word}'" if '"' in word else f'"{word}"'
 
 
 def triangulate(
@@ -196,26 +273,52 @@ def picked_again(
     return measured_again(moved, alignment)
 
 
+@dataclass(frozen=True)
+class Triangulation:
+    """The point in the scene that a pick's pixels show.
+
+    Attributes:
+        point: its coordinates in the scene's frame.
+        errors: reprojection error in each photograph, in pixels, by the view's name.
+        is_sharp: whether the pixels agree on one point.
+    """
+
+    point: Float64[np.ndarray, " 3"]
+    errors: Mapping[str, float]
+    is_sharp: bool
+
+
+def triangulated(pick: Pick, views: Mapping[str, View]) -> Triangulation:
+    """Triangulate a pick from its photographs.
+
+    Args:
+        pick: the pick.
+        views: the views of the scene by name.
+
+    Raises:
+        SceneError: it is in one photograph only, or its rays are parallel or meet behind a camera.
+    """
+    if len(pick.pixels) < 2:
+        raise SceneError(f"the pick {pick.name} is seen in one photograph only: pick it in another as well")
+    seen = [views[name] for name in pick.pixels]
+    pixels = np.concatenate([to_camera(v, np.array([pick.pixels[v.name]], dtype=np.float64)) for v in seen])
+    viewmats, Ks = (
+        np.stack([getattr(view.camera, name).cpu().double().numpy() for view in seen]) for name in ("viewmat", "K")
+    )
+    try:
+        point, error = triangulate(viewmats, Ks, pixels)
+    except ValueError as error:
+        raise SceneError(f"the pick {pick.name} cannot be triangulated: {error}") from error
+    limits = [MAX_REPROJECTION * max(1.0, max(v.camera.width, v.camera.height) / 1000) for v in seen]
+    return Triangulation(point, dict(zip(pick.pixels, error.tolist(), strict=True)), bool((error <= limits).all()))
+
+
 def _triangulate_all(
     picks: Sequence[Pick], views: Sequence[View]
 ) -> tuple[np.ndarray, list[float], list[str], Bool[np.ndarray, " N"]]:
     by_name = {view.name: view for view in views}
-    scene, reprojection, worst_view, sharp = [], [], [], []
-    for pick in picks:
-        if len(pick.pixels) < 2:
-            raise SceneError(f"the pick {pick.name} is seen in one photograph only: pick it in another as well")
-        seen = [by_name[name] for name in pick.pixels]
-        pixels = np.concatenate([to_camera(v, np.array([pick.pixels[v.name]], dtype=np.float64)) for v in seen])
-        viewmats, Ks = (
-            np.stack([getattr(view.camera, name).cpu().double().numpy() for view in seen]) for name in ("viewmat", "K")
-        )
-        try:
-            point, error = triangulate(viewmats, Ks, pixels)
-        except ValueError as error:
-            raise SceneError(f"the pick {pick.name} cannot be triangulated: {error}") from error
-        limits = [MAX_REPROJECTION * max(1.0, max(v.camera.width, v.camera.height) / 1000) for v in seen]
-        scene.append(point)
-        reprojection.append(float(error.max()))
-        worst_view.append(seen[int(error.argmax())].name)
-        sharp.append(bool((error <= limits).all()))
-    return np.stack(scene), reprojection, worst_view, np.array(sharp)
+    found = [triangulated(pick, by_name) for pick in picks]
+    worst_view = [max(one.errors, key=lambda name: one.errors[name]) for one in found]
+    reprojection = [max(one.errors.values()) for one in found]
+    sharp = np.array([one.is_sharp for one in found])
+    return np.stack([one.point for one in found]), reprojection, worst_view, sharp

@@ -19,8 +19,8 @@ from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import CueMap
 from shellgs_method.files.html import captioned, encoded, img, table, write_page
 from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import project
-from shellgs_method.geometry.distortion import to_pixels
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.correspondences import Correspondence
 from shellgs_method.registration.picks import PickedPoint
@@ -157,15 +157,9 @@ def _moved(validation: Validation) -> Iterator[tuple[ViewSupport, tuple[float, f
 
 
 def _in_photograph(view: View, points: np.ndarray) -> np.ndarray:
-    """Pixels of points of the scene in the photograph as it is stored, with its distortion."""
+    """Pixels of points of the scene in the photograph as it is calibrated, with its distortion."""
     pixels, _ = project(view.camera, points)
-    if view.lens is None:
-        return pixels
-    pinhole, K = view.camera.K.double().numpy(), view.lens.K.double().numpy()
-    rays = (pixels - pinhole[:2, 2]) / pinhole[[0, 1], [0, 1]]
-    k1, k2, k3, k4, p1, p2 = view.lens.distortion
-    lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, p1, p2, k3, k4])
-    return to_pixels(rays, np.tile(lens, (len(rays), 1)), view.lens.fisheye)[0]
+    return pixels if view.lens is None else distort_pixels(view.lens, pixels, view.camera.K.double().numpy())
 
 
 def _body(

@@ -295,13 +295,14 @@ def _checks(measured: Validation) -> Iterator[Check]:
     yield _check("bias", abs(measured.bias), "Bias along the normal, median", f"{measured.bias:+.3f} m")
     if measured.test is not None:
         evidence = measured.test.evidence
-        yield _check("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
+        if not measured.alignment.model:  # adjusted cameras fit picks and weighted tracks better than points alone tell
+            yield _check("pull", measured.test.moved, "Motion that would fit the points better", "{:.3f} m")
         words = "; ".join(evidence.in_words(measured.axes))
         name = "Directions the points do not determine"
         yield _check("weak", int(evidence.weak.sum()), name, f"{{:.0f}} {words}".strip())
     for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
-        yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.2f}")
+        yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
     if held_out := [p.residual for p in measured.correspondences if p.held_out]:
         yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
 

@@ -252,6 +252,9 @@ def test_the_command_unbends_and_one_switch_goes_back(tmp_path: Path, surface: S
     assert all(view.name in report for view in views)
     assert {path: path.read_bytes() for path in (tmp_path / "colmap/sparse/0").iterdir()} == files
 
+    with pytest.raises(SceneError, match="--refine would move the shell from where the cameras were adjusted to it"):
+        align(tmp_path, refine=0.1)
+    assert "Motion that would fit the points better" not in report
     alignment = Alignment.load(tmp_path / ALIGNMENT)
     cast(tmp_path, views[:1], alignment, max_image_size=64)
     align(tmp_path, paths=ORIGINAL)

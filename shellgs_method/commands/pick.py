@@ -1,0 +1,87 @@
+"""`shellgs pick`: points clicked in the scan and in photographs."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Optional
+
+import tyro
+
+from shellgs_method.commands.common import PATHS, Paths, Scene, console
+from shellgs_method.errors import SceneError
+
+
+def pick(
+    scene: Scene,
+    shell: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SHELL ...")],
+    picks: Path = Path("picks.txt"),
+    metres_per_shell_unit: float = 1.0,
+    crs: Optional[str] = None,
+    port: int = 7070,
+    open: bool = False,
+    paths: Paths = PATHS,
+) -> None:
+    """Pick points in the scan and in photographs, side by side in the browser, for `shellgs align --picks`.
+
+    Each click is written to the file of picks. The same command takes it up again.
+
+    Args:
+        scene: Scene folder.
+        shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates.
+        picks: File of picks, written and read back.
+        metres_per_shell_unit: Length of the shell's unit in metres.
+        crs: Coordinate reference system of the shell, such as EPSG:25832, to which a file of picks in another one is
+            converted. If not set: as the shell's file says, or a .prj beside it.
+        port: Port of the page.
+        open: Open the page in a browser.
+        paths: Paths of the scene's files.
+    """
+    import webbrowser
+
+    import numpy as np
+
+    from dataparsers.facade import read_views
+    from shellgs_method.errors import check_output
+    from shellgs_method.files.crs import crs_of, given_crs
+    from shellgs_method.picking.scan import Scan
+    from shellgs_method.picking.server import PickServer
+    from shellgs_method.picking.session import Session
+    from shellgs_method.registration.frames import ShellPlace
+
+    if not shell:
+        raise SceneError(f"name the shell's file: shellgs pick {scene} scan.ply")
+    check_output(picks)
+    picks.parent.mkdir(parents=True, exist_ok=True)
+    views = read_views(paths.of(scene).unadjusted())
+    if len(views) < 2:
+        raise SceneError(f"{scene} has {len(views)} photograph, and a point is picked in two or more")
+    with PickServer(port) as server:
+        place = ShellPlace(*shell)
+        session = Session(picks, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(*shell))
+        if session.state.picks:
+            place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")
+        scan = Scan(shell, place)
+        console.print(f"Pick in a browser: {server.url} (Ctrl-C or the page's button ends it).", highlight=False)
+        if open:
+            webbrowser.open(server.url)
+        with suppress(KeyboardInterrupt):
+            server.serve(session, scan)
+    said = session.said()
+    for point in said["points"]:
+        if point["problem"] and not point["left_out"]:
+            console.print(f"[yellow]{point['problem']}.", highlight=False, soft_wrap=True)
+    fit = said["fit"]
+    if "problem" in fit:
+        console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
+        return
+    options = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
+    options += f" --crs {shlex.quote(crs)}" if crs else ""
+    files = " ".join(shlex.quote(str(path)) for path in (scene, *shell))
+    console.print(
+        f"{fit['used']} of {fit['of']} picks are used; their residual is {fit['rms']:.3f} m (root mean square).\n"
+        f"Next: shellgs align {files} --picks {shlex.quote(str(picks))}{options}",
+        highlight=False,
+        soft_wrap=True,
+    )
