@@ -38,8 +38,9 @@ _PEAKS = 3  # shifts kept per orientation and scale
 _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with points
 # Candidates that are measured and refined, and tolerances relative to the distance: errors of SfM points grow with it,
 # and what a smaller scale brings nearer to the shell fits no better.
-_MEASURED, _POLISHED = 1000, 8
-_ROUNDS = ((250, 250, 1, 2, 10), (50, 800, 3, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
+_MEASURED, _POLISHED = 1000, 12
+_ROUNDS = ((500, 250, 1, 2, 10), (150, 800, 1, 4, 20))  # candidates, SfM points, how far apart and off in cells, steps
+_HOPEFUL = 0.6  # share of the best score from which candidates are refined: rivals that prove a place ambiguous too
 _MANY = 4000  # SfM points in the end
 _ROUGH, _COARSE, _FIT = 0.04, 0.012, 0.004
 _DIFFERENT = 0.5  # metres of mean displacement from which two candidates differ, or that share of the distance:
@@ -95,6 +96,7 @@ def propose(
     shuffled = np.random.default_rng(0).permutation(near)
     for number, (count, few, apart, reach, steps) in enumerate(_ROUNDS, 1):
         starts = _distinct(starts, spread, count, apart * search.cell)
+        starts = [start for start in starts if start.score > _HOPEFUL * starts[0].score]
         starts = [
             refined
             for start in track(starts, f"Refining candidates, round {number}", len(starts))
