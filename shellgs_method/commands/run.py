@@ -176,9 +176,11 @@ def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: boo
     """Take all steps that are not done."""
     video, *shell = recipe.sources
     steps.begin("cameras of the photographs")
-    if (scene / "capture").is_dir() or not any((scene / cameras).exists() for cameras in _CAMERAS):
+    of_another = "capture" in steps and steps.changed("capture", str(video.resolve()))
+    if of_another or not any((scene / cameras).exists() for cameras in _CAMERAS):
         capture(video, scene)
-    else:
+        steps.done("capture", str(video.resolve()))
+    else:  # captured with options of its own, perhaps
         console.print(f"{scene} has cameras.", highlight=False)
     steps.begin("the shell's place")
     _align(recipe, scene, tuple(shell), steps, accept)
@@ -217,6 +219,10 @@ class _Steps:
         """Show which step begins."""
         self._begun += 1
         console.rule(f"{self._begun} of {self._total}: {what}", align="left")
+
+    def __contains__(self, step: str) -> bool:
+        """Whether a step was done."""
+        return step in self._done
 
     def changed(self, step: str, *inputs: object) -> bool:
         """Whether a step was not done with these inputs."""

@@ -101,6 +101,31 @@ def test_a_doubtful_alignment_stops_the_run_and_changed_settings_void_what_was_a
     assert len(calls) == 2
 
 
+@pytest.mark.usefixtures("ends_with_the_cast")
+def test_photographs_are_captured_where_there_are_no_cameras_and_again_if_they_are_others(inputs, shellgs, monkeypatch):
+    photographs, shell, matrix = inputs
+    cameras, calls = Path("scene/transforms.json"), []
+
+    def capture(source, scene):
+        calls.append(source.name)
+        cameras.write_bytes(kept)
+
+    monkeypatch.setattr(run_command, "capture", capture)
+    (Path("scene") / "capture").mkdir()  # of `shellgs capture` with options
+    assert shellgs("run", photographs, shell, "--matrix", matrix, "--accept") == "refused: cast"
+    assert calls == []
+    kept = cameras.read_bytes()
+    cameras.unlink()
+    assert shellgs("run") == "refused: cast"
+    assert shellgs("run") == "refused: cast"
+    assert calls == ["images"]
+    Path("others").mkdir()
+    settings = Path("scene.run")
+    settings.write_text(settings.read_text().replace("scene/images", "others"))
+    assert shellgs("run") == "refused: cast"
+    assert calls == ["images", "others"]
+
+
 def test_settings_are_read_as_they_were_written_wherever_the_folder_is(tmp_path):
     recipe = Recipe((tmp_path / "walk by.mp4", Path("/elsewhere/scan.ply")), picks=tmp_path / "p#.txt", refine=0.3,
                     same_frame=True, crs="EPSG:25832", iterations=12)  # fmt: skip
