@@ -284,7 +284,8 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
     accepted = not steps.changed("accepted", *inputs)
     written = scene / (PROPOSAL if proposed and not accepted else ALIGNMENT)
     refinement = "" if recipe.refine or proposed else "add --refine 0.3, or "
-    remedy = f"{refinement}pick points (shellgs pick {named} {shlex.join(map(str, shell))}) and add --picks picks.txt"
+    pick = f"shellgs pick {named} {shlex.join(map(str, shell))}"
+    remedy = f"{refinement}pick {'more ' if recipe.picks else ''}points ({pick}) and have --picks picks.txt"
     try:
         if steps.changed("align", *inputs) or not _is_there(written, scene):
             align(
@@ -303,7 +304,7 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
     except SceneError as error:
         if report.is_file():
             open_page(report)
-        raise SceneError(f"{error}; {remedy}, to {scene}.run") from error
+        raise SceneError(f"{error}; {remedy} in {scene}.run") from error
     if accept:
         steps.done("accepted", *inputs)
     if not (accept or accepted) and (proposed or Alignment.load(scene / ALIGNMENT).verdict != "good"):
@@ -311,7 +312,7 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
         state = "a proposal" if proposed else "doubtful"
         raise SceneError(
             f"the alignment is {state}: if the images in {report} agree, go on with `shellgs run --scene {named} "
-            f"--accept`; else {remedy}, to {scene}.run"
+            f"--accept`; else {remedy} in {scene}.run"
         )
 
 
