@@ -93,6 +93,8 @@ def _shows(view: View, point: np.ndarray) -> bool:
 
 def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callable[..., str], free_port: int):
     url, shell = f"http://127.0.0.1:{free_port}", scene / "shell/facade.ply"
+    (scene / "my masks").mkdir()
+    chosen = ("--masks-path", "my masks")
 
     def user() -> None:
         for _ in range(600):
@@ -106,12 +108,12 @@ def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callab
 
     thread = Thread(target=user, daemon=True)
     thread.start()
-    said = shellgs("pick", scene, shell, "--picks", scene / "picks.txt", "--port", free_port)
+    said = shellgs("pick", scene, shell, "--picks", scene / "picks.txt", "--port", free_port, *chosen)
     thread.join()
     assert f"Pick in a browser: {url}" in said
     assert "4 of 4 picks are used; their residual is 0.00" in said
-    assert f"Next: shellgs align {scene} {shell} --picks {scene / 'picks.txt'}" in said
-    assert "4 of 4 picks are used" in shellgs("align", scene, shell, "--picks", scene / "picks.txt")
+    assert f"Next: shellgs align {scene} {shell} --picks {scene / 'picks.txt'} --masks-path 'my masks'" in said
+    assert "4 of 4 picks are used" in shellgs("align", scene, shell, "--picks", scene / "picks.txt", *chosen)
 
 
 def test_a_port_that_is_taken_is_refused(server: PickServer, scene: Path, shellgs: Callable[..., str]):
