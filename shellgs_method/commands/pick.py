@@ -77,7 +77,7 @@ def pick(
         console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
         return
     options = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
-    options += f" --crs {shlex.quote(crs)}" if crs else ""
+    options += (f" --crs {shlex.quote(crs)}" if crs else "") + paths.flags
     files = " ".join(shlex.quote(str(path)) for path in (scene, *shell))
     console.print(
         f"{fit['used']} of {fit['of']} picks are used; their residual is {fit['rms']:.3f} m (root mean square).\n"

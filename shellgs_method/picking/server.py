@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from inspect import signature
 from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 from PIL import Image
@@ -23,6 +27,20 @@ from shellgs_method.picking.session import Session
 
 _PAGE = Path(__file__).with_name("page.html")
 _DECODED = 8  # photographs kept in memory
+_FAR = 1e12  # no coordinate or pixel is farther from its origin
+_STEPS = {
+    "add": {"ray"},
+    "move": {"name", "ray"},
+    "mark": {"name", "view", "pixel"},
+    "unmark": {"name", "view"},
+    "remove": {"name"},
+    "leave_out": {"name"},
+    "rename": {"name", "new"},
+    "select": {"name"},
+    "undo": set[str](),
+    "done": set[str](),
+}
+"""Steps that the page takes, and their arguments: those of the session, but rays for places in the scan."""
 
 
 class PickServer(ThreadingHTTPServer):
@@ -81,18 +99,16 @@ class PickServer(ThreadingHTTPServer):
         """Take a step of the session and return what it says then.
 
         Args:
-            do: name of a step, or ``done``.
-            values: its arguments; places in the scan are rays, see :meth:`~shellgs_method.picking.scan.Scan.pick`.
+            do: one of the steps.
+            values: its arguments; a ray is as :meth:`~shellgs_method.picking.scan.Scan.pick` takes it.
 
         Raises:
             SceneError: the step cannot be taken, or the ray hits nothing.
+            OSError: the file of picks cannot be written, and the step is not taken.
         """
-        if do not in ("add", "move", "mark", "unmark", "remove", "leave_out", "rename", "select", "undo", "done"):
-            raise SceneError(f"{do} is no step")
         with self._lock:
             if "ray" in values:
-                origin, direction, reach = (np.array(part, np.float64) for part in values.pop("ray"))
-                values["shell"] = self.scan.pick(origin, direction, float(reach))
+                values["shell"] = self.scan.pick(*values.pop("ray"))
                 if values["shell"] is None:
                     raise SceneError("there is nothing of the scan: click on its surface")
             if do == "done":
@@ -101,20 +117,67 @@ class PickServer(ThreadingHTTPServer):
                 getattr(self.session, do)(**values)
             return self.said()
 
-    def image(self, number: int, side: float = 0, left: float = 0, top: float = 0, width: float = 0) -> bytes:
-        """A photograph as JPEG: whole, with its longer side at most ``side`` pixels, or a 4:3 part of it."""
+    def image(self, number: int, side: int = 0, left: int = 0, top: int = 0, width: int = 0) -> bytes:
+        """A photograph as JPEG: whole, with its longer side at most ``side`` pixels, or a 4:3 part of it.
+
+        Raises:
+            SceneError: there is no such photograph or part, or the file cannot be read.
+        """
+        if number not in range(len(self.session.views)):
+            raise SceneError(f"there is no photograph {number}: reload the page")
         image = self._photograph(number)
+        longer = max(image.size)
+        if side < 0 or not (width == 0 or 2 <= width <= longer) or max(abs(left), abs(top)) > 2 * longer:
+            raise SceneError(f"photograph {number} has no such part: reload the page")
         if width:
-            image = image.crop((int(left), int(top), int(left + width), int(top) + int(width * 3 / 4)))
+            image = image.crop((left, top, left + width, top + width * 3 // 4))
         elif side:
             image = image.copy()
             image.thumbnail((side, side), Image.Resampling.BOX)
         return encoded(np.asarray(image), "JPEG")
 
 
+@contextmanager
+def _reading() -> Iterator[None]:
+    """Refuse a request that cannot be read, which the page does not send."""
+    try:
+        yield
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise SceneError("the request is malformed: reload the page") from error
+
+
+def _numbers(values: Any, *shape: int) -> np.ndarray:
+    numbers = np.array(values, np.float64)
+    if numbers.shape != shape or not (np.abs(numbers) < _FAR).all():
+        raise ValueError("not such finite numbers")
+    return numbers
+
+
+def _argument(name: str, value: Any) -> Any:
+    if name == "ray":
+        origin, direction, reach = value
+        return _numbers(origin, 3), _numbers(direction, 3), float(_numbers(reach))
+    if name == "pixel":
+        return tuple(_numbers(value, 2).tolist())
+    if not isinstance(value, str):
+        raise TypeError(f"{name} is no text")
+    return value
+
+
 class _Answers(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: PickServer
+
+    def parse_request(self) -> bool:
+        """Refuse names of other sites, which they can let lead to this machine (DNS rebinding)."""
+        if not super().parse_request():
+            return False
+        host, port = self.headers.get("Host", ""), self.server.server_port
+        named = host if ":" in host else f"{host}:80"  # which browsers leave out
+        if named in (f"127.0.0.1:{port}", f"localhost:{port}"):
+            return True
+        self.send_error(403, f"this page is at {self.server.url} only")
+        return False
 
     def do_GET(self) -> None:
         try:
@@ -123,8 +186,9 @@ class _Answers(BaseHTTPRequestHandler):
             self._answer_json({"error": str(error)}, 400)
 
     def _get(self) -> None:
-        url = urlsplit(self.path)
-        numbers = {name: float(values[0]) for name, values in parse_qs(url.query).items()}
+        with _reading():
+            url = urlsplit(self.path)
+            query = dict(parse_qsl(url.query))
         scan = self.server.scan
         if url.path == "/":
             self._answer(_PAGE.read_bytes(), "text/html; charset=utf-8")
@@ -139,26 +203,41 @@ class _Answers(BaseHTTPRequestHandler):
         elif url.path == "/points":
             self._answer(scan.cloud.points.astype("<f4").tobytes() if scan.cloud else b"")
         elif url.path == "/detail" and scan.cloud:
-            centre = np.array([numbers[axis] for axis in "xyz"])
-            self._answer(scan.cloud.detail(centre, numbers["radius"]).astype("<f4").tobytes())
+            with _reading():
+                ball = _numbers([query[name] for name in ("x", "y", "z", "radius")], 4)
+            self._answer(scan.cloud.detail(ball[:3], ball[3]).astype("<f4").tobytes())
         elif url.path == "/image":
-            number, _ = int(numbers.pop("number")), numbers.pop("server", None)
-            content = self.server.image(number, **numbers)
-            self._answer(content, "image/jpeg", "max-age=86400")
+            with _reading():
+                part = {name: int(value) for name, value in query.items() if name != "server"}
+                signature(self.server.image).bind(**part)
+            self._answer(self.server.image(**part), "image/jpeg", "max-age=86400")
         else:
             self.send_error(404)
 
     def do_POST(self) -> None:
-        content = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-        if self.headers.get("Content-Type") != "application/json":  # a form of another page cannot send this
-            self.send_error(415)
-            return
         try:
-            self._answer_json(self.server.step(**json.loads(content)))
+            content = self._content()
+            if self.headers.get("Content-Type") != "application/json":  # a form of another page cannot send this
+                self.send_error(415)
+                return
+            with _reading():
+                step = dict(json.loads(content))
+                do = step.pop("do")
+                if step.keys() != _STEPS[do]:
+                    raise TypeError(f"{do} takes other arguments")
+                values = {name: _argument(name, value) for name, value in step.items()}
+            self._answer_json(self.server.step(do, **values))
         except SceneError as error:
             self._answer_json({"error": str(error)}, 400)
-        except OSError as error:  # a full disk: the next step writes all points again
-            self._answer_json({"error": explained(error)}, 400)
+        except OSError as error:
+            self._answer_json({"error": f"the step is not taken: {explained(error)}"}, 400)
+
+    def _content(self) -> bytes:
+        length = self.headers.get("Content-Length", "")
+        if not re.fullmatch("[0-9]{1,5}", length):
+            self.close_connection = True  # nobody knows where the next request begins
+            raise SceneError("the request does not say its length, or is too long: reload the page")
+        return self.rfile.read(int(length))
 
     def _answer_json(self, content: dict[str, Any], status: int = 200) -> None:
         text = json.dumps(content, default=np.ndarray.tolist)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.photographs import View, from_camera, to_camera
+from shellgs_method.files.photographs import View, from_camera, to_camera, upright_size
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.picks import Pick, PickedPoint, PicksFile, Triangulation, align_picks, triangulated
@@ -47,7 +47,7 @@ class State:
 
 
 class Session:
-    """Points that are picked one step after another; each step is written to the file.
+    """Points that are picked one step after another; a step that cannot be written to the file (OSError) is not taken.
 
     Args:
         path: the file of picks; what it holds is taken up.
@@ -87,10 +87,17 @@ class Session:
         self._step(self.state.with_pick(replace(self._pick(name), shell=shell)))
 
     def mark(self, name: str, view: str, pixel: tuple[float, float]) -> None:
-        """Set a point's pixel in a photograph."""
+        """Set a point's pixel in a photograph.
+
+        Raises:
+            SceneError: there is no such photograph, or the pixel is outside it.
+        """
         pick = self._pick(name)
         if view not in self._by_name:
             raise SceneError(f"{view} is not a photograph of the scene")
+        (x, y), (width, height) = pixel, upright_size(self._by_name[view])
+        if not (0 <= x <= width and 0 <= y <= height):
+            raise SceneError(f"the pixel ({x:.0f}, {y:.0f}) is outside {view}, which has {width}x{height}")
         self._step(self.state.with_pick(replace(pick, pixels={**pick.pixels, view: pixel})))
 
     def unmark(self, name: str, view: str) -> None:
@@ -112,10 +119,10 @@ class Session:
         """Rename a point; one whose name begins with "check" is only measured.
 
         Raises:
-            SceneError: the name is empty or taken.
+            SceneError: the name is empty, taken, or has characters that cannot be read.
         """
         new = " ".join(new.replace('"', "'").split())
-        if not new or new in self.state.named.keys() - {name}:
+        if not new or not new.isprintable() or new in self.state.named.keys() - {name}:
             raise SceneError(f"{new or 'an empty name'} cannot be the name of another point: give a new one")
         renamed = replace(self._pick(name), name=new)
         picks = tuple(renamed if pick.name == name else pick for pick in self.state.picks)
@@ -129,8 +136,8 @@ class Session:
     def undo(self) -> None:
         """Take back the last step, if there is one."""
         if self._earlier:
+            self._write(self._earlier[-1])
             self.state = self._earlier.pop()
-            self._write()
 
     def _pick(self, name: str) -> Pick:
         if name not in self.state.named:
@@ -138,14 +145,14 @@ class Session:
         return self.state.named[name]
 
     def _step(self, state: State) -> None:
+        self._write(state)  # first: a step that cannot be written is not taken
         self._earlier.append(self.state)
         self.state = state
-        self._write()
 
-    def _write(self) -> None:
+    def _write(self, state: State) -> None:
         used, aside = [], []
-        for pick in self.state.picks:
-            (aside if pick.name in self.state.left_out or len(pick.pixels) < 2 else used).append(pick)
+        for pick in state.picks:
+            (aside if pick.name in state.left_out or len(pick.pixels) < 2 else used).append(pick)
         PicksFile(used, aside, self._others).write(self.path, self.views)
 
     def said(self) -> dict[str, Any]:

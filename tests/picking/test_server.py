@@ -8,6 +8,7 @@ import socket
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from http.client import HTTPConnection
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -41,6 +42,16 @@ def post(url: str, kind: str = "application/json", **step: Any) -> Any:
 def get(url: str, **numbers: float) -> bytes:
     with urllib.request.urlopen(url + "?" + "&".join(f"{name}={value}" for name, value in numbers.items())) as answer:
         return answer.read()
+
+
+def asked(server: PickServer, path: str, body: str | None = None, **headers: str) -> tuple[int, Any]:
+    """Status and answer of a request that no page sends; a body is posted."""
+    connection = HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    own = {"Content-Type": "application/json"} | {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request("GET" if body is None else "POST", path, body, own)
+    with connection.getresponse() as answer:
+        content = answer.read()
+        return answer.status, json.loads(content) if answer.status == 400 else content
 
 
 @pytest.fixture
@@ -93,6 +104,8 @@ def _shows(view: View, point: np.ndarray) -> bool:
 
 def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callable[..., str], free_port: int):
     url, shell = f"http://127.0.0.1:{free_port}", scene / "shell/facade.ply"
+    (scene / "my masks").mkdir()
+    chosen = ("--masks-path", "my masks")
 
     def user() -> None:
         for _ in range(600):
@@ -106,12 +119,12 @@ def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callab
 
     thread = Thread(target=user, daemon=True)
     thread.start()
-    said = shellgs("pick", scene, shell, "--picks", scene / "picks.txt", "--port", free_port)
+    said = shellgs("pick", scene, shell, "--picks", scene / "picks.txt", "--port", free_port, *chosen)
     thread.join()
     assert f"Pick in a browser: {url}" in said
     assert "4 of 4 picks are used; their residual is 0.00" in said
-    assert f"Next: shellgs align {scene} {shell} --picks {scene / 'picks.txt'}" in said
-    assert "4 of 4 picks are used" in shellgs("align", scene, shell, "--picks", scene / "picks.txt")
+    assert f"Next: shellgs align {scene} {shell} --picks {scene / 'picks.txt'} --masks-path 'my masks'" in said
+    assert "4 of 4 picks are used" in shellgs("align", scene, shell, "--picks", scene / "picks.txt", *chosen)
 
 
 def test_a_port_that_is_taken_is_refused(server: PickServer, scene: Path, shellgs: Callable[..., str]):
@@ -129,10 +142,13 @@ def test_picks_of_another_frame_are_refused(scene: Path, shellgs: Callable[..., 
 def test_a_step_that_cannot_be_taken_changes_nothing(server: PickServer):
     clicked(server.url, server.session.path.parent, 3)
     before, text = server.session.state, server.session.path.read_text()
-    assert "is no step" in post(server.url, do="_write")["error"]
+    assert "malformed" in post(server.url, do="_write")["error"]
     assert "nothing of the scan" in post(server.url, do="add", ray=[[0, 0, 99], [0, 0, 1], 0])["error"]
     assert "no point p9" in post(server.url, do="remove", name="p9")["error"]
     assert "not a photograph" in post(server.url, do="mark", name="p1", view="x.png", pixel=[1, 2])["error"]
+    view = server.session.views[0].name
+    assert "which has 48x32" in post(server.url, do="mark", name="p1", view=view, pixel=[48.5, 2])["error"]
+    assert "cannot be the name" in post(server.url, do="rename", name="p1", new="\ud800")["error"]
     assert post(server.url, kind="text/plain", do="remove", name="p1") == 415  # what another site's form could send
     assert server.session.state is before
     assert server.session.path.read_text() == text
@@ -166,11 +182,105 @@ def test_the_page_is_whole(server: PickServer):
     assert "://" not in page
 
 
-def test_a_file_that_cannot_be_written_is_said_and_written_at_the_next_step(server: PickServer):
-    path = server.session.path
+def test_a_step_that_cannot_be_written_is_not_taken(server: PickServer):
+    clicked(server.url, server.session.path.parent, 3)
+    before, path = server.session.state, server.session.path
     server.session.path = path / "below" / "picks.txt"
-    said = post(server.url, do="add", ray=[[0, 0, 99], [0, 0, -1], 0])
-    assert said["error"].endswith("cannot be used: no such file or directory")
+    for step in ({"do": "remove", "name": "p1"}, {"do": "undo"}):
+        said = post(server.url, **step)["error"]
+        assert said.startswith("the step is not taken: ")
+        assert said.endswith("cannot be used: not a directory")
+        assert server.session.state is before
     server.session.path = path
-    clicked(server.url, path.parent, 3)
+    assert [point["name"] for point in post(server.url, do="remove", name="p1")["points"]] == ["p2", "p3"]
+    assert [point["name"] for point in post(server.url, do="undo")["points"]] == ["p1", "p2", "p3"]
     assert len(read_picks(path, server.session.views)) == 3
+
+
+NO_IMAGES = """
+number=99
+number=-1
+number=x
+number=nan
+number=1&foo=1
+number=1&side=-5
+number=1&width=1e9
+number=1&width=1000000000
+number=1&width=0.5
+number=1&width=1
+number=1&width=9&left=10000000000000000000000
+""".splitlines()
+NO_STEPS = """
+nonsense
+[]
+{}
+7
+null
+{"do": []}
+{"do": "fly"}
+{"do": "undo", "name": "p1"}
+{"do": "add"}
+{"do": "add", "shell": [1, 2, 3]}
+{"do": "move", "name": "p1", "shell": [1, 2, 3]}
+{"do": "add", "ray": []}
+{"do": "add", "ray": null}
+{"do": "add", "ray": [[0, 0], [0, 0, 1], 0]}
+{"do": "add", "ray": [[0, 0, 9], [0, 0, -1], NaN]}
+{"do": "add", "ray": [[0, 0, 1e300], [0, 0, -1], 0]}
+{"do": "add", "ray": [[0, 0, "x"], [0, 0, -1], 0]}
+{"do": "add", "ray": [[0, 0, {}], [0, 0, -1], 0]}
+{"do": "remove", "name": ["p1"]}
+{"do": "remove", "name": null}
+{"do": "rename", "name": "p1", "new": 3}
+{"do": "mark", "name": "p1", "view": "VIEW", "pixel": [1]}
+{"do": "mark", "name": "p1", "view": "VIEW", "pixel": [1, NaN]}
+{"do": "mark", "name": "p1", "view": "VIEW", "pixel": [1, null]}
+{"do": "mark", "name": "p1", "view": "VIEW", "pixel": 3}
+""".splitlines()
+
+
+@pytest.mark.parametrize("query", NO_IMAGES)
+def test_an_image_that_is_not_there_is_refused(server: PickServer, capfd: Any, query: str):
+    status, answer = asked(server, f"/image?{query}")
+    assert (status, list(answer)) == (400, ["error"])
+    assert "reload the page" in answer["error"]
+    assert not capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "body", [*NO_STEPS, "\xff", 9999 * "[", f'{{"do": "add", "ray": [[0, 0, 1{999 * "0"}], [0, 0, 1], 0]}}']
+)
+def test_a_malformed_step_is_refused_and_changes_nothing(server: PickServer, capfd: Any, body: str):
+    assert "error" not in post(server.url, do="add", ray=[[0, 0, 99], [0, 0, -1], 0])
+    before = server.session.state
+    body = body.replace("VIEW", server.session.views[0].name)
+    assert asked(server, "/step", body) == (400, {"error": "the request is malformed: reload the page"})
+    assert server.session.state is before
+    assert post(server.url, do="undo")["points"] == []
+    assert not capfd.readouterr().err
+
+
+@pytest.mark.parametrize("length", ["abc", "-1", "1000000000000", "²"])
+def test_a_step_of_no_length_is_refused(server: PickServer, capfd: Any, length: str):
+    status, answer = asked(server, "/step", "{}", Content_Length=length)
+    assert status == 400
+    assert "does not say its length" in answer["error"]
+    assert not capfd.readouterr().err
+
+
+def test_only_the_names_of_this_machine_are_answered(server: PickServer):
+    """The name of another site may lead here, and its page would then read and change the picks (DNS rebinding)."""
+    port = server.server_port
+    for host in (f"127.0.0.1:{port}", f"localhost:{port}"):
+        assert asked(server, "/said", Host=host)[0] == 200
+    others = (f"site.example:{port}", "site.example", "localhost", f"localhost:{port + 1}", f"localhost.x:{port}", "")
+    for host in others:
+        status, answer = asked(server, "/said", Host=host)
+        assert (status, b"points" in answer) == (403, False)
+        assert asked(server, "/step", '{"do": "undo"}', Host=host)[0] == 403
+
+
+@pytest.mark.parametrize("numbers", ["x=1&y=2&z=3", "x=1&y=2&z=3&radius=1e300", "x=1&y=2&z=nan&radius=1"])
+def test_a_detail_without_its_place_is_refused(server: PickServer, monkeypatch: pytest.MonkeyPatch, numbers: str):
+    monkeypatch.setattr(server.scan, "cloud", object())  # nothing is asked of it
+    assert asked(server, f"/detail?{numbers}") == (400, {"error": "the request is malformed: reload the page"})

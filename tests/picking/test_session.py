@@ -155,6 +155,16 @@ def test_names_stay_different(session):
     assert sorted(session.state.named) == ["p2", "p3"]
 
 
+@pytest.mark.parametrize("pixel", [(-0.1, 5.0), (800.1, 5.0), (5.0, 600.1), (float("nan"), 5.0), (5.0, float("inf"))])
+def test_a_pixel_is_inside_its_photograph(session, pixel):
+    session.add(CORNERS[0])
+    before = session.state
+    with pytest.raises(SceneError, match=r"is outside images/a photo 0\.png, which has 800x600"):
+        session.mark("p1", session.views[0].name, pixel)
+    assert session.state is before
+    session.mark("p1", session.views[0].name, (800.0, 600.0))
+
+
 def test_residuals_are_those_of_the_alignment(session):
     picked(session, 6, noise=1.0)
     said = session.said()
