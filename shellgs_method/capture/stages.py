@@ -356,11 +356,15 @@ class _Capture:
         if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
             groups = f", in {len(models)} groups without enough overlap" if len(models) > 1 else ""
             shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
+            matching = choose_matching(self.config.matching, len(names), self.is_video)
+            untried = ["--matching exhaustive"] if matching == "sequential" else []
+            untried += ["--quality high"] if self.config.quality == "fast" else []
+            untried += ["more --frames"] if self.is_video else []
+            advice = f"Try {' and '.join(untried)}; leave" if untried else "Leave"
             raise SceneError(
                 f"the cameras of only {registered} of {len(names)} photographs were found{groups}; a scene needs "
-                f"{LEAST_SHARE:.0%} of them and at least {LEAST_REGISTERED}. Not found: {shown}. Try --matching "
-                "exhaustive and --quality high; leave out photographs of other things; photograph with more overlap, "
-                "in small sidesteps rather than turns on the spot; from a video, take more --frames"
+                f"{LEAST_SHARE:.0%} of them and at least {LEAST_REGISTERED}. Not found: {shown}. {advice} out "
+                "photographs of other things; photograph larger, with more overlap, in sidesteps rather than turns"
             )
         for model in models[1:]:
             if len(model["names"]) >= LEAST_REGISTERED:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from shellgs_method.files.photographs import View
     from shellgs_method.shell import Alignment
 
+LITTLE, FAR_OFF = 0.2, 0.5
+"""Share of the shell that a truth covers, and metres between the two, that make a person look."""
+
 
 def cast(
     scene: Scene,
@@ -113,31 +116,39 @@ def cast(
 def _cast_truth(config: FacadeDataParserConfig, alignment: Alignment, max_image_size: int | None, flags: str) -> None:
     """Cast a scan held apart, and print how much of the shell it covers and how far it is from it."""
     from dataparsers.facade import held_out_names, read_views
+    from shellgs_method.files.atomic import content_hash
     from shellgs_method.files.cue_maps import CueMaps
-    from shellgs_method.shell import TRUTH, PlacedShell, cast_views
+    from shellgs_method.shell import ALIGNMENT, TRUTH, Alignment, PlacedShell, cast_views
     from shellgs_method.shell.cast import against_truth
 
     scene, views, start = config.data, read_views(config), time.monotonic()
     shell = CueMaps.open(scene, "shell")
+    if (scene / ALIGNMENT).is_file():
+        of_shell = {content_hash(path) for path in Alignment.load(scene / ALIGNMENT).files(scene) if path.is_file()}
+        if same := [path for path in alignment.files(scene) if path.is_file() and content_hash(path) in of_shell]:
+            raise SceneError(f"{same[0]} is the shell itself, and proves nothing: give a scan that was held apart")
     placed = PlacedShell.load(scene, views, alignment)
     alignment.record(scene / TRUTH, views)
     size = max_image_size or shell.manifest.max_image_size
     summary = cast_views(placed, kind="truth", max_image_size=size, flags=flags)
     held_out = [view for view in views if view.name in held_out_names(config)]
     covered, apart = against_truth(scene, held_out)
+    metres = apart * alignment.metres_per_unit
     console.print(
         f"{summary.cast} views cast, {summary.skipped} already there, in {time.monotonic() - start:.1f} s; the truth "
         f"covers {covered:.0%} of the shell in the {len(held_out)} held-out views, and metrics leave out the rest. "
-        f"In the median, the two are {apart * alignment.metres_per_unit:.3g} m apart there."
+        f"In the median, the two are {metres:.3f} m apart there."
     )
+    if covered < LITTLE or not metres < FAR_OFF:
+        console.print("[yellow]Is it of this building, and in the shell's frame? Look before you believe its metrics.")
     console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: what is grey has no truth.")
 
 
 def _words(truth: Sequence[Path], matrix: Path | None) -> str:
     """The words of a command that casts the truth again."""
-    return f" --truth {' '.join(quote(str(path)) for path in truth)}" + (
-        f" --matrix {quote(str(matrix))}" if matrix else ""
-    )
+    matrices = () if matrix is None else ("--matrix", matrix)
+    words = ("--truth", *truth, *matrices)
+    return "".join(f" {quote(str(word.resolve() if isinstance(word, Path) else word))}" for word in words)
 
 
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:
@@ -161,8 +172,8 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         )
     if verdicts.moved_in:
         console.print(
-            f"In {len(verdicts.moved_in)} views something hides the shell that no other photograph shows, such as a "
-            f"passer-by or a car, mostly in {verdicts.moved_in[0]}: shellgs-metric ignores it."
+            f"Views in which something hides the shell that no other photograph shows, such as a passer-by or a car: "
+            f"{len(verdicts.moved_in)}, mostly {verdicts.moved_in[0]}; shellgs-metric ignores it."
         )
     panel = _save_check_panel(scene, views)
     console.print(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Optional
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from shellgs_method.commands.common import RunConfig, console
@@ -37,11 +38,14 @@ def evaluate(
     import nerfstudio.configs.method_configs  # noqa: F401
 
     from shellgs_method.compare.measure import write_metrics
-    from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, rich_table
+    from shellgs_method.evaluation.tables import MAIN_COLUMNS, SURFACE_COLUMNS, against_truth, rich_table
 
     measured = write_metrics(config, output_path, holdout, renders, points)
+    metrics, truth = measured["results"], against_truth(measured["results"])
+    rows = {"against the shell": metrics, "against the truth": truth} if truth else {"run": metrics}
     for columns in (MAIN_COLUMNS, SURFACE_COLUMNS):
-        console.print(rich_table({"run": measured["results"]}, columns))
+        console.print(rich_table(rows, columns))
+    console.print(f"All metrics: {output_path}", highlight=False, soft_wrap=True)
     if points:
         _print_surveyed(measured["surveyed"])
 
@@ -49,7 +53,7 @@ def evaluate(
 def _print_surveyed(surveyed: Surveyed) -> None:
     table = Table("Point", "Surface before it (m)")
     for name, before in surveyed.before.items():
-        table.add_row(name, "no surface near it" if before is None else f"{before:+.3f}")
+        table.add_row(escape(name), "no surface near it" if before is None else f"{before:+.3f}")
     console.print(table)
     off = surveyed.distances
     console.print(
@@ -57,7 +61,8 @@ def _print_surveyed(surveyed: Surveyed) -> None:
         f"{off.max():.3f} m at most."
     )
     if pairs := sorted(surveyed.pairs, key=lambda pair: abs(pair[3])):
-        one, other, apart, difference = pairs[-1]
+        *names, apart, difference = pairs[-1]
+        one, other = map(escape, names)
         console.print(
             f"Distances between {len(pairs)} pairs of them differ by {abs(pairs[len(pairs) // 2][3]):.3f} m in the "
             f"median, at most by {abs(difference):.3f} m, from {one} to {other}, {apart:.3f} m apart."

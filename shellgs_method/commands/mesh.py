@@ -30,7 +30,7 @@ def mesh(
         faces: Number of triangles that the mesh is decimated to.
         margin: Distance from the shell, in metres, beyond which geometry is left out.
     """
-    from shellgs_method.evaluation.tables import SURFACE_COLUMNS, rich_table
+    from shellgs_method.evaluation.tables import SURFACE_COLUMNS, against_truth, rich_table
     from shellgs_method.export.meshes import METRE_FORMATS, check_mesh_format, write_mesh
     from shellgs_method.export.runs import TrainedRun, mesh_errors
     from shellgs_method.geometry.tsdf import decimate
@@ -43,8 +43,7 @@ def mesh(
     surface = decimate(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, surface)
     write_mesh(output, surface, run.frame, metrics)
-    truth = {name.removeprefix("truth_"): value for name, value in metrics.items() if name.startswith("truth_")}
-    rows = {name: row for name, row in (("shell", metrics), ("truth", truth)) if "rendered" in row}
+    rows = {name: row for name, row in (("shell", metrics), ("truth", against_truth(metrics))) if "rendered" in row}
     console.print(
         f"{output}: {len(surface.faces)} triangles, voxels of {surface.metadata['voxel']:.3g}. {place(run.frame)}"
     )

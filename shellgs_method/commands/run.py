@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import shlex
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -22,6 +25,7 @@ from shellgs_method.commands.sim import sim as simulate
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint, read_json
 from shellgs_method.files.scene import ALIGNMENT
+from shellgs_method.runs.folders import held
 
 if TYPE_CHECKING:
     from shellgs_method.compare.runs import Run
@@ -73,31 +77,72 @@ class Recipe:
 
     @classmethod
     def load(cls, file: Path) -> Recipe:
-        """Read what :meth:`save` wrote and a person may have changed; a wrong flag ends the program with a message."""
-        words = shlex.split(file.read_text(), comments=True)
+        """Read what :meth:`save` wrote and a person may have changed; a wrong flag ends the program with a message.
+
+        Raises:
+            SceneError: a quote is not closed, or it is no text.
+        """
+        try:
+            words = shlex.split(file.read_text(), comments=True)
+        except ValueError as error:
+            raise SceneError(f"{file} cannot be read ({error}): correct it") from error
         return tyro.cli(cls, args=words, prog=str(file)).located(lambda path: file.parent / path)
 
     def save(self, file: Path) -> None:
         """Write the settings as words of the command line; paths in the file's folder are relative to it."""
         folder = file.parent.resolve()
 
-        def seen_from_there(path: Path) -> Path:
-            path = path.resolve()
-            return path.relative_to(folder) if path.is_relative_to(folder) else path
+        def word(value: object) -> str:
+            if isinstance(value, Path) and value.resolve().is_relative_to(folder):
+                value = f"./{value.resolve().relative_to(folder)}"  # not taken for a flag
+            return shlex.quote(str(value.resolve() if isinstance(value, Path) else value))
 
-        recipe = self.located(seen_from_there)
-        lines = [" ".join(shlex.quote(str(path)) for path in recipe.sources)]
-        for field in fields(recipe)[1:]:
-            value, flag = getattr(recipe, field.name), "--" + field.name.replace("_", "-")
+        lines = [" ".join(map(word, self.sources))]
+        for field in fields(self)[1:]:
+            value = getattr(self, field.name)
             if value != field.default:
-                lines.append(flag if value is True else f"{flag} {shlex.quote(str(value))}")
+                lines.append(_flag(field.name) + ("" if value is True else f" {word(value)}"))
         with atomic_write(file) as written:
             written.write(
                 ("# Settings of `shellgs run`: change them, and run it again.\n" + "\n".join(lines) + "\n").encode()
             )
 
+    def check(self) -> None:
+        """Refuse what would fail hours later.
+
+        Raises:
+            FileNotFoundError: a file is missing.
+            SceneError: there is no video and scan, or a setting cannot be used.
+        """
+        from shellgs_method.compare.runs import Variant
+        from shellgs_method.files.crs import given_crs
+
+        if len(self.sources) < 2:
+            raise SceneError("give a video (or a folder of photographs) and a scan")
+        for path in (*self.sources, self.picks, self.matrix, self.positions):
+            if path and not path.exists():
+                raise FileNotFoundError(f"{path} does not exist")
+        scene = self.sources[0]
+        if any((scene / cameras).exists() for cameras in _CAMERAS):
+            raise SceneError(
+                f"{scene} is a scene with cameras: give its photographs, {scene / 'images'}, and --scene {scene}"
+            )
+        if len(self.starts) > 1:
+            raise SceneError(f"the alignment starts from one of {', '.join(map(_flag, self.starts))}")
+        if self.iterations < 1:
+            raise SceneError(f"--iterations must be at least 1, not {self.iterations}")
+        if self.crs:
+            given_crs(self.crs)
+        Variant.parse(self.method)
+        if self.sim:
+            check_packages()
+
 
 _DEFAULT = Recipe()
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 def run(
@@ -109,30 +154,40 @@ def run(
 
     The settings are written to SCENE.run, beside the scene: `shellgs run` alone goes on where it was interrupted, and
     repeats what changed settings change. It stops where the alignment is doubtful or proposed: look at the report that
-    it opens, then go on with --accept, or add --picks to SCENE.run. Results are in SCENE-results.
+    it opens, then go on with --accept, or add --picks to SCENE.run. Results are in SCENE-results. A scene that has
+    cameras already is not captured: give its photographs, and --scene.
 
     Args:
         recipe: Settings.
         scene: Scene folder.
         accept: Go on with the alignment that the report shows.
     """
+    scene = scene if scene.name not in ("", "..") else scene.resolve()
     recipe = _settled(recipe, scene.with_name(f"{scene.name}.run"))
-    if recipe.sim:
-        check_packages()  # fail before hours of work
     results = scene.with_name(f"{scene.name}-results")
-    steps = _Steps(results / "steps.json", total=5 + recipe.sim)
+    steps = _Steps(results / "steps", total=5 + recipe.sim)
+    with held(steps.folder) as alone:
+        if not alone:
+            raise SceneError(f"another run of {scene} is going on: wait for it")
+        _take(steps, recipe, scene, results, accept)
+
+
+def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: bool) -> None:
+    """Take all steps that are not done."""
     video, *shell = recipe.sources
     steps.begin("cameras of the photographs")
-    if (scene / "capture").is_dir() or not any((scene / cameras).exists() for cameras in _CAMERAS):
+    of_another = "capture" in steps and steps.changed("capture", str(video.resolve()))
+    if of_another or not any((scene / cameras).exists() for cameras in _CAMERAS):
         capture(video, scene)
-    else:
+        steps.done("capture", str(video.resolve()))
+    else:  # captured with options of its own, perhaps
         console.print(f"{scene} has cameras.", highlight=False)
     steps.begin("the shell's place")
     _align(recipe, scene, tuple(shell), steps, accept)
     steps.begin("the shell in the photographs")
     cast(scene, max_image_size=recipe.max_image_size)
     steps.begin("training and evaluation")
-    trained = _train(recipe, scene, results)
+    trained = _train(recipe, scene, results, steps)
     steps.begin("mesh")
     checkpoint = trained.key, *(path.name for path in trained.folder.glob("nerfstudio_models/*.ckpt"))
     if steps.changed("mesh", *checkpoint) or not (results / "mesh.ply").exists():
@@ -151,18 +206,23 @@ class _Steps:
     """Which steps are done, with what: kept in a file, so that a run goes on.
 
     Args:
-        path: the file.
+        folder: folder of the file, locked by the run.
         total: number of steps.
     """
 
-    def __init__(self, path: Path, total: int) -> None:
-        self._path, self._total, self._begun = path, total, 0
-        self._done = read_json(path) if path.is_file() else {}
+    def __init__(self, folder: Path, total: int) -> None:
+        self.folder, self._path, self._total, self._begun = folder, folder / "done.json", total, 0
+        folder.mkdir(parents=True, exist_ok=True)
+        self._done = read_json(self._path) if self._path.is_file() else {}
 
     def begin(self, what: str) -> None:
         """Show which step begins."""
         self._begun += 1
         console.rule(f"{self._begun} of {self._total}: {what}", align="left")
+
+    def __contains__(self, step: str) -> bool:
+        """Whether a step was done."""
+        return step in self._done
 
     def changed(self, step: str, *inputs: object) -> bool:
         """Whether a step was not done with these inputs."""
@@ -171,7 +231,6 @@ class _Steps:
     def done(self, step: str, *inputs: object) -> None:
         """Note that it was."""
         self._done[step] = fingerprint(*inputs)
-        self._path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(self._path) as file:
             file.write(json.dumps(self._done, indent=1).encode())
 
@@ -183,21 +242,28 @@ def _settled(recipe: Recipe, file: Path) -> Recipe:
         SceneError: there are none, or some are given again that differ from the file's.
     """
     if not file.is_file():
-        if len(recipe.sources) < 2:
-            raise SceneError(f"give a video (or a folder of photographs) and a scan: there is no {file} to go on with")
-        if missing := [path for path in recipe.sources if not path.exists()]:
-            raise FileNotFoundError(f"{missing[0]} does not exist")
+        if not recipe.sources:
+            others = [f"--scene {shlex.quote(str(other.with_suffix('')))}" for other in file.parent.glob("*.run")]
+            hint = f"; or go on with {' or '.join(others)}" if others else ""
+            raise SceneError(
+                f"there is no {file} to go on with: give a video (or a folder of photographs) and a scan{hint}"
+            )
+        recipe.check()
         recipe.save(file)
         return recipe
     stored = Recipe.load(file)
     given, known = (vars(each.located(Path.resolve)) for each in (recipe, stored))
+    typed = {word.partition("=")[0] for word in sys.argv}  # a value may be the default, and yet given
     for field in fields(Recipe):
-        if given[field.name] not in (field.default, known[field.name]):
+        named = recipe.sources if field.name == "sources" else _flag(field.name) in typed
+        if named and given[field.name] != known[field.name]:
             raise SceneError(
-                f"{file} has another {field.name.replace('_', ' ')}: change it there, then `shellgs run` goes on"
+                f"{file} has other {field.name.replace('_', ' ')}: change that there, or give another --scene"
             )
-    if len(stored.sources) < 2:
-        raise SceneError(f"{file} names no video and scan: write them into its first line")
+    try:
+        stored.check()
+    except (SceneError, FileNotFoundError) as error:
+        raise SceneError(f"{error}; the settings are in {file}") from error
     return stored
 
 
@@ -207,16 +273,21 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
     Raises:
         SceneError: the alignment is refused, doubtful, or a proposal, and not accepted.
     """
-    from shellgs_method.registration.align import REPORT
+    from shellgs_method.registration.align import PROPOSAL, REPORT
     from shellgs_method.shell import Alignment
 
     files = *shell, recipe.matrix, recipe.picks, recipe.positions, *(scene / cameras for cameras in _CAMERAS)
     hashes = [path and path.exists() and content_hash(path) for path in files]
     settings = recipe.refine, recipe.metres_per_shell_unit, recipe.crs, recipe.bundle_adjust, recipe.same_frame
     inputs, report = (*hashes, *settings), scene / REPORT / "index.html"
-    proposed = not recipe.starts
+    proposed, named = not recipe.starts, shlex.quote(str(scene))
+    accepted = not steps.changed("accepted", *inputs)
+    written = scene / (PROPOSAL if proposed and not accepted else ALIGNMENT)
+    refinement = "" if recipe.refine or proposed else "add --refine 0.3, or "
+    pick = f"shellgs pick {named} {shlex.join(map(str, shell))}"
+    remedy = f"{refinement}pick {'more ' if recipe.picks else ''}points ({pick}) and have --picks picks.txt"
     try:
-        if steps.changed("align", *inputs):
+        if steps.changed("align", *inputs) or not _is_there(written, scene):
             align(
                 scene,
                 shell,
@@ -227,33 +298,52 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
                 crs=recipe.crs,
             )
             steps.done("align", *inputs)
-        elif accept and proposed and steps.changed("accepted", *inputs):
+            accept, accepted = accept and not proposed, accepted and not proposed  # a proposal is seen first
+        elif accept and proposed and not accepted:
             align(scene, accept=True, bundle_adjust=recipe.bundle_adjust)
-    except SceneError:
+    except SceneError as error:
         if report.is_file():
             open_page(report)
-        raise
+        raise SceneError(f"{error}; {remedy} in {scene}.run") from error
     if accept:
         steps.done("accepted", *inputs)
-    if (proposed or Alignment.load(scene / ALIGNMENT).verdict != "good") and steps.changed("accepted", *inputs):
+    if not (accept or accepted) and (proposed or Alignment.load(scene / ALIGNMENT).verdict != "good"):
         open_page(report)
         state = "a proposal" if proposed else "doubtful"
-        files = " ".join(map(str, shell))
         raise SceneError(
-            f"the alignment is {state}: if the images in {report} agree, go on with `shellgs run --scene {scene} "
-            f"--accept`; else pick points (`shellgs pick {scene} {files}`), and add --picks picks.txt to {scene}.run"
+            f"the alignment is {state}: if the images in {report} agree, go on with `shellgs run --scene {named} "
+            f"--accept`; else {remedy} in {scene}.run"
         )
 
 
-def _train(recipe: Recipe, scene: Path, results: Path) -> Run:
-    """Train and evaluate, unless that is done; the run goes on where it was interrupted."""
+def _is_there(alignment: Path, scene: Path) -> bool:
+    """Whether there is an alignment whose shell is where it says: a project may have been moved."""
+    from shellgs_method.shell import Alignment
+
+    return alignment.is_file() and all(path.is_file() for path in Alignment.load(alignment).files(scene))
+
+
+def _train(recipe: Recipe, scene: Path, results: Path, steps: _Steps) -> Run:
+    """Train and evaluate, unless that is done; an interrupted run goes on, one with other settings is put aside."""
     import nerfstudio.configs.method_configs  # noqa: F401  (first: its import takes longer from deep in others)
 
     from shellgs_method.compare.results import compare
-    from shellgs_method.compare.runs import grid
+    from shellgs_method.compare.runs import DamagedRunError, OtherSettingsError, grid
     from shellgs_method.launch.local import launch_locally
 
     (trained,) = runs = grid([scene], [recipe.method], [0], recipe.iterations, results)
+    with suppress(DamagedRunError):  # which is told below
+        try:
+            trained.check()
+        except OtherSettingsError:
+            aside = next(path for k in count(1) if not (path := results / f"runs-{k}").exists())
+            (results / "runs").rename(aside)
+            console.print(f"What was trained with other settings or maps is now in {aside}.", highlight=False)
+    truth = scene / "cues/truth/manifest.json"
+    measured_by = content_hash(truth) if truth.is_file() else ""
+    if steps.changed("evaluation", measured_by):
+        trained.metrics().unlink(missing_ok=True)
     if compare(runs, partial(launch_locally, jobs=1, console=console), results, console).failures:
         raise SystemExit("shellgs: the training failed; the end of its output is above. The same command goes on.")
+    steps.done("evaluation", measured_by)
     return trained

@@ -35,6 +35,10 @@ SAVES = 10
 """Least number of checkpoints that a run writes, which bounds what an interruption costs."""
 
 
+class OtherSettingsError(SceneError):
+    """A folder holds a run with other settings or maps."""
+
+
 class DamagedRunError(SceneError):
     """The folder of one run cannot be used; the others continue."""
 
@@ -245,7 +249,7 @@ class Run:
             changed = [key for key in settings if settings[key] != known[key]]
             if changed:
                 what = "; ".join(f"{key}: {_short(known[key])}, now {_short(settings[key])}" for key in changed[:5])
-                raise SceneError(
+                raise OtherSettingsError(
                     f"{self.folder} is a run with other settings ({what}): give another --output, or remove that folder"
                 )
             return

@@ -136,7 +136,7 @@ def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) 
         role = table.name if not prefix else {"main": "second"}.get(table.name, "")
         rows = {name: row for name, row in table.rows.items() if any(c.key in row for c in table.columns)}
         if rows:
-            yield replace(table, name=prefix + table.name, rows=rows, paper=_paper(role))
+            yield replace(table, name=prefix + table.name, rows=rows, paper=_paper(role) if len(methods) > 1 else {})
 
 
 def _rows(runs: Sequence[Run], half: Half | None = None) -> dict[str, dict[str, list[float]]]:

@@ -178,3 +178,8 @@ def _deviation(values: float | Sequence[float]) -> float | None:
 
 def _latex_line(texts: Sequence[str]) -> str:
     return " & ".join(text.translate(_LATEX) for text in texts) + r" \\"
+
+
+def against_truth(metrics: Mapping[str, float]) -> dict[str, float]:
+    """Those of metrics that are against the true geometry, by the names of those against the shell."""
+    return {name.removeprefix("truth_"): value for name, value in metrics.items() if name.startswith("truth_")}

@@ -9,6 +9,7 @@ import pytest
 
 from shellgs_method.commands import run as run_command
 from shellgs_method.commands.run import Recipe
+from shellgs_method.registration.align import PROPOSAL
 from shellgs_method.shell import ALIGNMENT, Alignment
 
 
@@ -23,6 +24,11 @@ def inputs(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run_command, "open_page", lambda page: print("opened", page))
     return [scene / "images", Path("shell.ply"), Path("matrix.txt")]
+
+
+def scene_alignment(inputs: list[Path]) -> Alignment:
+    """The true alignment, of the shell where it was moved to."""
+    return Alignment(np.loadtxt(inputs[2]), ("../shell.ply",))
 
 
 @pytest.fixture
@@ -46,6 +52,10 @@ def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
     assert "0 views cast" in again
     assert "triangles" not in again  # no second mesh
     assert mesh.stat().st_mtime_ns == written
+    settings = Path("scene.run")
+    settings.write_text(settings.read_text().replace("--iterations 3", "--iterations 2"))
+    assert "is now in scene-results/runs-1" in shellgs("run")
+    assert mesh.stat().st_mtime_ns != written
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")
@@ -55,16 +65,22 @@ def test_a_proposal_stops_the_run_until_it_is_accepted(inputs, shellgs, monkeypa
 
     def align(scene, shell=(), accept=False, **settings):
         calls.append(accept)
-        if accept:
-            Alignment(np.eye(4), ("shell.ply",), verdict="doubtful").save(scene / ALIGNMENT)
+        path = scene / (ALIGNMENT if accept else PROPOSAL)
+        Alignment(np.eye(4), ("../shell.ply",), verdict="doubtful").save(path)
 
     monkeypatch.setattr(run_command, "align", align)
-    assert "is a proposal: if the images in scene/shell/report/index.html agree" in shellgs("run", photographs, shell)
+    earlier = scene_alignment(inputs)
+    earlier.save(Path("scene") / ALIGNMENT)  # of another shell, perhaps: it must not pass for the proposal
+    told = shellgs("run", photographs, shell, "--accept")
+    assert "is a proposal: if the images in scene/shell/report/index.html agree" in told  # it was not seen yet
+    assert Alignment.load(Path("scene") / ALIGNMENT) == earlier
     assert "is a proposal" in shellgs("run")
     assert calls == [False]  # not proposed again
     assert shellgs("run", "--accept") == "refused: cast"
     assert shellgs("run") == "refused: cast"
     assert calls == [False, True]
+    (Path("scene") / ALIGNMENT).unlink()  # lost: proposed again, and to be seen again
+    assert "is a proposal" in shellgs("run", "--accept")
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")
@@ -85,6 +101,31 @@ def test_a_doubtful_alignment_stops_the_run_and_changed_settings_void_what_was_a
     assert len(calls) == 2
 
 
+@pytest.mark.usefixtures("ends_with_the_cast")
+def test_photographs_are_captured_where_there_are_no_cameras_and_again_if_they_are_others(inputs, shellgs, monkeypatch):
+    photographs, shell, matrix = inputs
+    cameras, calls = Path("scene/transforms.json"), []
+
+    def capture(source, scene):
+        calls.append(source.name)
+        cameras.write_bytes(kept)
+
+    monkeypatch.setattr(run_command, "capture", capture)
+    (Path("scene") / "capture").mkdir()  # of `shellgs capture` with options
+    assert shellgs("run", photographs, shell, "--matrix", matrix, "--accept") == "refused: cast"
+    assert calls == []
+    kept = cameras.read_bytes()
+    cameras.unlink()
+    assert shellgs("run") == "refused: cast"
+    assert shellgs("run") == "refused: cast"
+    assert calls == ["images"]
+    Path("others").mkdir()
+    settings = Path("scene.run")
+    settings.write_text(settings.read_text().replace("scene/images", "others"))
+    assert shellgs("run") == "refused: cast"
+    assert calls == ["images", "others"]
+
+
 def test_settings_are_read_as_they_were_written_wherever_the_folder_is(tmp_path):
     recipe = Recipe((tmp_path / "walk by.mp4", Path("/elsewhere/scan.ply")), picks=tmp_path / "p#.txt", refine=0.3,
                     same_frame=True, crs="EPSG:25832", iterations=12)  # fmt: skip
@@ -99,7 +140,15 @@ def test_settings_are_read_as_they_were_written_wherever_the_folder_is(tmp_path)
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ([], "give a video (or a folder of photographs) and a scan: there is no scene.run to go on with"),
+        ([], "there is no scene.run to go on with: give a video (or a folder of photographs) and a scan"),
+        (["{photographs}", "shell.ply", "--picks", "no.txt"], "no.txt does not exist"),
+        (["{photographs}", "shell.ply", "--iterations", "0"], "--iterations must be at least 1"),
+        (["{photographs}", "shell.ply", "--method", "shelgs"], "there is no method 'shelgs'"),
+        (["{photographs}", "shell.ply", "--matrix", "matrix.txt", "--same-frame"], "starts from one of"),
+        (
+            ["scene", "shell.ply"],
+            "scene is a scene with cameras: give its photographs, scene/images, and --scene scene",
+        ),
         (["{photographs}"], "give a video"),
         (["{photographs}", "no.ply"], "no.ply does not exist"),
     ],
@@ -115,4 +164,11 @@ def test_settings_that_differ_from_the_files_are_refused(inputs, shellgs):
     words = [photographs, shell, "--matrix", matrix]
     assert shellgs("run", *words, "--accept") == "refused: cast"
     assert shellgs("run", *words) == "refused: cast"
-    assert "scene.run has another iterations: change it there" in shellgs("run", "--iterations", 5)
+    assert "scene.run has other iterations: change that there" in shellgs("run", "--iterations", 5)
+    settings = Path("scene.run")
+    settings.write_text(settings.read_text() + "--iterations 5\n")
+    assert "scene.run has other iterations" in shellgs("run", "--iterations", 30000)  # given, though it is the default
+    settings.write_text(settings.read_text() + "--picks 'unclosed\n")
+    assert "scene.run cannot be read (No closing quotation)" in shellgs("run")
+    settings.write_text(f"{photographs} gone.ply")
+    assert "gone.ply does not exist; the settings are in scene.run" in shellgs("run")

@@ -70,20 +70,22 @@ def test_what_photographs_show_before_the_truth_is_left_out_of_it(scene, shellgs
 
 def test_it_is_told_how_much_of_the_shell_has_a_truth_and_how_far_apart_they_are(scene, shellgs, tmp_path):
     alignment = Alignment.load(scene / ALIGNMENT)
-    told = shellgs("cast", scene, "--truth", alignment.files(scene)[0])
-    assert "covers 100% of the shell" in told
-    assert "0 m apart" in told
+    survey = write_survey(scene, tmp_path / "survey.obj")
+    told = shellgs("cast", scene, "--truth", survey)
+    assert 0.9 < float(told.split("covers ")[1].split("%")[0]) / 100 <= 1
+    assert "the two are 0.000 m apart" in told
     shifted = alignment.shell_to_scene.copy()
-    shifted[:3, 3] += 0.1 / alignment.metres_per_unit * shifted[:3, 1] / np.linalg.norm(shifted[:3, 1])
+    shifted[:3, 3] += 2.0 / alignment.metres_per_unit * shifted[:3, 1] / np.linalg.norm(shifted[:3, 1])
     np.save(tmp_path / "matrix.npy", shifted)
-    told = shellgs("cast", scene, "--truth", alignment.files(scene)[0], "--matrix", tmp_path / "matrix.npy")
-    assert float(told.split("the two are ")[1].split(" m apart")[0]) > 0.02
+    told = shellgs("cast", scene, "--truth", survey, "--matrix", tmp_path / "matrix.npy")
+    assert float(told.split("the two are ")[1].split(" m apart")[0]) > 0.5
+    assert "Is it of this building" in told
     assert Alignment.load(scene / ALIGNMENT) == alignment
 
 
 def test_a_truth_in_the_frame_of_the_shell_is_stale_once_the_shell_has_moved(scene, shellgs, tmp_path):
     alignment = Alignment.load(scene / ALIGNMENT)
-    survey = alignment.files(scene)[0]
+    survey = write_survey(scene, tmp_path / "survey.obj", materials=Material.RAILING)
     np.save(tmp_path / "matrix.npy", alignment.shell_to_scene + np.diag([1e-6, 1e-6, 1e-6, 0]))
     moved = alignment.shell_to_scene.copy()
     moved[0, 3] += 0.01
@@ -105,6 +107,7 @@ def test_a_truth_in_the_frame_of_the_shell_is_stale_once_the_shell_has_moved(sce
     ("words", "why"),
     [
         (["--truth", "no.ply"], "no.ply"),
+        (["--truth", "{shell}"], "is the shell itself, and proves nothing"),
         (["--truth", "{shell}", "--shell", "{shell}", "--matrix", "m.npy"], "give --shell or --truth"),
         (["--truth", "{shell}", "--metres-per-shell-unit", "0.001"], "go with --matrix"),
     ],
