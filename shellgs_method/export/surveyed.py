@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -14,10 +15,17 @@ from jaxtyping import Float64
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.registration.correspondences import are_numbers, read_lines, to_shell
+from shellgs_method.registration.correspondences import are_numbers, column_name, header_and_lines, to_shell
 
 REACH = 0.5
 """Distance in metres from a surveyed point within which the surface must be for the point to count."""
+_X = ("x", "easting", "east", "e", "rechtswert", "ostwert")
+_Y = ("y", "northing", "north", "n", "hochwert", "nordwert")
+_Z = ("z", "height", "elevation", "elev", "hoehe", "höhe", "h")
+_NAME = ("name", "id", "point", "punkt", "nr")
+"""What headers call the columns; of several, the first counts."""
+_UNIT = re.compile(r"[\[(][^\])]*[\])]")
+_DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*\d,\d+,?")
 
 
 @dataclass(frozen=True)
@@ -41,35 +49,72 @@ class Surveyed:
 
 
 def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 3"]]:
-    """Read surveyed points: a line each, ``name X Y Z`` or ``X Y Z [name]``.
+    """Read surveyed points: a line each, in the columns that a first line without numbers names.
 
-    They are in the coordinate reference system that a first line without numbers names, or else in that of the shell.
-
-    Words are separated by blanks, commas or semicolons; further columns after ``name X Y Z`` are skipped. Points
-    without a name are numbered.
+    Without names of columns, all lines are ``name X Y Z``, and what follows is skipped, or all are ``X Y Z [name]``; of
+    four numbers the last is the name if it is whole in all lines, and the first is not. The first line may also name
+    their coordinate reference system; else it is the shell's. Columns are separated by blanks, commas or semicolons.
+    Points without a name are numbered.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: a line cannot be read, two points have the same name, there are none, or they are in degrees and the
-            shell's system is not known.
+        SceneError: a line cannot be read, two points have the same name, there are none, or their system is unknown to
+            PROJ, or in degrees while the shell's is not known.
     """
     convert = to_shell(path, "surveyed points", crs)
+    header, lines = header_and_lines(path, "surveyed points")
+    rows = [(where, _cells(words)) for where, words in lines]
+    titles = _cells(_UNIT.sub("", " ".join(header)).split())
+    if columns := _columns(titles, path):
+        expected, width = ", ".join(titles), len(titles)
+    elif _is_name_last([row for _, row in rows]):
+        expected, width, columns = "X Y Z and perhaps a name", 4, (0, 1, 2, 3)
+    else:
+        expected, width, columns = "a name and X Y Z", np.inf, (1, 2, 3, 0)
     points: dict[str, np.ndarray] = {}
-    for where, words in read_lines(path, "surveyed points"):
-        separator = ";" if any(";" in word for word in words) else ","  # where it is a semicolon, commas are decimal
-        words = [piece for word in words for piece in word.split(separator) if piece]
-        if len(words) >= 4 and are_numbers(words[1:4]):
-            name, numbers = words[0], words[1:4]
-        elif len(words) in (3, 4) and are_numbers(words[:3]):
-            name, numbers = words[3] if len(words) == 4 else str(len(points) + 1), words[:3]
-        else:
-            raise SceneError(f"{where}: expected a name and X Y Z in the shell's coordinates, with decimal points")
+    for where, row in rows:
+        cells = dict(enumerate(row))
+        *numbers, name = (cells.get(k, "") for k in columns)
+        if len(row) > width or not are_numbers(numbers):
+            raise SceneError(f"{where}: expected {expected} in the shell's coordinates, with decimal points")
+        name = name or str(len(points) + 1)
         if name in points:
             raise SceneError(f"{where}: there is a point {name} already")
         points[name] = np.array(numbers, dtype=np.float64)
     if not points:
         raise SceneError(f"{path} holds no points")
     return dict(zip(points, convert(np.stack([*points.values()])), strict=True))
+
+
+def _cells(words: Sequence[str]) -> list[str]:
+    """The cells of a line, empty ones between separators too; none if commas are decimal."""
+    line = " ".join(words)
+    if any(_DECIMAL_COMMA.fullmatch(piece) for piece in re.split(r"[\s;]+", line)):
+        return []
+    separator = next((sign for sign in ";," if sign in line), None)
+    cells = [cell.strip() for cell in line.split(separator)] if separator else [*words]
+    return cells if any(cells[-1:]) else cells[:-1]
+
+
+def _columns(titles: Sequence[str], path: Path) -> tuple[int, ...]:
+    """Columns of X, Y, Z and the name, which is past the last one if there is none; empty if X and Y have no title."""
+    names = [column_name(title) for title in titles]
+    *axes, name = (next((names.index(n) for n in known if n in names), -1) for known in (_X, _Y, _Z, _NAME))
+    if max(axes[:2]) < 0:
+        return ()
+    if min(axes) < 0:
+        raise SceneError(
+            f"{path}: its first line, {', '.join(titles)}, must name one column each of X, Y and Z, or none"
+        )
+    return (*axes, name if name >= 0 else 0 if 0 not in axes else len(titles))
+
+
+def _is_name_last(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether the rows that can be read are X Y Z [name], and not the name and X Y Z."""
+    rows = [row for row in rows if any(len(some) == 3 and are_numbers(some) for some in (row[:3], row[1:4]))]
+    fourth = [row[3] for row in rows if len(row) > 3 and are_numbers(row[3:4])]
+    whole = all(cell.isdigit() for cell in fourth) and any("." in row[0] for row in rows)
+    return len(rows) > 0 and (whole or not fourth) and all(len(row) <= 4 and are_numbers(row[:3]) for row in rows)
 
 
 def at_surveyed(

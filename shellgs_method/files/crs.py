@@ -12,10 +12,11 @@ from jaxtyping import Float64
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 
 _NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
 """How a system is named; PROJ would find one for nearly any word."""
+_INTRODUCED = re.compile(r"^[CS]RS\s*[:=]\s*(?!\d)", re.IGNORECASE)  # CRS:84 is a code
 _UTM = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
 _IN_FILES = {
     **dict.fromkeys((".ifc",), re.compile(rb"IFCPROJECTEDCRS\s*\(\s*'([^']+)'", re.IGNORECASE)),
@@ -25,14 +26,20 @@ _IN_FILES = {
 
 
 def known_crs(text: str) -> CRS | None:
-    """The system that a text names: a code (EPSG:25832), urn, PROJ string, WKT, or OpenDroneMap's ``WGS84 UTM 32N``."""
-    text = text.strip()
+    """The system that a text names, also after ``CRS:``.
+
+    It may be a code (EPSG:25832), urn, PROJ string, WKT, PROJ's full name (ETRS89 / UTM zone 32N), or OpenDroneMap's
+    ``WGS84 UTM 32N``.
+    """
+    text = _INTRODUCED.sub("", text.strip())
     if utm := _UTM.fullmatch(text):
         text = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
     try:
-        return CRS.from_user_input(text) if _NAMED.match(text) else None
+        crs = CRS.from_user_input(text)
     except ProjError:
         return None
+    is_named = _NAMED.match(text) or crs.name.casefold() == text.casefold()
+    return crs if is_named and len(crs.axis_info) > 1 else None  # not heights alone
 
 
 def name_of(crs: CRS) -> str:
@@ -42,7 +49,7 @@ def name_of(crs: CRS) -> str:
 
 
 def crs_of(*paths: Path) -> str:
-    """Name of the system that a shell's files, or a ``.prj`` beside one, say they are in; empty if unknown.
+    """Name of the system that a shell's files, or a ``.prj`` beside one, say they are in; empty if unknown, or degrees.
 
     Raises:
         SceneError: they are in several.
@@ -56,9 +63,15 @@ def crs_of(*paths: Path) -> str:
 
 def _crs_of(path: Path) -> str:
     beside = path.with_suffix(".prj")
+    source = beside if beside.is_file() else path
     try:
-        crs = known_crs(beside.read_text("utf-8-sig")) if beside.is_file() else _written_in(path)
+        crs = known_crs(beside.read_text("utf-8-sig")) if source is beside else _written_in(path)
     except Exception:  # each format's reader raises errors of its own; a damaged file is refused where it is read
+        crs = None
+    if crs is None and source is beside:
+        notice(f"{beside} names no coordinate reference system that PROJ knows: give the shell's with --crs.")
+    if crs is not None and crs.is_geographic:
+        notice(f"{source} names {crs.name}, which is in degrees and so not the shell's: give the shell's with --crs.")
         return ""
     return name_of(crs) if crs else ""
 

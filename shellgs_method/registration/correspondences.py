@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from pyproj import CRS
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.crs import converter, known_crs
 from shellgs_method.files.paths import captured_name
 from shellgs_method.files.photographs import View
@@ -27,7 +27,12 @@ from photographs) and of RTK positions (2 to 3 cm)."""
 LARGEST = 1e12
 """Largest coordinate, in any unit."""
 _WORD = re.compile(r"""(?P<comment>\#.*)|"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<bare>\S+)""")
-_LATITUDE, _LONGITUDE = ("lat", "latitude"), ("lon", "long", "longitude")
+_LATITUDE, _LONGITUDE = ("lat", "latitude"), ("lon", "long", "lng", "longitude")
+_SYSTEM = re.compile(
+    r"\b(EPSG|UTM|ETRS|WGS|NAD\d|GDA\d|SRID|[CS]RS\s*[:=]|zone\s*\d|(PROJ|GEOG|GEOD|COMPD|BOUND)\w*\[)|\+\w+=",
+    re.IGNORECASE,
+)
+"""What a header holds that is meant to name a system."""
 _THIN = 0.02  # breadth over length below which points are on one line
 _MAX_TRIPLES = 2000
 
@@ -125,8 +130,8 @@ def worst_first(points: Sequence[Point]) -> list[Point]:
 def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
     """Yield the position, for messages, and the words of each line of a text file.
 
-    A header is skipped: a first line without numbers. So are comments after a # that begins a word. Words with spaces
-    are quoted; an apostrophe inside a word is part of it.
+    A header (:func:`header_and_lines`) is skipped. So are comments after a # that begins a word. Words with spaces are
+    quoted; an apostrophe inside a word is part of it.
 
     Args:
         path: the file.
@@ -136,7 +141,7 @@ def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
         FileNotFoundError: the file does not exist.
         SceneError: the file is not text, or a quote is not closed.
     """
-    yield from _split(path, contents)[1]
+    yield from header_and_lines(path, contents)[1]
 
 
 def to_shell(path: Path, contents: str, crs: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
@@ -148,20 +153,22 @@ def to_shell(path: Path, contents: str, crs: str) -> Callable[[np.ndarray], Floa
         crs: coordinate reference system of the shell; empty if unknown, as if the file's were the same.
 
     Raises:
-        SceneError: the header says that the file is in degrees, and the shell's system is unknown; while converting,
-            coordinates are outside the shell's system.
+        SceneError: the header names a system that PROJ does not know, or says that the file is in degrees, and the
+            shell's system is unknown; while converting, coordinates are outside the shell's system.
     """
-    header, _ = _split(path, contents)
-    pieces = [piece.lower() for word in header for piece in re.split("[,;]", word)]
-    source = known_crs(" ".join(header))
-    latitude, longitude = ([k for k, piece in enumerate(pieces) if piece in names] for names in (_LATITUDE, _LONGITUDE))
-    if source is None and latitude and longitude:
-        source = CRS.from_epsg(4326)
+    header = " ".join(header_and_lines(path, contents)[0])
+    names = [column_name(piece) for piece in re.split(r"[\s,;]+", header)]
+    latitude, longitude = ([k for k, name in enumerate(names) if name in axis] for axis in (_LATITUDE, _LONGITUDE))
+    source = known_crs(header) or (CRS.from_epsg(4326) if latitude and longitude else None)
+    if source is None and _SYSTEM.search(header):
+        raise SceneError(
+            f"{path}: cannot read the system {header}: write it as EPSG:25832, or leave it out if it is the shell's"
+        )
     if source is None:
         return lambda points: points
     if not crs and source.is_geographic:
         raise SceneError(
-            f"{path} is in degrees ({' '.join(header)}): say with --crs in which coordinate reference system the "
+            f"{path} is in degrees ({header}): say with --crs in which coordinate reference system the "
             "shell is, such as EPSG:25832, or convert the file to the shell's coordinates"
         )
     if not crs:
@@ -171,8 +178,16 @@ def to_shell(path: Path, contents: str, crs: str) -> Callable[[np.ndarray], Floa
     return lambda points: convert(points[:, order])
 
 
-def _split(path: Path, contents: str) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """Words of the header of a text file, and its lines as of :func:`read_lines`."""
+def column_name(cell: str) -> str:
+    """The name of a header's cell in lower case, without a unit or what else follows its first word."""
+    return re.split("[^a-zäöü]", cell.strip().lower())[0]
+
+
+def header_and_lines(path: Path, contents: str) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Words of the header of a text file, which is a first line without numbers, and its lines.
+
+    Args and errors are those of :func:`read_lines`.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"the file of {contents} {path} does not exist")
     try:
@@ -180,6 +195,9 @@ def _split(path: Path, contents: str) -> tuple[list[str], list[tuple[str, list[s
     except UnicodeDecodeError as error:
         raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
     lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
+    numbered = (re.split(r"[\s,;]+", line) for _, line in lines if re.match(r"\s*#\w", line))
+    if skipped := sum(sum(are_numbers([word]) for word in words) >= 3 for words in numbered):
+        notice(f"{path}: {skipped} lines of numbers begin with #, and are skipped: quote a name that begins so.")
     worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
     return (worded[0][1], worded[1:]) if worded and _is_header(worded[0][1]) else ([], worded)
 
@@ -200,9 +218,14 @@ def words_of(line: str, where: str) -> list[str]:
 
 
 def _is_header(words: Sequence[str]) -> bool:
-    """Whether nothing is a number, also where commas separate them; definitions (+zone=32, WKT) may hold some."""
+    """Whether nothing is a number, with or without a unit, also where commas separate them.
+
+    Definitions (+zone=32, WKT) may hold some, and names of systems what begins with a digit (UTM 32N).
+    """
     names = [word for word in words if "=" not in word and "[" not in word]
-    return not any(are_numbers([piece]) for word in names for piece in re.split("[,;]", word))
+    pieces = [piece for word in names for piece in re.split("[,;]", word)]
+    begins = not _SYSTEM.search(" ".join(words)) and any(re.match(r"[+-]?\.?\d", piece) for piece in pieces)
+    return not begins and not any(are_numbers([piece]) for piece in pieces)
 
 
 def view_named(name: str, views: Sequence[View], where: str) -> View | None:

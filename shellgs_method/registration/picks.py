@@ -83,8 +83,8 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is in degrees and the shell's system is not known, or a line cannot be read, names an image
-            that is not in the scene, or contradicts another line.
+        SceneError: the file is in a system that PROJ does not know, or in degrees and the shell's is not known, or a
+            line cannot be read, names an image that is not in the scene, or contradicts another line.
     """
     picks = _picks_of(read_lines(path, "picks"), path, views, to_shell(path, "picks", crs))
     if not picks:

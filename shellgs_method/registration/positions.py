@@ -52,8 +52,8 @@ def read_positions(path: Path, views: Sequence[View], crs: str = "") -> Surveyed
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is in degrees and the shell's system is not known, or a line cannot be read or contradicts
-            another.
+        SceneError: the file is in a system that PROJ does not know, or in degrees and the shell's is not known, or a
+            line cannot be read or contradicts another.
     """
     convert = to_shell(path, "camera positions", crs)
     found: dict[str, tuple[View, list[float]]] = {}

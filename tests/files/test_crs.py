@@ -64,10 +64,29 @@ def test_a_prj_beside_a_file_is_that_of_the_file(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (pyproj.CRS("EPSG:4326").to_wkt("WKT1_ESRI"), "scan.prj names WGS 84, which is in degrees"),
+        ("PROJCS[", "scan.prj names no coordinate reference system"),
+        (b"\xff\xfe", "scan.prj names no coordinate reference system"),
+    ],
+)
+def test_a_prj_that_is_not_the_shells_system_is_told_and_not_kept(tmp_path, caplog, text, why):
+    (tmp_path / "scan.prj").write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert not crs_of(tmp_path / "scan.ply")
+    assert why in caplog.text
+
+
+@pytest.mark.parametrize(
     ("text", "system"),
     [
         ("EPSG:25832", UTM),
         ("WGS84 UTM 32N", "EPSG:32632"),
+        ("ETRS89 / UTM zone 32N", UTM),
+        ("CRS: EPSG:25832", UTM),
+        ("UTM 32N", None),
+        ("EPSG:99999", None),
+        ("EPSG:5783", None),  # heights only
         ("WGS84 UTM 7S", "EPSG:32707"),
         ("urn:ogc:def:crs:EPSG::2056", "EPSG:2056"),
         ("+proj=longlat", "OGC:CRS84"),

@@ -107,6 +107,14 @@ def test_picks_in_degrees_are_gone_on_with_in_the_scans_system(tmp_path, views):
     np.testing.assert_array_equal(again.shell, [east, north, height])
 
 
+def test_picks_in_an_unknown_system_are_refused_and_their_file_left_alone(tmp_path, views):
+    text = "UTM 33N\n1 2 3 4 5 'a photo 0.png' a\n"
+    (tmp_path / "p.txt").write_text(text)
+    with pytest.raises(SceneError, match="cannot read the system UTM 33N"):
+        Session(tmp_path / "p.txt", views, crs="EPSG:25832")
+    assert (tmp_path / "p.txt").read_text() == text
+
+
 def test_each_step_is_in_the_file_and_undone_in_it(session):
     picked(session, 2)
     texts = [session.path.read_text()]

@@ -460,6 +460,8 @@ def test_an_invalid_line_of_a_picks_file_is_refused_with_its_number(rigged, tmp_
         "1.5; 2 3 4 5 images/0.png a",
         "1,2,3,4,5,images/0.png,a",
         "x1 2 3 4 5 images/0.png a",
+        "1.0m 2.0m 3.0m 4px 5px images/0.png a",
+        "-1m -.5m +3m images/0.png",
     ],
 )
 def test_a_slip_in_the_first_line_of_a_picks_file_is_no_header(rigged, tmp_path, first):
@@ -474,12 +476,28 @@ def test_a_slip_in_the_first_line_of_a_picks_file_is_no_header(rigged, tmp_path,
         "WGS84 UTM 32N",
         "+proj=tmerc +lat_0=0 +towgs84=598.1,73.7,418.2 +units=m",
         "X,Y,Z,x,y,image,name",
-        'PROJCS["ETRS89 / UTM 32N",GEOGCS["ETRS89"],PARAMETER["false_easting",500000]]',
+        "ETRS89 / UTM zone 33N",
+        pyproj.CRS("EPSG:25832").to_wkt("WKT1_GDAL"),
     ],
 )
 def test_a_header_of_a_picks_file_is_skipped(rigged, tmp_path, first):
     (tmp_path / "picks.txt").write_text(f"{first}\n1 2 3 4 5 images/1.png a\n")
     assert [pick.name for pick in read_picks(tmp_path / "picks.txt", rigged[0])] == ["a"]
+
+
+@pytest.mark.parametrize(
+    "header", ["EPSG:99999", "UTM 33N", "CRS: my own", "+proj=nothing", 'PROJCS["ETRS89 / UTM 32N",GEOGCS["ETRS89"]]']
+)
+def test_a_header_of_a_system_that_proj_does_not_know_is_refused(rigged, tmp_path, header):
+    (tmp_path / "picks.txt").write_text(f"{header}\n1 2 3 4 5 images/1.png a\n")
+    with pytest.raises(SceneError, match=re.escape(f"cannot read the system {header}: write it as EPSG:25832")):
+        read_picks(tmp_path / "picks.txt", rigged[0], "EPSG:25832")
+
+
+def test_lines_whose_names_begin_as_comments_do_are_counted(rigged, tmp_path, caplog):
+    (tmp_path / "geo.txt").write_text("#1 1 2 3\n#2,4,5,6\n# 7 8 9\n#by hand\n'images/0.png' 1 2 3\n")
+    read_positions(tmp_path / "geo.txt", rigged[0])
+    assert "geo.txt: 2 lines of numbers begin with #, and are skipped" in caplog.text
 
 
 @pytest.mark.parametrize("header", ["EPSG:4326", "+proj=longlat +datum=WGS84", "lon,lat,z,x,y,image"])
@@ -593,7 +611,7 @@ def test_camera_positions_that_do_not_determine_the_alignment_are_refused(settin
         align_positions(surveyed(**settings)[0])
 
 
-@pytest.mark.parametrize("first", ["EPSG:25832\n", "WGS84 UTM 32N\n", "+proj=utm +zone=32 +units=m +no_defs\n", ""])
+@pytest.mark.parametrize("first", ["EPSG:25832\n", "WGS84 UTM 32N\n", "+proj=utm +zone=32 +ellps=GRS80 +no_defs\n", ""])
 def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     views = [replace(view, image=Path(view.name).with_name(f"photo {k}.jpg")) for k, view in enumerate(rig()[0])]
     (tmp_path / "geo.txt").write_text(
@@ -1113,7 +1131,12 @@ def degrees_of(points: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("header", "order"),
-    [("EPSG:4326", [0, 1, 2]), ("image,latitude,longitude,height", [1, 0, 2]), ("WGS84", [0, 1, 2])],
+    [
+        ("EPSG:4326", [0, 1, 2]),
+        ("image,latitude,longitude,height", [1, 0, 2]),
+        ("image lat(deg) lng. height", [1, 0, 2]),
+        ("WGS84", [0, 1, 2]),
+    ],
 )
 def test_positions_in_degrees_are_converted_to_the_system_of_the_shell(tmp_path, header, order):
     views, truth = rig()[0], np.array([[410000.5, 5413000.25, 251.0], [410003.5, 5413001.25, 252.0]])
