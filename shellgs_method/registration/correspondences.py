@@ -153,25 +153,26 @@ def to_shell(path: Path, contents: str, crs: str) -> Callable[[np.ndarray], Floa
         crs: coordinate reference system of the shell; empty if unknown, as if the file's were the same.
 
     Raises:
-        SceneError: the header names a system that PROJ does not know, or says that the file is in degrees, and the
-            shell's system is unknown; while converting, coordinates are outside the shell's system.
+        SceneError: the header names a system that PROJ does not know, or the file is in degrees and the shell's system
+            is unknown; while converting, coordinates are outside the shell's system.
     """
     header = " ".join(header_and_lines(path, contents)[0])
     names = [column_name(piece) for piece in re.split(r"[\s,;]+", header)]
     latitude, longitude = ([k for k, name in enumerate(names) if name in axis] for axis in (_LATITUDE, _LONGITUDE))
     source = known_crs(header) or (CRS.from_epsg(4326) if latitude and longitude else None)
-    if source is None and _SYSTEM.search(header):
+    if source is None and not _SYSTEM.search(header):
+        return lambda points: points
+    if source is None and crs:
         raise SceneError(
             f"{path}: cannot read the system {header}: write it as EPSG:25832, or leave it out if it is the shell's"
         )
-    if source is None:
-        return lambda points: points
-    if not crs and source.is_geographic:
+    if not crs and source and source.is_geographic:
         raise SceneError(
             f"{path} is in degrees ({header}): say with --crs in which coordinate reference system the "
             "shell is, such as EPSG:25832, or convert the file to the shell's coordinates"
         )
-    if not crs:
+    if not crs or source is None:
+        notice(f"{path} is in {header}, and is taken for the shell's, whose system is not known: see --crs.")
         return lambda points: points
     order = [1, 0, 2] if latitude and longitude and latitude[0] < longitude[0] else [0, 1, 2]
     convert = converter(source, crs, f"{contents} of {path}")

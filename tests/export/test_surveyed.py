@@ -76,7 +76,7 @@ def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points
         ("X,Y,Z,ID\n1.5,,3,p1", "line 2: expected X, Y, Z, ID in the shell's coordinates"),
         ("Name X Y Z\ndoor 7 1 2 3", "line 2: expected Name, X, Y, Z"),
         ("Point,Northing,Easting,Level\np1,2,1.5,3", "must name one column each of X, Y and Z"),
-        ("Point,Northing,Easting,Zone 33N\np1,2,1.5,3", "cannot read the system"),
+        ("Point,Northing,Easting,Zone 33N\np1,2,1.5,3", "must name one column each of X, Y and Z"),
         ("p1 1 2 3\np1 4 5 6", "line 2: there is a point p1 already"),
         ("# nothing", "holds no points"),
         ("name lat lon height\np1 47.1 8.2 400", "in degrees"),
