@@ -228,6 +228,10 @@ class _Steps:
         """Whether a step was not done with these inputs."""
         return self._done.get(step) != fingerprint(*inputs)
 
+    def forget(self, step: str) -> None:
+        """Let a step be done again."""
+        self._done.pop(step, None)
+
     def done(self, step: str, *inputs: object) -> None:
         """Note that it was."""
         self._done[step] = fingerprint(*inputs)
@@ -297,8 +301,10 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
                 metres_per_shell_unit=recipe.metres_per_shell_unit,
                 crs=recipe.crs,
             )
+            if proposed:  # it is seen first
+                steps.forget("accepted")
+                accept = accepted = False
             steps.done("align", *inputs)
-            accept, accepted = accept and not proposed, accepted and not proposed  # a proposal is seen first
         elif accept and proposed and not accepted:
             align(scene, accept=True, bundle_adjust=recipe.bundle_adjust)
     except SceneError as error:

@@ -81,6 +81,7 @@ def test_a_proposal_stops_the_run_until_it_is_accepted(inputs, shellgs, monkeypa
     assert calls == [False, True]
     (Path("scene") / ALIGNMENT).unlink()  # lost: proposed again, and to be seen again
     assert "is a proposal" in shellgs("run", "--accept")
+    assert shellgs("run", "--accept") == "refused: cast"
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")
