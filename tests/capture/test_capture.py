@@ -556,7 +556,7 @@ def test_photographs_that_do_not_belong_together_are_refused_with_advice(tmp_pat
     for k in range(3):
         photograph(200, 150, seed=k).save(folder / f"{k}.png")
     Image.new("RGB", (200, 150), "grey").save(folder / "plain.png")  # has no features
-    with pytest.raises(SceneError, match=r"only 0 of 4 photographs were found.*--matching exhaustive"):
+    with pytest.raises(SceneError, match=r"only 0 of 4 photographs were found.*Try --quality high"):
         capture(folder, tmp_path / "scen å")
     assert [path.name for path in (tmp_path / "scen å").iterdir()] == ["capture"]
 

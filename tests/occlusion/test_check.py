@@ -402,7 +402,7 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
         image = np.array(photograph)
     image[square] = [200, 30, 160]
     Image.fromarray(image).save(scene / name)
-    assert f"mostly in {name}" in " ".join(shellgs("cast", scene).split())
+    assert f"mostly {name}" in " ".join(shellgs("cast", scene).split())
     trainer = trainer_of(scene, tmp_path, "shellgs_metric")
     model, data = model_of(trainer), data_of(trainer)
     index = [view.name for view in data.train_dataset.views].index(name)
