@@ -89,7 +89,8 @@ def cast(
             console.print(f"{unbound}: `shellgs align {scene}` records them.")
     if truth:
         in_place = replace(alignment, shells=names, verdict="", metrics={})
-        _cast_truth(config, in_place.meshed_by(mesher, spacing), max_image_size, _words(truth, matrix) + paths.flags)
+        flags = _words(truth, matrix) + paths.flags
+        _cast_truth(config, views, in_place.meshed_by(mesher, spacing), max_image_size, flags)
         return
     aligned = alignment.meshed_by(mesher, spacing)
     if aligned != alignment and alignment.verdict:
@@ -113,15 +114,21 @@ def cast(
     console.print(f"Look at {panel}: the shell's edges must lie on the photographed ones.")
 
 
-def _cast_truth(config: FacadeDataParserConfig, alignment: Alignment, max_image_size: int | None, flags: str) -> None:
+def _cast_truth(
+    config: FacadeDataParserConfig,
+    views: Sequence[View],
+    alignment: Alignment,
+    max_image_size: int | None,
+    flags: str,
+) -> None:
     """Cast a scan held apart, and print how much of the shell it covers and how far it is from it."""
-    from dataparsers.facade import held_out_names, read_views
+    from dataparsers.facade import held_out_names
     from shellgs_method.files.atomic import content_hash
     from shellgs_method.files.cue_maps import CueMaps
     from shellgs_method.shell import ALIGNMENT, TRUTH, Alignment, PlacedShell, cast_views
-    from shellgs_method.shell.cast import against_truth
+    from shellgs_method.shell.cast import truth_coverage
 
-    scene, views, start = config.data, read_views(config), time.monotonic()
+    scene, start = config.data, time.monotonic()
     shell = CueMaps.open(scene, "shell")
     if (scene / ALIGNMENT).is_file():
         of_shell = {content_hash(path) for path in Alignment.load(scene / ALIGNMENT).files(scene) if path.is_file()}
@@ -131,8 +138,9 @@ def _cast_truth(config: FacadeDataParserConfig, alignment: Alignment, max_image_
     alignment.record(scene / TRUTH, views)
     size = max_image_size or shell.manifest.max_image_size
     summary = cast_views(placed, kind="truth", max_image_size=size, flags=flags)
-    held_out = [view for view in views if view.name in held_out_names(config)]
-    covered, apart = against_truth(scene, held_out)
+    names = held_out_names(config)
+    held_out = [view for view in views if view.name in names]
+    covered, apart = truth_coverage(scene, held_out)
     metres = apart * alignment.metres_per_unit
     console.print(
         f"{summary.cast} views cast, {summary.skipped} already there, in {time.monotonic() - start:.1f} s; the truth "

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Optional
 
-import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
@@ -51,6 +50,9 @@ def evaluate(
 
 
 def _print_surveyed(surveyed: Surveyed) -> None:
+    """Print a table of the points, and what the pairs of them say."""
+    import numpy as np
+
     table = Table("Point", "Surface before it (m)")
     for name, before in surveyed.before.items():
         table.add_row(escape(name), "no surface near it" if before is None else f"{before:+.3f}")

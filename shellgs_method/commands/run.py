@@ -6,7 +6,6 @@ import json
 import shlex
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import count
@@ -29,8 +28,6 @@ from shellgs_method.runs.folders import held
 
 if TYPE_CHECKING:
     from shellgs_method.compare.runs import Run
-
-_CAMERAS = ("colmap/sparse", "sparse", "transforms.json")
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,7 @@ class Recipe:
             if path and not path.exists():
                 raise FileNotFoundError(f"{path} does not exist")
         scene = self.sources[0]
-        if any((scene / cameras).exists() for cameras in _CAMERAS):
+        if any(cameras.exists() for cameras in _cameras(scene)):
             raise SceneError(
                 f"{scene} is a scene with cameras: give its photographs, {scene / 'images'}, and --scene {scene}"
             )
@@ -139,6 +136,13 @@ class Recipe:
 
 
 _DEFAULT = Recipe()
+
+
+def _cameras(scene: Path) -> list[Path]:
+    """Where a scene has its cameras, in one of these."""
+    from shellgs_method.files import colmap, transforms
+
+    return [scene / place for place in (*colmap.PLACES, transforms.NAME)]
 
 
 def _flag(name: str) -> str:
@@ -177,7 +181,7 @@ def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: boo
     video, *shell = recipe.sources
     steps.begin("cameras of the photographs")
     of_another = "capture" in steps and steps.changed("capture", str(video.resolve()))
-    if of_another or not any((scene / cameras).exists() for cameras in _CAMERAS):
+    if of_another or not any(cameras.exists() for cameras in _cameras(scene)):
         capture(video, scene)
         steps.done("capture", str(video.resolve()))
     else:  # captured with options of its own, perhaps
@@ -280,7 +284,7 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
     from shellgs_method.registration.align import PROPOSAL, REPORT
     from shellgs_method.shell import Alignment
 
-    files = *shell, recipe.matrix, recipe.picks, recipe.positions, *(scene / cameras for cameras in _CAMERAS)
+    files = *shell, recipe.matrix, recipe.picks, recipe.positions, *_cameras(scene)
     hashes = [path and path.exists() and content_hash(path) for path in files]
     settings = recipe.refine, recipe.metres_per_shell_unit, recipe.crs, recipe.bundle_adjust, recipe.same_frame
     inputs, report = (*hashes, *settings), scene / REPORT / "index.html"
@@ -338,13 +342,14 @@ def _train(recipe: Recipe, scene: Path, results: Path, steps: _Steps) -> Run:
     from shellgs_method.launch.local import launch_locally
 
     (trained,) = runs = grid([scene], [recipe.method], [0], recipe.iterations, results)
-    with suppress(DamagedRunError):  # which is told below
-        try:
-            trained.check()
-        except OtherSettingsError:
-            aside = next(path for k in count(1) if not (path := results / f"runs-{k}").exists())
-            (results / "runs").rename(aside)
-            console.print(f"What was trained with other settings or maps is now in {aside}.", highlight=False)
+    try:
+        trained.check()
+    except OtherSettingsError:
+        aside = next(path for k in count(1) if not (path := results / f"runs-{k}").exists())
+        (results / "runs").rename(aside)
+        console.print(f"What was trained with other settings or maps is now in {aside}.", highlight=False)
+    except DamagedRunError:  # which is told below
+        pass
     truth = scene / "cues/truth/manifest.json"
     measured_by = content_hash(truth) if truth.is_file() else ""
     if steps.changed("evaluation", measured_by):

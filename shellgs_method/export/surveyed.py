@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.registration.correspondences import are_numbers, column_name, header_and_lines, to_shell
+from shellgs_method.registration.correspondences import are_numbers, column_name, read_lines, to_shell
 
 REACH = 0.5
 """Distance in metres from a surveyed point within which the surface must be for the point to count."""
@@ -61,8 +61,8 @@ def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 
         SceneError: a line cannot be read, two points have the same name, there are none, or their system is unknown to
             PROJ, or in degrees while the shell's is not known.
     """
-    convert = to_shell(path, "surveyed points", crs)
-    header, lines = header_and_lines(path, "surveyed points")
+    header, lines = read_lines(path, "surveyed points")
+    convert = to_shell(header, path, "surveyed points", crs)
     rows = [(where, _cells(words)) for where, words in lines]
     titles = _cells(_UNIT.sub("", " ".join(header)).split())
     if columns := _columns(titles, path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
@@ -127,28 +127,14 @@ def worst_first(points: Sequence[Point]) -> list[Point]:
     return sorted(points, key=lambda point: -point.residual)
 
 
-def read_lines(path: Path, contents: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield the position, for messages, and the words of each line of a text file.
-
-    A header (:func:`header_and_lines`) is skipped. So are comments after a # that begins a word. Words with spaces are
-    quoted; an apostrophe inside a word is part of it.
-
-    Args:
-        path: the file.
-        contents: name of its contents, for messages.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        SceneError: the file is not text, or a quote is not closed.
-    """
-    yield from header_and_lines(path, contents)[1]
-
-
-def to_shell(path: Path, contents: str, crs: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
+def to_shell(
+    header: Sequence[str], path: Path, contents: str, crs: str
+) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
     """Conversion of a text file's coordinates, whose header may name their system, to the shell's.
 
     Args:
-        path: the file, as of :func:`read_lines`.
+        header: its words, by :func:`read_lines`.
+        path: the file.
         contents: name of its contents, for messages.
         crs: coordinate reference system of the shell; empty if unknown, as if the file's were the same.
 
@@ -156,23 +142,23 @@ def to_shell(path: Path, contents: str, crs: str) -> Callable[[np.ndarray], Floa
         SceneError: the header names a system that PROJ does not know, or the file is in degrees and the shell's system
             is unknown; while converting, coordinates are outside the shell's system.
     """
-    header = " ".join(header_and_lines(path, contents)[0])
-    names = [column_name(piece) for piece in re.split(r"[\s,;]+", header)]
+    named = " ".join(header)
+    names = [column_name(piece) for piece in re.split(r"[\s,;]+", named)]
     latitude, longitude = ([k for k, name in enumerate(names) if name in axis] for axis in (_LATITUDE, _LONGITUDE))
-    source = known_crs(header) or (CRS.from_epsg(4326) if latitude and longitude else None)
-    if source is None and not _SYSTEM.search(header):
+    source = known_crs(named) or (CRS.from_epsg(4326) if latitude and longitude else None)
+    if source is None and not _SYSTEM.search(named):
         return lambda points: points
     if source is None and crs:
         raise SceneError(
-            f"{path}: cannot read the system {header}: write it as EPSG:25832, or leave it out if it is the shell's"
+            f"{path}: cannot read the system {named}: write it as EPSG:25832, or leave it out if it is the shell's"
         )
     if not crs and source and source.is_geographic:
         raise SceneError(
-            f"{path} is in degrees ({header}): say with --crs in which coordinate reference system the "
+            f"{path} is in degrees ({named}): say with --crs in which coordinate reference system the "
             "shell is, such as EPSG:25832, or convert the file to the shell's coordinates"
         )
     if not crs or source is None:
-        notice(f"{path} is in {header}, and is taken for the shell's, whose system is not known: see --crs.")
+        notice(f"{path} is in {named}, and is taken for the shell's, whose system is not known: see --crs.")
         return lambda points: points
     order = [1, 0, 2] if latitude and longitude and latitude[0] < longitude[0] else [0, 1, 2]
     convert = converter(source, crs, f"{contents} of {path}")
@@ -184,10 +170,19 @@ def column_name(cell: str) -> str:
     return re.split("[^a-zäöü]", cell.strip().lower())[0]
 
 
-def header_and_lines(path: Path, contents: str) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    """Words of the header of a text file, which is a first line without numbers, and its lines.
+def read_lines(path: Path, contents: str) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Read a text file: the words of its header, and of each other line, after the line's position, for messages.
 
-    Args and errors are those of :func:`read_lines`.
+    A header is a first line without numbers. Comments after a # that begins a word are skipped. Words with spaces are
+    quoted; an apostrophe inside a word is part of it.
+
+    Args:
+        path: the file.
+        contents: name of its contents, for messages.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        SceneError: the file is not text, or a quote is not closed.
     """
     if not path.is_file():
         raise FileNotFoundError(f"the file of {contents} {path} does not exist")

@@ -86,7 +86,8 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
         SceneError: the file is in a system that PROJ does not know, or in degrees and the shell's is not known, or a
             line cannot be read, names an image that is not in the scene, or contradicts another line.
     """
-    picks = _picks_of(read_lines(path, "picks"), path, views, to_shell(path, "picks", crs))
+    header, lines = read_lines(path, "picks")
+    picks = _picks_of(lines, path, views, to_shell(header, path, "picks", crs))
     if not picks:
         raise SceneError(f"{path} holds no picks")
     return picks
@@ -146,8 +147,9 @@ class PicksFile:
             FileNotFoundError: the file does not exist.
             SceneError: as :func:`read_picks`.
         """
-        convert = to_shell(path, "picks", crs)
-        picks = _picks_of(read_lines(path, "picks"), path, views, convert)
+        header, lines = read_lines(path, "picks")
+        convert = to_shell(header, path, "picks", crs)
+        picks = _picks_of(lines, path, views, convert)
         named, aside, others = {pick.name for pick in picks}, dict[str, Pick](), []
         for line in path.read_text(encoding="utf-8-sig").splitlines():
             after = line.lstrip("# \t")

@@ -55,10 +55,11 @@ def read_positions(path: Path, views: Sequence[View], crs: str = "") -> Surveyed
         SceneError: the file is in a system that PROJ does not know, or in degrees and the shell's is not known, or a
             line cannot be read or contradicts another.
     """
-    convert = to_shell(path, "camera positions", crs)
+    header, lines = read_lines(path, "camera positions")
+    convert = to_shell(header, path, "camera positions", crs)
     found: dict[str, tuple[View, list[float]]] = {}
     unknown: list[str] = []
-    for where, words in read_lines(path, "camera positions"):
+    for where, words in lines:
         if len(words) < 4 or not are_numbers(words[1:4]):
             raise SceneError(
                 f"{where}: expected the image, then X Y Z in the shell's coordinates; quote a name with spaces"

@@ -137,6 +137,7 @@ def cast_views(
         max_image_size=max_image_size,
         error=recorded.error,
     )
+    compared = _compared(scene) if kind == "truth" else None
     cast = 0
     with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast: at most two are in memory
         written: Future[None] | None = None
@@ -145,7 +146,7 @@ def cast_views(
             if maps.current(view.name, view.camera):
                 continue
             cue = _unmasked(shell.caster.cast(view.camera), view, scene)
-            cue = _unoccluded(cue, view, scene) if kind == "truth" else cue
+            cue = _unoccluded(cue, view, *compared) if compared else cue
             if written:
                 written.result()
             written = writer.submit(maps.write, view.name, cue, view.camera)
@@ -161,7 +162,7 @@ def cast_views(
     )
 
 
-def against_truth(scene: Path, views: Sequence[View]) -> tuple[float, float]:
+def truth_coverage(scene: Path, views: Sequence[View]) -> tuple[float, float]:
     """Share of the shell's pixels that have a truth, and the median distance between the two there, in scene units.
 
     Raises:
@@ -222,13 +223,17 @@ def _unmasked(cue: CueMap, view: View, scene: Path) -> CueMap:
     return cue if mask is None else replace(cue, mask=cue.mask & mask)
 
 
-def _unoccluded(cue: CueMap, view: View, scene: Path) -> CueMap:
-    """Leave out what photographs show to stand in front of a surface, or that moved, where they were compared."""
+def _compared(scene: Path) -> tuple[CueMaps, CueMaps] | None:
+    """What photographs say against the shell, and its maps; None if they were not compared."""
     try:
-        maps = [CueMaps.open(scene, kind).read(view.name, view.camera, any_size=True) for kind in ("checked", "shell")]
+        return CueMaps.open(scene, "checked"), CueMaps.open(scene, "shell")
     except FileNotFoundError:
-        return cue
-    checked, shell = maps
+        return None
+
+
+def _unoccluded(cue: CueMap, view: View, *sets: CueMaps) -> CueMap:
+    """Leave out what photographs show to stand in front of a surface, or that moved; sets by :func:`_compared`."""
+    checked, shell = (maps.read(view.name, view.camera, any_size=True) for maps in sets)
     if checked is None or shell is None:
         return cue
     found = Findings.of(checked, shell)
