@@ -117,7 +117,7 @@ def align(
     if accept:
         placement = place_as_proposed(scene / PROPOSAL, scene, views)
     elif not shell:
-        placement = place_as_before(scene / ALIGNMENT, views)
+        placement = place_as_before(scene / ALIGNMENT, scene, views)
     elif matrix:
         placement = Placement(Alignment.from_matrix_file(matrix, names, metres_per_shell_unit, global_shift))
     elif same_frame:
@@ -165,7 +165,7 @@ def align(
                 placement = seen_again(placement, views, picks)
                 after = validate(mesh, placement.alignment, views, points, placement.correspondences)
                 validation = after.after(adjustment, validation)
-        validated = validation.validated(views)
+        validated = validation.validated(scene, views)
         told = [up_in_words(validated), unit_doubted(replace(validation, alignment=validated), mesh, views)]
         placement = replace(placement, history=[*placement.history, *filter(None, told)])
         write_report(scene / REPORT, mesh, validation, placement.history)

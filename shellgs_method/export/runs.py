@@ -81,8 +81,8 @@ class TrainedRun:
             return None
         alignment = Alignment.load(scene / ALIGNMENT)
         views = [view for dataset in self.datasets for view in dataset.views]
-        alignment.check_cameras(scene, views)
-        alignment = alignment if alignment.cameras.cameras else alignment.seen_by(views)
+        alignment.check(scene, views)
+        alignment = alignment if alignment.cameras.cameras else alignment.bound(scene, views)
         return alignment, alignment.load_shell(scene, views)
 
     @cached_property

@@ -68,16 +68,20 @@ class Placement:
     checks: Sequence[Check] = ()
 
 
-def place_as_before(path: Path, views: Sequence[View]) -> Placement:
-    """The alignment of a file, to be validated again, possibly with other cameras than it was found for.
+def place_as_before(path: Path, scene: Path, views: Sequence[View]) -> Placement:
+    """The alignment of a file, to be validated again, possibly with other cameras or a shell that has changed since.
 
     Raises:
         FileNotFoundError: the file does not exist.
         SceneError: the file is damaged.
     """
     alignment = Alignment.load(path)
-    changed = alignment.cameras.changed(views)
-    return Placement(alignment, [f"It was found for other cameras than these: {changed}."] if changed else [])
+    history = []
+    if changed := alignment.cameras.changed(views):
+        history.append(f"It was found for other cameras than these: {changed}.")
+    if file := alignment.changed_file(scene):
+        history.append(f"{file} has changed since it was aligned.")
+    return Placement(alignment, history)
 
 
 def place_as_it_is(shells: tuple[str, ...], metres_per_shell_unit: float) -> Placement:
@@ -90,14 +94,14 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is damaged, or the proposal was made for other cameras than the user's.
+        SceneError: the file is damaged, or the proposal was made for other cameras than the user's, or another shell.
     """
     alignment = Alignment.load(path)
+    again = f"propose again, with `shellgs align {shlex.quote(str(scene))} {shlex.join(alignment.shells)}`"
     if changed := alignment.cameras.changed(views):
-        raise SceneError(
-            f"{path} was proposed for other cameras than those of {scene}: {changed}; propose again, with "
-            f"`shellgs align {shlex.quote(str(scene))} {shlex.join(alignment.shells)}`"
-        )
+        raise SceneError(f"{path} was proposed for other cameras than those of {scene}: {changed}; {again}")
+    if file := alignment.changed_file(scene):
+        raise SceneError(f"{file} has changed since {path} was proposed for it: {again}")
     return Placement(alignment)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import unfinished
+from shellgs_method.files.atomic import content_hash, unfinished
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.geometry.camera import Camera
@@ -208,5 +208,6 @@ def _write_shell(scene: Path, mesh: Mesh, cameras: BoundCameras) -> None:
     path.parent.mkdir(parents=True)
     write_scan(path, mesh)
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
-    alignment = Alignment(matrix, (SHELL,), source="the synthetic facade's own frames", cameras=cameras)
+    source, hashes = "the synthetic facade's own frames", (content_hash(path),)
+    alignment = Alignment(matrix, (SHELL,), source=source, cameras=cameras, hashes=hashes)
     alignment.save(scene / ALIGNMENT)

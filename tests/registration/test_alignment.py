@@ -49,6 +49,7 @@ from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera
 from shellgs_method.synthetic.path import walk
+from shellgs_method.synthetic.scene import write_scan
 
 OPAQUE = Path(__file__).parents[2] / "docs/picture.jpg"
 """Any photograph: validation looks whether it is transparent."""
@@ -235,7 +236,7 @@ def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, surve
 @pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
 def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
     motion = turned(axis)
-    alignment = Alignment(TRUTH @ np.linalg.inv(motion), ("shell/facade.obj",)).seen_by(views)
+    alignment = Alignment(TRUTH @ np.linalg.inv(motion), ("shell/facade.obj",), cameras=BoundCameras.of(views))
     assert alignment.up is not None
     cosine = alignment.up @ motion[:3, :3] @ [0.0, 0, 1]
     assert np.degrees(np.arccos(min(cosine, 1.0))) <= within
@@ -936,16 +937,54 @@ def test_maps_of_an_alignment_to_other_cameras_are_refused_even_if_they_are_of_t
         maps.check(views[0].name, views[0].camera)
 
 
-def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
-    move_cameras(scene, ANOTHER_FRAME)
+def change_shell(scene: Path) -> None:
+    """Leave out one triangle of it."""
+    mesh = shell(Layout(6, 3))
+    write_scan(scene / "shell/facade.ply", replace(mesh, triangles=mesh.triangles[:-1]))
+
+
+def run_of(scene: Path) -> TrainedRun:
+    """A run of a scene, without a model."""
     views = scene_views(scene)
     halves = [SimpleNamespace(views=views[:5]), SimpleNamespace(views=views[5:])]
     config = SimpleNamespace(dataparser=SimpleNamespace(data=scene))
     data: Any = SimpleNamespace(config=config, train_dataset=halves[0], eval_dataset=halves[1])
     model: Any = None
     with pytest.raises(SceneError, match="was found for other cameras"):
-        _ = TrainedRun(model, data).shell
+        _ = run_of(scene).shell
 
+
+def test_a_shell_that_has_changed_is_used_once_it_is_validated_again(scene, shellgs):
+    assert run_of(scene).shell is not None
+    change_shell(scene)
+    changed = r"shell/facade\.ply has changed since it was aligned: run `shellgs align"
+    with pytest.raises(SceneError, match=changed):
+        _ = run_of(scene).shell
+    assert re.search(changed, shellgs("cast", scene))
+    assert "facade.ply has changed since it was aligned" in shellgs("align", scene)
+    assert run_of(scene).shell is not None
+    assert "views cast" in shellgs("cast", scene)
+
+
+def test_an_alignment_of_an_older_version_knows_no_hashes_and_is_used(scene):
+    fields = json.loads((scene / ALIGNMENT).read_text())
+    del fields["hashes"]
+    (scene / ALIGNMENT).write_text(json.dumps(fields))
+    (scene / "shell/facade.ply").touch()
+    assert run_of(scene).shell is not None
+
+
+def test_a_proposal_for_a_shell_that_has_changed_is_not_accepted(scene, shellgs):
+    (scene / ALIGNMENT).rename(scene / PROPOSAL)
+    change_shell(scene)
+    assert "facade.ply has changed since" in shellgs("align", scene, "--accept")
+    assert not (scene / ALIGNMENT).exists()
+
+    return TrainedRun(model, data)
+
+
+def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
+    move_cameras(scene, ANOTHER_FRAME)
 
 def test_an_alignment_that_fits_other_cameras_too_is_validated_for_them(scene, shellgs):
     move_cameras(scene, displaced(0.02, 0.0, 0.0, seed=3))
