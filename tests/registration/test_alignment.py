@@ -459,7 +459,6 @@ def test_an_invalid_line_of_a_picks_file_is_refused_with_its_number(rigged, tmp_
     [
         "1,5 2 3 4 5 images/0.png a",
         "1.5; 2 3 4 5 images/0.png a",
-        "1,2,3,4,5,images/0.png,a",
         "x1 2 3 4 5 images/0.png a",
         "1.0m 2.0m 3.0m 4px 5px images/0.png a",
         "-1m -.5m +3m images/0.png",
@@ -629,7 +628,11 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     ("line", "sentence"),
     [
         ("EPSG:4326", "is in degrees (EPSG:4326): say with --crs"),
-        ("#name,lat,lon,alt\nimages/0.png,1,2,3", "line 2: expected the image"),
+        ("#name,lat,lon,alt\nimages/0.png,1,2,3", "is in degrees (name, lat, lon, alt): say with --crs"),
+        ("images/0.png,12,5,0,25,3,125", "line 1: its commas separate columns, or are decimal"),
+        ("image,X,Y\nimages/0.png,1,2", "its header, image, X, Y, must name one column each of image, X, Y and Z"),
+        ("EPSG:25832\n# EPSG:25833\nimages/0.png 1 2 3", "names two systems, EPSG:25832 and EPSG:25833"),
+        ("# EPSG:25832\nimage lat lon h\nimages/0.png 47 8 3", "names EPSG:25832, and columns of degrees"),
         ("images/0.png 1,5 2 3", "line 1: expected the image"),
         ("EPSG:25832\nimages/0.png 1 2", "line 2: expected the image, then X Y Z"),
         ("EPSG:25832\nimages/0.png 1 2 nan", "line 2: expected the image"),
@@ -950,6 +953,11 @@ def run_of(scene: Path) -> TrainedRun:
     config = SimpleNamespace(dataparser=SimpleNamespace(data=scene))
     data: Any = SimpleNamespace(config=config, train_dataset=halves[0], eval_dataset=halves[1])
     model: Any = None
+    return TrainedRun(model, data)
+
+
+def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
+    move_cameras(scene, ANOTHER_FRAME)
     with pytest.raises(SceneError, match="was found for other cameras"):
         _ = run_of(scene).shell
 
@@ -980,11 +988,6 @@ def test_a_proposal_for_a_shell_that_has_changed_is_not_accepted(scene, shellgs)
     assert "facade.ply has changed since" in shellgs("align", scene, "--accept")
     assert not (scene / ALIGNMENT).exists()
 
-    return TrainedRun(model, data)
-
-
-def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
-    move_cameras(scene, ANOTHER_FRAME)
 
 def test_an_alignment_that_fits_other_cameras_too_is_validated_for_them(scene, shellgs):
     move_cameras(scene, displaced(0.02, 0.0, 0.0, seed=3))
@@ -1198,6 +1201,37 @@ def test_picks_in_another_zone_are_converted_and_those_in_the_shells_own_are_kep
     np.testing.assert_allclose(pick.shell, point[0], atol=1e-4)
     (pick,) = read_picks(tmp_path / "picks.txt", rigged[0], "EPSG:25833")
     np.testing.assert_array_equal(pick.shell, [round(x, 6), round(y, 6), z])
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("X,Y,Z,photo,u,v", "410000.5,5413000.25,251,images/1.png,30,40"),
+        ("photo;name;u;v;Northing [m];Easting [m];Height [m]", "images/1.png;a;30;40;5413000.25;410000.5;251"),
+        ("x y image X Y Z", "30 40 images/1.png 410000.5 5413000.25 251"),
+        ("E N H x y image", "410000.5 5413000.25 251 30 40 images/1.png"),
+        ("image image_x image_y x y z", "images/1.png 30 40 410000.5 5413000.25 251"),
+        ("# name X Y Z image u v", "a 410000.5 5413000.25 251 images/1.png 30 40"),
+        ("EPSG:25832\nimage u v Y X Z", "images/1.png 30 40 5413000.25 410000.5 251"),
+        ("# X Y Z of the shell   x y in the photograph   image   name", "410000.5 5413000.25 251 30 40 images/1.png a"),
+    ],
+)
+def test_a_header_of_picks_chooses_the_columns(rigged, tmp_path, header, line):
+    (tmp_path / "picks.txt").write_text(f"{header}\n{line}\n")
+    (pick,) = read_picks(tmp_path / "picks.txt", rigged[0], "EPSG:25832")
+    np.testing.assert_array_equal(pick.shell, [410000.5, 5413000.25, 251])
+    assert pick.pixels == {"images/1.png": (30, 40)}
+
+
+@pytest.mark.parametrize(
+    "text", ["name,lat,lon,height\n{image},{lat},{lon},{h}", "# EPSG:4326\n{image} {lon} {lat} {h}",
+             "EPSG:4326\nheight lon lat file\n{h} {lon} {lat} {image}"]
+)  # fmt: skip
+def test_a_header_or_comment_of_positions_chooses_columns_and_system(tmp_path, text):
+    view, truth = rig()[0][0], np.array([[410000.5, 5413000.25, 251.0]])
+    lon, lat, h = degrees_of(truth)[0]
+    (tmp_path / "geo.txt").write_text(text.format(image=view.name, lon=f"{lon:.10f}", lat=f"{lat:.10f}", h=h))
+    np.testing.assert_allclose(read_positions(tmp_path / "geo.txt", [view], "EPSG:25832").shell, truth, atol=1e-3)
 
 
 def test_latitudes_in_place_of_longitudes_are_refused(tmp_path):
