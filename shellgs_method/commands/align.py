@@ -38,8 +38,9 @@ def align(
     """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.
 
     The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
-    verdict. Without --matrix, --picks and --positions, an alignment is proposed: look at the report, then accept the
-    proposal with --accept. Without a shell, the existing alignment is validated again, or refined.
+    verdict. Without --matrix, --picks and --positions, an alignment is proposed, near the photographs' geo-tags if the
+    shell's --crs is known: look at the report, then accept the proposal with --accept. Without a shell, the existing
+    alignment is validated again, or refined.
 
     Args:
         scene: Scene folder.
@@ -129,7 +130,7 @@ def align(
     else:
         method, unit = mesher or "planes", metres_per_shell_unit
         unaligned = load_shell(*shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
-        placement = place_by_guess(unaligned, views, points, names, metres_per_shell_unit)
+        placement = place_by_guess(unaligned, views, points, names, metres_per_shell_unit, system)
     aligned = placement.alignment.meshed_by(mesher, spacing)
     placement = replace(placement, alignment=replace(aligned, crs=system or aligned.crs))
     mesh = placement.alignment.load_shell(scene, views, place.surfaces if place else ())

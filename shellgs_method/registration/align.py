@@ -22,6 +22,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again
 from shellgs_method.registration.frames import ShellPlace, apart
+from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, propose
@@ -226,16 +227,28 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
 
 
 def place_by_guess(
-    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shells: tuple[str, ...], metres_per_shell_unit: float
+    mesh: ShellMesh,
+    views: Sequence[View],
+    points: SparsePoints,
+    shells: tuple[str, ...],
+    metres_per_shell_unit: float,
+    crs: str = "",
 ) -> Placement:
     """Propose an alignment by coarse registration; the shell may have any orientation in its file.
+
+    Where its coordinate reference system is known, geo-tags of the photographs say where to look.
 
     Raises:
         SceneError: the points show no wall, or it fits nowhere.
     """
     surface = ShellSurface(mesh, metres_per_shell_unit)
-    best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views))
+    tags = GeoTags.of(views, crs, surface.survey_from_shell) if crs else None
+    best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views), tags)
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
+    if tags is not None:
+        off = tags.apart(best.survey_from_scene)
+        said = "" if off < REACH else ": it agrees with none, so look whether the building and --crs are the right ones"
+        history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m off it{said}.")
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
         for rival in rivals

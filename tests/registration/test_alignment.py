@@ -14,7 +14,7 @@ import pyproj
 import pytest
 import torch
 import trimesh
-from PIL import Image
+from PIL import ExifTags, Image
 from scenes import cast, write_colmap
 from scipy.spatial.transform import Rotation
 
@@ -34,6 +34,7 @@ from shellgs_method.geometry.precision import mesh_step
 from shellgs_method.geometry.similarity import fit_similarity, transformed
 from shellgs_method.registration import proposal
 from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
+from shellgs_method.registration.geotags import GeoTags
 from shellgs_method.registration.orientations import scene_axes
 from shellgs_method.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.registration.positions import SurveyedPositions, align_positions, read_positions
@@ -231,6 +232,43 @@ def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, surve
     alignment = place_by_guess(askew, views, points, ("shell/facade.ply",), 1.0).alignment
     found = surface.survey_from_shell @ np.linalg.inv(alignment.shell_to_scene @ motion)
     assert error(surface, found, survey_from_scene) < 0.02
+
+
+def tagged(folder: Path, views: list[View], noise: float, seed: int = 0) -> list[View]:
+    """The views with photographs that say where they were taken, metres off in UTM 32."""
+    places = transformed(np.stack([v.camera.position.double().numpy() for v in views]), np.linalg.inv(TRUTH))
+    places[:, :2] += np.random.default_rng(seed).normal(0, noise, (len(views), 2))
+    images = []
+    for view, (lon, lat, _) in zip(views, degrees_of(places), strict=True):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: minutes(lat), 3: "E", 4: minutes(lon), 6: 77.0})
+        images.append(folder / f"{Path(view.name).stem}.jpg")
+        Image.new("RGB", (96, 64)).save(images[-1], exif=exif)
+    return [replace(view, image=image) for view, image in zip(views, images, strict=True)]
+
+
+def minutes(degrees: float) -> tuple[float, float, float]:
+    whole = int(degrees)
+    return whole, int(60 * (degrees - whole)), 60 * ((60 * (degrees - whole)) % 1)
+
+
+def test_geo_tags_are_read_in_the_system_of_the_shell(tmp_path, views, surface, survey_from_scene):
+    tags = GeoTags.of(tagged(tmp_path, views, 0.0), "EPSG:25832", surface.survey_from_shell)
+    assert tags is not None
+    assert tags.apart(survey_from_scene) < 0.1  # seconds as fractions of whole numbers
+    assert GeoTags.of(views, "EPSG:25832", surface.survey_from_shell) is None
+    some = tagged(tmp_path, views, 0.0)[:3]
+    some[0].image.write_bytes(some[0].image.read_bytes()[:60])  # damaged
+    assert GeoTags.of(some, "EPSG:25832", surface.survey_from_shell) is None
+
+
+def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
+    beside = mesh.vertices + 40 * AXES[:, 0]
+    twins = ShellMesh(np.concatenate([mesh.vertices, beside]), np.concatenate([mesh.faces, mesh.faces + len(beside)]))
+    placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, ("s.ply",), 1.0, "EPSG:25832")
+    assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
+    assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m off it\.", placement.history[1])
+    assert not any("Ambiguous" in sentence for sentence in placement.history)
 
 
 @pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
