@@ -848,7 +848,9 @@ def test_a_matrix_is_validated_reported_and_written(scene, shellgs):
     assert f"Verdict: <b>{written.verdict}</b>" in page
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
     assert "http" not in page
-    assert len(list((scene / REPORT).glob("view_*.png"))) >= 6
+    overlays = list((scene / REPORT).glob("view_*.png"))
+    assert len(overlays) >= 6
+    assert all(Image.open(overlay).size == (640, 427) for overlay in overlays)  # of photographs of 48 x 32
     assert json.loads((scene / REPORT / "validation.json").read_text())["verdict"] == written.verdict
 
 
