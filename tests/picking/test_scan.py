@@ -197,6 +197,7 @@ def test_a_mesh_is_drawn_in_the_colours_of_its_vertices(tmp_path: Path):
     ball = trimesh.creation.icosphere(3, radius=5.0)
     drawn = opened(write_colours(tmp_path / "ball.ply", ball.vertices + NATIONAL, ball.faces))
     assert drawn.mesh is not None
+    assert drawn.mesh.colours is not None
     np.testing.assert_array_equal(drawn.mesh.colours, painted(drawn.mesh.vertices + drawn.middle))
 
 

@@ -35,7 +35,7 @@ def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
             points = np.stack([np.array(piece[axis]) for axis in "xyz"], axis=1)
             kept = ~(withheld | noisy)
             colours = NO_COLOURS
-            if {"red", "green", "blue"} <= {*piece.point_format.dimension_names}:
+            if {"red", "green", "blue"} <= {*file.header.point_format.dimension_names}:
                 bands = np.stack([np.array(piece[band])[kept] for band in ("red", "green", "blue")], axis=1)
                 deep = deep or bool((bands > 255).any())  # 16 bits, as they should, or 8, as some programs write
                 colours = (bands >> 8 if deep else bands).astype(np.uint8)
