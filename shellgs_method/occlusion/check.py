@@ -39,8 +39,6 @@ from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sight
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
-MAX_SIZE_BEHIND = 320
-"""The same for what is behind the shell: windows are large, and what they show is blurred."""
 ERRORS = (0.05, 0.15)
 """Metres that the shell's place may be off at least, whatever its alignment says, and at most."""
 NEIGHBOURS = 6
@@ -132,8 +130,6 @@ class _TrainingViews:
     """The views as they were taken."""
     sweeps: dict[str, Sweep]
     colours: ColourModel
-    small: dict[str, ShellView]
-    """The views at :data:`MAX_SIZE_BEHIND`."""
     error: float
     """Possible error of the shell's place, in scene units; 0 where their size is not known."""
     windows: bool
@@ -169,8 +165,7 @@ class _TrainingViews:
                     stream.write(content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
         colours = ColourModel(shell_views.values(), sweeps.values())
-        small = {name: view.shrunk(MAX_SIZE_BEHIND) for name, view in shell_views.items()}
-        return cls(shell_views, exposures, sweeps, colours, small, _error(shell.manifest), windows)
+        return cls(shell_views, exposures, sweeps, colours, _error(shell.manifest), windows)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -207,8 +202,8 @@ class _TrainingViews:
     ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
         """Score of the best depth behind the shell, and this depth relative to the shell's."""
         names = [name for name, view in self.views.items() if view is not seen]
-        others, sweeps = [self.small[name] for name in names], [self.sweeps[name] for name in names]
-        found = sweep_behind(seen.shrunk(MAX_SIZE_BEHIND), others, sweeps, self.error)
+        others, sweeps = [self.views[name] for name in names], [self.sweeps[name] for name in names]
+        found = sweep_behind(seen, others, sweeps, self.error)
         return _resized(found.score.float(), size).numpy(), _relative_depth(found, size)
 
     def _neighbours(self, seen: ShellView) -> list[str]:

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Float16, Int64, UInt8
 from kornia.filters import guided_blur
 from scipy.ndimage import binary_fill_holes
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate, max_pool2d
+from torch.nn.functional import grid_sample, max_pool2d
 
 from shellgs_method.geometry.camera import Camera
 
@@ -37,6 +37,8 @@ MOVES = 5.5
 finer steps of depth than the offsets have."""
 PER_SIDE = 4
 """Neighbours on either side of a view: what is occluded on one side is visible from the other."""
+PER_SIDE_BEHIND = 2
+"""The same for what is behind the shell."""
 CONTRADICTED = 0.14
 """Score above which a pixel is contradicted, if its colour counts neither way. With 0.08 more are found, and renders of
 what is in front of the shell improve, but mirrors contradict the shell too, and surfaces left to the photographs alone
@@ -45,7 +47,7 @@ ALONE = 0.12
 """Difference from the colours that other photographs agree on above which a pixel shows something that moved."""
 CONFIRMED = -0.03
 """Score of the best nearer depth below which the shell is confirmed."""
-REFLECTED = 0.01
+REFLECTED = 0.02
 """Score of the best farther depth above which a pixel shows something behind the shell, as a window does."""
 
 Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
@@ -58,6 +60,7 @@ _FAST: Any = {"separable": True, "subsample": 2} if "separable" in signature(gui
 _FEATHERED = 4  # times the silhouette is feathered
 _COLOUR, _GRADIENT = 0.12, 0.06  # truncation of colour and gradient differences, for values in [0, 1]
 _WEIGHTS = (1 / (6 * _COLOUR), 1 / (4 * _GRADIENT))  # of a colour and a gradient: each mean is truncated at a half
+_APART = 0.004  # relative difference of the depths of two surfaces, less than a third of a step of offsets
 _SEEN = 0.5  # views that must see the shell on one side, at least
 _SUPPORT = 0.2  # weight of the other views' scores relative to the photographs
 
@@ -91,20 +94,6 @@ class ShellView:
             inside &= _smooth(pixels, inside.float()[None])[0] > 0.5
         return inside
 
-    def shrunk(self, longest: int) -> ShellView:
-        """The same at another size, if it is larger."""
-        camera = self.camera.shrunk(longest)
-        size = camera.height, camera.width
-        if size == self.depth.shape:
-            return self
-        image = interpolate(self.image.permute(2, 0, 1)[None].float(), size, mode="area")[0].permute(1, 2, 0)
-        depth = interpolate(self.depth[None, None], size, mode="nearest")[0, 0]
-        kept = self.kept
-        if kept is not None:
-            kept = interpolate(kept[None, None].float(), size, mode="area")[0, 0] == 1
-            depth = depth.where(kept, 0.0)
-        return ShellView(camera, image.round().byte(), depth, kept)
-
 
 class Sweep(NamedTuple):
     """The best depth in front of the shell, or behind it, by one view and its neighbours."""
@@ -116,7 +105,9 @@ class Sweep(NamedTuple):
     """Relative excess of the inverse depth over the shell's, interpolated between those that were tried."""
 
 
-def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
+def neighbours(
+    view: Camera, others: Sides, depth: float, offset: float, per_side: int = PER_SIDE
+) -> list[tuple[int, int]]:
     """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES` pixels.
 
     Args:
@@ -124,6 +115,7 @@ def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list
         others: cameras to choose from, by :func:`sides`.
         depth: typical depth of the shell in the view.
         offset: one of :data:`OFFSETS` or :data:`OFFSETS_BEHIND`.
+        per_side: number of cameras on either side.
 
     Returns:
         Index and side of each camera: 0 on the left, 1 on the right.
@@ -135,7 +127,7 @@ def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list
         )
         for side in others
     ]
-    return [(index, side) for side in (0, 1) for _, index in found[side][:PER_SIDE]]
+    return [(index, side) for side in (0, 1) for _, index in found[side][:per_side]]
 
 
 def sides(view: Camera, others: Sequence[Camera]) -> Sides:
@@ -208,7 +200,9 @@ def _costs(
     near, depth = sides(pixels.camera, [other.camera for other in others]), float(pixels.surface.median())
     roles: dict[int, list[tuple[int, int]]] = {}
     for step, offset in enumerate(offsets):
-        for index, side in neighbours(pixels.camera, near, depth, offset):
+        for index, side in neighbours(
+            pixels.camera, near, depth, offset, PER_SIDE if sweeps is None else PER_SIDE_BEHIND
+        ):
             roles.setdefault(index, []).append((step, side))
     weights = torch.zeros(len(offsets), 2, *pixels.surface.shape)
     sums = torch.zeros(len(surfaces) + 2, *weights.shape)
@@ -216,8 +210,8 @@ def _costs(
         neighbour = _Neighbour(pixels, others[index])
         visible = neighbour.visible
         if sweeps is not None:
-            visible = visible * (1 - neighbour.hidden(sweeps[index]))
-        shells = [neighbour.on_shell, *(neighbour.disagreement(neighbour.look(offset)) for offset in surfaces)]
+            visible = visible * (1 - neighbour.hidden(sweeps[index], neighbour.shell, 1.0))
+        shells = [neighbour.on_shell, *(neighbour.on_surface(offset) for offset in surfaces)]
         for step, side in asked:
             look = neighbour.look(offsets[step])
             counts = visible * neighbour.kept(look)
@@ -262,7 +256,7 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
         neighbour = _Neighbour(pixels, other)
         look = neighbour.look(found.offset.float())
         hidden = (neighbour.visible == 0) | ~look.inside | (neighbour.kept(look) == 0)
-        of_shell, of_nearer = neighbour.hidden(sweep_there), neighbour.hidden(sweep_there, look)
+        of_shell, of_nearer = (neighbour.hidden(sweep_there, at, 0.4) for at in (neighbour.shell, look))
         offset = _sampled(other.depth, look.grid, "nearest") / look.z - 1
         found_offset = _sampled(sweep_there.offset.float(), look.grid, "nearest")
         alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
@@ -351,10 +345,21 @@ class _Neighbour:
         """1 where the other photograph counts at these positions."""
         return 1.0 if self._kept is None else _sampled(self._kept, look.grid, "nearest")
 
-    def hidden(self, found: Sweep, look: _Look | None = None) -> Float[Tensor, "h w"]:
-        """Probability, by the other view's sweep, that something stands before the shell at positions, or on it."""
-        probability = torch.sigmoid((found.score.float() - 0.4 * CONTRADICTED) / 0.02)
-        return _sampled(probability, (look or self.shell).grid)
+    def hidden(self, found: Sweep, at: _Look, threshold: float) -> Float[Tensor, "h w"]:
+        """Probability, by the other view's sweep, that something stands before the shell at these positions.
+
+        It is 1/2 at a score of ``threshold`` times :data:`CONTRADICTED`.
+        """
+        probability = torch.sigmoid((found.score.float() - threshold * CONTRADICTED) / 0.02)
+        return _sampled(probability, at.grid)
+
+    def on_surface(self, offset: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+        """Disagreement on another surface, which is computed only where it is not that of the shell."""
+        apart = offset.abs() > _APART
+        x, y, z = self._surface[:, apart] + offset[apart] * self._start[..., 0]
+        grid = (torch.stack([x, y]) / z.clamp_min(1e-9)).T[None, None]
+        there = grid_sample(self._there[None], grid, padding_mode="border", align_corners=False)[0, :, 0]
+        return self.on_shell.masked_scatter(apart, _difference(there, self._features[:, apart]))
 
     def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
         """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
@@ -364,8 +369,12 @@ class _Neighbour:
         return grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
 
     def _disagreement(self, there: Float[Tensor, "5 h w"]) -> Float[Tensor, "h w"]:
-        red, green, blue, across, down = (there - self._features).abs_()  # in place: it is most of a sweep's time
-        return (red.add_(green).add_(blue)).clamp_max_(0.5).add_(across.add_(down).clamp_max_(0.5))
+        return _difference(there, self._features)
+
+
+def _difference(there: Float[Tensor, "5 *N"], here: Float[Tensor, "5 *N"]) -> Float[Tensor, "*N"]:
+    red, green, blue, across, down = (there - here).abs_()  # in place: it is most of a sweep's time
+    return (red.add_(green).add_(blue)).clamp_max_(0.5).add_(across.add_(down).clamp_max_(0.5))
 
 
 def _alone(pixels: _Pixels, shown: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "h w"]:
