@@ -1,6 +1,7 @@
 """How much geometry in front of the shell the photographs reveal, on the synthetic facade with its true geometry.
 
 python -m benchmarks.check --width 640
+python -m benchmarks.check --off 0.03
 python -m benchmarks.check --passers-by --keep moving/
 """
 
@@ -11,12 +12,14 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import tyro
 from jaxtyping import Bool
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from shellgs_method.files.cue_maps import CueMaps, Findings
@@ -25,6 +28,8 @@ from shellgs_method.occlusion import check_views
 from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 from shellgs_method.synthetic import FacadeConfig, write_scene
 from shellgs_method.synthetic.appearance import Daylight, developed, exposed, rays
+from shellgs_method.synthetic.building import Layout
+from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
 from shellgs_method.synthetic.geometry import Material, Mesh, box, merge
 from shellgs_method.synthetic.scene import Facade
 from shellgs_method.synthetic.street import car
@@ -34,13 +39,27 @@ NEARER = 0.1
 """Metres by which the true geometry must be nearer than the shell to count."""
 
 
-def main(width: int = 320, views: int = 40, seed: int = 0, passers_by: bool = False, keep: Path | None = None) -> None:
+SOLID = {Material.WALL, Material.COLUMN, Material.SLAB, Material.DOOR, Material.FRAME}
+"""What nothing is seen through."""
+
+
+def main(
+    width: int = 320,
+    views: int = 40,
+    seed: int = 0,
+    off: float = 0.0,
+    turned: float = 0.0,
+    passers_by: bool = False,
+    keep: Path | None = None,
+) -> None:
     """Print recall and precision over the pixels of all views, recall by material, and times.
 
     Args:
         width: width of the photographs.
         views: number of photographs.
         seed: seed of the facade.
+        off: metres by which the shell is moved, diagonally.
+        turned: degrees by which it is turned about its middle, around the vertical.
         passers_by: add pedestrians and cars, others in each training photograph, and measure how well they are found.
         keep: copy the scene here, to train on.
     """
@@ -53,7 +72,9 @@ def main(width: int = 320, views: int = 40, seed: int = 0, passers_by: bool = Fa
         held_out, photographs = held_out_names(parsed), read_views(parsed)
         moving = add_passers_by(facade, photographs, held_out, config.supersampling) if passers_by else {}
         start = time.perf_counter()
-        cast_views(PlacedShell.load(scene, photographs, Alignment.load(scene / ALIGNMENT)))
+        alignment = misplaced(Alignment.load(scene / ALIGNMENT), facade.layout, off, turned)
+        alignment.save(scene / ALIGNMENT)
+        cast_views(PlacedShell.load(scene, photographs, alignment))
         cast = time.perf_counter() - start
         seconds = check_views(scene, photographs, held_out).seconds
         print(f"{views} views of {width} x {config.height}")
@@ -61,6 +82,7 @@ def main(width: int = 320, views: int = 40, seed: int = 0, passers_by: bool = Fa
             print_moving(scene, [view for view in photographs if view.name in moving], moving)
         else:
             print_still(scene, photographs, facade)
+            print_behind(scene, photographs, facade)
         print(f"compared in {seconds:.1f} s, {seconds / cast:.1f} times as long as the cast took ({cast:.1f} s)")
         if keep is not None:
             shutil.copytree(scene, keep)
@@ -87,6 +109,29 @@ def print_still(scene: Path, photographs: list[View], facade: Facade) -> None:
     print(f"recall {recall:.2f}, precision {precision:.2f}")
     for name, count in there.most_common():
         print(f"  {name:8} {count / sum(there.values()):6.1%} of the pixels, recall {right[name] / count:.2f}")
+
+
+def print_behind(scene: Path, photographs: list[View], facade: Facade) -> None:
+    """Print how much of the panes is found to show something behind the shell, and how much of what is solid."""
+    shell, checked = CueMaps.open(scene, "shell"), CueMaps.open(scene, "checked")
+    panes, solid = np.zeros(2, int), np.zeros(2, int)
+    for view, camera in zip(photographs, facade.cameras, strict=True):
+        on, check = shell.require(view.name, view.camera), checked.require(view.name, view.camera)
+        material = facade.daylight.world.material[facade.daylight.world.cast(*rays(camera)).triangle]
+        behind = Findings.of(check, on).behind
+        for counts, kinds in ((panes, [Material.GLASS]), (solid, list(SOLID))):
+            there = np.isin(material, kinds) & (on.depth > 0)
+            counts += there.sum(), (there & behind).sum()
+    print(f"seen behind the shell: {panes[1] / panes[0]:.3f} of the panes, {solid[1] / solid[0]:.4f} of what is solid")
+
+
+def misplaced(alignment: Alignment, layout: Layout, off: float, turned: float) -> Alignment:
+    """The alignment of a shell that is off by some metres and degrees."""
+    turn, middle = np.eye(4), np.array([layout.length / 2, 0, layout.height / 2])
+    turn[:3, :3] = Rotation.from_euler("z", turned, degrees=True).as_matrix()
+    turn[:3, 3] = middle - turn[:3, :3] @ middle + off / 3**0.5
+    moved = alignment.shell_to_scene @ SHELL_FROM_BUILDING @ turn @ np.linalg.inv(SHELL_FROM_BUILDING)
+    return replace(alignment, shell_to_scene=moved) if off or turned else alignment
 
 
 def print_moving(scene: Path, photographs: list[View], moving: dict[str, Bool[np.ndarray, "h w"]]) -> None:

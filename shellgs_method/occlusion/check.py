@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.machine.progress import track
@@ -27,21 +27,23 @@ from shellgs_method.occlusion.contradiction import (
     ALONE,
     CONFIRMED,
     CONTRADICTED,
-    OFFSETS_BEHIND,
     REFLECTED,
     ShellView,
     Sweep,
     agreement,
     sides,
     sweep,
+    sweep_behind,
 )
 from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sightings_on_surface
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
+ERRORS = (0.05, 0.15)
+"""Metres that the shell's place may be off at least, whatever its alignment says, and at most."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 9
+VERSION = 10
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -128,6 +130,8 @@ class _TrainingViews:
     """The views as they were taken."""
     sweeps: dict[str, Sweep]
     colours: ColourModel
+    error: float
+    """Possible error of the shell's place, in scene units; 0 where their size is not known."""
     windows: bool
     """Whether the shell's model has windows: elsewhere, nothing is seen behind it."""
 
@@ -160,7 +164,8 @@ class _TrainingViews:
                 with atomic_write(files[name]) as stream:
                     stream.write(content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
-        return cls(shell_views, exposures, sweeps, ColourModel(shell_views.values(), sweeps.values()), windows)
+        colours = ColourModel(shell_views.values(), sweeps.values())
+        return cls(shell_views, exposures, sweeps, colours, _error(shell.manifest), windows)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -196,7 +201,9 @@ class _TrainingViews:
         self, seen: ShellView, size: tuple[int, ...]
     ) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
         """Score of the best depth behind the shell, and this depth relative to the shell's."""
-        found = sweep(seen, [view for view in self.views.values() if view is not seen], OFFSETS_BEHIND)
+        names = [name for name, view in self.views.items() if view is not seen]
+        others, sweeps = [self.views[name] for name in names], [self.sweeps[name] for name in names]
+        found = sweep_behind(seen, others, sweeps, self.error)
         return _resized(found.score.float(), size).numpy(), _relative_depth(found, size)
 
     def _neighbours(self, seen: ShellView) -> list[str]:
@@ -235,6 +242,11 @@ def _shell_view(view: View, cue: CueMap) -> ShellView:
     # Without the borders of what is ignored, whose gradients and interpolated colours are not of the photograph.
     counts = torch.from_numpy(cv2.erode(kept.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
     return ShellView(camera, torch.from_numpy(image), depth.where(counts, 0.0), counts)
+
+
+def _error(shell: Manifest) -> float:
+    low, high = ERRORS
+    return min(max(shell.error or 0.0, low), high) / shell.metres_per_unit if shell.metres_per_unit else 0.0
 
 
 def _exposed(view: ShellView) -> Exposed:

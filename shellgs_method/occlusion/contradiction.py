@@ -9,6 +9,7 @@ by the silhouettes of other views.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,7 @@ from jaxtyping import Bool, Float, Float16, Int64, UInt8
 from kornia.filters import guided_blur
 from scipy.ndimage import binary_fill_holes
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, max_pool2d
 
 from shellgs_method.geometry.camera import Camera
 
@@ -28,13 +29,16 @@ _NEAREST, _STEP = 0.0125, 1.4
 OFFSETS = tuple(_NEAREST * _STEP**k for k in range(15))
 """Tried depths, as the relative excess of their inverse over the shell's: from 10 cm in front of a wall that is 8 m
 away to a third of its depth."""
-OFFSETS_BEHIND = tuple(-_NEAREST * 2.0**k for k in range(7))
-"""The same behind the shell, to five times its depth: coarser, since what is found there need not be accurate."""
+OFFSETS_BEHIND = tuple(-2 * _NEAREST * 2.0**k for k in range(6))
+"""The same behind the shell, from 20 cm behind a wall that is 8 m away to five times its depth: coarser, since what is
+found there need not be accurate."""
 MOVES = 5.5
 """Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and much more needs
 finer steps of depth than the offsets have."""
 PER_SIDE = 4
 """Neighbours on either side of a view: what is occluded on one side is visible from the other."""
+PER_SIDE_BEHIND = 2
+"""The same for what is behind the shell."""
 CONTRADICTED = 0.14
 """Score above which a pixel is contradicted, if its colour counts neither way. With 0.08 more are found, and renders of
 what is in front of the shell improve, but mirrors contradict the shell too, and surfaces left to the photographs alone
@@ -44,7 +48,7 @@ ALONE = 0.12
 CONFIRMED = -0.03
 """Score of the best nearer depth below which the shell is confirmed."""
 REFLECTED = 0.02
-"""Score of the best farther depth above which a pixel counts as a window that shows something behind the shell."""
+"""Score of the best farther depth above which a pixel shows something behind the shell, as a window does."""
 
 Sides = tuple[list[tuple[float, int]], list[tuple[float, int]]]
 """Distances and indices of cameras on the left and on the right of a view."""
@@ -55,6 +59,9 @@ _WINDOW, _EDGES = 13, 1e-3  # guided filter: window side in pixels, regularisati
 _FAST: Any = {"separable": True, "subsample": 2} if "separable" in signature(guided_blur).parameters else {}
 _FEATHERED = 4  # times the silhouette is feathered
 _COLOUR, _GRADIENT = 0.12, 0.06  # truncation of colour and gradient differences, for values in [0, 1]
+_WEIGHTS = (1 / (6 * _COLOUR), 1 / (4 * _GRADIENT))  # of a colour and a gradient: each mean is truncated at a half
+_APART = 0.004  # relative difference of the depths of two surfaces, less than a third of a step of offsets
+_SEEN = 0.5  # views that must see the shell on one side, at least
 _SUPPORT = 0.2  # weight of the other views' scores relative to the photographs
 
 
@@ -98,7 +105,9 @@ class Sweep(NamedTuple):
     """Relative excess of the inverse depth over the shell's, interpolated between those that were tried."""
 
 
-def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list[tuple[int, int]]:
+def neighbours(
+    view: Camera, others: Sides, depth: float, offset: float, per_side: int = PER_SIDE
+) -> list[tuple[int, int]]:
     """Choose the cameras on either side of a view whose parallax at an offset is closest to :data:`MOVES` pixels.
 
     Args:
@@ -106,6 +115,7 @@ def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list
         others: cameras to choose from, by :func:`sides`.
         depth: typical depth of the shell in the view.
         offset: one of :data:`OFFSETS` or :data:`OFFSETS_BEHIND`.
+        per_side: number of cameras on either side.
 
     Returns:
         Index and side of each camera: 0 on the left, 1 on the right.
@@ -117,7 +127,7 @@ def neighbours(view: Camera, others: Sides, depth: float, offset: float) -> list
         )
         for side in others
     ]
-    return [(index, side) for side in (0, 1) for _, index in found[side][:PER_SIDE]]
+    return [(index, side) for side in (0, 1) for _, index in found[side][:per_side]]
 
 
 def sides(view: Camera, others: Sequence[Camera]) -> Sides:
@@ -130,7 +140,7 @@ def sides(view: Camera, others: Sequence[Camera]) -> Sides:
     return found
 
 
-def sweep(view: ShellView, others: Sequence[ShellView], offsets: Sequence[float] = OFFSETS) -> Sweep:
+def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
     """Find the best depth in front of the shell, by the photographs of a view and its neighbours.
 
     Costs are averaged over the neighbours of a side; the side with the lower cost counts.
@@ -138,24 +148,80 @@ def sweep(view: ShellView, others: Sequence[ShellView], offsets: Sequence[float]
     Args:
         view: the view.
         others: all other views.
-        offsets: a geometric sequence of depths to try; :data:`OFFSETS_BEHIND` for those behind the shell.
     """
-    pixels, near = _Pixels(view), sides(view.camera, [other.camera for other in others])
-    depth = float(pixels.surface.median())
+    pixels = _Pixels(view)
+    on_shell, nearer = _costs(pixels, others, OFFSETS).amin(dim=2)
+    return _best(view, OFFSETS, _smooth(pixels, on_shell - nearer))
+
+
+def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[Sweep], error: float) -> Sweep:
+    """Find the best depth behind the shell, of what a window reflects or lets through.
+
+    The photographs must agree better there than on any surface that the shell may have at a pixel if it is off by its
+    error: at its edges, that is the nearest or the farthest surface around the pixel. Neighbours in which something
+    stands before the shell do not count.
+
+    Args:
+        view: the view.
+        others: all other views.
+        sweeps: their sweeps in front of the shell.
+        error: possible error of the shell's place, in scene units.
+    """
+    pixels = _Pixels(view)
+    reach = math.ceil(float(view.camera.K[0, 0]) * error / float(pixels.surface.median()))
+    window, around = 2 * reach + 1, pixels.surface[None]
+    farthest, nearest = max_pool2d(around, window, 1, reach)[0], -max_pool2d(-around, window, 1, reach)[0]
+    surfaces = [pixels.surface / depth - 1 for depth in (nearest, farthest)]
+    *shells, behind = _costs(pixels, others, OFFSETS_BEHIND, surfaces, sweeps).amin(dim=2)
+    on_shell = torch.stack([_smooth(pixels, each) for each in shells]).amin(dim=0)
+    inside = -max_pool2d(-(view.depth > 0).float()[None], window, 1, reach)[0] > 0
+    found = _best(view, OFFSETS_BEHIND, on_shell - _smooth(pixels, behind))
+    return found._replace(score=found.score.where(inside, -1.0))
+
+
+def _costs(
+    pixels: _Pixels,
+    others: Sequence[ShellView],
+    offsets: Sequence[float],
+    surfaces: Sequence[Float[Tensor, "h w"]] = (),
+    sweeps: Sequence[Sweep] | None = None,
+) -> Float[Tensor, "S+2 K 2 h w"]:
+    """Disagreement of photographs on the shell, on other surfaces near it, and last at each offset, by side.
+
+    Each offset has neighbours of its own. A side on which none sees a pixel has a cost of 1.
+
+    Args:
+        pixels: a view's.
+        others: all other views.
+        offsets: depths to try.
+        surfaces: offsets of other surfaces.
+        sweeps: sweeps of the other views: the shell is not visible where they show something in front of it.
+    """
+    near, depth = sides(pixels.camera, [other.camera for other in others]), float(pixels.surface.median())
     roles: dict[int, list[tuple[int, int]]] = {}
     for step, offset in enumerate(offsets):
-        for index, side in neighbours(view.camera, near, depth, offset):
+        for index, side in neighbours(
+            pixels.camera, near, depth, offset, PER_SIDE if sweeps is None else PER_SIDE_BEHIND
+        ):
             roles.setdefault(index, []).append((step, side))
-    sums = torch.zeros(len(offsets), 2, 3, *view.depth.shape)
+    weights = torch.zeros(len(offsets), 2, *pixels.surface.shape)
+    sums = torch.zeros(len(surfaces) + 2, *weights.shape)
     for index, asked in roles.items():
         neighbour = _Neighbour(pixels, others[index])
+        visible = neighbour.visible
+        if sweeps is not None:
+            visible = visible * (1 - neighbour.hidden(sweeps[index], neighbour.shell, 1.0))
+        shells = [neighbour.on_shell, *(neighbour.on_surface(offset) for offset in surfaces)]
         for step, side in asked:
-            look = neighbour.look(pixels.surface / (1 + offsets[step]))
-            nearer, counts = neighbour.disagreement(look), neighbour.visible * neighbour.kept(look)
-            sums[step, side] += counts * torch.stack([neighbour.visible, neighbour.on_shell, nearer])
-    weight, on_shell, nearer = sums.unbind(dim=2)
-    on_shell, nearer = ((each / weight).nan_to_num(1.0).amin(dim=1) for each in (on_shell, nearer))
-    scores = _smooth(pixels, on_shell - nearer)
+            look = neighbour.look(offsets[step])
+            counts = visible * neighbour.kept(look)
+            weights[step, side] += counts
+            for total, cost in zip(sums[:, step, side], (*shells, neighbour.disagreement(look)), strict=True):
+                total.addcmul_(counts, cost)
+    return torch.where(weights > _SEEN, sums / weights, 1.0)
+
+
+def _best(view: ShellView, offsets: Sequence[float], scores: Float[Tensor, "K h w"]) -> Sweep:
     score, best = scores.max(dim=0)
     offset = offsets[0] * (offsets[1] / offsets[0]) ** (best + _vertex(scores, best))
     return Sweep(score.where(view.depth > 0, -1.0).half(), offset.half())
@@ -188,17 +254,15 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
     shell, shown, nearer, trust, support, outside = [], [], [], [], [], []
     for other, sweep_there in zip(others, found_there, strict=True):
         neighbour = _Neighbour(pixels, other)
-        look = neighbour.look(pixels.surface / (1 + found.offset.float()))
+        look = neighbour.look(found.offset.float())
         hidden = (neighbour.visible == 0) | ~look.inside | (neighbour.kept(look) == 0)
-        probability = torch.sigmoid((sweep_there.score.float() - 0.4 * CONTRADICTED) / 0.02)
-        of_shell = _sampled(probability, neighbour.shell.grid)
-        of_nearer = _sampled(probability, look.grid)
+        of_shell, of_nearer = (neighbour.hidden(sweep_there, at, 0.4) for at in (neighbour.shell, look))
         offset = _sampled(other.depth, look.grid, "nearest") / look.z - 1
         found_offset = _sampled(sweep_there.offset.float(), look.grid, "nearest")
         alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
         shell.append(neighbour.on_shell.masked_fill(hidden, torch.nan))
         unseen = (neighbour.visible == 0) | (of_shell > 0.5)
-        shown.append(neighbour.shown[:3].masked_fill(unseen, torch.nan))
+        shown.append(neighbour.shown.masked_fill(unseen, torch.nan))
         nearer.append(neighbour.disagreement(look).masked_fill(hidden, torch.nan))
         trust.append(1 - of_shell)
         out = _sampled((~other.silhouette).float(), neighbour.shell.grid, "nearest")
@@ -222,9 +286,16 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
 class _Look(NamedTuple):
     """Position of a view's pixels in another view, at some depth."""
 
-    grid: Float[Tensor, "1 h w 2"]  # from -1 to 1
+    position: Float[Tensor, "2 h w"]  # from -1 to 1
     z: Float[Tensor, "h w"]
-    inside: Bool[Tensor, "h w"]
+
+    @property
+    def grid(self) -> Float[Tensor, "1 h w 2"]:
+        return self.position.permute(1, 2, 0)[None]
+
+    @property
+    def inside(self) -> Bool[Tensor, "h w"]:
+        return (self.z > 0) & (self.position.abs() < 1).all(dim=0)
 
 
 class _Pixels:
@@ -241,34 +312,54 @@ class _Neighbour:
     """A neighbour of a view; the epipolar lines of the view's pixels in it are computed once."""
 
     def __init__(self, pixels: _Pixels, other: ShellView) -> None:
+        width, height = other.camera.width, other.camera.height
+        to_grid = torch.tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]], dtype=torch.float64)
         motion = other.camera.viewmat.double() @ torch.linalg.inv(pixels.camera.viewmat.double())
-        K = other.camera.K.double()
-        self._direction = torch.einsum("ij,hwj->ihw", (K @ motion[:3, :3]).float(), pixels.rays)
-        self._start = (K @ motion[:3, 3]).float()
-        self._size = other.camera.width, other.camera.height
+        K = to_grid @ other.camera.K.double()
+        self._start = (K @ motion[:3, 3]).float()[:, None, None]
+        self._surface = torch.einsum("ij,hwj->ihw", (K @ motion[:3, :3]).float(), pixels.rays) * pixels.surface
+        self._surface += self._start
         self._features, self._there = pixels.features, _features(other)
-        self.shell = self.look(pixels.surface)
+        self.shell = self.look(0.0)
         """Position of the pixels if they lie on the shell."""
         surface = _sampled(other.depth, self.shell.grid, "nearest")
         hidden = ~self.shell.inside | ((surface > 0) & (self.shell.z > 1.01 * surface))
         self._kept = None if other.kept is None else other.kept.float()
         self.visible = (~hidden).float() * self.kept(self.shell)
         """1 where the shell is visible in the other view: inside what counts of its image, not behind other parts."""
-        self.shown = self._at(self.shell)
-        """The other photograph's features on the shell."""
-        self.on_shell = self._disagreement(self.shown)
+        self._shown = self._at(self.shell)
+        self.on_shell = self._disagreement(self._shown)
         """Disagreement of the two photographs on the shell."""
 
-    def look(self, depth: Float[Tensor, "h w"]) -> _Look:
-        """Project the pixels, at these depths, into the other view."""
-        x, y, z = (direction * depth + start for direction, start in zip(self._direction, self._start, strict=True))
-        near = z.clamp_min(1e-9)
-        u, v = (2 / size * along / near - 1 for size, along in zip(self._size, (x, y), strict=True))
-        return _Look(torch.stack([u, v], dim=-1)[None], z, (z > 0) & (u.abs() < 1) & (v.abs() < 1))
+    def look(self, offset: Float[Tensor, "h w"] | float) -> _Look:
+        """Project the pixels into the other view, at depths whose inverse exceeds the shell's by a relative offset."""
+        x, y, z = self._surface + offset * self._start  # of the pixels' places, times 1 + offset
+        return _Look(torch.stack([x, y]).div_(z.clamp_min(1e-9)), z / (1 + offset))
+
+    @property
+    def shown(self) -> Float[Tensor, "3 h w"]:
+        """The other photograph's colours on the shell."""
+        return self._shown[:3] / _WEIGHTS[0]
 
     def kept(self, look: _Look) -> Float[Tensor, "h w"] | float:
         """1 where the other photograph counts at these positions."""
         return 1.0 if self._kept is None else _sampled(self._kept, look.grid, "nearest")
+
+    def hidden(self, found: Sweep, at: _Look, threshold: float) -> Float[Tensor, "h w"]:
+        """Probability, by the other view's sweep, that something stands before the shell at these positions.
+
+        It is 1/2 at a score of ``threshold`` times :data:`CONTRADICTED`.
+        """
+        probability = torch.sigmoid((found.score.float() - threshold * CONTRADICTED) / 0.02)
+        return _sampled(probability, at.grid)
+
+    def on_surface(self, offset: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+        """Disagreement on another surface, which is computed only where it is not that of the shell."""
+        apart = offset.abs() > _APART
+        x, y, z = self._surface[:, apart] + offset[apart] * self._start[..., 0]
+        grid = (torch.stack([x, y]) / z.clamp_min(1e-9)).T[None, None]
+        there = grid_sample(self._there[None], grid, padding_mode="border", align_corners=False)[0, :, 0]
+        return self.on_shell.masked_scatter(apart, _difference(there, self._features[:, apart]))
 
     def disagreement(self, look: _Look) -> Float[Tensor, "h w"]:
         """Mean of the truncated differences of colours and gradients at these positions, from 0 to 1."""
@@ -278,9 +369,12 @@ class _Neighbour:
         return grid_sample(self._there[None], look.grid, padding_mode="border", align_corners=False)[0]
 
     def _disagreement(self, there: Float[Tensor, "5 h w"]) -> Float[Tensor, "h w"]:
-        difference = (self._features - there).abs_()
-        colours, gradients = difference[:3].mean(dim=0) / _COLOUR, difference[3:].mean(dim=0) / _GRADIENT
-        return (colours.clamp_max_(1) + gradients.clamp_max_(1)) / 2
+        return _difference(there, self._features)
+
+
+def _difference(there: Float[Tensor, "5 *N"], here: Float[Tensor, "5 *N"]) -> Float[Tensor, "*N"]:
+    red, green, blue, across, down = (there - here).abs_()  # in place: it is most of a sweep's time
+    return (red.add_(green).add_(blue)).clamp_max_(0.5).add_(across.add_(down).clamp_max_(0.5))
 
 
 def _alone(pixels: _Pixels, shown: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "h w"]:
@@ -293,7 +387,7 @@ def _alone(pixels: _Pixels, shown: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "h
     typical = shown.nanmedian(dim=0).values
     spread = (shown - typical).abs().mean(dim=1).nanquantile(0.75, dim=0)
     known = shown[:, 0].isfinite().sum(dim=0) >= 2
-    alone = (pixels.features[:3] - typical).abs().mean(dim=0) - 2 * spread
+    alone = (pixels.features[:3] / _WEIGHTS[0] - typical).abs().mean(dim=0) - 2 * spread
     alone, weight = _smooth(pixels, torch.stack([alone.where(known, 0.0), known.float()]))
     return alone / weight.clamp_min(0.05)
 
@@ -305,10 +399,10 @@ def _sampled(
 
 
 def _features(view: ShellView) -> Float[Tensor, "5 h w"]:
-    """Features for comparison: colours in [0, 1], and both gradients of their mean."""
-    colours = view.image.permute(2, 0, 1).float() / 255
-    down, across = torch.gradient(colours.mean(dim=0))
-    return torch.cat([colours, across[None], down[None]])
+    """Features for comparison: colours, and both gradients of their mean, with their weights."""
+    colours = view.image.permute(2, 0, 1) / 255
+    down, across = torch.gradient(_WEIGHTS[1] * colours.mean(dim=0))
+    return torch.cat([_WEIGHTS[0] * colours, across[None], down[None]])
 
 
 def _vertex(scores: Float[Tensor, "K h w"], best: Int64[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -330,4 +424,4 @@ def _better_half(costs: Float[Tensor, "V h w"], weights: Float[Tensor, "V h w"])
 
 
 def _smooth(pixels: _Pixels, maps: Float[Tensor, "C h w"]) -> Float[Tensor, "C h w"]:
-    return guided_blur(pixels.features[None, :3], maps[None], _WINDOW, _EDGES, "replicate", **_FAST)[0]
+    return guided_blur(pixels.features[None, :3] / _WEIGHTS[0], maps[None], _WINDOW, _EDGES, "replicate", **_FAST)[0]

@@ -22,13 +22,13 @@ from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_view
 from shellgs_method.evaluation import Rendering
 from shellgs_method.evaluation.pixels import reference_maps
 from shellgs_method.evaluation.regions import reference_errors, regions
-from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
+from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 from shellgs_method.occlusion import check as checking
-from shellgs_method.occlusion.check import _at_mean_exposure, _exposed, _gains, _told_apart
+from shellgs_method.occlusion.check import _at_mean_exposure, _error, _exposed, _gains, _told_apart
 from shellgs_method.occlusion.colours import ColourModel
 from shellgs_method.occlusion.contradiction import (
     ALONE,
@@ -36,7 +36,6 @@ from shellgs_method.occlusion.contradiction import (
     CONTRADICTED,
     MOVES,
     OFFSETS,
-    OFFSETS_BEHIND,
     REFLECTED,
     Agreement,
     ShellView,
@@ -46,6 +45,7 @@ from shellgs_method.occlusion.contradiction import (
     neighbours,
     sides,
     sweep,
+    sweep_behind,
 )
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.viewer import ContradictedShell
@@ -148,14 +148,69 @@ def test_what_photographs_do_not_count_for_is_found_nowhere():
     assert agree.numpy()[np.logical_not(spread)].mean() > 0.97
 
 
-def test_what_a_mirror_shows_is_found_behind_the_wall():
-    views = [view for view, _ in street(CAMERAS, mirror=1 / 0.6)]
-    found = sweep(views[MIDDLE], views[:MIDDLE] + views[MIDDLE + 1 :], OFFSETS_BEHIND)
+def behind(views: list[ShellView], error: float, sweeps: list[Sweep] | None = None) -> Sweep:
+    """What the middle view shows behind the shell; nothing is in front of it if no sweeps are given."""
+    nothing = Sweep(torch.full((HEIGHT, WIDTH), -0.1), torch.zeros(HEIGHT, WIDTH))
+    beside = [k for k in range(len(views)) if k != MIDDLE]
+    clear = [nothing if sweeps is None else sweeps[k] for k in beside]
+    return sweep_behind(views[MIDDLE], [views[k] for k in beside], clear, error)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.1])
+def test_what_a_mirror_shows_is_found_behind_the_wall(error: float):
+    found = behind([view for view, _ in street(CAMERAS, mirror=1 / 0.6)], error)
     pane = np.abs(WALL * CAMERAS[MIDDLE].rays().numpy()[..., 0]) < 1.5
-    behind = found.score.numpy() > REFLECTED
-    assert behind[pane].mean() > 0.6
-    assert behind[~pane].mean() < 0.1
-    np.testing.assert_allclose(np.median(found.offset.numpy()[pane & behind]), -0.4, rtol=0.1)
+    shown = found.score.numpy() > REFLECTED
+    assert shown[pane].mean() > 0.6
+    assert shown[~pane].mean() < 0.1
+    np.testing.assert_allclose(np.median(found.offset.numpy()[pane & shown]), -0.4, rtol=0.1)
+
+
+def with_pilaster(views: list[ShellView], shift: float) -> tuple[list[ShellView], np.ndarray]:
+    """The views of a wall with a pilaster 1 m wide before it, which is farther right in the shell by a shift.
+
+    The mask is where the shell has the pilaster, and the middle view shows the wall.
+    """
+    added, masks = [], []
+    for view in views:
+        place = view.camera.position.numpy() + 7.0 * view.camera.rays().numpy()
+        there, in_shell = (np.abs(place[..., 0] - x) < 0.5 for x in (0.0, shift))
+        image = view.image.numpy().copy()
+        image[there] = (painted(place, 2).clip(0, 1) * 255).round().astype(np.uint8)[there]
+        depth = view.depth.where(torch.from_numpy(~in_shell), 7.0)
+        added.append(replace(view, image=torch.from_numpy(image), depth=depth))
+        masks.append(in_shell & ~there)
+    return added, masks[MIDDLE]
+
+
+def test_the_wall_beside_a_pilaster_is_not_behind_a_shell_that_is_off_by_its_error():
+    views, strip = with_pilaster([view for view, _ in street(CAMERAS)], shift=0.3)
+    exactly, within = ((behind(views, error).score > REFLECTED).numpy() for error in (0.0, 0.3))
+    assert strip.sum() > HEIGHT
+    assert exactly[strip].mean() > 0.3, "the shell says nothing that the photographs contradict"
+    assert within.mean() < 0.01
+
+
+def test_a_plain_wall_between_posts_is_not_behind_the_shell_where_they_hide_it_from_others():
+    """Photographs agree on the wall's colour anywhere behind it, and beside the posts only there."""
+    views, posts = [], []
+    for view, _ in street(CAMERAS):
+        place = view.camera.position.numpy() + 5.0 * view.camera.rays().numpy()
+        posts.append(np.abs(place[..., 0] % 1.6 - 0.8) < 0.4)
+        image = np.full((HEIGHT, WIDTH, 3), 190, np.uint8)
+        image[posts[-1]] = (painted(place, 2).clip(0, 1) * 255)[posts[-1]]
+        views.append(replace(view, image=torch.from_numpy(image)))
+    sweeps = [sweep(view, [other for other in views if other is not view]) for view in views]
+    unaware, aware = ((behind(views, 0.1, known).score > REFLECTED).numpy() for known in (None, sweeps))
+    wall = ~posts[MIDDLE]
+    assert unaware[wall].mean() > 0.5, "the posts hide nothing"
+    assert aware[wall].mean() < 0.15
+
+
+@pytest.mark.parametrize(("known", "metres"), [(None, 0.05), (0.02, 0.05), (0.08, 0.08), (0.5, 0.15)])
+def test_the_error_allowed_for_is_that_of_the_alignment_within_limits(known: float | None, metres: float):
+    assert _error(Manifest("cast", metres_per_unit=2.0, error=known)) == pytest.approx(metres / 2)
+    assert _error(Manifest("cast", error=known)) == 0
 
 
 def test_a_wall_that_agrees_with_the_shell_is_confirmed():
