@@ -19,7 +19,7 @@ from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.registration.adjustment import Adjustment, adjusted
+from shellgs_method.registration.adjustment import SIGNIFICANT, Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.geotags import REACH, GeoTags
@@ -196,8 +196,8 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
     if held.were_straight:
         sentence = (
-            f"The cameras are left as they are: {held.points} points held out of their adjustment are {after} from the "
-            f"shell with it, {before} without."
+            f"The cameras are left as they are: {held.points} points held out of their adjustment do not fit the shell "
+            f"better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are asked)."
         )
         return replace(placement, history=[*placement.history, sentence]), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
@@ -206,7 +206,7 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
         f"Cameras adjusted to the shell: they moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm "
         f"at most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of the "
         f"adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their keypoints, "
-        f"{held.pixels[0]:.2f} px before (medians)."
+        f"{held.pixels[0]:.2f} px before (medians); they fit the shell better by {held.gain:.1f} standard errors."
     )
     found = replace(
         alignment, shell_to_scene=matrix, source=f"{alignment.source}, cameras adjusted", model=ADJUSTED.as_posix()
