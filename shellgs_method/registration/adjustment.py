@@ -43,7 +43,8 @@ GATE = 0.05
 HELD_OUT = 0.1
 """Share of the tracks that are left out of the adjustment, and checked."""
 SIGNIFICANT = 2.0
-"""Standard errors by which held-out points must be likelier with adjusted cameras. True ones reach none of these."""
+"""Standard errors by which held-out points must be likelier with adjusted cameras. True ones of two scenes reach
+none of these, and the film of the tutorial 3.2."""
 _FINEST = 0.005
 """Metres: smallest noise of a shell. No scan of a building is better, and no building is its model."""
 _PATCH = 1.0
