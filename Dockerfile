@@ -8,7 +8,7 @@ ARG TORCH="torch torchvision"
 COPY . /opt/shellgs
 WORKDIR /opt/shellgs
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends g++ libegl1 libgl1 libgomp1 libidn2-0 libudev1 libx11-6 \
+    && apt-get install --yes --no-install-recommends g++ libegl1 libgl1 libgomp1 libidn2-0 libudev1 libusb-1.0-0 libx11-6 \
     && rm -rf /var/lib/apt/lists/*
 RUN pip install --no-cache-dir ${TORCH} \
     && pip install --no-cache-dir ".[sim,las,e57,bim]" \
@@ -21,7 +21,7 @@ ENV TORCH_CUDA_ARCH_LIST="7.5;8.0;8.6;8.9;9.0" TORCH_EXTENSIONS_DIR=/opt/kernels
 COPY . /opt/shellgs
 WORKDIR /opt/shellgs
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends g++ libegl1 libgl1 libgomp1 libidn2-0 libudev1 libx11-6 \
+    && apt-get install --yes --no-install-recommends g++ libegl1 libgl1 libgomp1 libidn2-0 libudev1 libusb-1.0-0 libx11-6 \
     && rm -rf /var/lib/apt/lists/*
 RUN pip install --no-cache-dir ninja ".[sim,las,e57,bim]" \
     && pip install --no-cache-dir --no-deps gsplat==1.5.3 \

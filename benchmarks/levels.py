@@ -97,7 +97,7 @@ def main(folder: tyro.conf.Positional[Path]) -> None:
             write_scene(scene, FacadeConfig())
             settings = settings_of(scene)
             write_model(scene / MODEL, level, levels(Layout(settings["bays"], settings["storeys"]))[level])
-            replace(Alignment.load(scene / ALIGNMENT), shell=MODEL).save(scene / ALIGNMENT)
+            replace(Alignment.load(scene / ALIGNMENT), shells=(MODEL,), hashes=()).save(scene / ALIGNMENT)
         table.add_row(level, *measure(scene))
     Console().print(table)
 

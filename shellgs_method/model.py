@@ -316,10 +316,11 @@ class FacadeModel(SplatfactoModel):
         if not self.training:
             outputs["background"] = background.expand(pinhole.height, pinhole.width, 3)
         if self.geometry is not None:
-            outputs["depth"] = self.geometry.depth
-            if self.config.depth == "mode" and not self.training:
-                outputs["depth"] = self.renderer.mode_of_depth(self.geometry.depth, gaussians, pinhole)
-            outputs["normal"] = normals_to_colours(nn.functional.normalize(self.geometry.normal, dim=-1))
+            depth, normal = self.geometry.depth, self.geometry.normal
+            if not self.training:
+                depth, normal = self.renderer.view_of_geometry(self.geometry, gaussians, pinhole)
+            outputs["depth"] = depth
+            outputs["normal"] = normals_to_colours(nn.functional.normalize(normal, dim=-1))
         return outputs
 
     @property

@@ -53,6 +53,9 @@ WORK = Path("capture")
 SUSPICIOUS_ERROR = 0.75
 """Mean reprojection error in pixels: correct models of real and synthetic facades had 0.4 to 0.65, folded ones more."""
 
+LEAST_SEEN = 30
+"""Points that a photograph shows in the mean: COLMAP places none by fewer. Of 960 x 540 pixels they are 750."""
+
 _HOMOGRAPHIES = (4, 5, 6)  # COLMAP's PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
 _NO_PARALLAX = 0.95  # share of such pairs: all of a camera on a tripod, a sixth of a walk along the synthetic facade
 
@@ -98,7 +101,8 @@ def capture(
 
     Raises:
         FileNotFoundError: the source or the folder of masks is missing.
-        SceneError: the source cannot be used, the scene holds cameras already, or too few photographs are registered.
+        SceneError: the source cannot be used, the scene holds cameras already, too few photographs are registered, or
+            they show too few points.
     """
     config = config or CaptureConfig()
     if not source.exists():
@@ -335,7 +339,7 @@ class _Capture:
         """Summary of the largest model.
 
         Raises:
-            SceneError: it has too few of the photographs.
+            SceneError: it has too few of the photographs, or they show too few points.
         """
         names, models = found["photographs"], found["models"]
         largest: dict[str, Any] = models[0] if models else {"names": []}
@@ -365,6 +369,12 @@ class _Capture:
                 f"the cameras of only {registered} of {len(names)} photographs were found{groups}; a scene needs "
                 f"{LEAST_SHARE:.0%} of them and at least {LEAST_REGISTERED}. Not found: {shown}. {advice} out "
                 "photographs of other things; photograph larger, with more overlap, in sidesteps rather than turns"
+            )
+        if largest["points"] * largest["track_length"] < LEAST_SEEN * registered:
+            raise SceneError(
+                f"the photographs of {self.source} show too little to find cameras by: only {largest['points']} "
+                f"points, each in {largest['track_length']:.1f} of {registered} photographs. Give larger and sharper "
+                f"photographs of the building, which show at least {LEAST_SEEN} points each"
             )
         for model in models[1:]:
             if len(model["names"]) >= LEAST_REGISTERED:

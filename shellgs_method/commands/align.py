@@ -38,8 +38,9 @@ def align(
     """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.
 
     The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
-    verdict. Without --matrix, --picks and --positions, an alignment is proposed: look at the report, then accept the
-    proposal with --accept. Without a shell, the existing alignment is validated again, or refined.
+    verdict. Without --matrix, --picks and --positions, an alignment is proposed, near the photographs' geo-tags if the
+    shell's --crs is known: look at the report, then accept the proposal with --accept. Without a shell, the existing
+    alignment is validated again, or refined.
 
     Args:
         scene: Scene folder.
@@ -117,7 +118,7 @@ def align(
     if accept:
         placement = place_as_proposed(scene / PROPOSAL, scene, views)
     elif not shell:
-        placement = place_as_before(scene / ALIGNMENT, views)
+        placement = place_as_before(scene / ALIGNMENT, scene, views)
     elif matrix:
         placement = Placement(Alignment.from_matrix_file(matrix, names, metres_per_shell_unit, global_shift))
     elif same_frame:
@@ -129,7 +130,7 @@ def align(
     else:
         method, unit = mesher or "planes", metres_per_shell_unit
         unaligned = load_shell(*shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
-        placement = place_by_guess(unaligned, views, points, names, metres_per_shell_unit)
+        placement = place_by_guess(unaligned, views, points, names, metres_per_shell_unit, system)
     aligned = placement.alignment.meshed_by(mesher, spacing)
     placement = replace(placement, alignment=replace(aligned, crs=system or aligned.crs))
     mesh = placement.alignment.load_shell(scene, views, place.surfaces if place else ())
@@ -165,7 +166,7 @@ def align(
                 placement = seen_again(placement, views, picks)
                 after = validate(mesh, placement.alignment, views, points, placement.correspondences)
                 validation = after.after(adjustment, validation)
-        validated = validation.validated(views)
+        validated = validation.validated(scene, views)
         told = [up_in_words(validated), unit_doubted(replace(validation, alignment=validated), mesh, views)]
         placement = replace(placement, history=[*placement.history, *filter(None, told)])
         write_report(scene / REPORT, mesh, validation, placement.history)

@@ -88,7 +88,7 @@ def cast(
             unbound = f"{scene / ALIGNMENT} does not say which cameras it was found for"
             console.print(f"{unbound}: `shellgs align {scene}` records them.")
     if truth:
-        in_place = replace(alignment, shells=names, verdict="", metrics={})
+        in_place = replace(alignment, shells=names, hashes=(), verdict="", metrics={})
         flags = _words(truth, matrix) + paths.flags
         _cast_truth(config, views, in_place.meshed_by(mesher, spacing), max_image_size, flags)
         return

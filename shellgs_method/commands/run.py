@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from importlib import metadata
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -173,11 +174,29 @@ def run(
     with held(steps.folder) as alone:
         if not alone:
             raise SceneError(f"another run of {scene} is going on: wait for it")
-        _take(steps, recipe, scene, results, accept)
+        if not steps.changed("all", *_state(recipe, scene, results)):
+            trained = next((results / "runs").rglob("config.yml"))
+            console.print("Nothing is left to do.", highlight=False)
+        else:
+            trained = _take(steps, recipe, scene, results, accept)
+            steps.done("all", *_state(recipe, scene, results))
+    console.print(f"Done: {results / 'mesh.ply'}, {results / 'report.html'}.", highlight=False, soft_wrap=True)
+    console.print(f"Walk around: ns-viewer --load-config {trained}", highlight=False, soft_wrap=True)
 
 
-def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: bool) -> None:
-    """Take all steps that are not done."""
+def _state(recipe: Recipe, scene: Path, results: Path) -> list[object]:
+    """Sizes and times of all files that a run reads and writes: while these are the same, nothing is left to do."""
+    recipe, scene, results = recipe.located(Path.resolve), scene.resolve(), results.resolve()
+    given = *recipe.sources, recipe.picks, recipe.matrix, recipe.positions
+    roots = [path for path in (*given, scene, results) if path]
+    found = [path for root in roots for path in (sorted(root.rglob("*")) if root.is_dir() else [root])]
+    files = [path for path in found if path.is_file() and results / "steps" not in path.parents]
+    stats = [(str(path), stat.st_size, stat.st_mtime_ns) for path in files for stat in [path.stat()]]
+    return [str(recipe), metadata.version("shellgs"), stats]
+
+
+def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: bool) -> Path:
+    """Take all steps that are not done, and return the config of what was trained."""
     video, *shell = recipe.sources
     steps.begin("cameras of the photographs")
     of_another = "capture" in steps and steps.changed("capture", str(video.resolve()))
@@ -202,8 +221,7 @@ def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: boo
         if steps.changed("sim", *checkpoint) or not (results / "sim").exists():
             simulate((trained.config, results / "sim"))
             steps.done("sim", *checkpoint)
-    console.print(f"Done: {results / 'mesh.ply'}, {results / 'report.html'}.", highlight=False, soft_wrap=True)
-    console.print(f"Walk around: ns-viewer --load-config {trained.config}", highlight=False, soft_wrap=True)
+    return trained.config
 
 
 class _Steps:

@@ -27,6 +27,9 @@ def sim(
         settings: Settings.
     """
     check_packages()  # fail before hours of work
+    from shellgs_method.machine.progress import tell
+
+    tell("Importing what simulates")
     from shellgs_method.sim.simulate import simulate
 
     def report(sentence: str) -> None:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
-from PIL import Image
+from PIL import Image, TiffImagePlugin, TiffTags
 
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.colours import depth_colours, deviation_colours
@@ -46,6 +46,7 @@ INCH = 0.0254
 GRID = 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0
 """Distances in metres of the lines of the grid."""
 MOST_LINES = 30
+_USER_DEFINED, _AREA, _METRE = 32767, 1, 9001  # GTModelType, GTRasterType and ProjLinearUnits of GeoTIFF
 FULL = 0.1
 """Distance in metres of the full colours of deviations."""
 
@@ -169,10 +170,11 @@ def _tensor(values: np.ndarray) -> torch.Tensor:
 
 
 def write_elevation(folder: Path, name: str, elevation: Elevation) -> None:
-    """Write an elevation: images and distances with world files, and a drawing to scale.
+    """Write an elevation: images and distances with their place, and a drawing to scale.
 
-    ``NAME.png``; ``NAME-depth.tif`` and ``NAME-deviations.tif``, distances in metres as float32; ``NAME.pdf`` with all
-    three. Coordinates of the world files are those of :attr:`Elevation.extent`.
+    ``NAME.png`` and ``NAME.tif``; ``NAME-depth.tif`` and ``NAME-deviations.tif``, distances in metres as float32;
+    ``NAME.pdf`` with all three. World files and GeoTIFF's tags give the coordinates of :attr:`Elevation.extent`, in a
+    local system, as a vertical plane has none on a map.
     """
     folder.mkdir(parents=True, exist_ok=True)
     left, _, _, top = elevation.extent
@@ -181,18 +183,40 @@ def write_elevation(folder: Path, name: str, elevation: Elevation) -> None:
     world = "".join(f"{number:.9g}\n" for number in numbers).encode()
     maps = {
         f"{name}.png": elevation.colours,
+        f"{name}.tif": elevation.colours,
         f"{name}-depth.tif": elevation.surface,
         f"{name}-deviations.tif": elevation.deviations,
     }
     for file_name, values in maps.items():
         path = folder / file_name
         with atomic_write(path) as file:
-            Image.fromarray(values).save(file, format={".png": "PNG", ".tif": "TIFF"}[path.suffix])
+            if path.suffix == ".png":
+                Image.fromarray(values).save(file, format="PNG")
+            else:
+                tags = _geotiff_tags(elevation, f"{name}, metres along the wall and upwards")
+                Image.fromarray(values).save(file, format="TIFF", tiffinfo=tags, compression="tiff_adobe_deflate")
         with atomic_write(path.with_suffix({".png": ".pgw", ".tif": ".tfw"}[path.suffix])) as file:
             file.write(world)
     with atomic_write(folder / f"{name}.pdf") as file, PdfPages(file) as pages:
         for title, image in _drawings(elevation).items():
             pages.savefig(_sheet(elevation, f"{name}, {title}", image))
+
+
+def _geotiff_tags(elevation: Elevation, called: str) -> TiffImagePlugin.ImageFileDirectory_v2:
+    """Place of an elevation in GeoTIFF 1.1 (OGC 19-008): in a local system, as GDAL writes LOCAL_CS."""
+    left, _, _, top = elevation.extent
+    citation = f"{called}|"
+    keys = [(1024, 0, 1, _USER_DEFINED), (1025, 0, 1, _AREA), (1026, 34737, len(citation), 0), (3076, 0, 1, _METRE)]
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    for tag, kind, values in (
+        (33550, TiffTags.DOUBLE, (elevation.pixel, elevation.pixel, 0.0)),  # ModelPixelScale
+        (33922, TiffTags.DOUBLE, (0.0, 0.0, 0.0, left, top, 0.0)),  # ModelTiepoint: of the upper left corner
+        (34735, TiffTags.SHORT, (1, 1, 1, len(keys), *(number for key in keys for number in key))),  # GeoKeyDirectory
+        (34737, TiffTags.ASCII, citation),  # GeoAsciiParams
+    ):
+        tags.tagtype[tag] = kind
+        tags[tag] = values
+    return tags
 
 
 def _drawings(elevation: Elevation) -> dict[str, UInt8[np.ndarray, "H W 3"]]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32, Float64
 
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.evaluation import Rendering, mean_over_views
 from shellgs_method.evaluation.regions import reference_errors
 from shellgs_method.evaluation.view import OPAQUE
@@ -26,7 +26,7 @@ from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.tsdf import DepthView, fuse, least_voxel
-from shellgs_method.machine.progress import track
+from shellgs_method.machine.progress import tell, track
 from shellgs_method.model import FacadeModel
 from shellgs_method.occlusion.exposure import Sightings, log_gains
 from shellgs_method.runs.trained import load_run
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 NEAR = 0.2
 """Distance in metres up to which a mesh is near the shell: more than the details that a shell leaves out."""
+SHORT = 500
+"""Iterations below which Gaussians have hardly left where they began."""
 SCENE_MARGIN = 0.05
 """Margin around the SfM points as a share of their box, if there is no shell to bound the facade."""
 SCENE_TRIM = 0.02
@@ -60,7 +62,13 @@ class TrainedRun:
             FileNotFoundError: there is no such file.
             SceneError: the run is not of a ShellGS method.
         """
-        _, pipeline, _ = load_run(config, "inference")
+        tell("Loading the run")
+        settings, pipeline, checkpoint = load_run(config, "inference")
+        done, all_of = 1 + int(checkpoint.stem.removeprefix("step-")), settings.max_num_iterations
+        if done < all_of:
+            notice(f"{config.parent} was trained for {done} of {all_of} iterations: it was stopped, or is going on.")
+        elif done < SHORT:
+            notice(f"{config.parent} was trained for {done} iterations only: give ns-train {SHORT} or more.")
         model, datamanager = pipeline.model, pipeline.datamanager
         if not isinstance(model, FacadeModel) or not isinstance(datamanager, FacadeDataManager):
             raise SceneError(f"{config} is not a run of a ShellGS method: only these render the depth that is needed")
@@ -81,8 +89,8 @@ class TrainedRun:
             return None
         alignment = Alignment.load(scene / ALIGNMENT)
         views = [view for dataset in self.datasets for view in dataset.views]
-        alignment.check_cameras(scene, views)
-        alignment = alignment if alignment.cameras.cameras else alignment.seen_by(views)
+        alignment.check(scene, views)
+        alignment = alignment if alignment.cameras.cameras else alignment.bound(scene, views)
         return alignment, alignment.load_shell(scene, views)
 
     @cached_property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -14,18 +13,11 @@ from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
+from shellgs_method.files.tables import NAME, Table, are_numbers, cells_of
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.registration.correspondences import are_numbers, column_name, read_lines, to_shell
 
 REACH = 0.5
 """Distance in metres from a surveyed point within which the surface must be for the point to count."""
-_X = ("x", "easting", "east", "e", "rechtswert", "ostwert")
-_Y = ("y", "northing", "north", "n", "hochwert", "nordwert")
-_Z = ("z", "height", "elevation", "elev", "hoehe", "höhe", "h")
-_NAME = ("name", "id", "point", "punkt", "nr")
-"""What headers call the columns; of several, the first counts."""
-_UNIT = re.compile(r"[\[(][^\])]*[\])]")
-_DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*\d,\d+,?")
 
 
 @dataclass(frozen=True)
@@ -61,52 +53,22 @@ def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 
         SceneError: a line cannot be read, two points have the same name, there are none, or their system is unknown to
             PROJ, or in degrees while the shell's is not known.
     """
-    header, lines = read_lines(path, "surveyed points")
-    convert = to_shell(header, path, "surveyed points", crs)
-    rows = [(where, _cells(words)) for where, words in lines]
-    titles = _cells(_UNIT.sub("", " ".join(header)).split())
-    if columns := _columns(titles, path):
-        expected, width = ", ".join(titles), len(titles)
-    elif _is_name_last([row for _, row in rows]):
-        expected, width, columns = "X Y Z and perhaps a name", 4, (0, 1, 2, 3)
-    else:
-        expected, width, columns = "a name and X Y Z", np.inf, (1, 2, 3, 0)
+    table = Table.read(path, "surveyed points")
+    convert, usual = table.to_shell(crs), {"name": 0, "X": 1, "Y": 2, "Z": 3}
+    expected = "a name and X Y Z"
+    if _is_name_last([cells_of(words) for _, words in table.lines]):
+        usual, expected = {"X": 0, "Y": 1, "Z": 2, "name": 3}, "X Y Z and perhaps a name"
+    columns = table.columns({"name": NAME}, usual)
+    expected = ", ".join(table.titles) if table.names_axes else expected
     points: dict[str, np.ndarray] = {}
-    for where, row in rows:
-        cells = dict(enumerate(row))
-        *numbers, name = (cells.get(k, "") for k in columns)
-        if len(row) > width or not are_numbers(numbers):
-            raise SceneError(f"{where}: expected {expected} in the shell's coordinates, with decimal points")
-        name = name or str(len(points) + 1)
+    for where, row in table.rows(columns, f"{expected} in the shell's coordinates, with decimal points"):
+        name = row["name"] or str(len(points) + 1)
         if name in points:
             raise SceneError(f"{where}: there is a point {name} already")
-        points[name] = np.array(numbers, dtype=np.float64)
+        points[name] = np.array([row[axis] for axis in "XYZ"], dtype=np.float64)
     if not points:
         raise SceneError(f"{path} holds no points")
     return dict(zip(points, convert(np.stack([*points.values()])), strict=True))
-
-
-def _cells(words: Sequence[str]) -> list[str]:
-    """The cells of a line, empty ones between separators too; none if commas are decimal."""
-    line = " ".join(words)
-    if any(_DECIMAL_COMMA.fullmatch(piece) for piece in re.split(r"[\s;]+", line)):
-        return []
-    separator = next((sign for sign in ";," if sign in line), None)
-    cells = [cell.strip() for cell in line.split(separator)] if separator else [*words]
-    return cells if any(cells[-1:]) else cells[:-1]
-
-
-def _columns(titles: Sequence[str], path: Path) -> tuple[int, ...]:
-    """Columns of X, Y, Z and the name, which is past the last one if there is none; empty if X and Y have no title."""
-    names = [column_name(title) for title in titles]
-    *axes, name = (next((names.index(n) for n in known if n in names), -1) for known in (_X, _Y, _Z, _NAME))
-    if max(axes[:2]) < 0:
-        return ()
-    if min(axes) < 0:
-        raise SceneError(
-            f"{path}: its first line, {', '.join(titles)}, must name one column each of X, Y and Z, or none"
-        )
-    return (*axes, name if name >= 0 else 0 if 0 not in axes else len(titles))
 
 
 def _is_name_last(rows: Sequence[Sequence[str]]) -> bool:

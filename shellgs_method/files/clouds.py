@@ -157,8 +157,8 @@ def damaged(path: Path, error: Exception) -> SceneError:
 
 
 def _chosen(piece: Points, mask: np.ndarray) -> Points:
-    normals = None if piece.normals is None else piece.normals[mask]
-    return replace(piece, positions=piece.positions[mask], normals=normals)
+    normals, colours = (None if values is None else values[mask] for values in (piece.normals, piece.colours))
+    return replace(piece, positions=piece.positions[mask], normals=normals, colours=colours)
 
 
 class _Sample:

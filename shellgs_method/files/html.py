@@ -25,6 +25,7 @@ th, td { text-align: left; padding: .3rem 1rem .3rem 0; border-bottom: 1px solid
 pre { background: #f6f8fa; padding: .5rem; overflow-x: auto }
 figure { margin: 0 0 1rem } img { max-width: 100%; display: block }
 .row { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 20rem), 1fr)); gap: 1rem }
+.row img { width: 100% }
 .layers { position: relative } .layers img { width: 100% } .layers img + img { position: absolute; inset: 0 }
 .verdict { font-size: 1.3rem; border-left: .4rem solid; padding: .2rem 1rem }
 """

@@ -8,14 +8,15 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt32
+from jaxtyping import Float64, Int64, UInt8, UInt32
 
-from shellgs_method.files.clouds import Cloud
+from shellgs_method.files.clouds import MOST, Cloud
 from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.surfaces import usual_up
 from shellgs_method.geometry.axes import main_direction
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.geometry.voxels import VoxelMeans
 from shellgs_method.registration.frames import ShellPlace
 from shellgs_method.shell.loading import load_shell
 from shellgs_method.shell.mesh import ShellMesh
@@ -71,12 +72,12 @@ class Blocks:
         index, along, tangent = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return index, along, tangent
 
-    def in_ball(self, centre: Float64[np.ndarray, " 3"], radius: float) -> Float64[np.ndarray, "M 3"]:
-        """All points within a radius of a centre."""
+    def in_ball(self, centre: Float64[np.ndarray, " 3"], radius: float) -> Int64[np.ndarray, " M"]:
+        """Indices of all points within a radius of a centre."""
         touched = np.linalg.norm(self._centres - centre, axis=1) <= self._radii + radius
-        blocks = (self.points[start : start + _BLOCK] for start in (_BLOCK * np.flatnonzero(touched)).tolist())
-        inside = [block[((block - centre) ** 2).sum(axis=1) <= radius**2] for block in blocks]
-        return np.concatenate([np.empty((0, 3)), *inside])
+        starts = (_BLOCK * np.flatnonzero(touched)).tolist()
+        off = [(((self.points[start : start + _BLOCK] - centre) ** 2).sum(axis=1), start) for start in starts]
+        return np.concatenate([np.empty(0, np.int64), *(at + np.flatnonzero(d <= radius**2) for d, at in off)])
 
 
 class MeshPart:
@@ -85,12 +86,24 @@ class MeshPart:
     Attributes:
         vertices: vertices to draw, relative to the middle.
         faces: triangles between them.
+        colours: of the vertices that are drawn; None where the files have none.
         out: direction that most of its upright triangles face, or face away from.
     """
 
-    def __init__(self, mesh: ShellMesh, middle: Float64[np.ndarray, " 3"], size: float, up: np.ndarray) -> None:
+    def __init__(
+        self,
+        mesh: ShellMesh,
+        middle: Float64[np.ndarray, " 3"],
+        size: float,
+        up: np.ndarray,
+        surfaces: Sequence[Geometry] = (),
+    ) -> None:
         self._triangles = Triangles(mesh.vertices - middle, mesh.faces)
         self.vertices, self.faces = thinned(self._triangles.vertices, mesh.faces)
+        known = [(part.vertices - middle, part.colours) for part in surfaces if part.colours is not None]
+        self.colours = (
+            _nearest_colours(self.vertices, *map(np.concatenate, zip(*known, strict=True))) if known else None
+        )
         normals = self._triangles.normals[:: max(1, len(mesh.faces) // FACES)]
         level = normals[np.abs(normals @ up) < 0.5]
         self.out = main_direction(level if len(level) else normals)
@@ -119,6 +132,7 @@ class CloudPart:
 
     Attributes:
         points: points to draw, means of those in a voxel, relative to the middle.
+        colours: of the points that are drawn; None where the files have none.
         spacing: distance between them.
         scanners: scanner positions, relative to the middle.
     """
@@ -130,16 +144,27 @@ class CloudPart:
         # To the fourth neighbour it is as far as to the next on a lattice of this density, in a random cloud too.
         some = np.random.default_rng(0).permutation(self.points)[:_SAMPLES]
         self.spacing = min(float(np.median(point_tree(self.points).query(some, k=5)[0][:, -1])), size)
-        count = 0
-        with tempfile.TemporaryFile() as file:  # the map keeps it
+        count, means = 0, VoxelMeans(middle, max(cloud.whole.voxel for cloud in clouds), MOST, 3)
+        with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as tints:  # the maps keep them
             for piece in chain.from_iterable(clouds):
-                positions = piece.positions[np.isfinite(piece.positions).all(axis=1)]
+                finite = np.isfinite(piece.positions).all(axis=1)
+                positions = piece.positions[finite]
                 cells = np.floor((positions - middle) / (_CELL * size or 1.0)).clip(-(1 << 9), (1 << 9) - 1)
                 order = np.argsort(cells @ [1 << 20, 1 << 10, 1], kind="stable")
                 file.write(positions[order].astype("<f8").tobytes())
                 count += len(positions)
+                if piece.colours is not None and len(positions):
+                    means.add(positions, piece.colours[finite].astype(np.float64))
+                    tints.write(piece.colours[finite][order].tobytes())
             file.flush()
+            tints.flush()
             self._blocks = Blocks(np.memmap(file, "<f8", "r", shape=(count, 3)))
+            coloured = count > 0 and tints.tell() == 3 * count  # not in parts
+            self._tints = np.memmap(tints, np.uint8, "r", shape=(count, 3)) if coloured else None
+        self.colours = None
+        if coloured:
+            places, colours, _ = means.means()
+            self.colours = _nearest_colours(self.points, places - middle, colours.round().astype(np.uint8))
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, reach: float) -> np.ndarray | None:
         """Of the points in front, the one nearest to the ray; see :meth:`Scan.pick`."""
@@ -151,10 +176,13 @@ class CloudPart:
         visible = along <= front * (1 + _SLOPE * reach)
         return np.array(self._blocks.points[index[visible][tangent[visible].argmin()]])
 
-    def detail(self, centre: Float64[np.ndarray, " 3"], radius: float) -> Float64[np.ndarray, "M 3"]:
-        """Points of the files around a centre, :data:`DETAIL` at most, all relative to the middle."""
-        points = self._blocks.in_ball(centre + self._middle, radius)
-        return points[:: 1 + len(points) // DETAIL] - self._middle
+    def detail(
+        self, centre: Float64[np.ndarray, " 3"], radius: float
+    ) -> tuple[Float64[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"] | None]:
+        """Points of the files around a centre, :data:`DETAIL` at most, relative to the middle, and their colours."""
+        index = self._blocks.in_ball(centre + self._middle, radius)
+        index = index[:: 1 + len(index) // DETAIL]
+        return self._blocks.points[index] - self._middle, None if self._tints is None else self._tints[index]
 
 
 class Scan:
@@ -185,7 +213,7 @@ class Scan:
         self.mesh = self.cloud = None
         if meshes:
             mesh = load_shell(*[path for path, _ in meshes], surfaces=[surface for _, surface in meshes])
-            self.mesh = MeshPart(mesh, self.middle, self.size, self.up)
+            self.mesh = MeshPart(mesh, self.middle, self.size, self.up, [surface for _, surface in meshes])
         if clouds:
             self.cloud = CloudPart(clouds, self.middle, self.size)
         self.out: Float64[np.ndarray, " 3"] = self._front()
@@ -214,6 +242,13 @@ class Scan:
         hits = [part.pick(origin, direction, reach) for part in (self.mesh, self.cloud) if part is not None]
         hits = [hit for hit in hits if hit is not None]
         return min(hits, key=lambda hit: float((hit - self.middle - origin) @ direction), default=None)
+
+
+def _nearest_colours(
+    points: Float64[np.ndarray, "N 3"], coloured: Float64[np.ndarray, "M 3"], colours: UInt8[np.ndarray, "M 3"]
+) -> UInt8[np.ndarray, "N 3"]:
+    """For each point, the colour of the coloured one nearest to it."""
+    return colours[point_tree(coloured).query(points)[1]]
 
 
 def thinned(

@@ -27,6 +27,7 @@ from shellgs_method.picking.session import Session
 
 _PAGE = Path(__file__).with_name("page.html")
 _DECODED = 8  # photographs kept in memory
+_GREY = 255, 247, 235, 0  # of what has no colour
 _FAR = 1e12  # no coordinate or pixel is farther from its origin
 _STEPS = {
     "add": {"ray"},
@@ -146,6 +147,15 @@ def _reading() -> Iterator[None]:
         raise SceneError("the request is malformed: reload the page") from error
 
 
+def _coloured(points: np.ndarray, colours: np.ndarray | None) -> bytes:
+    """Points in single precision, each with four bytes: its colour and 255, or a light grey and 0."""
+    rows = np.empty(len(points), [("at", "<f4", 3), ("colour", "u1", 4)])
+    rows["at"], rows["colour"] = points, _GREY
+    if colours is not None:
+        rows["colour"][:, :3], rows["colour"][:, 3] = colours, 255
+    return rows.tobytes()
+
+
 def _numbers(values: Any, *shape: int) -> np.ndarray:
     numbers = np.array(values, np.float64)
     if numbers.shape != shape or not (np.abs(numbers) < _FAR).all():
@@ -197,15 +207,15 @@ class _Answers(BaseHTTPRequestHandler):
         elif url.path == "/said":
             self._answer_json(self.server.said())
         elif url.path == "/vertices":
-            self._answer(scan.mesh.vertices.astype("<f4").tobytes() if scan.mesh else b"")
+            self._answer(_coloured(scan.mesh.vertices, scan.mesh.colours) if scan.mesh else b"")
         elif url.path == "/faces":
             self._answer(scan.mesh.faces.astype("<u4").tobytes() if scan.mesh else b"")
         elif url.path == "/points":
-            self._answer(scan.cloud.points.astype("<f4").tobytes() if scan.cloud else b"")
+            self._answer(_coloured(scan.cloud.points, scan.cloud.colours) if scan.cloud else b"")
         elif url.path == "/detail" and scan.cloud:
             with _reading():
                 ball = _numbers([query[name] for name in ("x", "y", "z", "radius")], 4)
-            self._answer(scan.cloud.detail(ball[:3], ball[3]).astype("<f4").tobytes())
+            self._answer(_coloured(*scan.cloud.detail(ball[:3], ball[3])))
         elif url.path == "/image":
             with _reading():
                 part = {name: int(value) for name, value in query.items() if name != "server"}

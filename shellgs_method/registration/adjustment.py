@@ -42,8 +42,8 @@ GATE = 0.05
 """The same in the last rounds: most frames, sills and railings, which a scan lacks, are farther from its planes."""
 HELD_OUT = 0.1
 """Share of the tracks that are left out of the adjustment, and checked."""
-STRAIGHT = 0.95
-"""Distance of the points held out from the shell, relative to the one before, above which cameras were not bent."""
+SIGNIFICANT = 2.0
+"""Standard errors by which held-out points must be likelier with adjusted cameras. True ones reach none of these."""
 _FINEST = 0.005
 """Metres: smallest noise of a shell. No scan of a building is better, and no building is its model."""
 _PATCH = 1.0
@@ -73,16 +73,19 @@ class HeldOut:
         points: how many are near the shell.
         pixels: median reprojection error, before and after.
         metres: median distance from the shell, before and after.
+        gain: in the log-likelihood of the points, by its standard error (Vuong 1989), patches of the shell being
+            independent.
     """
 
     points: int
     pixels: tuple[float, float]
     metres: tuple[float, float]
+    gain: float
 
     @property
     def were_straight(self) -> bool:
-        """Whether the points are no closer to the shell than before."""
-        return not self.metres[1] < STRAIGHT * self.metres[0]
+        """Whether the points are no likelier than by chance afterwards."""
+        return not self.gain > SIGNIFICANT
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,7 @@ def adjusted(
 
     First without the shell, leaving out observations that are outliers by Tukey's biweight. Then points within a gate
     of the shell are drawn onto the planes of their closest triangles, each by the probability that it lies on it
-    (:func:`inliers`). The gate shrinks from :data:`REACH` to :data:`GATE`.
+    (:class:`Mixture`). The gate shrinks from :data:`REACH` to :data:`GATE`.
 
     The pinhole lens of undistorted photographs becomes one that distorts (OPENCV), since a distortion that was found
     wrong has left a rest in them, which bends cameras.
@@ -207,7 +210,7 @@ def adjusted(
         dict(zip(called, spread.tolist(), strict=True)),
         objective.pixel,
         objective.planes.sigma,
-        _held_out(surface, start, final, seen, ~fitted & (counts >= _VIEWS)),
+        _held_out(surface, whole, start, final, ~fitted & (counts >= _VIEWS)),
     )
 
 
@@ -307,45 +310,82 @@ def _planes(
             "cameras are bent"
         )
     feet, normals = closest.point[close].astype(np.float64), surface.normals[closest.triangle[close]]
-    deviation = np.sqrt(np.einsum("ki,kij,kj->k", normals, covariance[near], normals))
+    facing = _facing(normals, bundle)
+    distance = np.einsum("nd,nd->n", normals, offset[close])
+    found = Mixture.of(distance, _deviation(normals, covariance[near]), facing, gate)
+    patch = _patches(feet, facing)
+    crowd = np.bincount(patch, found.probability)[patch]
+    sigma = float(np.median(found.sigma[facing]))
+    weights = found.probability / np.maximum(crowd, 1.0) * (sigma / found.sigma[facing]) ** 2
+    return Planes(near, normals, feet, weights, sigma)
+
+
+def _facing(normals: np.ndarray, bundle: Bundle) -> np.ndarray:
+    """The side of the building that each plane belongs to."""
     axes = facade_axes(normals, -bundle.rotations[:, 1].mean(axis=0))
-    facing = (normals @ np.concatenate([axes, -axes]).T).argmax(axis=1)
-    probability, sigma = inliers(np.einsum("nd,nd->n", normals, offset[close]), deviation, facing, gate)
+    return (normals @ np.concatenate([axes, -axes]).T).argmax(axis=1)
+
+
+def _deviation(normals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Standard deviation of points along their planes' normals."""
+    return np.sqrt(np.einsum("ki,kij,kj->k", normals, covariance, normals))
+
+
+def _patches(feet: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """The patch of the shell that each point belongs to."""
     cells = np.column_stack([np.floor(feet / _PATCH).astype(np.int64), facing])
-    _, patch = np.unique(cells, axis=0, return_inverse=True)
-    crowd = np.bincount(patch.ravel(), probability)[patch.ravel()]
-    return Planes(near, normals, feet, probability / np.maximum(crowd, 1.0), sigma)
+    return np.unique(cells, axis=0, return_inverse=True)[1].ravel()
 
 
-def inliers(
-    distance: Float64[np.ndarray, " N"],
-    deviation: Float64[np.ndarray, " N"],
-    facing: Int64[np.ndarray, " N"],
-    gate: float,
-) -> tuple[Float64[np.ndarray, " N"], float]:
-    """Probability of each point to be of the shell, and the noise of the shell in metres.
+@dataclass(frozen=True)
+class Mixture:
+    """Distances of points from their planes: those of the shell are normal, others equally frequent up to a gate.
 
-    Expectation maximisation (Dempster, Laird and Rubin 1977) of a mixture: distances of the shell's points are normal,
-    those of others (frames, sills, railings) equally frequent up to the gate. Each side of the building has its own
-    share of the shell's points: before reveals there are hardly any but those of frames.
+    Others are of frames, sills and railings. Each side of the building has its own share of the shell's points, since
+    before reveals there are hardly any but those of frames, and its own noise: points of edges seen against the sky or
+    at grazing angles scatter more than their tracks tell.
 
-    Args:
-        distance: distance of each point from its plane, in metres.
-        deviation: standard deviation of that by triangulation.
-        facing: the side of the building that it is on.
-        gate: largest distance.
+    Attributes:
+        probability: of each point to be of the shell.
+        likelihood: density of each distance, per metre.
+        sigma: noise of each side, in metres.
     """
-    share, sigma = np.full(facing.max() + 1, 0.5), gate / 4
-    count = np.maximum(np.bincount(facing), 1)
-    for _ in range(_EXPECTATIONS):
-        variance = sigma**2 + deviation**2
-        of_shell = share[facing] * np.exp(-0.5 * distance**2 / variance) / np.sqrt(2 * np.pi * variance)
-        probability = of_shell / (of_shell + (1 - share[facing]) / (2 * gate) + 1e-12)
-        share = np.bincount(facing, probability) / count
-        by_shell = sigma**2 / variance  # of a distance, the part that is the shell's
-        noise = probability @ ((by_shell * distance) ** 2 + by_shell * deviation**2) / max(probability.sum(), 1e-12)
-        sigma = max(float(np.sqrt(noise)), _FINEST)
-    return probability, sigma
+
+    probability: Float64[np.ndarray, " N"]
+    likelihood: Float64[np.ndarray, " N"]
+    sigma: Float64[np.ndarray, " S"]
+
+    @classmethod
+    def of(
+        cls,
+        distance: Float64[np.ndarray, " N"],
+        deviation: Float64[np.ndarray, " N"],
+        facing: Int64[np.ndarray, " N"],
+        gate: float,
+    ) -> Mixture:
+        """Expectation maximisation (Dempster, Laird and Rubin 1977).
+
+        Args:
+            distance: distance of each point from its plane, in metres.
+            deviation: standard deviation of that by triangulation.
+            facing: the side of the building that it is on.
+            gate: largest distance, in metres.
+        """
+        sides = int(facing.max()) + 1
+        share, sigma = np.full(sides, 0.5), np.full(sides, gate / 4)
+        count = np.maximum(np.bincount(facing), 1)
+        probability = likelihood = np.empty(0)
+        for _ in range(_EXPECTATIONS):
+            variance = sigma[facing] ** 2 + deviation**2
+            of_shell = share[facing] * np.exp(-0.5 * distance**2 / variance) / np.sqrt(2 * np.pi * variance)
+            likelihood = of_shell + (1 - share[facing]) / (2 * gate) + 1e-12
+            probability = of_shell / likelihood
+            total = np.bincount(facing, probability)
+            share = total / count
+            by_shell = sigma[facing] ** 2 / variance  # of a distance, the part that is the shell's
+            noise = np.bincount(facing, probability * ((by_shell * distance) ** 2 + by_shell * deviation**2))
+            sigma = np.maximum(np.sqrt(noise / np.maximum(total, 1e-12)), _FINEST)
+        return cls(probability, likelihood, sigma)
 
 
 def _noise_of_pixels(bundle: Bundle, seen: Observations) -> float:
@@ -355,8 +395,8 @@ def _noise_of_pixels(bundle: Bundle, seen: Observations) -> float:
     return 1.4826 * float(np.median(np.abs(error[front]))) * np.sqrt(2 * len(error) / max(freedom, 1))
 
 
-def _held_out(surface: ShellSurface, start: Bundle, final: Bundle, seen: Observations, chosen: np.ndarray) -> HeldOut:
-    distances = [surface.distance(bundle.points) for bundle in (start, final)]
+def _held_out(surface: ShellSurface, whole: Objective, start: Bundle, final: Bundle, chosen: np.ndarray) -> HeldOut:
+    seen, distances = whole.observations, [surface.distance(bundle.points) for bundle in (start, final)]
     chosen = chosen & (np.minimum(*distances) < 2 * GATE)
     pixels, metres = [], []
     for bundle, distance in zip((start, final), distances, strict=True):
@@ -364,7 +404,25 @@ def _held_out(surface: ShellSurface, start: Bundle, final: Bundle, seen: Observa
         of = chosen[seen.points] & front
         pixels.append(float(np.median(np.linalg.norm(error[of], axis=1))) if of.any() else float("nan"))
         metres.append(float(np.median(distance[chosen])) if chosen.any() else float("nan"))
-    return HeldOut(int(chosen.sum()), (pixels[0], pixels[1]), (metres[0], metres[1]))
+    gain = _gain(surface, whole, start, final, np.flatnonzero(chosen))
+    return HeldOut(int(chosen.sum()), (pixels[0], pixels[1]), (metres[0], metres[1]), gain)
+
+
+def _gain(surface: ShellSurface, whole: Objective, before: Bundle, after: Bundle, points: np.ndarray) -> float:
+    """Gain in log-likelihood of points by its standard error; their likelihoods are those of the best mixtures."""
+    if len(points) < _FEW:
+        return 0.0
+    logarithms, patches = [], np.empty(0, np.int64)
+    for bundle in (before, after):
+        closest = surface.closest(bundle.points[points])
+        normals = surface.normals[closest.triangle]
+        distance = np.einsum("nd,nd->n", normals, bundle.points[points] - closest.point)
+        facing, covariance = _facing(normals, bundle), covariances(whole, bundle)[points]
+        found = Mixture.of(distance, _deviation(normals, covariance), facing, 2 * GATE)
+        logarithms.append(np.log(found.likelihood))
+        patches = _patches(closest.point, facing)
+    gains = np.bincount(patches, logarithms[1] - logarithms[0])
+    return float(gains.mean() / (gains.std(ddof=1) / np.sqrt(len(gains)) + 1e-12)) if len(gains) > 1 else 0.0
 
 
 def _with_distortion(model: Model) -> Model:

@@ -19,9 +19,10 @@ from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.registration.adjustment import Adjustment, adjusted
+from shellgs_method.registration.adjustment import SIGNIFICANT, Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again
 from shellgs_method.registration.frames import ShellPlace, apart
+from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
 from shellgs_method.registration.positions import align_positions, read_positions
 from shellgs_method.registration.proposal import AMBIGUOUS, propose
@@ -68,16 +69,20 @@ class Placement:
     checks: Sequence[Check] = ()
 
 
-def place_as_before(path: Path, views: Sequence[View]) -> Placement:
-    """The alignment of a file, to be validated again, possibly with other cameras than it was found for.
+def place_as_before(path: Path, scene: Path, views: Sequence[View]) -> Placement:
+    """The alignment of a file, to be validated again, possibly with other cameras or a shell that has changed since.
 
     Raises:
         FileNotFoundError: the file does not exist.
         SceneError: the file is damaged.
     """
     alignment = Alignment.load(path)
-    changed = alignment.cameras.changed(views)
-    return Placement(alignment, [f"It was found for other cameras than these: {changed}."] if changed else [])
+    history = []
+    if changed := alignment.cameras.changed(views):
+        history.append(f"It was found for other cameras than these: {changed}.")
+    if file := alignment.changed_file(scene):
+        history.append(f"{file} has changed since it was aligned.")
+    return Placement(alignment, history)
 
 
 def place_as_it_is(shells: tuple[str, ...], metres_per_shell_unit: float) -> Placement:
@@ -90,14 +95,14 @@ def place_as_proposed(path: Path, scene: Path, views: Sequence[View]) -> Placeme
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the file is damaged, or the proposal was made for other cameras than the user's.
+        SceneError: the file is damaged, or the proposal was made for other cameras than the user's, or another shell.
     """
     alignment = Alignment.load(path)
+    again = f"propose again, with `shellgs align {shlex.quote(str(scene))} {shlex.join(alignment.shells)}`"
     if changed := alignment.cameras.changed(views):
-        raise SceneError(
-            f"{path} was proposed for other cameras than those of {scene}: {changed}; propose again, with "
-            f"`shellgs align {shlex.quote(str(scene))} {shlex.join(alignment.shells)}`"
-        )
+        raise SceneError(f"{path} was proposed for other cameras than those of {scene}: {changed}; {again}")
+    if file := alignment.changed_file(scene):
+        raise SceneError(f"{file} has changed since {path} was proposed for it: {again}")
     return Placement(alignment)
 
 
@@ -191,8 +196,8 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
     if held.were_straight:
         sentence = (
-            f"The cameras are left as they are: {held.points} points held out of their adjustment are {after} from the "
-            f"shell with it, {before} without."
+            f"The cameras are left as they are: {held.points} points held out of their adjustment do not fit the shell "
+            f"better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are asked)."
         )
         return replace(placement, history=[*placement.history, sentence]), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
@@ -201,7 +206,7 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
         f"Cameras adjusted to the shell: they moved by {moved.mean():.1f} cm in the mean, {moved.max():.1f} cm "
         f"at most, with a standard deviation of {np.median(deviation):.1f} cm. {held.points} points held out of the "
         f"adjustment are {after} from the shell, {before} before, and {held.pixels[1]:.2f} px from their keypoints, "
-        f"{held.pixels[0]:.2f} px before (medians)."
+        f"{held.pixels[0]:.2f} px before (medians); they fit the shell better by {held.gain:.1f} standard errors."
     )
     found = replace(
         alignment, shell_to_scene=matrix, source=f"{alignment.source}, cameras adjusted", model=ADJUSTED.as_posix()
@@ -222,16 +227,28 @@ def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) 
 
 
 def place_by_guess(
-    mesh: ShellMesh, views: Sequence[View], points: SparsePoints, shells: tuple[str, ...], metres_per_shell_unit: float
+    mesh: ShellMesh,
+    views: Sequence[View],
+    points: SparsePoints,
+    shells: tuple[str, ...],
+    metres_per_shell_unit: float,
+    crs: str = "",
 ) -> Placement:
     """Propose an alignment by coarse registration; the shell may have any orientation in its file.
+
+    Where its coordinate reference system is known, geo-tags of the photographs say where to look.
 
     Raises:
         SceneError: the points show no wall, or it fits nowhere.
     """
     surface = ShellSurface(mesh, metres_per_shell_unit)
-    best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views))
+    tags = GeoTags.of(views, crs, surface.survey_from_shell) if crs else None
+    best, *rivals = propose(surface, points, views, likely_up(view.camera for view in views), tags)
     history = ["Proposed from the SfM points and the cameras; not yet confirmed."]
+    if tags is not None:
+        off = tags.apart(best.survey_from_scene)
+        said = "" if off < REACH else ": it agrees with none, so look whether the building and --crs are the right ones"
+        history.append(f"{len(tags.places)} photographs have geo-tags, in the median {off:.1f} m off it{said}.")
     history += [
         f"Ambiguous: an alignment {rival.displacement:.1f} m from this one scores {rival.score / best.score:.0%} of it."
         for rival in rivals

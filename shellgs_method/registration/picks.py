@@ -4,15 +4,15 @@ The file is a `gcp_list.txt` in OpenDroneMap's format, which several picking too
 photograph, ``X Y Z  x y  image  [name]``. X Y Z are the point's coordinates in the shell's file, x y the pixel (from
 the top left corner of the image). Lines with the same name, or without a name with the same X Y Z, are one point,
 which needs two photographs. A first line without numbers names the coordinate reference system of X Y Z, if it is not
-the shell's; comments after # are skipped. Quote image names with spaces. Points whose name begins with "check" are not
-fitted, only measured. Lines of picks after a # are set aside: `shellgs pick` writes them for points that are left out
-or in one photograph only, and takes them up again.
+the shell's, or the columns, if they are in another order; comments after # are skipped. Quote image names with spaces.
+Points whose name begins with "check" are not fitted, only measured. Lines of picks after a # are set aside: `shellgs
+pick` writes them for points that are left out or in one photograph only, and takes them up again.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -22,19 +22,17 @@ from jaxtyping import Bool, Float64
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.photographs import View, to_camera
+from shellgs_method.files.tables import IMAGE, NAME, PIXELS, Table, words_of
 from shellgs_method.registration.correspondences import (
     Correspondence,
-    are_numbers,
     fit_robustly,
     measured_again,
-    read_lines,
-    to_shell,
     view_named,
-    words_of,
     worst_first,
 )
 from shellgs_method.shell.alignment import Alignment
 
+_COLUMNS = {"X": 0, "Y": 1, "Z": 2, "x": 3, "y": 4, "image": 5, "name": 6}
 _HEAD = ("# X Y Z of the shell   x y in the photograph   image   name",)
 MAX_REPROJECTION = 4.0
 """Largest distance of a picked pixel from the triangulated point, in pixels of a photograph 1000 pixels wide."""
@@ -86,40 +84,32 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
         SceneError: the file is in a system that PROJ does not know, or in degrees and the shell's is not known, or a
             line cannot be read, names an image that is not in the scene, or contradicts another line.
     """
-    header, lines = read_lines(path, "picks")
-    picks = _picks_of(lines, path, views, to_shell(header, path, "picks", crs))
+    picks = _picks_of(Table.read(path, "picks"), views, crs)
     if not picks:
         raise SceneError(f"{path} holds no picks")
     return picks
 
 
-def _picks_of(
-    lines: Iterable[tuple[str, list[str]]],
-    path: Path,
-    views: Sequence[View],
-    convert: Callable[[np.ndarray], Float64[np.ndarray, "N 3"]],
-) -> list[Pick]:
+def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
-    for where, words in lines:
-        if len(words) < 6 or not are_numbers(words[:5]):
-            raise SceneError(
-                f"{where}: expected X Y Z of the shell, x y in the photograph, the image, a name, separated by spaces"
-            )
-        point, pixel = np.array(words[:3], dtype=np.float64), (float(words[3]), float(words[4]))
-        view = view_named(words[5], views, where)
+    convert, columns = table.to_shell(crs), table.columns({**PIXELS, "image": IMAGE, "name": NAME}, _COLUMNS)
+    for where, row in table.rows(columns, "X Y Z of the shell, x y in the photograph, the image, a name"):
+        coordinates = [row[axis] for axis in "XYZ"]
+        point, pixel = np.array(coordinates, dtype=np.float64), (float(row["x"]), float(row["y"]))
+        view = view_named(row["image"], views, where)
         if view is None:
-            raise SceneError(f"{where}: {words[5]} is not a photograph of the scene; quote a name with spaces")
-        if PureWindowsPath(words[5]).name not in (PurePosixPath(view.name).name, view.image.name):
+            raise SceneError(f"{where}: {row['image']} is not a photograph of the scene; quote a name with spaces")
+        if PureWindowsPath(row["image"]).name not in (PurePosixPath(view.name).name, view.image.name):
             notice(
-                f"{path} names photographs as they were before the capture ({words[5]} is {view.name}, for example): "
-                "pixels must be those of the photographs in the scene, which have no lens distortion."
+                f"{table.path} names photographs as they were before the capture ({row['image']} is {view.name}, for "
+                "example): pixels must be those of the photographs in the scene, which have no lens distortion."
             )
-        name = words[6] if len(words) > 6 else " ".join(words[:3])
+        name = row["name"] or " ".join(coordinates)
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")
         if view.name in pixels.setdefault(name, {}):
-            raise SceneError(f"{where}: the point {name} is picked twice in {words[5]}")
+            raise SceneError(f"{where}: the point {name} is picked twice in {row['image']}")
         pixels[name][view.name] = pixel
     points = convert(np.array([*shell.values()]).reshape(-1, 3))
     return [Pick(name, point, pixels[name]) for name, point in zip(shell, points, strict=True)]
@@ -141,22 +131,22 @@ class PicksFile:
 
     @staticmethod
     def read(path: Path, views: Sequence[View], crs: str = "") -> PicksFile:
-        """Read a file, which may hold no picks yet; the header of another system than ``crs`` goes, as it is converted.
+        """Read a file, which may hold no picks yet; what names columns, or another system than ``crs``, is left out.
 
         Raises:
             FileNotFoundError: the file does not exist.
             SceneError: as :func:`read_picks`.
         """
-        header, lines = read_lines(path, "picks")
-        convert = to_shell(header, path, "picks", crs)
-        picks = _picks_of(lines, path, views, convert)
+        table = Table.read(path, "picks")
+        picks = _picks_of(table, views, crs)
         named, aside, others = {pick.name for pick in picks}, dict[str, Pick](), []
         for line in path.read_text(encoding="utf-8-sig").splitlines():
-            after = line.lstrip("# \t")
+            after = line.lstrip("# \t").rstrip()
             try:
-                (pick,) = _picks_of([(str(path), words_of(after, str(path)))], path, views, convert)
+                (pick,) = _picks_of(replace(table, lines=[(str(path), words_of(after, str(path)))]), views, crs)
             except SceneError:  # the header, or words
-                if line.startswith("#") or not crs or line.strip() == crs:
+                is_system = after == table.system
+                if not crs or after == crs if is_system else line.startswith("#") and not table.is_header(after):
                     others.append(line)
                 continue
             if not line.lstrip().startswith("#"):

@@ -1,9 +1,9 @@
 """Align the shell by surveyed camera positions (RTK or similar) in a text file.
 
 The file is a `geo.txt` in OpenDroneMap's format: the coordinate system in a first line without numbers, then one line
-per photograph, ``image X Y Z``; further columns (angles, accuracies) and comments after # are skipped. X Y Z are the
-camera's coordinates, in the shell's frame and units if the first line names no other system. Quote image names with
-spaces.
+per photograph, ``image X Y Z``; further columns (angles, accuracies) and comments after # are skipped. A header may
+name the columns in another order. X Y Z are the camera's coordinates, in the shell's frame and units if the file names
+no other system. Quote image names with spaces.
 """
 
 from __future__ import annotations
@@ -17,14 +17,12 @@ from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View
+from shellgs_method.files.tables import IMAGE, NAME, Table
 from shellgs_method.geometry.camera import positions
 from shellgs_method.registration.correspondences import (
     MAX_ERROR,
     Correspondence,
-    are_numbers,
     fit_robustly,
-    read_lines,
-    to_shell,
     view_named,
     worst_first,
 )
@@ -55,22 +53,19 @@ def read_positions(path: Path, views: Sequence[View], crs: str = "") -> Surveyed
         SceneError: the file is in a system that PROJ does not know, or in degrees and the shell's is not known, or a
             line cannot be read or contradicts another.
     """
-    header, lines = read_lines(path, "camera positions")
-    convert = to_shell(header, path, "camera positions", crs)
+    table = Table.read(path, "camera positions")
+    convert = table.to_shell(crs)
+    columns = table.columns({"image": (*IMAGE, *NAME)}, {"image": 0, "X": 1, "Y": 2, "Z": 3})
     found: dict[str, tuple[View, list[float]]] = {}
     unknown: list[str] = []
-    for where, words in lines:
-        if len(words) < 4 or not are_numbers(words[1:4]):
-            raise SceneError(
-                f"{where}: expected the image, then X Y Z in the shell's coordinates; quote a name with spaces"
-            )
-        view = view_named(words[0], views, where)
+    for where, row in table.rows(columns, "the image, then X Y Z in the shell's coordinates; quote a name with spaces"):
+        view = view_named(row["image"], views, where)
         if view is None:
-            unknown.append(words[0])
+            unknown.append(row["image"])
         elif view.name in found:
-            raise SceneError(f"{where}: {words[0]} has a position already")
+            raise SceneError(f"{where}: {row['image']} has a position already")
         else:
-            found[view.name] = view, [float(word) for word in words[1:4]]
+            found[view.name] = view, [float(row[axis]) for axis in "XYZ"]
     shell = np.array([position for _, position in found.values()]).reshape(-1, 3)
     return SurveyedPositions([view for view, _ in found.values()], convert(shell), unknown)
 

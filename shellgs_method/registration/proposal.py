@@ -23,6 +23,7 @@ from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.machine.progress import track
+from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.orientations import scene_axes, shell_axes
 from shellgs_method.registration.refinement import FINAL_GATE, refine
 from shellgs_method.registration.sightlines import Sightlines
@@ -63,7 +64,11 @@ class Candidate:
 
 
 def propose(
-    surface: ShellSurface, points: SparsePoints, views: Sequence[View], scene_up: Float64[np.ndarray, " 3"]
+    surface: ShellSurface,
+    points: SparsePoints,
+    views: Sequence[View],
+    scene_up: Float64[np.ndarray, " 3"],
+    tags: GeoTags | None = None,
 ) -> list[Candidate]:
     """Propose alignments, the best first, and what fits best elsewhere.
 
@@ -72,6 +77,7 @@ def propose(
         points: SfM points in the scene's frame.
         views: photographs, all taken from outside the building.
         scene_up: approximate up direction of the cameras.
+        tags: geo-tags of the photographs: only alignments that agree with them are looked at, if there are any.
 
     Raises:
         SceneError: the SfM points have no main wall, or it fits nowhere.
@@ -88,6 +94,8 @@ def propose(
     starts: list[Candidate] = []
     for turn in track(turns, "Trying orientations", len(turns)):
         starts += search.placed(turn)
+    if tags is not None:
+        starts = [start for start in starts if tags.apart(start.survey_from_scene) < REACH] or starts
     starts = _distinct(starts, spread, _MEASURED, search.cell)
     starts = [
         replace(start, score=sight.agreement(surface, start.survey_from_scene, _ROUGH))

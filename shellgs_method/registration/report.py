@@ -34,7 +34,7 @@ COLOURS = {"good": "#1a7f37", "doubtful": "#9a6700", "refused": "#cf222e"}
 _EDGE = (255, 0, 140)
 _EDGE_BEFORE = (0, 200, 255)
 _MOVED = 6  # photographs shown for having moved most
-_OVERLAY = 1280  # pixels of the longer side
+_OVERLAY, _LEAST = 1280, 640  # pixels of the longer side, at most and at least
 _BLUR = 2  # pixels
 
 
@@ -108,7 +108,9 @@ def _overlays(folder: Path, mesh: ShellMesh, validation: Validation) -> Iterator
         before = {support.view.name: support.view.camera for support in earlier.views}
         caster_before = ShellCaster(mesh, earlier.alignment.shell_to_scene)
     for number, support in enumerate(_shown(validation), start=1):
-        view = replace(support.view, camera=support.view.camera.shrunk(_OVERLAY))
+        camera = support.view.camera.shrunk(_OVERLAY)
+        camera = camera.scaled(max(1.0, _LEAST / max(camera.width, camera.height)))
+        view = replace(support.view, camera=camera)
         photograph = np.ascontiguousarray(load_photograph(view))
         edges = shell_edges(caster.cast(view.camera), validation.alignment.metres_per_unit)
         composite = photograph.copy()

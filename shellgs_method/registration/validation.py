@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -138,9 +139,9 @@ class Validation:
         not_good = sorted((c for c in self.checks if c.verdict != "good"), key=lambda c: -_ORDER.index(c.verdict))
         return [f"{check.name}: {check.value} ({check.limits}); {check.why}" for check in not_good]
 
-    def validated(self, views: Sequence[View]) -> Alignment:
-        """The alignment with its verdict and metrics, bound to the cameras of the views that it was validated with."""
-        return replace(self.alignment, verdict=self.verdict, metrics=self.metrics()).seen_by(views)
+    def validated(self, scene: Path, views: Sequence[View]) -> Alignment:
+        """The alignment with its verdict and metrics, bound to the shell and the views that it was validated with."""
+        return replace(self.alignment, verdict=self.verdict, metrics=self.metrics()).bound(scene, views)
 
     def with_checks(self, checks: Sequence[Check]) -> Validation:
         """This validation with more checks."""

@@ -27,6 +27,10 @@ Gaussians = Mapping[str, Tensor]
 """The parameters, and ``surface``, the weight of each Gaussian in depth and normals, if they differ in it."""
 
 
+PAST = 0.1
+"""Share of a pixel's opacity below which what is not behind the shell is no surface, but haze before something else."""
+
+
 class Rendered(NamedTuple):
     """A rendered view."""
 
@@ -79,10 +83,29 @@ class ViewRenderer:
             maps = rendered_geometry(composited[..., 3:], alpha, info, camera, self.depth, origin, surface)
         return Rendered(rgb, alpha, maps, info)
 
-    def mode_of_depth(
+    def view_of_geometry(
+        self, geometry: Geometry, gaussians: Gaussians, camera: Camera
+    ) -> tuple[Float[Tensor, "H W 1"], Float[Tensor, "H W 3"]]:
+        """Depth and normals of a view outside training, given those that are supervised.
+
+        Where hardly anything of what a pixel shows is the surface (:data:`PAST`), the view goes past it: depth and
+        normals are of all splats.
+        """
+        depth, normal = self._mode_of_depth(geometry.depth, gaussians, camera), geometry.normal
+        if geometry.surface is None or not bool((past := geometry.surface < PAST * geometry.alpha).any()):
+            return depth, normal
+        everything = {**gaussians, "surface": torch.ones_like(gaussians["surface"])}
+        whole = self(everything, camera, depth.new_zeros(3), degree=0).geometry
+        assert whole is not None
+        depth = torch.where(past, self._mode_of_depth(whole.depth, everything, camera), depth)
+        return depth, torch.where(past, whole.normal, normal)
+
+    def _mode_of_depth(
         self, expected: Float[Tensor, "H W 1"], gaussians: Gaussians, camera: Camera
     ) -> Float[Tensor, "H W 1"]:
-        """:func:`~.maps.mode_of_depth` of a view, given its expected depth."""
+        """:func:`~.maps.mode_of_depth` of a view, given its expected depth, if this is what is rendered."""
+        if self.depth != "mode":
+            return expected
         _, depths = geometry_channels(gaussians, camera, "expected")
         powers, median = depth_powers(depths, gaussians.get("surface"))
         padding = self._n_features(gaussians) - powers.shape[1]

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, read_json, remove_leftovers
+from shellgs_method.files.atomic import atomic_write, content_hash, read_json, remove_leftovers
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.clouds import Cloud
 from shellgs_method.files.photographs import View
@@ -44,6 +44,7 @@ class Alignment:
         spacing: size in metres of the voxels in which a point cloud is merged; None for what the cameras resolve.
         up: the shell's direction upwards, a unit vector: as the cameras tell if None, where they tell.
         crs: coordinate reference system of the shell, a code such as EPSG:25832 or WKT; empty if unknown.
+        hashes: sha256 of the shell's files that it was found for; none in files of older versions.
 
     Raises:
         SceneError: the matrix is not a similarity, or mirrors, the mesher is unknown, or the spacing is not positive.
@@ -61,6 +62,7 @@ class Alignment:
     spacing: float | None = None
     up: Float64[np.ndarray, " 3"] | None = None
     crs: str = ""
+    hashes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the matrix, the unit and the mesher."""
@@ -73,6 +75,8 @@ class Alignment:
         object.__setattr__(self, "up", self._upwards() if self.up is None else _direction(self.up))
         if not self.shells:
             raise SceneError("the alignment names no file of the shell")
+        if self.hashes and len(self.hashes) != len(self.shells):
+            raise SceneError(f"the alignment has {len(self.hashes)} hashes of {len(self.shells)} files")
         if self.mesher not in get_args(Mesher):
             raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
         if self.spacing is not None and not 0 < self.spacing < np.inf:
@@ -107,9 +111,14 @@ class Alignment:
         up = upwards(self.cameras.cameras.values(), [sign * axis for axis in self.rotation.T for sign in (1, -1)])
         return None if up is None else _direction(self.rotation.T @ up)
 
-    def seen_by(self, views: Sequence[View]) -> Alignment:
-        """The alignment bound to the cameras of views, which tell what is up."""
-        return replace(self, cameras=BoundCameras.of(views), up=None)
+    def bound(self, scene: Path, views: Sequence[View]) -> Alignment:
+        """The alignment bound to the shell's files as they are and to the cameras of views, which tell what is up.
+
+        Raises:
+            FileNotFoundError: a file is missing.
+        """
+        hashes = tuple(map(content_hash, self.files(scene)))
+        return replace(self, hashes=hashes, cameras=BoundCameras.of(views), up=None)
 
     @property
     def metres_per_unit(self) -> float:
@@ -135,14 +144,25 @@ class Alignment:
             and self.metres_per_shell_unit == other.metres_per_shell_unit
             and self.mesher == other.mesher
             and self.spacing == other.spacing
+            and (self.hashes == other.hashes or not (self.hashes and other.hashes))
         )
 
-    def check_cameras(self, scene: Path, views: Sequence[View]) -> None:
-        """Refuse photographs whose cameras are not those that the alignment was found for.
+    def changed_file(self, scene: Path) -> Path | None:
+        """The first of the shell's files that is not as it was when it was aligned, if there is one."""
+        hashes = dict(zip(self.files(scene), self.hashes, strict=False))
+        return next((path for path, known in hashes.items() if path.is_file() and content_hash(path) != known), None)
+
+    def check(self, scene: Path, views: Sequence[View]) -> None:
+        """Refuse a shell that has changed, and photographs whose cameras are not those that it was aligned to.
 
         Raises:
-            SceneError: they are others.
+            SceneError: a file has changed, or the cameras are others.
         """
+        if path := self.changed_file(scene):
+            raise SceneError(
+                f"{path} has changed since it was aligned: run `shellgs align {shlex.quote(str(scene))}` to validate "
+                "it as it is now, or align it again"
+            )
         if changed := self.cameras.changed(views):
             raise SceneError(
                 f"the alignment of {self.named} was found for other cameras than those of {scene}: {changed}; run "
@@ -198,11 +218,10 @@ class Alignment:
 
     def record(self, path: Path, views: Sequence[View]) -> None:
         """Write a file of the alignment, bound to the cameras of views; one that says the same keeps its verdict."""
-        known = Alignment.load(path) if path.is_file() else None
+        known, bound = Alignment.load(path) if path.is_file() else None, self.bound(path.parents[1], views)
         same = known is not None and not known.cameras.changed(views)
-        if known is None or not same or not known.places_like(self):
-            model = known.model if known and same else self.model
-            replace(self, model=model).seen_by(views).save(path)
+        if known is None or not same or not known.places_like(bound):
+            replace(bound, model=known.model if known and same else self.model).save(path)
 
     @classmethod
     def load(cls, path: Path) -> Alignment:
@@ -240,6 +259,7 @@ class Alignment:
                 spacing,
                 up,
                 str(fields.get("crs", "")),
+                tuple(map(str, fields.get("hashes", ()))),
             )
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error

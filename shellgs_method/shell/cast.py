@@ -76,10 +76,10 @@ class PlacedShell:
 
         Raises:
             FileNotFoundError: the shell is missing.
-            SceneError: the alignment was found for other cameras, the shell or the masks cannot be used, or no camera
-                sees it.
+            SceneError: the alignment was found for other cameras or another shell, the shell or the masks cannot be
+                used, or no camera sees it.
         """
-        alignment.check_cameras(scene, views)
+        alignment.check(scene, views)
         cameras = [view.camera for view in views]
         mesh = alignment.load_shell(scene, views)
         refuse_coarse(camera_step(cameras).scaled(alignment.metres_per_unit), f"the cameras of {scene}")

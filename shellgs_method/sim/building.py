@@ -23,6 +23,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.tsdf import DepthView, decimate
+from shellgs_method.machine.progress import tell
 from shellgs_method.occlusion import shell_verdicts
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.shell import ShellCaster
@@ -88,7 +89,9 @@ class Reconstruction:
         """
         views = [view for dataset in run.datasets for view in dataset.views]
         hidden: list[np.ndarray] = []
-        fused = decimate(run.surface(MARGIN, voxel, _views_and_occlusions(run, hidden)), faces)
+        surface = run.surface(MARGIN, voxel, _views_and_occlusions(run, hidden))
+        tell("Simplifying the surface")
+        fused = decimate(surface, faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
         frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground)
         folder = Path(run.datamanager.config.dataparser.data)

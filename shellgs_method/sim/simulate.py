@@ -16,6 +16,7 @@ from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
+from shellgs_method.machine.progress import tell
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import GROUND, Collider, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
@@ -79,6 +80,7 @@ def simulate(
     write_worlds(out, buildings)
     write_usd_world(out / "facade.usda", buildings, home.metric, all(chapter.with_splats for chapter in chapters))
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
+    tell("Throwing, walking and drawing in MuJoCo")
     metrics = write_report(out, buildings, chapters, log)
     write_readme(out, buildings, home, metrics)
     with atomic_write(out / "metrics.json") as file:
@@ -99,6 +101,7 @@ def _building(
         shell, _ = outward(made.shell, eyes)
         standing = standing_before(shell, fused, eyes, ahead)
         beside = (shell.signed_distance(fused.centres) > ahead) & ~standing
+    tell("Making the collision geometry")
     collider = make_collider(shell, fused, standing, settings.parts)
     # The reconstruction continues beside the shell's outline and below its foot: leave that out from here on.
     mesh = made.fused
@@ -108,6 +111,7 @@ def _building(
     _report_gaps(collider, made.scene, log)
     write_parts(folder, collider.parts)
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
+    tell("Baking the texture")
     textured = bake(fused, colours, made.photos, settings.texel)
     facts = write_visual(folder, textured, settings.megabytes)
     write_splats(folder / "splats.ply", made.splats)
@@ -118,10 +122,12 @@ def _building(
     if shell is not None:
         views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]
         of = {"classes": made.classes, "sources": made.sources, "files": made.files}
+        tell("Looking for deviations from the shell")
         deviations = find_deviations(shell, fused, views, ahead, made.contradicted, **of)
         deviations.write(folder / "deviations.ply")
         with atomic_write(folder / "deviations.json") as file:
             file.write((json.dumps([asdict(region) for region in deviations.regions], indent=1) + "\n").encode())
+    tell("Measuring the collision geometry")
     surfaces = {"shell": shell, "fused surface": fused, "truth": truth}
     distances = {
         name: both_ways(collider.surface, other, shell, made.cameras, ahead)

@@ -231,6 +231,15 @@ def _house(points: np.ndarray, noise: Noise) -> np.ndarray:
     return wall
 
 
+def _court(points: np.ndarray, noise: Noise) -> np.ndarray:
+    along, z = points[:, 0] + points[:, 1], points[:, 2]
+    brick = _tinted((0.50, 0.30, 0.22), 1 + 0.12 * noise(along, z, 0.4) + 0.08 * noise(along, z, 0.1))
+    across, up = np.mod(along, 2.4) / 2.4, np.mod(z, 3.0) / 3.0
+    brick[(np.abs(across - 0.5) < 0.27) & (np.abs(up - 0.5) < 0.33)] = 0.70
+    brick[(np.abs(across - 0.5) < 0.22) & (np.abs(up - 0.5) < 0.28)] = 0.08
+    return brick
+
+
 def _car(points: np.ndarray, noise: Noise) -> np.ndarray:
     paint = np.array([[0.45, 0.05, 0.04], [0.08, 0.12, 0.3], [0.75, 0.75, 0.76], [0.05, 0.05, 0.06]])
     colour = paint[np.floor(points[:, 0] / CAR).astype(int) % len(paint)]
@@ -252,4 +261,5 @@ _ALBEDO: dict[Material, Callable[[np.ndarray, Noise], np.ndarray]] = {
     Material.LEAF: _leaf,
     Material.HOUSE: _house,
     Material.CAR: _car,
+    Material.COURT: _court,
 }

@@ -28,6 +28,7 @@ class Material(IntEnum):
     LEAF = 11
     HOUSE = 12
     CAR = 13
+    COURT = 14
 
 
 @dataclass(frozen=True)

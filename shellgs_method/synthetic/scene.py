@@ -8,12 +8,13 @@ import shutil
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import unfinished
+from shellgs_method.files.atomic import content_hash, unfinished
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.geometry.camera import Camera
@@ -29,7 +30,7 @@ from shellgs_method.synthetic.geometry import Material, Mesh, merge
 from shellgs_method.synthetic.monocular import predicted_disparity
 from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.sfm import Points, features, triangulate
-from shellgs_method.synthetic.street import street
+from shellgs_method.synthetic.street import court, street
 from shellgs_method.synthetic.world import World
 
 SHELL = "shell/facade.ply"
@@ -57,6 +58,8 @@ class FacadeConfig:
     """Maximum number of SfM points."""
     supersampling: int = 3
     """Rays per pixel along each image axis."""
+    surroundings: Literal["street", "court"] = "street"
+    """What is around the building: a street below the sky, or a court without sky."""
 
     def __post_init__(self) -> None:
         """Refuse settings that no scene can be made with."""
@@ -87,7 +90,8 @@ class Facade:
         """Build the facade of a configuration."""
         layout = Layout(config.bays, config.storeys)
         tree, texture, hand = _generators(config.seed, 3)
-        mesh = merge([building(layout), street(layout, tree)])
+        around = {"street": street, "court": court}[config.surroundings]
+        mesh = merge([building(layout), around(layout, tree)])
         daylight = Daylight(World(mesh), texture.uniform(-1.0, 1.0, (256, 256)).astype(np.float32))
         return cls(layout, mesh, daylight, walk(layout.length, config.views, config.width, config.height, hand))
 
@@ -120,7 +124,7 @@ def write_scene(scene: Path, config: FacadeConfig) -> None:
         raise
 
 
-def settings_of(scene: Path) -> dict[str, int]:
+def settings_of(scene: Path) -> dict[str, Any]:
     """Settings that a synthetic scene was made with, as far as known.
 
     Raises:
@@ -208,5 +212,6 @@ def _write_shell(scene: Path, mesh: Mesh, cameras: BoundCameras) -> None:
     path.parent.mkdir(parents=True)
     write_scan(path, mesh)
     matrix = SCENE_FROM_BUILDING @ np.linalg.inv(SHELL_FROM_BUILDING)
-    alignment = Alignment(matrix, (SHELL,), source="the synthetic facade's own frames", cameras=cameras)
+    source, hashes = "the synthetic facade's own frames", (content_hash(path),)
+    alignment = Alignment(matrix, (SHELL,), source=source, cameras=cameras, hashes=hashes)
     alignment.save(scene / ALIGNMENT)

@@ -1,4 +1,4 @@
-"""The street: ground, a pole and a tree in front of the building, houses and cars for its glass to reflect."""
+"""What is around the building: a street with houses and cars for its glass to reflect, or a court without sky."""
 
 from __future__ import annotations
 
@@ -22,19 +22,37 @@ def street(layout: Layout, rng: np.random.Generator) -> Mesh:
     return merge(_street(layout, rng))
 
 
+def court(layout: Layout, rng: np.random.Generator) -> Mesh:
+    """A court so high and narrow that no photograph shows the sky: walls at both sides, behind and across."""
+    left, right, height = -6.0, layout.length + 6.0, 40.0
+    walls = [
+        box((left - 4, -22, 0), (left, 14, height), Material.COURT),
+        box((right, -22, 0), (right + 4, 14, height), Material.COURT),
+        box((left, 9, 0), (right, 14, height), Material.COURT),
+        box((left, -22, 0), (right, -18, height), Material.COURT),
+    ]
+    return merge([*_pavement(layout, rng), *walls])
+
+
 def _street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
     middle = layout.length / 2
-    yield parallelogram((middle - 80, -60, 0), (160, 0, 0), (0, 140, 0), Material.GROUND)
-    yield cylinder((0.3 * layout.length, -2.4, 0), 0.075, 7.0, Material.POLE)
-    yield box((0.3 * layout.length - 0.05, -3.6, 6.9), (0.3 * layout.length + 0.05, -2.4, 7.0), Material.POLE)
-    yield cylinder((0.76 * layout.length, -2.2, 0), 0.07, 2.6, Material.TRUNK)
-    yield _crown(np.array([0.76 * layout.length, -2.2, 3.0]), rng)
+    yield from _pavement(layout, rng)
     for y, heights in ((-24.0, (8.0, 15.0)), (30.0, (6.0, 11.0))):
         for x in np.arange(middle - 46, middle + 46, HOUSE):
             x = np.floor(x / HOUSE) * HOUSE
             yield box((x, y - 4, 0), (x + HOUSE, y + 4, rng.uniform(*heights)), Material.HOUSE)
     for x in np.arange(np.floor((middle - 24) / CAR) * CAR, middle + 24, CAR):
         yield car(x, -14.5 + rng.uniform(-0.2, 0.2))
+
+
+def _pavement(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
+    """The ground, a pole and a tree in front of the building."""
+    middle = layout.length / 2
+    yield parallelogram((middle - 80, -60, 0), (160, 0, 0), (0, 140, 0), Material.GROUND)
+    yield cylinder((0.3 * layout.length, -2.4, 0), 0.075, 7.0, Material.POLE)
+    yield box((0.3 * layout.length - 0.05, -3.6, 6.9), (0.3 * layout.length + 0.05, -2.4, 7.0), Material.POLE)
+    yield cylinder((0.76 * layout.length, -2.2, 0), 0.07, 2.6, Material.TRUNK)
+    yield _crown(np.array([0.76 * layout.length, -2.2, 3.0]), rng)
 
 
 def car(x: float, y: float) -> Mesh:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -619,7 +619,7 @@ def without_colmap(monkeypatch) -> list[str]:
             (output / "images").mkdir()
             for name in names:
                 (output / "images" / name).write_bytes(b"undistorted")
-        return [{"names": names, "points": 9, "reprojection_error": 0.5, "track_length": 3.0}]
+        return [{"names": names, "points": 900, "reprojection_error": 0.5, "track_length": 3.0}]
 
     monkeypatch.setattr("shellgs_method.capture.stages.run_step", run_step)
     return steps
@@ -629,7 +629,7 @@ def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch,
     for k in range(8):
         (tmp_path / "photographs" / "ab"[k > 4]).mkdir(parents=True, exist_ok=True)
         photograph(seed=k).save(tmp_path / "photographs" / "ab"[k > 4] / f"{k}.jpg")
-    model = {"points": 9, "reprojection_error": 0.5, "track_length": 3.0}
+    model = {"points": 900, "reprojection_error": 0.5, "track_length": 3.0}
     near, far = [f"a/{k}.jpg" for k in range(5)], [f"b/{k}.jpg" for k in range(5, 8)]
     answers: dict[str, Any] = {
         "reconstruct": [{"names": near, **model}, {"names": far, **model}],
@@ -650,6 +650,25 @@ def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch,
     assert summary.missing == far
     assert "3 photographs of" in caplog.text
     assert "b/5.jpg to b/7.jpg, did not join the others, nobody knows why" in caplog.text
+
+
+@pytest.mark.parametrize(("points", "message"), [(49, "only 49 points, each in 3.0 of 5 photographs"), (50, "")])
+def test_a_model_of_a_few_points_is_no_scene(tmp_path, monkeypatch, points, message):
+    (tmp_path / "photographs").mkdir()
+    for k in range(5):
+        photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
+    found = [{"names": [f"{k}.jpg" for k in range(5)], "points": points, "reprojection_error": 0.5, "track_length": 3}]
+
+    def run_step(step: str, arguments: dict, **_):
+        if step == "undistort":
+            for name in ("images", "sparse"):
+                (Path(arguments["output"]) / name).mkdir()
+        return found if step == "reconstruct" else []
+
+    monkeypatch.setattr(stages, "run_step", run_step)
+    with pytest.raises(SceneError, match=message) if message else nullcontext():
+        capture(tmp_path / "photographs", tmp_path / "scene")
+    assert (tmp_path / "scene/colmap").exists() == (not message)
 
 
 def exposure_of(seconds: float, iso: int = 200) -> Image.Exif:

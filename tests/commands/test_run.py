@@ -48,6 +48,10 @@ def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
     written = mesh.stat().st_mtime_ns
     assert Path("scene-results/report.html").is_file()
     again = shellgs("run")
+    assert again.startswith("Nothing is left to do. Done: scene-results/mesh.ply, scene-results/report.html.")
+    assert "config.yml" in again
+    Path("matrix.txt").touch()
+    again = shellgs("run")
     assert "1 of 1 runs are already finished" in again
     assert "0 views cast" in again
     assert "triangles" not in again  # no second mesh

@@ -368,7 +368,7 @@ def test_an_ascii_ply_that_is_cut_in_its_faces_is_refused(scene, shellgs, kept):
     cut = faces[: int(kept * len(faces))]
     (scene / "shell" / "facade.ply").write_text("\n".join([*header, *lines, *cut]) + "\n")
     assert f"it holds {len(cut)} of the {len(faces)} lines of its element 'face'" in refused(
-        shellgs, scene, "cast", scene
+        shellgs, scene, "align", scene
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image
 from training_runs import data_of, model_of, trainer_of
@@ -81,9 +82,10 @@ def test_a_gaussian_is_drawn_where_it_is_at_every_distance_before_the_wall(run):
         np.testing.assert_allclose(found, [column, row], atol=0.1)
 
 
-def test_the_command_writes_images_with_world_files_and_a_drawing(run, trained, shellgs, tmp_path):
+def test_the_command_writes_images_with_world_files_and_a_drawing(run, trained, shellgs, tmp_path, caplog):
     config = trained.config.get_base_dir() / "config.yml"
     assert "wall-1.pdf" in shellgs("elevation", config, "--output", tmp_path / "out", "--pixel", PIXEL)
+    assert "was trained for 4 iterations only" in caplog.text
     image = np.asarray(Image.open(tmp_path / "out/wall-1.png"))
     depth = np.asarray(Image.open(tmp_path / "out/wall-1-depth.tif"))
     assert image.shape[:2] == depth.shape
@@ -91,5 +93,14 @@ def test_the_command_writes_images_with_world_files_and_a_drawing(run, trained, 
     facts = json.loads((tmp_path / "out/walls.json").read_text())
     height = facts["wall-1"]["upper_left"][2] + facts["offset"][2]
     np.testing.assert_allclose(world, [PIXEL, 0, 0, -PIXEL, PIXEL / 2, height - PIXEL / 2], atol=1e-6)
+    for name in ("wall-1", "wall-1-depth", "wall-1-deviations"):
+        with tifffile.TiffFile(tmp_path / f"out/{name}.tif") as file:
+            assert file.asarray().shape[:2] == image.shape[:2]
+            tags = file.geotiff_metadata
+        assert tags is not None
+        assert (int(tags["GTModelTypeGeoKey"]), int(tags["ProjLinearUnitsGeoKey"])) == (32767, 9001)
+        assert "metres along the wall" in tags["GTCitationGeoKey"]
+        np.testing.assert_allclose(tags["ModelPixelScale"], [PIXEL, PIXEL, 0])
+        np.testing.assert_allclose(tags["ModelTiepoint"], [0, 0, 0, 0, height, 0], atol=1e-6)
     assert (tmp_path / "out/wall-1.pdf").read_bytes().startswith(b"%PDF")
     assert "give a --pixel of at least" in shellgs("elevation", config, "--output", tmp_path / "o", "--pixel", 1e-5)

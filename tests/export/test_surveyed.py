@@ -51,6 +51,7 @@ def test_points_before_and_behind_the_surface_are_measured_in_metres(run):
         ("Punkt;Hochwert [m];Rechtswert [m];H [m]\np1;2;1.5;3", {"p1": [1.5, 2, 3]}),
         ("Name N [m] E [m] Z [m]\n'p 1' 2 1.5 3", {"p 1": [1.5, 2, 3]}),
         (",x,y,z\n0,1.5,2,3\n1,4,5,6,", {"0": [1.5, 2, 3], "1": [4, 5, 6]}),
+        ("p1,12,5,0\np2,13,5,0", {"p1": [12, 5, 0], "p2": [13, 5, 0]}),
         ("N X Y Z\n7 1.5 2 3", {"7": [1.5, 2, 3]}),
     ],
 )
@@ -62,6 +63,8 @@ def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points
 @pytest.mark.parametrize(
     ("text", "why"),
     [
+        ("P1,12,5,0,25,3,125", "line 1: its commas separate columns, or are decimal: write decimal points"),
+        ("name,x,y,z\nP1,12,5,0,25,3,125", "line 2: expected name, x, y, z"),
         ("p1;1,5;2,0;3,0", "line 1: expected a name and X Y Z"),
         ("p1 1 2", "line 1: expected a name and X Y Z"),
         ("P1 12,5 0,25 3,125", "line 1: .*with decimal points"),

@@ -129,7 +129,7 @@ def test_blocks_find_what_all_points_would(monkeypatch):
     np.testing.assert_allclose(along, (away @ direction)[index])
     assert len(index) > 5
     ball = blocks.in_ball(points[300], 1.0)
-    np.testing.assert_array_equal(ball, points[np.linalg.norm(points - points[300], axis=1) <= 1.0])
+    np.testing.assert_array_equal(points[ball], points[np.linalg.norm(points - points[300], axis=1) <= 1.0])
 
 
 def test_detail_is_of_the_file_and_not_too_much(tmp_path: Path, monkeypatch):
@@ -137,11 +137,68 @@ def test_detail_is_of_the_file_and_not_too_much(tmp_path: Path, monkeypatch):
     points = scan(20_000) + NATIONAL
     cloud = opened(written(tmp_path / "cloud.ply", points))
     assert cloud.cloud is not None
-    detail = cloud.cloud.detail(national(2, 1, 0) - cloud.middle, 0.9)
+    detail, colours = cloud.cloud.detail(national(2, 1, 0) - cloud.middle, 0.9)
+    assert colours is None
     assert 250 < len(detail) <= 500
     inside = np.linalg.norm(points - NATIONAL - [2, 1, 0], axis=1) <= 0.9
     nearest = np.abs(points[inside][:, None] - cloud.middle - detail[None]).max(axis=2).min(axis=0)
     assert nearest.max() < 1e-5
+
+
+def painted(points: np.ndarray) -> np.ndarray:
+    """Colours by the place, which change slowly."""
+    return (128 + 20 * (points - NATIONAL).clip(-6, 6)).round().astype(np.uint8)
+
+
+def write_colours(path: Path, points: np.ndarray, faces: np.ndarray) -> Path:
+    rows = np.empty(len(points), [*((axis, "<f8") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))])
+    for k, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        rows[axis], rows[colour] = points[:, k], painted(points)[:, k]
+    corners = np.empty(len(faces), [("n", "u1"), ("k", "<i4", 3)])
+    corners["n"], corners["k"] = 3, faces
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz")
+    header += "".join(f"property uchar {colour}\n" for colour in ("red", "green", "blue"))
+    if len(faces):
+        header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+    path.write_bytes(f"{header}end_header\n".encode() + rows.tobytes() + corners.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["ply", "las", "e57"])
+def test_a_cloud_is_drawn_in_its_colours(tmp_path: Path, suffix: str):
+    points, path = scan(20_000) + NATIONAL, tmp_path / f"cloud.{suffix}"
+    if suffix == "ply":
+        write_colours(path, points, np.empty((0, 3), int))
+    elif suffix == "las":
+        laspy = pytest.importorskip("laspy")
+        las = laspy.create(point_format=2)
+        las.header.offsets, las.header.scales = NATIONAL, [1e-4] * 3
+        las.xyz = points
+        las.red, las.green, las.blue = (painted(points).astype(np.uint16) << 8).T
+        las.write(path)
+    else:
+        file = pytest.importorskip("pye57").E57(str(path), mode="w")
+        names = "cartesianX", "cartesianY", "cartesianZ", "colorRed", "colorGreen", "colorBlue"
+        file.write_scan_raw(dict(zip(names, [*points.T, *painted(points).T], strict=True)))
+        file.close()
+    cloud = opened(path)
+    part = cloud.cloud
+    assert part is not None
+    assert part.colours is not None
+    off = 12 if suffix == "e57" else 3  # in the mean of a voxel; this writer rounds to half a metre here
+    assert np.abs(part.colours - painted(part.points + cloud.middle).astype(int)).max() <= off
+    detail, colours = part.detail(national(2, 1, 0) - cloud.middle, 0.9)
+    assert colours is not None
+    np.testing.assert_allclose(colours, painted(detail + cloud.middle), atol=off)
+
+
+def test_a_mesh_is_drawn_in_the_colours_of_its_vertices(tmp_path: Path):
+    ball = trimesh.creation.icosphere(3, radius=5.0)
+    drawn = opened(write_colours(tmp_path / "ball.ply", ball.vertices + NATIONAL, ball.faces))
+    assert drawn.mesh is not None
+    assert drawn.mesh.colours is not None
+    np.testing.assert_array_equal(drawn.mesh.colours, painted(drawn.mesh.vertices + drawn.middle))
 
 
 def test_a_mesh_is_drawn_thinned_and_picked_whole(tmp_path: Path, monkeypatch):

@@ -156,7 +156,9 @@ def test_a_step_that_cannot_be_taken_changes_nothing(server: PickServer):
 
 def test_the_page_gets_the_scan_relative_to_its_middle(server: PickServer):
     mesh = load_shell(server.session.path.parent / "shell/facade.ply")
-    points = np.frombuffer(get(f"{server.url}/vertices"), "<f4").reshape(-1, 3)
+    rows = np.frombuffer(get(f"{server.url}/vertices"), [("at", "<f4", 3), ("colour", "u1", 4)])
+    points = rows["at"]
+    assert not rows["colour"][:, 3].any()  # a shell without colours
     np.testing.assert_allclose(points + server.scan.middle, mesh.vertices, atol=1e-4)
     np.testing.assert_array_equal(np.frombuffer(get(f"{server.url}/faces"), "<u4").reshape(-1, 3), mesh.faces)
 

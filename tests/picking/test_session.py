@@ -92,8 +92,9 @@ def test_a_comment_in_the_middle_of_a_point_is_kept_and_no_pick(tmp_path, views)
     assert file.others == lines[2:]
 
 
-def test_picks_in_degrees_are_gone_on_with_in_the_scans_system(tmp_path, views):
-    lines = ["EPSG:4326", "7.86 46.25 215 4 5 'a photo 0.png' a", "7.86 46.25 215 6 7 'a photo 1.png' a", "# by hand"]
+@pytest.mark.parametrize("header", [["EPSG:4326"], ["# EPSG:4326"], ["EPSG:4326", "lon lat h x y image name"]])
+def test_picks_in_degrees_are_gone_on_with_in_the_scans_system(tmp_path, views, header):
+    lines = [*header, "7.86 46.25 215 4 5 'a photo 0.png' a", "7.86 46.25 215 6 7 'a photo 1.png' a", "# by hand"]
     (tmp_path / "p.txt").write_text("\n".join(lines))
     session = Session(tmp_path / "p.txt", views, crs="EPSG:25832")
     ((east, north, height),) = [pick.shell for pick in session.state.picks]
@@ -102,6 +103,7 @@ def test_picks_in_degrees_are_gone_on_with_in_the_scans_system(tmp_path, views):
     session.undo()
     text = (tmp_path / "p.txt").read_text()
     assert "EPSG" not in text
+    assert "lon" not in text
     assert "# by hand" in text
     (again,) = read_picks(tmp_path / "p.txt", views, "EPSG:25832")
     np.testing.assert_array_equal(again.shell, [east, north, height])

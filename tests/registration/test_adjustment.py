@@ -28,7 +28,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import ADJUSTED, ScenePaths
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.similarity import fit_similarity, transformed
-from shellgs_method.registration.adjustment import Adjustment, adjusted, inliers
+from shellgs_method.registration.adjustment import SIGNIFICANT, Adjustment, Mixture, adjusted
 from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh
 from shellgs_method.shell.surface import ShellSurface
@@ -164,7 +164,7 @@ def test_bent_cameras_are_straightened(surface: ShellSurface, model: Model, bent
     assert before.mean() > 0.03
     assert after.mean() < 0.015
     assert after.mean() < 3 * np.median(list(found.deviations.values()))
-    assert not found.held_out.were_straight
+    assert found.held_out.gain > 2 * SIGNIFICANT
     assert found.held_out.pixels[1] < 1.05 * found.held_out.pixels[0]
 
 
@@ -194,13 +194,27 @@ def test_points_are_told_from_those_beside_the_shell():
     of_shell, deviation = np.repeat([True, False, True, False], [800, 200, 40, 300]), random.uniform(0.003, 0.02, 1340)
     facing = np.repeat([0, 1], [1000, 340])
     distance = np.where(of_shell, random.normal(0, np.hypot(0.01, deviation)), random.uniform(-0.01, 0.1, 1340))
-    probability, sigma = inliers(distance, deviation, facing, 0.1)
-    assert sigma == pytest.approx(0.01, rel=0.2)
+    found = Mixture.of(distance, deviation, facing, 0.1)
+    probability = found.probability
+    assert found.sigma[0] == pytest.approx(0.01, rel=0.2)
     shares = [probability[facing == side].mean() for side in (0, 1)]
     assert shares[0] == pytest.approx(0.8, abs=0.1)
     assert shares[1] == pytest.approx(40 / 340, abs=0.15)
     close = np.abs(distance) < 0.01
     assert probability[close & (facing == 0)].mean() > 0.2 + probability[close & (facing == 1)].mean()
+
+
+def test_each_side_has_its_own_noise():
+    random = np.random.default_rng(0)
+    facing, deviation = np.repeat([0, 1], 1000), np.full(2000, 0.005)
+    distance = np.concatenate([random.normal(0, np.hypot(noise, 0.005), 1000) for noise in (0.01, 0.03)])
+    np.testing.assert_allclose(Mixture.of(distance, deviation, facing, 0.1).sigma, [0.01, 0.03], rtol=0.1)
+
+
+def test_a_mixture_s_density_is_one_in_all():
+    distance = np.linspace(-0.1, 0.1, 2001)
+    found = Mixture.of(distance, np.full(2001, 0.01), np.zeros(2001, np.int64), 0.1)
+    assert found.likelihood.mean() * 0.2 == pytest.approx(1.0, abs=0.02)
 
 
 def test_picks_say_where_along_a_bare_wall_it_is(surface: ShellSurface, model: Model):

@@ -14,7 +14,7 @@ import pyproj
 import pytest
 import torch
 import trimesh
-from PIL import Image
+from PIL import ExifTags, Image
 from scenes import cast, write_colmap
 from scipy.spatial.transform import Rotation
 
@@ -34,6 +34,7 @@ from shellgs_method.geometry.precision import mesh_step
 from shellgs_method.geometry.similarity import fit_similarity, transformed
 from shellgs_method.registration import proposal
 from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
+from shellgs_method.registration.geotags import GeoTags
 from shellgs_method.registration.orientations import scene_axes
 from shellgs_method.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.registration.positions import SurveyedPositions, align_positions, read_positions
@@ -49,6 +50,7 @@ from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera
 from shellgs_method.synthetic.path import walk
+from shellgs_method.synthetic.scene import write_scan
 
 OPAQUE = Path(__file__).parents[2] / "docs/picture.jpg"
 """Any photograph: validation looks whether it is transparent."""
@@ -232,10 +234,47 @@ def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, surve
     assert error(surface, found, survey_from_scene) < 0.02
 
 
+def tagged(folder: Path, views: list[View], noise: float, seed: int = 0) -> list[View]:
+    """The views with photographs that say where they were taken, metres off in UTM 32."""
+    places = transformed(np.stack([v.camera.position.double().numpy() for v in views]), np.linalg.inv(TRUTH))
+    places[:, :2] += np.random.default_rng(seed).normal(0, noise, (len(views), 2))
+    images = []
+    for view, (lon, lat, _) in zip(views, degrees_of(places), strict=True):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: minutes(lat), 3: "E", 4: minutes(lon), 6: 77.0})
+        images.append(folder / f"{Path(view.name).stem}.jpg")
+        Image.new("RGB", (96, 64)).save(images[-1], exif=exif)
+    return [replace(view, image=image) for view, image in zip(views, images, strict=True)]
+
+
+def minutes(degrees: float) -> tuple[float, float, float]:
+    whole = int(degrees)
+    return whole, int(60 * (degrees - whole)), 60 * ((60 * (degrees - whole)) % 1)
+
+
+def test_geo_tags_are_read_in_the_system_of_the_shell(tmp_path, views, surface, survey_from_scene):
+    tags = GeoTags.of(tagged(tmp_path, views, 0.0), "EPSG:25832", surface.survey_from_shell)
+    assert tags is not None
+    assert tags.apart(survey_from_scene) < 0.1  # seconds as fractions of whole numbers
+    assert GeoTags.of(views, "EPSG:25832", surface.survey_from_shell) is None
+    some = tagged(tmp_path, views, 0.0)[:3]
+    some[0].image.write_bytes(some[0].image.read_bytes()[:60])  # damaged
+    assert GeoTags.of(some, "EPSG:25832", surface.survey_from_shell) is None
+
+
+def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
+    beside = mesh.vertices + 40 * AXES[:, 0]
+    twins = ShellMesh(np.concatenate([mesh.vertices, beside]), np.concatenate([mesh.faces, mesh.faces + len(beside)]))
+    placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, ("s.ply",), 1.0, "EPSG:25832")
+    assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
+    assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m off it\.", placement.history[1])
+    assert not any("Ambiguous" in sentence for sentence in placement.history)
+
+
 @pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
 def test_up_is_asked_of_the_cameras_and_stored(tmp_path, views, axis, within):
     motion = turned(axis)
-    alignment = Alignment(TRUTH @ np.linalg.inv(motion), ("shell/facade.obj",)).seen_by(views)
+    alignment = Alignment(TRUTH @ np.linalg.inv(motion), ("shell/facade.obj",), cameras=BoundCameras.of(views))
     assert alignment.up is not None
     cosine = alignment.up @ motion[:3, :3] @ [0.0, 0, 1]
     assert np.degrees(np.arccos(min(cosine, 1.0))) <= within
@@ -458,7 +497,6 @@ def test_an_invalid_line_of_a_picks_file_is_refused_with_its_number(rigged, tmp_
     [
         "1,5 2 3 4 5 images/0.png a",
         "1.5; 2 3 4 5 images/0.png a",
-        "1,2,3,4,5,images/0.png,a",
         "x1 2 3 4 5 images/0.png a",
         "1.0m 2.0m 3.0m 4px 5px images/0.png a",
         "-1m -.5m +3m images/0.png",
@@ -628,7 +666,11 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     ("line", "sentence"),
     [
         ("EPSG:4326", "is in degrees (EPSG:4326): say with --crs"),
-        ("#name,lat,lon,alt\nimages/0.png,1,2,3", "line 2: expected the image"),
+        ("#name,lat,lon,alt\nimages/0.png,1,2,3", "is in degrees (name, lat, lon, alt): say with --crs"),
+        ("images/0.png,12,5,0,25,3,125", "line 1: its commas separate columns, or are decimal"),
+        ("image,X,Y\nimages/0.png,1,2", "its header, image, X, Y, must name one column each of image, X, Y and Z"),
+        ("EPSG:25832\n# EPSG:25833\nimages/0.png 1 2 3", "names two systems, EPSG:25832 and EPSG:25833"),
+        ("# EPSG:25832\nimage lat lon h\nimages/0.png 47 8 3", "names EPSG:25832, and columns of degrees"),
         ("images/0.png 1,5 2 3", "line 1: expected the image"),
         ("EPSG:25832\nimages/0.png 1 2", "line 2: expected the image, then X Y Z"),
         ("EPSG:25832\nimages/0.png 1 2 nan", "line 2: expected the image"),
@@ -806,7 +848,9 @@ def test_a_matrix_is_validated_reported_and_written(scene, shellgs):
     assert f"Verdict: <b>{written.verdict}</b>" in page
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
     assert "http" not in page
-    assert len(list((scene / REPORT).glob("view_*.png"))) >= 6
+    overlays = list((scene / REPORT).glob("view_*.png"))
+    assert len(overlays) >= 6
+    assert all(Image.open(overlay).size == (640, 427) for overlay in overlays)  # of photographs of 48 x 32
     assert json.loads((scene / REPORT / "validation.json").read_text())["verdict"] == written.verdict
 
 
@@ -936,15 +980,53 @@ def test_maps_of_an_alignment_to_other_cameras_are_refused_even_if_they_are_of_t
         maps.check(views[0].name, views[0].camera)
 
 
-def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
-    move_cameras(scene, ANOTHER_FRAME)
+def change_shell(scene: Path) -> None:
+    """Leave out one triangle of it."""
+    mesh = shell(Layout(6, 3))
+    write_scan(scene / "shell/facade.ply", replace(mesh, triangles=mesh.triangles[:-1]))
+
+
+def run_of(scene: Path) -> TrainedRun:
+    """A run of a scene, without a model."""
     views = scene_views(scene)
     halves = [SimpleNamespace(views=views[:5]), SimpleNamespace(views=views[5:])]
     config = SimpleNamespace(dataparser=SimpleNamespace(data=scene))
     data: Any = SimpleNamespace(config=config, train_dataset=halves[0], eval_dataset=halves[1])
     model: Any = None
+    return TrainedRun(model, data)
+
+
+def test_a_run_is_not_exported_in_the_frame_of_other_cameras(scene):
+    move_cameras(scene, ANOTHER_FRAME)
     with pytest.raises(SceneError, match="was found for other cameras"):
-        _ = TrainedRun(model, data).shell
+        _ = run_of(scene).shell
+
+
+def test_a_shell_that_has_changed_is_used_once_it_is_validated_again(scene, shellgs):
+    assert run_of(scene).shell is not None
+    change_shell(scene)
+    changed = r"shell/facade\.ply has changed since it was aligned: run `shellgs align"
+    with pytest.raises(SceneError, match=changed):
+        _ = run_of(scene).shell
+    assert re.search(changed, shellgs("cast", scene))
+    assert "facade.ply has changed since it was aligned" in shellgs("align", scene)
+    assert run_of(scene).shell is not None
+    assert "views cast" in shellgs("cast", scene)
+
+
+def test_an_alignment_of_an_older_version_knows_no_hashes_and_is_used(scene):
+    fields = json.loads((scene / ALIGNMENT).read_text())
+    del fields["hashes"]
+    (scene / ALIGNMENT).write_text(json.dumps(fields))
+    (scene / "shell/facade.ply").touch()
+    assert run_of(scene).shell is not None
+
+
+def test_a_proposal_for_a_shell_that_has_changed_is_not_accepted(scene, shellgs):
+    (scene / ALIGNMENT).rename(scene / PROPOSAL)
+    change_shell(scene)
+    assert "facade.ply has changed since" in shellgs("align", scene, "--accept")
+    assert not (scene / ALIGNMENT).exists()
 
 
 def test_an_alignment_that_fits_other_cameras_too_is_validated_for_them(scene, shellgs):
@@ -1159,6 +1241,37 @@ def test_picks_in_another_zone_are_converted_and_those_in_the_shells_own_are_kep
     np.testing.assert_allclose(pick.shell, point[0], atol=1e-4)
     (pick,) = read_picks(tmp_path / "picks.txt", rigged[0], "EPSG:25833")
     np.testing.assert_array_equal(pick.shell, [round(x, 6), round(y, 6), z])
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("X,Y,Z,photo,u,v", "410000.5,5413000.25,251,images/1.png,30,40"),
+        ("photo;name;u;v;Northing [m];Easting [m];Height [m]", "images/1.png;a;30;40;5413000.25;410000.5;251"),
+        ("x y image X Y Z", "30 40 images/1.png 410000.5 5413000.25 251"),
+        ("E N H x y image", "410000.5 5413000.25 251 30 40 images/1.png"),
+        ("image image_x image_y x y z", "images/1.png 30 40 410000.5 5413000.25 251"),
+        ("# name X Y Z image u v", "a 410000.5 5413000.25 251 images/1.png 30 40"),
+        ("EPSG:25832\nimage u v Y X Z", "images/1.png 30 40 5413000.25 410000.5 251"),
+        ("# X Y Z of the shell   x y in the photograph   image   name", "410000.5 5413000.25 251 30 40 images/1.png a"),
+    ],
+)
+def test_a_header_of_picks_chooses_the_columns(rigged, tmp_path, header, line):
+    (tmp_path / "picks.txt").write_text(f"{header}\n{line}\n")
+    (pick,) = read_picks(tmp_path / "picks.txt", rigged[0], "EPSG:25832")
+    np.testing.assert_array_equal(pick.shell, [410000.5, 5413000.25, 251])
+    assert pick.pixels == {"images/1.png": (30, 40)}
+
+
+@pytest.mark.parametrize(
+    "text", ["name,lat,lon,height\n{image},{lat},{lon},{h}", "# EPSG:4326\n{image} {lon} {lat} {h}",
+             "EPSG:4326\nheight lon lat file\n{h} {lon} {lat} {image}"]
+)  # fmt: skip
+def test_a_header_or_comment_of_positions_chooses_columns_and_system(tmp_path, text):
+    view, truth = rig()[0][0], np.array([[410000.5, 5413000.25, 251.0]])
+    lon, lat, h = degrees_of(truth)[0]
+    (tmp_path / "geo.txt").write_text(text.format(image=view.name, lon=f"{lon:.10f}", lat=f"{lat:.10f}", h=h))
+    np.testing.assert_allclose(read_positions(tmp_path / "geo.txt", [view], "EPSG:25832").shell, truth, atol=1e-3)
 
 
 def test_latitudes_in_place_of_longitudes_are_refused(tmp_path):

@@ -21,6 +21,7 @@ from shellgs_method.render.maps import (
     squared_depths,
 )
 from shellgs_method.render.rasterizer import rasterize
+from shellgs_method.render.view import ViewRenderer
 
 CAMERA = Camera(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]]), width=40, height=30)
 
@@ -200,3 +201,29 @@ def test_depth_is_positive_and_finite_for_planes_seen_edge_on():
 
 def test_the_thickness_of_a_disc_is_finite_in_float32():
     assert 0 < float(torch.tensor(DISC_LOG_THICKNESS).exp()) < 1e-8
+
+
+@pytest.mark.parametrize("kind", ["expected", "mode"])
+def test_a_view_past_the_surface_has_the_depth_of_what_it_shows(kind):
+    """A house behind the plane of a facade, seen past its end through haze; the facade hides it elsewhere."""
+    (near, normal), (house, turned) = wall(0.0), wall(0.3)
+    house["means"] = house["means"] + torch.tensor([0.0, 0.0, 5.0])
+    facade = near["means"][:, 0] < 0
+    both = {name: torch.cat([near[name], house[name]]) for name in near}
+    count = len(both["means"])
+    opacities = torch.cat([torch.where(facade, 0.9, 0.01), torch.full((len(house["means"]),), 0.9)])
+    weights = torch.cat([torch.ones(len(facade), 1), torch.full((len(house["means"]), 1), 1e-3)])
+    both |= {"opacities": opacities.logit()[:, None], "surface": weights}
+    both |= {"features_dc": torch.zeros(count, 3), "features_rest": torch.zeros(count, 0, 3)}
+    renderer = ViewRenderer("3d", kind)
+    supervised = renderer(both, CAMERA, torch.zeros(3), degree=0).geometry
+    assert supervised is not None
+    depth, normals = renderer.view_of_geometry(supervised, both, CAMERA)
+    alone = render(house, "3d", "expected")
+    past, wanted = slice(26, 36), {"rtol": 0.02, "atol": 0.0}
+    assert (supervised.depth[8:22, past] < 0.7 * alone.depth[8:22, past]).all()
+    torch.testing.assert_close(depth[8:22, past], alone.depth[8:22, past], **wanted)
+    directions = torch.nn.functional.normalize(normals, dim=-1)
+    assert (directions[8:22, past] @ turned > 0.99).all()
+    torch.testing.assert_close(depth[8:22, 4:14], torch.full((14, 10, 1), 5.0), **wanted)
+    assert (directions[8:22, 4:14] @ normal > 0.99).all()

@@ -117,7 +117,7 @@ def split(scene: Path) -> list[Path]:
     return [ply(scene / "shell" / "left.ply", mesh.vertices, mesh.faces[left]), model]
 
 
-def test_two_files_go_through_all_commands(scene: Path, tmp_path: Path, shellgs, monkeypatch):
+def test_two_files_go_through_all_commands(scene: Path, tmp_path: Path, shellgs, monkeypatch, capsys):
     """Aligned by the matrix of the whole, they are cast like it, and a simulation knows them."""
     from shellgs_method.sim import report, simulate
 
@@ -147,12 +147,16 @@ def test_two_files_go_through_all_commands(scene: Path, tmp_path: Path, shellgs,
     trainer.save_checkpoint(5)
     trainer.config.save_config()
     cli.sim((trainer.base_dir / "config.yml", tmp_path / "sim"), SimSettings(faces=4000))
+    done = [line.removesuffix(" ...") for line in capsys.readouterr().out.splitlines() if line.endswith(" ...")]
+    assert done.index("Loading the run") < done.index("Baking the texture") < len(done) - 1
     assert (tmp_path / "sim" / "report.html").is_file()
     (of,) = asked
     assert list(of["files"]) == names
     np.testing.assert_array_equal(of["sources"], load_shell(*files).source)
 
     files[1].write_text(files[1].read_text() + " ")
+    assert "right.json has changed since it was aligned" in shellgs("cast", scene)
+    shellgs("align", scene)
     assert "10 views cast, 0 already there" in shellgs("cast", scene, "--no-check")
 
 

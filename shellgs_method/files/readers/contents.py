@@ -27,6 +27,7 @@ class Geometry:
         faces: three vertex indices per triangle; empty for a point cloud.
         scanners: scanner positions, if the file has them.
         classes: :class:`~shellgs_method.geometry.surface_classes.SurfaceClass` of each triangle; OTHER if not given.
+        colours: colours of the vertices; None if the file has none, or they are not read.
         drawn: whether it is a model, whose coordinates may all be round, and not a measurement, which was rounded then.
     """
 
@@ -35,6 +36,7 @@ class Geometry:
     scanners: Float64[np.ndarray, "S 3"] = field(default_factory=NO_POINTS.copy)
     classes: UInt8[np.ndarray, " F"] = field(default_factory=NO_CLASSES.copy)
     drawn: bool = False
+    colours: UInt8[np.ndarray, "V 3"] | None = None
 
     def __post_init__(self) -> None:
         """Fill in the classes."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Shaped, UInt8
 
 from shellgs_method.files.headers import PlyElement, PlyHeader, read_ply_header
 from shellgs_method.files.readers.contents import (
@@ -24,7 +24,7 @@ from shellgs_method.files.readers.points import PIECE, Points
 
 _KNOWN = ("vertex", "face", "tristrips", "edge", "range_grid", "material", "camera")
 _SPLAT = ({"opacity", "scale_0", "rot_0"}, {"packed_position", "packed_rotation"})
-_NORMAL = ("nx", "ny", "nz")
+_NORMAL, _COLOUR = ("nx", "ny", "nz"), ("red", "green", "blue")
 _STRIP_END = -1
 _TEXT = 1 << 25  # bytes of text read at once
 
@@ -58,7 +58,11 @@ def read_ply(path: Path) -> Geometry:
     for element in header.elements:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
-    return Geometry(vertices, np.concatenate(faces))
+    colours = None
+    if {*_COLOUR} <= {*read.get("vertex", ())}:
+        (kind,) = (p.type for e in header.elements for p in e.properties if (e.name, p.name) == ("vertex", "red"))
+        colours = _colours([read["vertex"][name][1] for name in _COLOUR], _unit(kind))
+    return Geometry(vertices, np.concatenate(faces), colours=colours)
 
 
 def ply_points(path: Path) -> Iterator[Points] | None:
@@ -80,20 +84,32 @@ def ply_points(path: Path) -> Iterator[Points] | None:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     at = names.index("vertex")
-    used = [columns.index(name) for name in ("x", "y", "z", *(_NORMAL if {*_NORMAL} <= {*columns} else ()))]
+    used = [[columns.index(name) for name in names if {*names} <= {*columns}] for names in ("xyz", _NORMAL, _COLOUR)]
+    unit = _unit(there[at].properties[used[2][0]].type) if used[2] else 1.0
     if header.order is None:
         numbers = [element.count * len(element.properties) for element in there]
         tables = _text_tables(path, header.length, sum(numbers[:at]), there[at].count, len(columns), sum(numbers))
-        return (_of_columns([table[:, k] for k in used]) for table in tables)
+        return (_of_columns([[table[:, k] for k in part] for part in used], unit) for table in tables)
     rows = [np.dtype([(f"{k}", header.order + p.type) for k, p in enumerate(e.properties)]) for e in there]
     before = sum(row.itemsize * element.count for row, element in zip(rows[:at], there, strict=False))
     tables = _binary_tables(path, header.length + before, rows[at], there[at].count)
-    return (_of_columns([table[f"{k}"] for k in used]) for table in tables)
+    return (_of_columns([[table[f"{k}"] for k in part] for part in used], unit) for table in tables)
 
 
-def _of_columns(columns: list[np.ndarray]) -> Points:
-    values = np.stack(columns, axis=1).astype(np.float64)
-    return Points(values[:, :3], values[:, 3:] if len(columns) > 3 else None)
+def _of_columns(parts: list[list[np.ndarray]], unit: float) -> Points:
+    """Points of columns of positions, normals and colours, of which the latter may be none."""
+    positions, normals = (np.stack(part, axis=1).astype(np.float64) if part else None for part in parts[:2])
+    assert positions is not None
+    return Points(positions, normals, colours=_colours(parts[2], unit) if parts[2] else None)
+
+
+def _unit(kind: str) -> float:
+    """What to multiply colours of a type by, for 255 to be white."""
+    return 255.0 if kind.startswith("f") else 255 / np.iinfo(kind).max
+
+
+def _colours(columns: list[np.ndarray], unit: float) -> UInt8[np.ndarray, "N 3"]:
+    return np.stack([(unit * np.nan_to_num(column)).clip(0, 255).astype(np.uint8) for column in columns], axis=1)
 
 
 def _binary_tables(path: Path, start: int, kinds: np.dtype, rows: int) -> Iterator[np.ndarray]:

@@ -1,7 +1,8 @@
 """Read LAS, LAZ and E57: a script that runs in its own process, which a damaged file may end.
 
-It writes pieces on standard output: a line of json with the numbers of points and scanners, then the points and the
-positions of the scanners as doubles. The last line says how many points were left out and why, or what went wrong.
+It writes pieces on standard output: a line of json with the numbers of points, scanners and colours, then the points
+and the positions of the scanners as doubles, and the points' colours, if they have any, as bytes. The last line says
+how many points were left out and why, or what went wrong.
 """
 
 from __future__ import annotations
@@ -17,23 +18,28 @@ import numpy as np
 PIECE = 1_000_000
 NOISE = (7, 18)
 """Classes of LAS: low and high noise."""
-NO_POINTS = np.empty((0, 3))
-Piece = tuple[np.ndarray, np.ndarray]
-"""Points, and scanner positions."""
+NO_POINTS, NO_COLOURS = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Points, scanner positions, and colours of the points, if they have any."""
 
 
 def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
     """Read the points that are neither withheld nor classified as noise."""
     import laspy
 
-    read = 0
+    read, deep = 0, False
     with laspy.open(path) as file:  # in chunks: points that a damaged file only claims to hold take no memory
         for piece in file.chunk_iterator(PIECE):
             withheld = np.array(piece.withheld).astype(bool)
             noisy = np.isin(np.array(piece.classification), NOISE) & ~withheld
             points = np.stack([np.array(piece[axis]) for axis in "xyz"], axis=1)
-            dropped = withheld | noisy
-            yield points[~dropped] if dropped.any() else points, NO_POINTS
+            kept = ~(withheld | noisy)
+            colours = NO_COLOURS
+            if {"red", "green", "blue"} <= {*file.header.point_format.dimension_names}:
+                bands = np.stack([np.array(piece[band])[kept] for band in ("red", "green", "blue")], axis=1)
+                deep = deep or bool((bands > 255).any())  # 16 bits, as they should, or 8, as some programs write
+                colours = (bands >> 8 if deep else bands).astype(np.uint8)
+            yield points[kept], NO_POINTS, colours
             read += len(points)
             left_out["points, which are withheld"] += int(withheld.sum())
             left_out["points, which are classified as noise"] += int(noisy.sum())
@@ -52,27 +58,31 @@ def read_e57(path: str, left_out: Counter[str]) -> Iterator[Piece]:
         header = file.get_header(index)
         rotation, translation = _pose(header)
         if translation.any() or not np.array_equal(rotation, np.eye(3)):
-            yield NO_POINTS, translation[None]
+            yield NO_POINTS, translation[None], NO_COLOURS
         kind = "cartesian" if "cartesianX" in header.point_fields else "spherical"
         axes = [kind + axis for axis in ("XYZ" if kind == "cartesian" else ("Range", "Azimuth", "Elevation"))]
         flag = kind + "InvalidState"
-        fields = [*axes, flag] if flag in header.point_fields else axes
+        bands = [band for band in ("colorRed", "colorGreen", "colorBlue") if band in header.point_fields]
+        fields = [*axes, *bands, *([flag] if flag in header.point_fields else [])]
         columns, buffers = file.make_buffers(fields, min(PIECE, max(1, header.point_count)))
         reader = header.points.reader(buffers)
         while count := reader.read():
             points = np.stack([columns[axis][:count] for axis in axes], axis=1)
-            if flag in fields:
-                points = points[columns[flag][:count] == 0]
+            kept = columns[flag][:count] == 0 if flag in fields else np.ones(count, bool)
+            points = points[kept]
             if kind == "spherical":
                 points = convert_spherical_to_cartesian(points)
             missed = (points == 0).all(axis=1)  # at the scanner itself
             left_out["points, which are flagged as invalid"] += count - len(points)
             left_out["points at 0 0 0, which are misses of the scanner"] += int(missed.sum())
-            yield points[~missed] @ rotation.T + translation, NO_POINTS
+            colours = NO_COLOURS
+            if len(bands) == 3:
+                colours = np.stack([columns[band][:count][kept][~missed] for band in bands], axis=1).astype(np.uint8)
+            yield points[~missed] @ rotation.T + translation, NO_POINTS, colours
         reader.close()  # only one may be open
 
 
-def _pose(header) -> Piece:
+def _pose(header) -> tuple[np.ndarray, np.ndarray]:
     """Rotation matrix and translation of a scan; the identity where they are not set."""
     if not header.has_pose():
         return np.eye(3), np.zeros(3)
@@ -85,10 +95,11 @@ def _main(path: str) -> None:
     os.dup2(2, 1)  # libraries may print
     left_out: Counter[str] = Counter()
     try:
-        for points, scanners in (read_e57 if path.lower().endswith(".e57") else read_las)(path, left_out):
-            output.write(json.dumps({"points": len(points), "scanners": len(scanners)}).encode() + b"\n")
-            for array in (points, scanners):
-                output.write(np.ascontiguousarray(array, "<f8").data)
+        for points, scanners, colours in (read_e57 if path.lower().endswith(".e57") else read_las)(path, left_out):
+            counts = {"points": len(points), "scanners": len(scanners), "colours": len(colours)}
+            output.write(json.dumps(counts).encode() + b"\n")
+            for array, kind in ((points, "<f8"), (scanners, "<f8"), (colours, "u1")):
+                output.write(np.ascontiguousarray(array, kind).data)
     except BrokenPipeError:  # the points are not wanted any more
         os._exit(1)
     except Exception as error:  # of any kind, for a damaged file

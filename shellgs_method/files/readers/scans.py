@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Shaped
 
 from shellgs_method.files.headers import check_las
 from shellgs_method.files.readers.contents import left_out
@@ -56,10 +56,11 @@ def _read(path: Path) -> Iterator[Points]:
             assert process.stdout is not None
             while "points" in (about := _line(process.stdout)):
                 points, scanners = (_rows(process.stdout, about[what]) for what in ("points", "scanners"))
-                if points is None or scanners is None:
+                colours = _rows(process.stdout, about["colours"], "u1")
+                if points is None or scanners is None or colours is None:
                     break
                 read += len(points)
-                yield Points(points, scanners=scanners)
+                yield Points(points, scanners=scanners, colours=colours if len(colours) == len(points) else None)
         messages.seek(0)
         said = messages.read()
     if "error" in about:
@@ -77,10 +78,11 @@ def _line(stream: IO[bytes]) -> dict[str, Any]:
     return json.loads(line) if line.endswith(b"\n") else {}
 
 
-def _rows(stream: IO[bytes], count: int) -> Float64[np.ndarray, "N 3"] | None:
-    """The next points; None if there are fewer."""
-    data = stream.read(24 * count)
-    return np.frombuffer(data, "<f8").reshape(-1, 3) if len(data) == 24 * count else None
+def _rows(stream: IO[bytes], count: int, kind: str = "<f8") -> Shaped[np.ndarray, "N 3"] | None:
+    """The next points, or colours; None if there are fewer."""
+    size = 3 * count * np.dtype(kind).itemsize
+    data = stream.read(size)
+    return np.frombuffer(data, kind).reshape(-1, 3) if len(data) == size else None
 
 
 def _ending(code: int, messages: bytes) -> str:

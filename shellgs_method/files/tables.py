@@ -1,0 +1,271 @@
+"""Text files of points that people write: a line each, in an order of columns that a header may name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from pyproj import CRS
+
+from shellgs_method.errors import SceneError, notice
+from shellgs_method.files.crs import converter, known_crs
+
+LARGEST = 1e12
+"""Largest coordinate, in any unit."""
+_LONGITUDE, _LATITUDE = ("lon", "long", "lng", "longitude"), ("lat", "latitude")
+COORDINATES = {
+    "X": (*_LONGITUDE, "x", "easting", "east", "e", "rechtswert", "ostwert"),
+    "Y": (*_LATITUDE, "y", "northing", "north", "n", "hochwert", "nordwert"),
+    "Z": ("z", "height", "altitude", "alt", "elevation", "elev", "hoehe", "höhe", "h"),
+}
+IMAGE = ("image", "photo", "photograph", "picture", "img", "file", "filename", "foto", "bild")
+NAME = ("name", "id", "point", "punkt", "nr", "label", "gcp")
+PIXELS = {"x": ("u", "px", "col", "column", "imagex", "pixelx"), "y": ("v", "py", "row", "line", "imagey", "pixely")}
+"""What headers call the columns; of several, the first counts."""
+_UNIT = re.compile(r"[\[(][^\])]*[\])]")
+_WORD = re.compile(r"""(?P<comment>\#.*)|"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<bare>\S+)""")
+_SYSTEM = re.compile(
+    r"\b(EPSG|UTM|ETRS|WGS|NAD\d|GDA\d|SRID|[CS]RS\s*[:=]|zone\s*\d|(PROJ|GEOG|GEOD|COMPD|BOUND)\w*\[)|\+\w+=",
+    re.IGNORECASE,
+)
+"""What a header holds that is meant to name a system."""
+_DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*\d,\d+,?")
+
+
+@dataclass(frozen=True)
+class Table:
+    """What a text file of points holds.
+
+    Attributes:
+        path: the file.
+        contents: name of its contents, for messages.
+        system: the coordinate reference system that a first line without numbers, or a comment, names; else empty.
+        titles: what such a line, or one after it, calls the columns.
+        lines: the words of each other line, after its position, for messages.
+    """
+
+    path: Path
+    contents: str
+    system: str
+    titles: Sequence[str]
+    lines: Sequence[tuple[str, list[str]]]
+
+    @classmethod
+    def read(cls, path: Path, contents: str) -> Table:
+        """Read a file.
+
+        A header is a first line without numbers; below one that names a system, there may be another of the columns.
+        Comments after a # that begins a word are skipped, but for one that names a system alone, or that names all
+        columns. Words with spaces are quoted; an apostrophe inside a word is part of it.
+
+        Raises:
+            FileNotFoundError: the file does not exist.
+            SceneError: the file is not text, a quote is not closed, or it names two systems.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(f"the file of {contents} {path} does not exist")
+        try:
+            text = path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
+        lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
+        numbered = (re.split(r"[\s,;]+", line) for _, line in lines if re.match(r"\s*#\w", line))
+        if skipped := sum(sum(are_numbers([word]) for word in words) >= 3 for words in numbered):
+            notice(f"{path}: {skipped} lines of numbers begin with #, and are skipped: quote a name that begins so.")
+        worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
+        comments = [line.lstrip("# \t").rstrip() for _, line in lines if line.lstrip().startswith("#")]
+        systems = [comment for comment in comments if names_system(comment)]
+        titles = [cells for line in comments if worded and len(cells := _titles(line)) == len(cells_of(worded[0][1]))]
+        titles = next((cells for cells in titles if _are_axes(cells, "XYZ")), [])
+        if worded and _is_header(worded[0][1]):
+            header = " ".join(worded.pop(0)[1])
+            if _SYSTEM.search(header):
+                systems.insert(0, header)
+            if known_crs(header) is None and '["' not in header:
+                titles = _titles(header)
+            elif worded and _is_header(worded[0][1]) and _are_axes(below := _titles(" ".join(worded[0][1]))):
+                titles = below
+                worded.pop(0)
+        known = {crs: system for system in systems if (crs := known_crs(system))}
+        if len(known) > 1:
+            raise SceneError(f"{path} names two systems, {' and '.join(known.values())}: leave out the wrong one")
+        return cls(path, contents, systems[0] if systems else "", titles, worded)
+
+    @property
+    def names_axes(self) -> bool:
+        """Whether the header names a column of X or Y."""
+        return _are_axes(self.titles, "X") or _are_axes(self.titles, "Y")
+
+    def is_header(self, line: str) -> bool:
+        """Whether a line names the system, or the columns."""
+        return names_system(line) or (bool(self.titles) and _titles(line) == self.titles)
+
+    def columns(self, roles: Mapping[str, Sequence[str]], usual: Mapping[str, int]) -> dict[str, int]:
+        """The column of each role: as the header calls them, or the usual ones if it calls none X or Y.
+
+        A name that no column is called is in the first one, or past the last if that is another.
+
+        Args:
+            roles: what columns may be called, besides :data:`COORDINATES`: ``x`` and ``y`` are those in a photograph,
+                also where the header has ``x`` twice: in lower case, or the last.
+            usual: the columns without such a header.
+
+        Raises:
+            SceneError: one is missing.
+        """
+        called, found = [_called(title) for title in self.titles], dict[str, int]()
+        if not self.names_axes:
+            return dict(usual)
+        for axis in {"x", "y"} & roles.keys():
+            places = [k for k, names in enumerate(called) if names & {*COORDINATES[axis.upper()]}]
+            if len(places) > 1 and (own := [k for k in places if axis in called[k]]):
+                found[axis] = min(own, key=lambda k: (self.titles[k].isupper(), -k))
+        for role, known in {**roles, **COORDINATES}.items():
+            places = [k for name in known for k, names in enumerate(called) if name in names]
+            if left := [k for k in places if k not in found.values()]:
+                found.setdefault(role, left[0])
+        needed = [role for role in usual if role != "name"]
+        if any(role not in found for role in needed):
+            wanted = f"{', '.join(needed[:-1])} and {needed[-1]}"
+            raise SceneError(
+                f"{self.path}: its header, {', '.join(self.titles)}, must name one column each of {wanted}, or none"
+            )
+        return {"name": 0 if 0 not in found.values() else len(self.titles)} | found
+
+    def rows(self, columns: Mapping[str, int], expected: str) -> Iterator[tuple[str, dict[str, str]]]:
+        """The cells of each line by their roles, after its position, for messages; those of coordinates are numbers.
+
+        Args:
+            columns: by :meth:`columns`.
+            expected: what a line should hold, for messages.
+
+        Raises:
+            SceneError: a line does not, or its commas may be decimal.
+        """
+        numeric = [role for role in columns if role in ("X", "Y", "Z", "x", "y")]
+        width = max(len(self.titles), columns.get("name", 0) + 1) if self.names_axes else None
+        split = [cells_of(words) for _, words in self.lines]
+        whole = not any("." in cell for cells in split for cell in cells if are_numbers([cell]))
+        for (where, words), separated in zip(self.lines, split, strict=True):
+            both = (
+                {role: dict(enumerate(cells)).get(k, "") for role, k in columns.items()} for cells in (words, separated)
+            )
+            row = next(
+                (row for row in both if are_numbers([row[role] for role in numeric]) and row.get("image") != ""), None
+            )
+            if row is None or (width and len(separated) > width):
+                raise SceneError(f"{where}: expected {expected}")
+            digits = list(takewhile(str.isdigit, separated[columns["X"] :]))
+            if whole and not width and len(separated) > len(words) and len(digits) > len(numeric):
+                raise SceneError(f"{where}: its commas separate columns, or are decimal: write decimal points")
+            yield where, row
+
+    def to_shell(self, crs: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
+        """Conversion of the coordinates to the shell's.
+
+        Args:
+            crs: coordinate reference system of the shell; empty if unknown, as if the file's were the same.
+
+        Raises:
+            SceneError: the file names a system that PROJ does not know, or it is in degrees and the shell's system is
+                unknown; while converting, coordinates are outside the shell's system.
+        """
+        named = self.system or ", ".join(self.titles)
+        source = known_crs(self.system)
+        if self._are_degrees:
+            if source and not source.is_geographic:
+                raise SceneError(f"{self.path} names {named}, and columns of degrees: leave out the wrong one")
+            source = source or CRS.from_epsg(4326)
+        if source is None and not self.system:
+            return lambda points: points
+        if source is None and crs:
+            raise SceneError(
+                f"{self.path}: cannot read the system {named}: write it as EPSG:25832, or leave it out if it is the "
+                "shell's"
+            )
+        if not crs and source and source.is_geographic:
+            raise SceneError(
+                f"{self.path} is in degrees ({named}): say with --crs in which coordinate reference system the "
+                "shell is, such as EPSG:25832, or convert the file to the shell's coordinates"
+            )
+        if not crs or source is None:
+            notice(f"{self.path} is in {named}, and is taken for the shell's, whose system is not known: see --crs.")
+            return lambda points: points
+        return converter(source, crs, f"{self.contents} of {self.path}")
+
+    @cached_property
+    def _are_degrees(self) -> bool:
+        """Whether the header calls columns latitude and longitude."""
+        names = {name for title in self.titles for name in _called(title)}
+        return bool(names & {*_LATITUDE} and names & {*_LONGITUDE})
+
+
+def names_system(text: str) -> bool:
+    """Whether a text is the name of a coordinate reference system, and nothing else."""
+    return bool(_SYSTEM.search(text) and (known_crs(text) or re.fullmatch(r"EPSG:\d+", text, re.IGNORECASE)))
+
+
+def words_of(line: str, where: str) -> list[str]:
+    """The words of a line without its comment; see :meth:`Table.read`.
+
+    Raises:
+        SceneError: a quote is not closed.
+    """
+    words = []
+    for word in _WORD.finditer(line):
+        if word["bare"] and word["bare"][0] in "\"'":
+            raise SceneError(f"{where}: the quote before {word['bare'][1:]} is not closed")
+        if not word["comment"]:
+            words.append(next(text for text in word.group("double", "single", "bare") if text is not None))
+    return words
+
+
+def cells_of(words: Sequence[str]) -> list[str]:
+    """The cells of a line, empty ones between commas or semicolons too; none if commas are decimal."""
+    line = " ".join(words)
+    if any(_DECIMAL_COMMA.fullmatch(piece) for piece in re.split(r"[\s;]+", line)):
+        return []
+    separator = next((sign for sign in ";," if sign in line), None)
+    cells = [cell.strip() for cell in line.split(separator)] if separator else [*words]
+    return cells if any(cells[-1:]) else cells[:-1]
+
+
+def are_numbers(words: Sequence[str]) -> bool:
+    """Whether all words are finite numbers below :data:`LARGEST`."""
+    try:
+        return all(abs(float(word)) < LARGEST for word in words)
+    except ValueError:
+        return False
+
+
+def _titles(header: str) -> list[str]:
+    return cells_of(_UNIT.sub("", header).split())
+
+
+def _called(title: str) -> set[str]:
+    """What a title may be called by: its first word, and all its letters, in lower case."""
+    title = title.strip().lower()
+    return {re.split("[^a-zäöü]", title)[0], re.sub("[^a-zäöü]", "", title)}
+
+
+def _are_axes(titles: Sequence[str], axes: str = "XY") -> bool:
+    """Whether titles name columns of coordinates."""
+    names = {name for title in titles for name in _called(title)}
+    return all(names & {*COORDINATES[axis]} for axis in axes)
+
+
+def _is_header(words: Sequence[str]) -> bool:
+    """Whether nothing is a number, with or without a unit, also where commas separate them.
+
+    Definitions (+zone=32, WKT) may hold some, and names of systems what begins with a digit (UTM 32N).
+    """
+    names = [word for word in words if "=" not in word and "[" not in word]
+    pieces = [piece for word in names for piece in re.split("[,;]", word)]
+    begins = not _SYSTEM.search(" ".join(words)) and any(re.match(r"[+-]?\.?\d", piece) for piece in pieces)
+    return not begins and not any(are_numbers([piece]) for piece in pieces)

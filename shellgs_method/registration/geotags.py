@@ -1,0 +1,81 @@
+"""Geo-tags of photographs, by a phone or drone: metres off, enough to keep the search for the shell to where it was.
+
+Their heights are above the ellipsoid, the sea or the start, by the maker, and are not used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from PIL import ExifTags, Image
+from pyproj import CRS
+
+from shellgs_method.files.crs import converter
+from shellgs_method.files.exif import exif_of
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import positions
+from shellgs_method.geometry.similarity import transformed
+
+REACH = 10.0
+"""Median distance in metres of cameras from their geo-tags, beyond which an alignment is another: between houses,
+signals are reflected."""
+_LEAST = 3
+
+
+@dataclass(frozen=True)
+class GeoTags:
+    """Where photographs say that they were taken, in the shell's frame.
+
+    Attributes:
+        cameras: positions of their cameras in the scene's frame.
+        places: their easting and northing, in a frame of the shell in metres whose z is up.
+    """
+
+    cameras: Float64[np.ndarray, "N 3"]
+    places: Float64[np.ndarray, "N 2"]
+
+    @staticmethod
+    def of(views: Sequence[View], crs: str, survey_from_shell: Float64[np.ndarray, "4 4"]) -> GeoTags | None:
+        """Those of the photographs, if three or more have one.
+
+        Args:
+            views: the photographs.
+            crs: coordinate reference system of the shell.
+            survey_from_shell: motion and unit of the shell's frame in metres, which keeps the vertical.
+
+        Raises:
+            SceneError: they are outside the area of the shell's system.
+        """
+        tagged = [(view, place) for view in views if (place := _geo_tag(view.image))]
+        if len(tagged) < _LEAST:
+            return None
+        degrees = np.array([[*place, 0.0] for _, place in tagged])
+        shell = converter(CRS.from_epsg(4326), crs, "the geo-tags of the photographs")(degrees)
+        cameras = positions(view.camera for view, _ in tagged)
+        return GeoTags(cameras, transformed(shell, survey_from_shell)[:, :2])
+
+    def apart(self, survey_from_scene: Float64[np.ndarray, "4 4"]) -> float:
+        """Median distance, on the ground, of cameras from their geo-tags under an alignment, in metres."""
+        placed = transformed(self.cameras, survey_from_scene)[:, :2]
+        return float(np.median(np.linalg.norm(placed - self.places, axis=1)))
+
+
+def _geo_tag(path: Path) -> tuple[float, float] | None:
+    """Longitude and latitude in degrees, by WGS 84; None where there is none, or it is damaged, or 0 0 of no signal."""
+    try:
+        with Image.open(path) as image:
+            gps = exif_of(image).get_ifd(ExifTags.IFD.GPSInfo)
+        lon, lat = (
+            float(np.dot([float(part) for part in gps[tag]], [1, 1 / 60, 1 / 3600])) * (-1 if gps[ref] in "SW" else 1)
+            for tag, ref in (
+                (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef),
+                (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef),
+            )
+        )
+    except (OSError, KeyError, ValueError, TypeError, ZeroDivisionError):
+        return None
+    return (lon, lat) if (lon or lat) and abs(lon) <= 180 and abs(lat) <= 90 else None
