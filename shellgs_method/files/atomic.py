@@ -17,6 +17,7 @@ from typing import IO, Any
 import psutil
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.headers import buffer_files
 from shellgs_method.machine.cache import cache_folder
 
 _LARGE = 1 << 24  # bytes, which are hashed in a moment
@@ -88,6 +89,8 @@ def _delete(path: Path) -> None:
 def content_hash(path: Path) -> str:
     """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden files are ignored.
 
+    That of a glTF with buffers in files beside it is of these too.
+
     That of a large file is kept in the user's cache, until the file's size, times or inode change.
     """
     if path.is_dir():
@@ -95,6 +98,12 @@ def content_hash(path: Path) -> str:
         for file in sorted(file for file in path.rglob("[!.]*") if file.is_file()):
             digest.update(f"{file.relative_to(path).as_posix()}\0{content_hash(file)}\n".encode())
         return digest.hexdigest()
+    if path.suffix.lower() in (".gltf", ".glb") and (buffers := buffer_files(path)):
+        return fingerprint(*map(_file_hash, (path, *buffers)))
+    return _file_hash(path)
+
+
+def _file_hash(path: Path) -> str:
     stat = path.stat()
     if stat.st_size < _LARGE:
         return _hashed(path)

@@ -1,10 +1,16 @@
-"""Read PLY and LAS headers and check them against the file size: readers allocate whatever a header claims."""
+"""Read PLY and LAS headers and check them against the file size: readers allocate whatever a header claims.
+
+Of glTF, find the files beside it.
+"""
 
 from __future__ import annotations
 
+import json
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -141,3 +147,19 @@ def check_las(path: Path) -> None:
     most = (size - start) * _MOST_POINTS_PER_BYTE if kind & 0x80 else (size - start) // max(each, 1)
     if points > most:
         raise ValueError(f"its header claims {points} points, for which {size} bytes are too few")
+
+
+def buffer_file(path: Path, uri: str) -> Path:
+    """The file beside a glTF that a uri of it names."""
+    return path.parent / unquote(uri)
+
+
+def buffer_files(path: Path) -> list[Path]:
+    """The files beside a .gltf or .glb that have its geometry; those that are missing, or of a damaged one, are not."""
+    with path.open("rb") as file:
+        start = file.read(20)
+        text = file.read(int.from_bytes(start[12:16], "little")) if start.startswith(b"glTF") else start + file.read()
+    with suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        uris = [buffer["uri"] for buffer in json.loads(text).get("buffers", ()) if "uri" in buffer]
+        return [file for uri in uris if not uri.startswith("data:") and (file := buffer_file(path, uri)).is_file()]
+    return []

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import struct
 from pathlib import Path
 
 import pytest
@@ -64,3 +66,23 @@ def test_a_damaged_cache_is_made_again(scan: Path, damage: bytes):
     kept.write_bytes(damage)
     assert atomic.content_hash(scan) == expected
     assert expected.encode() in kept.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", ["gltf", "glb"])
+def test_the_hash_of_a_gltf_is_of_the_files_beside_it_too(tmp_path: Path, suffix: str):
+    path, buffer = tmp_path / f"a.{suffix}", tmp_path / "a b.bin"
+    text = json.dumps({"buffers": [{"uri": "a%20b.bin"}, {"uri": "data:,c"}, {"byteLength": 4}]}).encode()
+    path.write_bytes(text if suffix == "gltf" else struct.pack("<4sIII4s", b"glTF", 2, 0, len(text), b"JSON") + text)
+    hashes = set()
+    for data in (b"one", b"two"):
+        buffer.write_bytes(data)
+        hashes |= {atomic.content_hash(path), atomic.content_hash(path)}
+    assert len(hashes) == 2
+    buffer.unlink()
+    assert atomic.content_hash(path) == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("data", [b"", b"glTF", b"{", b"[]", b'{"buffers": [1, {"uri": 2}]}', b"\xff"])
+def test_a_damaged_gltf_has_the_hash_of_its_bytes(tmp_path: Path, data: bytes):
+    (tmp_path / "a.gltf").write_bytes(data)
+    assert atomic.content_hash(tmp_path / "a.gltf") == hashlib.sha256(data).hexdigest()

@@ -11,13 +11,13 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.headers import buffer_file
 from shellgs_method.files.readers.contents import (
     NO_FACES,
     NO_POINTS,
@@ -273,7 +273,7 @@ class _Document:
             return self.chunk
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(",")[2])
-        file = self.path.parent / unquote(uri)
+        file = buffer_file(self.path, uri)
         if not file.is_file():
             raise SceneError(f"the shell {self.path} has its geometry in {file}, which does not exist: copy both")
         return file.read_bytes()
