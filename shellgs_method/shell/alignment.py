@@ -76,7 +76,9 @@ class Alignment:
         if not self.shells:
             raise SceneError("the alignment names no file of the shell")
         if self.hashes and len(self.hashes) != len(self.shells):
-            raise SceneError(f"the alignment has {len(self.hashes)} hashes of {len(self.shells)} files")
+            raise SceneError(
+                f"the alignment has {len(self.hashes)} hashes of {len(self.shells)} files: align the shell again"
+            )
         if self.mesher not in get_args(Mesher):
             raise SceneError(f"unknown mesher {self.mesher!r}: it must be one of {', '.join(get_args(Mesher))}")
         if self.spacing is not None and not 0 < self.spacing < np.inf:
@@ -248,7 +250,7 @@ class Alignment:
             up = None if fields.get("up") is None else np.array(fields["up"], dtype=np.float64)  # older files lack it
             return cls(
                 matrix,
-                (shells,) if isinstance(shells := fields["shell"], str) else tuple(map(str, shells)),
+                _strings(fields["shell"]),
                 float(unit),
                 str(source),
                 verdict,
@@ -259,7 +261,7 @@ class Alignment:
                 spacing,
                 up,
                 str(fields.get("crs", "")),
-                tuple(map(str, fields.get("hashes", ()))),
+                tuple(map(str.lower, _strings(fields.get("hashes", ())))),
             )
         except KeyError as error:
             raise SceneError(f"{path}: the entry {error} is missing") from error
@@ -309,6 +311,10 @@ class Alignment:
             "metrics": dict(self.metrics),
             "cameras": self.cameras.to_json(),
         }
+
+
+def _strings(value: str | Sequence[object]) -> tuple[str, ...]:
+    return (value,) if isinstance(value, str) else tuple(map(str, value))
 
 
 def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:

@@ -1022,6 +1022,28 @@ def test_an_alignment_of_an_older_version_knows_no_hashes_and_is_used(scene):
     assert run_of(scene).shell is not None
 
 
+def test_a_gltf_has_changed_if_the_file_of_its_vertices_has(tmp_path):
+    trimesh.Scene(trimesh.creation.box()).export(tmp_path / "a.gltf")
+    bound = Alignment(np.eye(4), ("a.gltf",)).bound(tmp_path, [])
+    assert bound.changed_file(tmp_path) is None
+    buffer = max(tmp_path.glob("*.bin"), key=lambda file: file.stat().st_size)
+    buffer.write_bytes(buffer.read_bytes()[::-1])
+    assert bound.changed_file(tmp_path) == tmp_path / "a.gltf"
+    assert not bound.places_like(bound.bound(tmp_path, []))
+
+
+def test_hashes_that_are_edited_by_hand_are_read_or_refused_with_a_remedy(scene):
+    def edit(hashes: Any) -> Alignment:
+        fields = json.loads((scene / ALIGNMENT).read_text())
+        (scene / ALIGNMENT).write_text(json.dumps(fields | {"hashes": hashes}))
+        return Alignment.load(scene / ALIGNMENT)
+
+    known = Alignment.load(scene / ALIGNMENT).hashes
+    assert edit(known[0].upper()).hashes == known
+    with pytest.raises(SceneError, match=r"alignment\.json: .* has 2 hashes of 1 files: align the shell again"):
+        edit([*known, *known])
+
+
 def test_a_proposal_for_a_shell_that_has_changed_is_not_accepted(scene, shellgs):
     (scene / ALIGNMENT).rename(scene / PROPOSAL)
     change_shell(scene)
