@@ -95,6 +95,10 @@ def read_ply_header(path: Path) -> PlyHeader:
                 elements[-1].properties.append(PlyProperty(name, _TYPES[kind], _TYPES[counted]))
             case ["property", kind, name]:
                 elements[-1].properties.append(PlyProperty(name, _TYPES[kind]))
+    for element in elements:
+        for k, prop in enumerate(element.properties):
+            if any(other.name == prop.name for other in element.properties[:k]):
+                prop.name += f" {k}"  # no name that is read: the first is
     if any(element.count < 0 for element in elements):
         raise ValueError("its header has a negative count")
     if order is None:

@@ -359,6 +359,32 @@ def test_faces_of_two_corners_and_unknown_elements_of_a_ply_are_counted(tmp_path
     assert "left out 3 of 3 of the element 'blob'" in caplog.text
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_of_a_property_that_a_ply_has_twice_the_first_is_read(tmp_path: Path, form: str):
+    bands = [f"property uchar {name}" for name in ("red", "green", "blue", "red")]
+    header = ["element vertex 6", *XYZ, *bands, "element face 1", INDICES]
+    if form == "ascii":
+        data = rows(HEXAGON).replace("\n", " 9 8 7 6\n") + "3 0 1 2\n"
+    else:
+        data = b"".join(point.tobytes() + bytes([9, 8, 7, 6]) for point in HEXAGON) + struct.pack("<B3i", 3, 0, 1, 2)
+    read = read_geometry(save_ply(tmp_path / "a.ply", header, data, form))
+    np.testing.assert_array_equal(read.vertices, HEXAGON)
+    assert read.colours is not None
+    np.testing.assert_array_equal(read.colours, [[9, 8, 7]] * 6)
+
+
+def test_a_list_of_a_ply_is_no_colour_and_no_coordinate(tmp_path: Path):
+    bands = ["property list uchar uchar red", "property uchar green", "property uchar blue"]
+    face, data = ["element face 1", INDICES], rows(HEXAGON).replace("\n", " 1 9 8 7\n") + "3 0 1 2\n"
+    assert (
+        read_geometry(save_ply(tmp_path / "a.ply", ["element vertex 6", *XYZ, *bands, *face], data, "ascii")).colours
+        is None
+    )
+    lists, data = ["property list uchar double x", *XYZ[1:]], "1 0.0 1.0 2.0\n" * 6 + "3 0 1 2\n"
+    with pytest.raises(SceneError, match="its vertices have y, z, but no x"):
+        read_geometry(save_ply(tmp_path / "b.ply", ["element vertex 6", *lists, *face], data, "ascii"))
+
+
 @pytest.mark.parametrize("extra", ["0.5\n", "word\n"])
 def test_an_ascii_ply_with_other_numbers_than_its_header_claims_is_refused(tmp_path: Path, extra: str):
     header = ["element vertex 6", *XYZ, "element face 1", INDICES]

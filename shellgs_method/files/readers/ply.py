@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Shaped
 
 from shellgs_method.files.headers import PlyElement, PlyHeader, read_ply_header
 from shellgs_method.files.readers.contents import (
@@ -20,7 +20,7 @@ from shellgs_method.files.readers.contents import (
     splats,
     strip_triangles,
 )
-from shellgs_method.files.readers.points import PIECE, Points
+from shellgs_method.files.readers.points import PIECE, Colours, Points
 
 _KNOWN = ("vertex", "face", "tristrips", "edge", "range_grid", "material", "camera")
 _SPLAT = ({"opacity", "scale_0", "rot_0"}, {"packed_position", "packed_rotation"})
@@ -44,10 +44,12 @@ def read_ply(path: Path) -> Geometry:
     if "edge" in read and not read.keys() & {"face", "tristrips"}:
         raise drawing(path)
     vertices = np.empty((0, 3))
+    lists = {p.name for e in header.elements for p in e.properties if e.name == "vertex" and p.counted}
+    columns = {name: values for name, (_, values) in read.get("vertex", {}).items() if name not in lists}
     if "vertex" in read:
-        if missing := [axis for axis in "xyz" if axis not in read["vertex"]]:
-            raise ValueError(f"its vertices have {', '.join(read['vertex'])}, but no {missing[0]}")
-        vertices = np.stack([read["vertex"][axis][1].astype(np.float64) for axis in "xyz"], axis=1)
+        if missing := [axis for axis in "xyz" if axis not in columns]:
+            raise ValueError(f"its vertices have {', '.join(columns)}, but no {missing[0]}")
+        vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
     faces = [NO_FACES]
     if "face" in read:
         faces.append(polygon_triangles(vertices, *_corners(read["face"]), path))
@@ -58,10 +60,8 @@ def read_ply(path: Path) -> Geometry:
     for element in header.elements:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
-    colours = None
-    if {*_COLOUR} <= {*read.get("vertex", ())}:
-        (kind,) = (p.type for e in header.elements for p in e.properties if (e.name, p.name) == ("vertex", "red"))
-        colours = _colours([read["vertex"][name][1] for name in _COLOUR], _unit(kind))
+    bands = [columns[name] for name in _COLOUR if name in columns]
+    colours = Colours().of(np.stack(bands, axis=1)) if len(bands) == 3 else None
     return Geometry(vertices, np.concatenate(faces), colours=colours)
 
 
@@ -85,31 +85,22 @@ def ply_points(path: Path) -> Iterator[Points] | None:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     at = names.index("vertex")
     used = [[columns.index(name) for name in names if {*names} <= {*columns}] for names in ("xyz", _NORMAL, _COLOUR)]
-    unit = _unit(there[at].properties[used[2][0]].type) if used[2] else 1.0
+    colours = Colours()
     if header.order is None:
         numbers = [element.count * len(element.properties) for element in there]
         tables = _text_tables(path, header.length, sum(numbers[:at]), there[at].count, len(columns), sum(numbers))
-        return (_of_columns([[table[:, k] for k in part] for part in used], unit) for table in tables)
+        return (_of_columns([[table[:, k] for k in part] for part in used], colours) for table in tables)
     rows = [np.dtype([(f"{k}", header.order + p.type) for k, p in enumerate(e.properties)]) for e in there]
     before = sum(row.itemsize * element.count for row, element in zip(rows[:at], there, strict=False))
     tables = _binary_tables(path, header.length + before, rows[at], there[at].count)
-    return (_of_columns([[table[f"{k}"] for k in part] for part in used], unit) for table in tables)
+    return (_of_columns([[table[f"{k}"] for k in part] for part in used], colours) for table in tables)
 
 
-def _of_columns(parts: list[list[np.ndarray]], unit: float) -> Points:
+def _of_columns(parts: list[list[np.ndarray]], colours: Colours) -> Points:
     """Points of columns of positions, normals and colours, of which the latter may be none."""
     positions, normals = (np.stack(part, axis=1).astype(np.float64) if part else None for part in parts[:2])
     assert positions is not None
-    return Points(positions, normals, colours=_colours(parts[2], unit) if parts[2] else None)
-
-
-def _unit(kind: str) -> float:
-    """What to multiply colours of a type by, for 255 to be white."""
-    return 255.0 if kind.startswith("f") else 255 / np.iinfo(kind).max
-
-
-def _colours(columns: list[np.ndarray], unit: float) -> UInt8[np.ndarray, "N 3"]:
-    return np.stack([(unit * np.nan_to_num(column)).clip(0, 255).astype(np.uint8) for column in columns], axis=1)
+    return Points(positions, normals, colours=colours.of(np.stack(parts[2], axis=1)) if parts[2] else None)
 
 
 def _binary_tables(path: Path, start: int, kinds: np.dtype, rows: int) -> Iterator[np.ndarray]:

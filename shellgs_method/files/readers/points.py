@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Shaped, UInt8
 
 PIECE = 1 << 20
 """Points read at once, about: 24 MB of positions."""
@@ -27,3 +27,20 @@ class Points:
     normals: Float64[np.ndarray, "N 3"] | None = None
     scanners: Float64[np.ndarray, "S 3"] = field(default_factory=NO_POINTS.copy)
     colours: UInt8[np.ndarray, "N 3"] | None = None
+
+
+class Colours:
+    """Scales a file's colours, piece by piece: white is the least of 1, 255 and 65535 that none so far exceeds.
+
+    Types do not tell: 8 bits are written as 16 or 32, and as floats.
+    """
+
+    def __init__(self) -> None:
+        self._most = 0.0
+
+    def of(self, bands: Shaped[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:
+        """Red, green and blue of a piece, of which NaN is black."""
+        bands = np.nan_to_num(bands.astype(np.float32), posinf=0, neginf=0)
+        self._most = max(self._most, float(bands.max(initial=0)))
+        white = next((white for white in (1, 255, 65535) if self._most < white + 1), self._most)
+        return (bands * (255 / white)).clip(0, 255).round().astype(np.uint8)

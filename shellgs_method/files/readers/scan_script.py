@@ -1,7 +1,7 @@
 """Read LAS, LAZ and E57: a script that runs in its own process, which a damaged file may end.
 
 It writes pieces on standard output: a line of json with the numbers of points, scanners and colours, then the points
-and the positions of the scanners as doubles, and the points' colours, if they have any, as bytes. The last line says
+and the positions of the scanners as doubles, and the points' colours, if they have any, as floats. The last line says
 how many points were left out and why, or what went wrong.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 PIECE = 1_000_000
 NOISE = (7, 18)
 """Classes of LAS: low and high noise."""
-NO_POINTS, NO_COLOURS = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+NO_POINTS, NO_COLOURS = np.empty((0, 3)), np.empty((0, 3))
 Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Points, scanner positions, and colours of the points, if they have any."""
 
@@ -27,7 +27,7 @@ def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
     """Read the points that are neither withheld nor classified as noise."""
     import laspy
 
-    read, deep = 0, False
+    read = 0
     with laspy.open(path) as file:  # in chunks: points that a damaged file only claims to hold take no memory
         for piece in file.chunk_iterator(PIECE):
             withheld = np.array(piece.withheld).astype(bool)
@@ -36,9 +36,7 @@ def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
             kept = ~(withheld | noisy)
             colours = NO_COLOURS
             if {"red", "green", "blue"} <= {*file.header.point_format.dimension_names}:
-                bands = np.stack([np.array(piece[band])[kept] for band in ("red", "green", "blue")], axis=1)
-                deep = deep or bool((bands > 255).any())  # 16 bits, as they should, or 8, as some programs write
-                colours = (bands >> 8 if deep else bands).astype(np.uint8)
+                colours = np.stack([np.array(piece[band])[kept] for band in ("red", "green", "blue")], axis=1)
             yield points[kept], NO_POINTS, colours
             read += len(points)
             left_out["points, which are withheld"] += int(withheld.sum())
@@ -63,8 +61,12 @@ def read_e57(path: str, left_out: Counter[str]) -> Iterator[Piece]:
         axes = [kind + axis for axis in ("XYZ" if kind == "cartesian" else ("Range", "Azimuth", "Elevation"))]
         flag = kind + "InvalidState"
         bands = [band for band in ("colorRed", "colorGreen", "colorBlue") if band in header.point_fields]
-        fields = [*axes, *bands, *([flag] if flag in header.point_fields else [])]
-        columns, buffers = file.make_buffers(fields, min(PIECE, max(1, header.point_count)))
+        fields = [*axes, *([flag] if flag in header.point_fields else [])]
+        capacity = min(PIECE, max(1, header.point_count))
+        columns, buffers = file.make_buffers(fields, capacity)
+        for band in bands:  # pye57's own buffers hold 8 bits
+            columns[band] = np.empty(capacity, np.float32)
+            buffers.append(pye57.libe57.SourceDestBuffer(file.image_file, band, columns[band], capacity, True, True))
         reader = header.points.reader(buffers)
         while count := reader.read():
             points = np.stack([columns[axis][:count] for axis in axes], axis=1)
@@ -77,7 +79,7 @@ def read_e57(path: str, left_out: Counter[str]) -> Iterator[Piece]:
             left_out["points at 0 0 0, which are misses of the scanner"] += int(missed.sum())
             colours = NO_COLOURS
             if len(bands) == 3:
-                colours = np.stack([columns[band][:count][kept][~missed] for band in bands], axis=1).astype(np.uint8)
+                colours = np.stack([columns[band][:count][kept][~missed] for band in bands], axis=1)
             yield points[~missed] @ rotation.T + translation, NO_POINTS, colours
         reader.close()  # only one may be open
 
@@ -98,7 +100,7 @@ def _main(path: str) -> None:
         for points, scanners, colours in (read_e57 if path.lower().endswith(".e57") else read_las)(path, left_out):
             counts = {"points": len(points), "scanners": len(scanners), "colours": len(colours)}
             output.write(json.dumps(counts).encode() + b"\n")
-            for array, kind in ((points, "<f8"), (scanners, "<f8"), (colours, "u1")):
+            for array, kind in ((points, "<f8"), (scanners, "<f8"), (colours, "<f4")):
                 output.write(np.ascontiguousarray(array, kind).data)
     except BrokenPipeError:  # the points are not wanted any more
         os._exit(1)

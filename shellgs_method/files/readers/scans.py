@@ -17,7 +17,7 @@ from jaxtyping import Shaped
 
 from shellgs_method.files.headers import check_las
 from shellgs_method.files.readers.contents import left_out
-from shellgs_method.files.readers.points import Points
+from shellgs_method.files.readers.points import Colours, Points
 from shellgs_method.machine.extras import import_extra
 
 _SCRIPT = Path(__file__).with_name("scan_script.py")  # run as a file, to import none of the package's libraries
@@ -50,17 +50,19 @@ def read_e57(path: Path) -> Iterator[Points]:
 
 def _read(path: Path) -> Iterator[Points]:
     """Take the pieces that the script hands over, which reads on meanwhile."""
-    command, read, about = [sys.executable, _SCRIPT, path.absolute()], 0, {}
+    command, read, about, scaled = [sys.executable, _SCRIPT, path.absolute()], 0, {}, Colours()
     with tempfile.TemporaryFile() as messages:
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=messages, bufsize=1 << 20) as process:
             assert process.stdout is not None
             while "points" in (about := _line(process.stdout)):
                 points, scanners = (_rows(process.stdout, about[what]) for what in ("points", "scanners"))
-                colours = _rows(process.stdout, about["colours"], "u1")
+                colours = _rows(process.stdout, about["colours"], "<f4")
                 if points is None or scanners is None or colours is None:
                     break
                 read += len(points)
-                yield Points(points, scanners=scanners, colours=colours if len(colours) == len(points) else None)
+                yield Points(
+                    points, scanners=scanners, colours=scaled.of(colours) if len(colours) == len(points) else None
+                )
         messages.seek(0)
         said = messages.read()
     if "error" in about:
