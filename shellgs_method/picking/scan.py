@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ FACES = 1_000_000
 """Triangles that a browser draws; a mesh of more is drawn with vertices merged in voxels."""
 DETAIL = 400_000
 """Points of a cloud that are drawn beside those of the voxels, where one looks closely."""
+_GREY = np.array([255, 247, 235, 0], np.uint8)  # of what has no colour
 _BLOCK = 1 << 14  # points that are skipped at once where a ray passes them by
 _ACROSS = 1024  # voxels along the extent of a mesh that is thinned
 _FRONT = 1 / 3  # of the reach, within which a point hides what is behind it, if the cloud is not sparser
@@ -86,7 +86,7 @@ class MeshPart:
     Attributes:
         vertices: vertices to draw, relative to the middle.
         faces: triangles between them.
-        colours: of the vertices that are drawn; None where the files have none.
+        colours: of the vertices that are drawn, and 255; a light grey and 0 where their files have none.
         out: direction that most of its upright triangles face, or face away from.
     """
 
@@ -100,10 +100,11 @@ class MeshPart:
     ) -> None:
         self._triangles = Triangles(mesh.vertices - middle, mesh.faces)
         self.vertices, self.faces = thinned(self._triangles.vertices, mesh.faces)
-        known = [(part.vertices - middle, part.colours) for part in surfaces if part.colours is not None]
-        self.colours = (
-            _nearest_colours(self.vertices, *map(np.concatenate, zip(*known, strict=True))) if known else None
-        )
+        self.colours = _opaque(None, len(self.vertices))
+        if any(part.colours is not None for part in surfaces):
+            colours = np.concatenate([_opaque(part.colours, len(part.vertices)) for part in surfaces])
+            places = np.concatenate([part.vertices for part in surfaces]) - middle
+            self.colours = _nearest_colours(self.vertices, places, colours)
         normals = self._triangles.normals[:: max(1, len(mesh.faces) // FACES)]
         level = normals[np.abs(normals @ up) < 0.5]
         self.out = main_direction(level if len(level) else normals)
@@ -132,7 +133,7 @@ class CloudPart:
 
     Attributes:
         points: points to draw, means of those in a voxel, relative to the middle.
-        colours: of the points that are drawn; None where the files have none.
+        colours: of the points that are drawn, and 255; a light grey and 0 where their files have none.
         spacing: distance between them.
         scanners: scanner positions, relative to the middle.
     """
@@ -144,27 +145,31 @@ class CloudPart:
         # To the fourth neighbour it is as far as to the next on a lattice of this density, in a random cloud too.
         some = np.random.default_rng(0).permutation(self.points)[:_SAMPLES]
         self.spacing = min(float(np.median(point_tree(self.points).query(some, k=5)[0][:, -1])), size)
-        count, means = 0, VoxelMeans(middle, max(cloud.whole.voxel for cloud in clouds), MOST, 3)
+        means = VoxelMeans(middle, max(cloud.whole.voxel for cloud in clouds), MOST, 3)
+        count, coloured = 0, set()
         with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as tints:  # the maps keep them
-            for piece in chain.from_iterable(clouds):
+            for k, piece in ((k, piece) for k, cloud in enumerate(clouds) for piece in cloud):
                 finite = np.isfinite(piece.positions).all(axis=1)
                 positions = piece.positions[finite]
                 cells = np.floor((positions - middle) / (_CELL * size or 1.0)).clip(-(1 << 9), (1 << 9) - 1)
                 order = np.argsort(cells @ [1 << 20, 1 << 10, 1], kind="stable")
                 file.write(positions[order].astype("<f8").tobytes())
                 count += len(positions)
-                if piece.colours is not None and len(positions):
-                    means.add(positions, piece.colours[finite].astype(np.float64))
-                    tints.write(piece.colours[finite][order].tobytes())
+                colours = _opaque(piece.colours, len(finite))[finite]
+                tints.write(colours[order].tobytes())
+                if colours[:, 3].any():
+                    means.add(positions, colours[:, :3].astype(np.float64))
+                    coloured.add(k)
             file.flush()
             tints.flush()
             self._blocks = Blocks(np.memmap(file, "<f8", "r", shape=(count, 3)))
-            coloured = count > 0 and tints.tell() == 3 * count  # not in parts
-            self._tints = np.memmap(tints, np.uint8, "r", shape=(count, 3)) if coloured else None
-        self.colours = None
+            self._tints = np.memmap(tints, np.uint8, "r", shape=(count, 4))
+        self.colours = _opaque(None, len(self.points))
         if coloured:
             places, colours, _ = means.means()
-            self.colours = _nearest_colours(self.points, places - middle, colours.round().astype(np.uint8))
+            drawn = np.repeat([k in coloured for k in range(len(clouds))], [len(c.whole.points) for c in clouds])
+            opaque = _opaque(colours.round().astype(np.uint8), len(colours))
+            self.colours[drawn] = _nearest_colours(self.points[drawn], places - middle, opaque)
 
     def pick(self, origin: np.ndarray, direction: np.ndarray, reach: float) -> np.ndarray | None:
         """Of the points in front, the one nearest to the ray; see :meth:`Scan.pick`."""
@@ -178,11 +183,11 @@ class CloudPart:
 
     def detail(
         self, centre: Float64[np.ndarray, " 3"], radius: float
-    ) -> tuple[Float64[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"] | None]:
+    ) -> tuple[Float64[np.ndarray, "M 3"], UInt8[np.ndarray, "M 4"]]:
         """Points of the files around a centre, :data:`DETAIL` at most, relative to the middle, and their colours."""
         index = self._blocks.in_ball(centre + self._middle, radius)
         index = index[:: 1 + len(index) // DETAIL]
-        return self._blocks.points[index] - self._middle, None if self._tints is None else self._tints[index]
+        return self._blocks.points[index] - self._middle, self._tints[index]
 
 
 class Scan:
@@ -244,9 +249,16 @@ class Scan:
         return min(hits, key=lambda hit: float((hit - self.middle - origin) @ direction), default=None)
 
 
+def _opaque(colours: UInt8[np.ndarray, "N 3"] | None, count: int) -> UInt8[np.ndarray, "N 4"]:
+    """Colours and 255; grey and 0 if there are none, or all are black: many programs write those that they lack so."""
+    if colours is None or not colours.any():
+        return np.tile(_GREY, (count, 1))
+    return np.insert(colours, 3, 255, axis=1)
+
+
 def _nearest_colours(
-    points: Float64[np.ndarray, "N 3"], coloured: Float64[np.ndarray, "M 3"], colours: UInt8[np.ndarray, "M 3"]
-) -> UInt8[np.ndarray, "N 3"]:
+    points: Float64[np.ndarray, "N 3"], coloured: Float64[np.ndarray, "M 3"], colours: UInt8[np.ndarray, "M 4"]
+) -> UInt8[np.ndarray, "N 4"]:
     """For each point, the colour of the coloured one nearest to it."""
     return colours[point_tree(coloured).query(points)[1]]
 

@@ -27,7 +27,6 @@ from shellgs_method.picking.session import Session
 
 _PAGE = Path(__file__).with_name("page.html")
 _DECODED = 8  # photographs kept in memory
-_GREY = 255, 247, 235, 0  # of what has no colour
 _FAR = 1e12  # no coordinate or pixel is farther from its origin
 _STEPS = {
     "add": {"ray"},
@@ -147,12 +146,10 @@ def _reading() -> Iterator[None]:
         raise SceneError("the request is malformed: reload the page") from error
 
 
-def _coloured(points: np.ndarray, colours: np.ndarray | None) -> bytes:
-    """Points in single precision, each with four bytes: its colour and 255, or a light grey and 0."""
+def _coloured(points: np.ndarray, colours: np.ndarray) -> bytes:
+    """Points in single precision, each with the four bytes of its colour."""
     rows = np.empty(len(points), [("at", "<f4", 3), ("colour", "u1", 4)])
-    rows["at"], rows["colour"] = points, _GREY
-    if colours is not None:
-        rows["colour"][:, :3], rows["colour"][:, 3] = colours, 255
+    rows["at"], rows["colour"] = points, colours
     return rows.tobytes()
 
 

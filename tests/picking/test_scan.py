@@ -138,7 +138,7 @@ def test_detail_is_of_the_file_and_not_too_much(tmp_path: Path, monkeypatch):
     cloud = opened(written(tmp_path / "cloud.ply", points))
     assert cloud.cloud is not None
     detail, colours = cloud.cloud.detail(national(2, 1, 0) - cloud.middle, 0.9)
-    assert colours is None
+    assert not colours[:, 3].any()
     assert 250 < len(detail) <= 500
     inside = np.linalg.norm(points - NATIONAL - [2, 1, 0], axis=1) <= 0.9
     nearest = np.abs(points[inside][:, None] - cloud.middle - detail[None]).max(axis=2).min(axis=0)
@@ -185,20 +185,91 @@ def test_a_cloud_is_drawn_in_its_colours(tmp_path: Path, suffix: str):
     cloud = opened(path)
     part = cloud.cloud
     assert part is not None
-    assert part.colours is not None
     off = 12 if suffix == "e57" else 3  # in the mean of a voxel; this writer rounds to half a metre here
-    assert np.abs(part.colours - painted(part.points + cloud.middle).astype(int)).max() <= off
+    assert np.abs(part.colours[:, :3] - painted(part.points + cloud.middle).astype(int)).max() <= off
     detail, colours = part.detail(national(2, 1, 0) - cloud.middle, 0.9)
-    assert colours is not None
-    np.testing.assert_allclose(colours, painted(detail + cloud.middle), atol=off)
+    np.testing.assert_allclose(colours[:, :3], painted(detail + cloud.middle), atol=off)
+    assert (np.concatenate([part.colours, colours])[:, 3] == 255).all()
+
+
+def cloud_of(path: Path, points: np.ndarray, kind: str, colour: tuple[float, ...]) -> Path:
+    """A text PLY of points of one colour."""
+    names = "red", "green", "blue"
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+    ]
+    header += [f"property {kind} {name}" for name in names[: len(colour)]]
+    rows = [" ".join(map(repr, [*point, *colour])) for point in points.tolist()]
+    path.write_text("\n".join([*header, "end_header", *rows, ""]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "colour"),
+    [
+        ("uchar", (200, 100, 50)),
+        ("ushort", (51400, 25700, 12850)),
+        ("ushort", (200, 100, 50)),
+        ("int", (200, 100, 50)),
+        ("float", (200.0, 100.0, 50.0)),
+        ("float", (200 / 255, 100 / 255, 50 / 255)),
+    ],
+)
+def test_colours_of_a_cloud_are_scaled_by_what_is_there(tmp_path: Path, kind: str, colour: tuple[float, ...]):
+    part = opened(cloud_of(tmp_path / "a.ply", scan(500) + NATIONAL, kind, colour)).cloud
+    assert part is not None
+    np.testing.assert_array_equal(np.unique(part.colours, axis=0), [[200, 100, 50, 255]])
+
+
+@pytest.mark.parametrize("colour", [(), (0, 0, 0)])
+def test_a_cloud_without_colours_is_grey_beside_one_with_them(tmp_path: Path, colour: tuple[int, ...]):
+    points = scan(2000) + NATIONAL
+    grey = cloud_of(tmp_path / "a.ply", points, "uchar", colour)
+    part = opened(grey, cloud_of(tmp_path / "b.ply", points + np.array([0, 0, 20]), "uchar", (200, 100, 50))).cloud
+    assert part is not None
+    for places, colours in ((part.points, part.colours), part.detail(np.zeros(3), 100.0)):
+        first = places[:, 2] < 0
+        assert first.any()
+        assert not colours[first, 3].any()
+        assert colours[first, :3].min() > 200
+        np.testing.assert_array_equal(np.unique(colours[~first], axis=0), [[200, 100, 50, 255]])
+
+
+def test_colours_of_16_bits_of_an_e57_are_drawn(tmp_path: Path):
+    libe57 = pytest.importorskip("pye57").libe57
+    points = scan(500)
+    columns = {f"cartesian{axis}": np.ascontiguousarray(points[:, k]) for k, axis in enumerate("XYZ")}
+    columns |= {f"color{band}": np.full(500, 257.0 * v) for band, v in (("Red", 200), ("Green", 100), ("Blue", 50))}
+    file = libe57.ImageFile(str(tmp_path / "a.e57"), "w")
+    part, fields, parts = libe57.StructureNode(file), libe57.StructureNode(file), libe57.VectorNode(file, True)
+    file.root().set("data3D", parts)
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, column in columns.items():
+        coloured = name.startswith("color")
+        node = libe57.IntegerNode(file, 0, 0, 65535) if coloured else libe57.FloatNode(file, 0.0, libe57.E57_DOUBLE)
+        fields.set(name, node)
+        buffers.append(libe57.SourceDestBuffer(file, name, column, 500, True, True))
+    rows = libe57.CompressedVectorNode(file, fields, libe57.VectorNode(file, True))
+    part.set("points", rows)
+    parts.append(part)
+    writer = rows.writer(buffers)
+    writer.write(500)
+    writer.close()
+    file.close()
+    cloud = opened(tmp_path / "a.e57").cloud
+    assert cloud is not None
+    np.testing.assert_array_equal(np.unique(cloud.colours, axis=0), [[200, 100, 50, 255]])
 
 
 def test_a_mesh_is_drawn_in_the_colours_of_its_vertices(tmp_path: Path):
     ball = trimesh.creation.icosphere(3, radius=5.0)
     drawn = opened(write_colours(tmp_path / "ball.ply", ball.vertices + NATIONAL, ball.faces))
     assert drawn.mesh is not None
-    assert drawn.mesh.colours is not None
-    np.testing.assert_array_equal(drawn.mesh.colours, painted(drawn.mesh.vertices + drawn.middle))
+    np.testing.assert_array_equal(drawn.mesh.colours[:, :3], painted(drawn.mesh.vertices + drawn.middle))
+    assert (drawn.mesh.colours[:, 3] == 255).all()
 
 
 def test_a_mesh_is_drawn_thinned_and_picked_whole(tmp_path: Path, monkeypatch):
