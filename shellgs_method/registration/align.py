@@ -19,7 +19,7 @@ from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.registration.adjustment import SIGNIFICANT, Adjustment, adjusted
+from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.geotags import REACH, GeoTags
@@ -195,9 +195,15 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     held = adjustment.held_out
     before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
     if held.were_straight:
+        why = (
+            f"do not fit the shell better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are "
+            "asked)"
+            if held.points >= FEW
+            else f"are too few to tell ({FEW} are needed)"
+        )
         sentence = (
-            f"The cameras are left as they are: {held.points} points held out of their adjustment do not fit the shell "
-            f"better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are asked)."
+            f"The cameras are left as they are: {held.points} points near the shell, held out of their adjustment, "
+            f"{why}."
         )
         return replace(placement, history=[*placement.history, sentence]), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
