@@ -62,7 +62,9 @@ def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
     assert mesh.stat().st_mtime_ns != written
     settings.write_text(settings.read_text().replace("--method photo-gs", "--method shellgs"))
     assert "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]
-    assert "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]  # of two methods there, that of the settings
+    assert (
+        "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]
+    )  # of two methods there, that of the settings
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")
