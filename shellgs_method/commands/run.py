@@ -175,7 +175,7 @@ def run(
         if not alone:
             raise SceneError(f"another run of {scene} is going on: wait for it")
         if not steps.changed("all", *_state(recipe, scene, results)):
-            trained = next((results / "runs").rglob("config.yml"))
+            (trained,) = (results / "runs").glob(f"*/*/{recipe.method}/*/config.yml")
             console.print("Nothing is left to do.", highlight=False)
         else:
             trained = _take(steps, recipe, scene, results, accept)

@@ -193,7 +193,12 @@ def _integrate(grid, view: DepthView, axis: int, low: float, high: float) -> Non
     )
     K, viewmat = (o3d.core.Tensor(matrix.double().numpy()) for matrix in (view.camera.K, view.camera.viewmat))
     unit, far = 1.0, 2 * float(view.depth.max())
-    blocks = grid.compute_unique_block_coordinates(depth, K, viewmat, unit, far, TRUNCATION).numpy()
+    try:
+        blocks = grid.compute_unique_block_coordinates(depth, K, viewmat, unit, far, TRUNCATION).numpy()
+    except RuntimeError as error:
+        if "No block is touched" not in str(error):
+            raise
+        return  # the view has hardly any depth
     blocks = blocks[(blocks[:, axis] >= low) & (blocks[:, axis] <= high)]
     if len(blocks):
         grid.integrate(o3d.core.Tensor(blocks), depth, colour, K, K, viewmat, unit, far, TRUNCATION)

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Bool, Float, Float16, Int64, UInt8
 from kornia.filters import guided_blur
-from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import binary_fill_holes, maximum_filter, minimum_filter
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d
+from torch.nn.functional import grid_sample
 
 from shellgs_method.geometry.camera import Camera
 
@@ -149,6 +149,8 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
         view: the view.
         others: all other views.
     """
+    if not (view.depth > 0).any():
+        return _nothing(view)
     pixels = _Pixels(view)
     on_shell, nearer = _costs(pixels, others, OFFSETS).amin(dim=2)
     return _best(view, OFFSETS, _smooth(pixels, on_shell - nearer))
@@ -167,16 +169,23 @@ def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[
         sweeps: their sweeps in front of the shell.
         error: possible error of the shell's place, in scene units.
     """
+    if not (view.depth > 0).any():
+        return _nothing(view)
     pixels = _Pixels(view)
     reach = math.ceil(float(view.camera.K[0, 0]) * error / float(pixels.surface.median()))
-    window, around = 2 * reach + 1, pixels.surface[None]
-    farthest, nearest = max_pool2d(around, window, 1, reach)[0], -max_pool2d(-around, window, 1, reach)[0]
-    surfaces = [pixels.surface / depth - 1 for depth in (nearest, farthest)]
+    window = 2 * min(reach, max(view.depth.shape)) + 1
+    near, far = (each(pixels.surface.numpy(), window, mode="nearest") for each in (minimum_filter, maximum_filter))
+    surfaces = [pixels.surface / torch.from_numpy(depth) - 1 for depth in (near, far)]
     *shells, behind = _costs(pixels, others, OFFSETS_BEHIND, surfaces, sweeps).amin(dim=2)
     on_shell = torch.stack([_smooth(pixels, each) for each in shells]).amin(dim=0)
-    inside = -max_pool2d(-(view.depth > 0).float()[None], window, 1, reach)[0] > 0
+    inside = torch.from_numpy(minimum_filter((view.depth > 0).numpy(), window, mode="nearest"))
     found = _best(view, OFFSETS_BEHIND, on_shell - _smooth(pixels, behind))
     return found._replace(score=found.score.where(inside, -1.0))
+
+
+def _nothing(view: ShellView) -> Sweep:
+    """The sweep of a view that shows no shell."""
+    return Sweep(torch.full_like(view.depth, -1).half(), torch.zeros_like(view.depth).half())
 
 
 def _costs(

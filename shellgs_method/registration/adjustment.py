@@ -41,7 +41,11 @@ REACH = 0.3
 GATE = 0.05
 """The same in the last rounds: most frames, sills and railings, which a scan lacks, are farther from its planes."""
 HELD_OUT = 0.1
-"""Share of the tracks that are left out of the adjustment, and checked."""
+"""Share of the tracks that are left out of the adjustment, and checked; more of few (:data:`ENOUGH`)."""
+ENOUGH = 200
+"""Tracks that are left out, if these are not more than three in ten."""
+FEW = 50
+"""Points on the shell that determine nothing, and tell nothing of cameras."""
 SIGNIFICANT = 2.0
 """Standard errors by which held-out points must be likelier with adjusted cameras. True ones of two scenes reach
 none of these, and the film of the tutorial 3.2."""
@@ -62,7 +66,6 @@ _LOOSE = 0.3  # metres: a prior that keeps what nothing determines, such as wher
 _STILL = 5e-4  # metres that cameras move by in a round, from which they stand still
 _WEAK = 0.01  # singular value, relative to the largest, below which a motion of all stays: noise would determine it
 _EXPECTATIONS = 50
-_FEW = 50  # points on the shell that determine nothing
 _SHARED = 10  # photographs of a lens from which on its distortion is found
 
 
@@ -177,7 +180,8 @@ def adjusted(
     model = _with_distortion(model)
     start, seen = bundle_of(model, survey_from_scene)
     start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
-    fitted = np.random.default_rng(0).random(len(start.points)) >= HELD_OUT
+    share = min(max(HELD_OUT, ENOUGH / len(start.points)), 0.3)
+    fitted = np.random.default_rng(0).random(len(start.points)) >= share
     called = [names[number] for number in model.images]
     priors = dict(zip(called, start.centres, strict=True)) | dict(known or {})
     positions = Positions(
@@ -305,7 +309,7 @@ def _planes(
     offset = bundle.points[tracks] - closest.point
     close = np.linalg.norm(offset, axis=1) < gate
     near = tracks[close]
-    if len(near) < _FEW:
+    if len(near) < FEW:
         raise SceneError(
             f"only {len(near)} SfM points with tracks are within {gate:.2g} m of the shell: too few to tell how "
             "cameras are bent"
@@ -411,7 +415,7 @@ def _held_out(surface: ShellSurface, whole: Objective, start: Bundle, final: Bun
 
 def _gain(surface: ShellSurface, whole: Objective, before: Bundle, after: Bundle, points: np.ndarray) -> float:
     """Gain in log-likelihood of points by its standard error; their likelihoods are those of the best mixtures."""
-    if len(points) < _FEW:
+    if len(points) < FEW:
         return 0.0
     logarithms, patches = [], np.empty(0, np.int64)
     for bundle in (before, after):

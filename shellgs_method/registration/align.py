@@ -19,7 +19,7 @@ from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.registration.adjustment import SIGNIFICANT, Adjustment, adjusted
+from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, adjusted
 from shellgs_method.registration.correspondences import Correspondence, measured_again
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.geotags import REACH, GeoTags
@@ -195,9 +195,15 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
     held = adjustment.held_out
     before, after = (f"{100 * metres:.1f} cm" for metres in held.metres)
     if held.were_straight:
+        why = (
+            f"do not fit the shell better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are "
+            "asked)"
+            if held.points >= FEW
+            else f"are too few to tell ({FEW} are needed)"
+        )
         sentence = (
-            f"The cameras are left as they are: {held.points} points held out of their adjustment do not fit the shell "
-            f"better with it than by chance ({held.gain:.1f} standard errors; {SIGNIFICANT:g} are asked)."
+            f"The cameras are left as they are: {held.points} points near the shell, held out of their adjustment, "
+            f"{why}."
         )
         return replace(placement, history=[*placement.history, sentence]), None
     matrix = np.linalg.inv(adjustment.survey_from_scene) @ surface.survey_from_shell
@@ -215,15 +221,23 @@ def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[
 
 
 def seen_again(placement: Placement, views: Sequence[View], picks: Path | None) -> Placement:
-    """The placement with the residuals that its correspondences have in other cameras."""
-    known = placement.correspondences
+    """The placement with the residuals that its correspondences have in other cameras, and those before, in words."""
+    known, alignment = placement.correspondences, placement.alignment
+    if not known:
+        return placement
     if picks is not None:
-        of_picks, alignment = [point for point in known if isinstance(point, PickedPoint)], placement.alignment
+        of_picks = [point for point in known if isinstance(point, PickedPoint)]
         again = picked_again(of_picks, read_picks(picks, views, alignment.crs), views, alignment)
-        return replace(placement, correspondences=again)
-    centres = {view.name: view.camera.position.double().numpy() for view in views}
-    moved = [replace(point, scene=centres[point.name]) for point in known]
-    return replace(placement, correspondences=measured_again(moved, placement.alignment))
+    else:
+        centres = {view.name: view.camera.position.double().numpy() for view in views}
+        again = measured_again([replace(point, scene=centres[point.name]) for point in known], alignment)
+    again = [replace(point, left_out_residual=float("nan")) for point in again]
+    before, after = (float(np.sqrt(np.mean([point.residual**2 for point in each]))) for each in (known, again))
+    sentence = (
+        f"In the adjusted cameras, the points are {after:.3f} m off (root mean square of all, check points too), "
+        f"{before:.3f} m before."
+    )
+    return replace(placement, correspondences=again, history=[*placement.history, sentence])
 
 
 def place_by_guess(

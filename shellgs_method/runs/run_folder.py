@@ -203,8 +203,6 @@ def _find(path: Path, written: Path, folder: Path) -> Path | None:
 def _candidates(path: Path, written: Path, folder: Path) -> Iterator[Path]:
     start = Path("/", *["_"] * 64)  # any folder in which training may have been started
     inside = (start / path).is_relative_to(start / written)
-    if path.is_absolute() and not inside:
-        yield path
     in_place = folder.parent.name == written.parent.name  # still in the folder of its method
     if inside or (in_place and path.is_absolute() == written.is_absolute()):  # moved together with the run
         yield Path(os.path.normpath(folder / os.path.relpath(start / path, start / written)))

@@ -60,6 +60,11 @@ def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
     settings.write_text(settings.read_text().replace("--iterations 3", "--iterations 2"))
     assert "is now in scene-results/runs-1" in shellgs("run")
     assert mesh.stat().st_mtime_ns != written
+    settings.write_text(settings.read_text().replace("--method photo-gs", "--method shellgs"))
+    assert "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]
+    assert (
+        "/scene/shellgs/" in shellgs("run").rpartition("--load-config")[2]
+    )  # of two methods there, that of the settings
 
 
 @pytest.mark.usefixtures("ends_with_the_cast")

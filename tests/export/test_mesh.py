@@ -69,6 +69,17 @@ def test_tiles_of_one_lattice_meet_without_a_seam(sphere, monkeypatch):
     assert tiled.area == pytest.approx(sphere.area)
 
 
+def test_a_view_with_hardly_any_depth_adds_nothing(sphere):
+    """Open3D looks at every fourth pixel, and fails where none of these has a depth."""
+    angles = np.linspace(-0.6, 0.6, 7)
+    hardly = view_of_sphere(camera_at(0.0))
+    depth = torch.zeros_like(hardly.depth)
+    depth[33, 49] = hardly.depth[33, 49]
+    assert depth.max() > 0
+    views = [hardly._replace(depth=depth), *(view_of_sphere(camera_at(angle)) for angle in angles)]
+    assert len(fuse(views, ROOM, 0.05).faces) == len(sphere.faces)
+
+
 def view_of_street(x: float) -> DepthView:
     """Depth of the wall z = 0.1 sin(x), from 5 before it, by fixed-point iteration along the rays."""
     viewmat = torch.eye(4, dtype=torch.float64)

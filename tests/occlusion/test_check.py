@@ -166,6 +166,15 @@ def test_what_a_mirror_shows_is_found_behind_the_wall(error: float):
     np.testing.assert_allclose(np.median(found.offset.numpy()[pane & shown]), -0.4, rtol=0.1)
 
 
+def test_a_view_that_shows_no_shell_has_nothing_before_or_behind_it_in_a_scene_of_any_unit():
+    views = [view for view, _ in street(CAMERAS)]
+    away = replace(views[MIDDLE], depth=torch.zeros_like(views[MIDDLE].depth))
+    others = [view for view in views if view is not views[MIDDLE]]
+    sweeps = [sweep(view, views) for view in others]
+    for found in (sweep(away, others), sweep_behind(away, others, sweeps, error=1e6)):
+        assert (found.score == -1).all()
+
+
 def with_pilaster(views: list[ShellView], shift: float) -> tuple[list[ShellView], np.ndarray]:
     """The views of a wall with a pilaster 1 m wide before it, which is farther right in the shell by a shift.
 

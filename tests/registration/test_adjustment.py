@@ -28,7 +28,7 @@ from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import ADJUSTED, ScenePaths
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.similarity import fit_similarity, transformed
-from shellgs_method.registration.adjustment import SIGNIFICANT, Adjustment, Mixture, adjusted
+from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, Mixture, adjusted
 from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh
 from shellgs_method.shell.surface import ShellSurface
@@ -166,6 +166,21 @@ def test_bent_cameras_are_straightened(surface: ShellSurface, model: Model, bent
     assert after.mean() < 3 * np.median(list(found.deviations.values()))
     assert found.held_out.gain > 2 * SIGNIFICANT
     assert found.held_out.pixels[1] < 1.05 * found.held_out.pixels[0]
+
+
+def test_of_few_tracks_more_are_held_out(surface: ShellSurface, bent: Model):
+    points = bent.points
+    kept = np.sort(np.random.default_rng(1).permutation(len(points.ids))[:450])
+    few = Points(
+        points.positions[kept],
+        points.colours[kept],
+        [points.observers[k] for k in kept],
+        [points.keypoints[k] for k in kept],
+        points.ids[kept],
+    )
+    found = adjusted(surface, replace(bent, points=few), surface.survey_from_shell, NAMES)
+    assert found.held_out.points > FEW
+    assert found.held_out.gain > SIGNIFICANT
 
 
 def test_the_scene_keeps_its_frame(surface: ShellSurface, bent: Model):

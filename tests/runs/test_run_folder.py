@@ -120,6 +120,16 @@ def test_a_scene_that_was_moved_together_with_its_run_is_found(tmp_path, monkeyp
     assert scene_of(open_run(tmp_path / "new" / NAMES / "config.yml")) == tmp_path / "new/scene"
 
 
+def test_a_project_that_was_copied_has_its_own_scene(tmp_path):
+    """Its config names the first one's by an absolute path, where there still is one."""
+    (tmp_path / "old/scene").mkdir(parents=True)
+    write_run(tmp_path / "old" / NAMES, tmp_path / "old/outputs", tmp_path / "old/scene")
+    shutil.copytree(tmp_path / "old", tmp_path / "new")
+    assert scene_of(open_run(tmp_path / "new" / NAMES / "config.yml")) == tmp_path / "new/scene"
+    shutil.rmtree(tmp_path / "new/scene")
+    assert scene_of(open_run(tmp_path / "new" / NAMES / "config.yml")) == tmp_path / "old/scene"
+
+
 def test_a_scene_that_lies_beside_the_run_is_found(tmp_path):
     path = write_run(tmp_path / "best", Path("outputs"), Path("/nowhere/facade"))
     (tmp_path / "facade").mkdir()
