@@ -1282,6 +1282,8 @@ def test_picks_in_another_zone_are_converted_and_those_in_the_shells_own_are_kep
         ("X,Y,Z,photo,u,v", "410000.5,5413000.25,251,images/1.png,30,40"),
         ("photo;name;u;v;Northing [m];Easting [m];Height [m]", "images/1.png;a;30;40;5413000.25;410000.5;251"),
         ("x y image X Y Z", "30 40 images/1.png 410000.5 5413000.25 251"),
+        ("image x y x y z", "images/1.png 30 40 410000.5 5413000.25 251"),
+        ("x y z X Y image", "410000.5 5413000.25 251 30 40 images/1.png"),
         ("E N H x y image", "410000.5 5413000.25 251 30 40 images/1.png"),
         ("image image_x image_y x y z", "images/1.png 30 40 410000.5 5413000.25 251"),
         ("# name X Y Z image u v", "a 410000.5 5413000.25 251 images/1.png 30 40"),
@@ -1298,7 +1300,12 @@ def test_a_header_of_picks_chooses_the_columns(rigged, tmp_path, header, line):
 
 @pytest.mark.parametrize(
     "text", ["name,lat,lon,height\n{image},{lat},{lon},{h}", "# EPSG:4326\n{image} {lon} {lat} {h}",
-             "EPSG:4326\nheight lon lat file\n{h} {lon} {lat} {image}"]
+             "EPSG:4326\nheight lon lat file\n{h} {lon} {lat} {image}",
+             "# coordinate system EPSG:4326\n{image} {lon} {lat} {h}",
+             "#Label,X/Longitude,Y/Latitude,Z/Altitude\n{image},{lon},{lat},{h}",
+             "# CoordinateSystem: " + pyproj.CRS("EPSG:4326").to_wkt("WKT1_GDAL") + "\n{image},{lon},{lat},{h}",
+             "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n{image},{lat},{lon},{h}",
+             "name,lat,lon,altitude_error,alt\n{image},{lat},{lon},0.2,{h}"]
 )  # fmt: skip
 def test_a_header_or_comment_of_positions_chooses_columns_and_system(tmp_path, text):
     view, truth = rig()[0][0], np.array([[410000.5, 5413000.25, 251.0]])
