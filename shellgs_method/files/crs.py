@@ -17,7 +17,7 @@ from shellgs_method.errors import SceneError, notice
 _NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
 """How a system is named; PROJ would find one for nearly any word."""
 _INTRODUCED = re.compile(
-    r"^(the |coordinates?\s*|reference\s*|projection\b\s*|(system|[CS]RS)\b\s*)+([:=]\s*|\bis\s+)?(?!\d)",
+    r"^(the |coordinate(s(?!ystem))?\s*|reference\s*|(projection|system|[CS]RS)\b\s*)+([:=]\s*|is\s+)?(?![\d:=])",
     re.IGNORECASE,  # CRS:84 is a code
 )
 _UTM = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
