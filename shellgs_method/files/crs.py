@@ -16,7 +16,10 @@ from shellgs_method.errors import SceneError, notice
 
 _NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
 """How a system is named; PROJ would find one for nearly any word."""
-_INTRODUCED = re.compile(r"^[CS]RS\s*[:=]\s*(?!\d)", re.IGNORECASE)  # CRS:84 is a code
+_INTRODUCED = re.compile(
+    r"^(the |coordinate(s(?!ystem))?\s*|reference\s*|(projection|system|[CS]RS)\b\s*)+([:=]\s*|is\s+)?(?![\d:=])",
+    re.IGNORECASE,  # CRS:84 is a code
+)
 _UTM = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
 _IN_FILES = {
     **dict.fromkeys((".ifc",), re.compile(rb"IFCPROJECTEDCRS\s*\(\s*'([^']+)'", re.IGNORECASE)),
@@ -26,7 +29,7 @@ _IN_FILES = {
 
 
 def known_crs(text: str) -> CRS | None:
-    """The system that a text names, also after ``CRS:``.
+    """The system that a text names, also after ``CRS:`` or ``coordinate system``.
 
     It may be a code (EPSG:25832), urn, PROJ string, WKT, PROJ's full name (ETRS89 / UTM zone 32N), or OpenDroneMap's
     ``WGS84 UTM 32N``.

@@ -18,16 +18,18 @@ from shellgs_method.files.crs import converter, known_crs
 
 LARGEST = 1e12
 """Largest coordinate, in any unit."""
-_LONGITUDE, _LATITUDE = ("lon", "long", "lng", "longitude"), ("lat", "latitude")
+_LONGITUDE = ("lon", "long", "lng", "longitude", "gpslongitude")
+_LATITUDE = ("lat", "latitude", "gpslatitude")
 COORDINATES = {
-    "X": (*_LONGITUDE, "x", "easting", "east", "e", "rechtswert", "ostwert"),
-    "Y": (*_LATITUDE, "y", "northing", "north", "n", "hochwert", "nordwert"),
-    "Z": ("z", "height", "altitude", "alt", "elevation", "elev", "hoehe", "höhe", "h"),
+    "X": (*_LONGITUDE, "x", "easting", "east", "e", "rechtswert", "ostwert", "ost", "pointx"),
+    "Y": (*_LATITUDE, "y", "northing", "north", "n", "hochwert", "nordwert", "nord", "pointy"),
+    "Z": ("z", "height", "altitude", "alt", "elevation", "elev", "hoehe", "höhe", "h", "pointz", "gpsaltitude"),
 }
-IMAGE = ("image", "photo", "photograph", "picture", "img", "file", "filename", "foto", "bild")
+IMAGE = ("image", "photo", "photograph", "picture", "img", "file", "filename", "foto", "bild", "sourcefile")
 NAME = ("name", "id", "point", "punkt", "nr", "label", "gcp")
 PIXELS = {"x": ("u", "px", "col", "column", "imagex", "pixelx"), "y": ("v", "py", "row", "line", "imagey", "pixely")}
 """What headers call the columns; of several, the first counts."""
+_ACCURACY = {"std", "sd", "sigma", "error", "err", "accuracy", "acc"}
 _UNIT = re.compile(r"[\[(][^\])]*[\])]")
 _WORD = re.compile(r"""(?P<comment>\#.*)|"(?P<double>[^"]*)"|'(?P<single>[^']*)'|(?P<bare>\S+)""")
 _SYSTEM = re.compile(
@@ -74,6 +76,11 @@ class Table:
             text = path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             raise SceneError(f"{path} is not a text file of {contents} ({error.reason}): save it as UTF-8") from error
+        tabbed = (
+            line for line in text.splitlines() if "\t" in line and _are_axes(_titles(line.lstrip("# ").split("\t")))
+        )
+        if not re.search("[,;]", next(tabbed, ",")):
+            text = text.replace("\t", ";")  # which shows empty cells
         lines = [(f"{path}, line {number}", line) for number, line in enumerate(text.splitlines(), start=1)]
         numbered = (re.split(r"[\s,;]+", line) for _, line in lines if re.match(r"\s*#\w", line))
         if skipped := sum(sum(are_numbers([word]) for word in words) >= 3 for words in numbered):
@@ -81,17 +88,23 @@ class Table:
         worded = [(where, words) for where, line in lines if (words := words_of(line, where))]
         comments = [line.lstrip("# \t").rstrip() for _, line in lines if line.lstrip().startswith("#")]
         systems = [comment for comment in comments if names_system(comment)]
-        titles = [cells for line in comments if worded and len(cells := _titles(line)) == len(cells_of(worded[0][1]))]
+        cells = [_titles(line.split()) for line in comments]
+        titles = [titles for titles in cells if worded and len(titles) == len(cells_of(worded[0][1]))]
         titles = next((cells for cells in titles if _are_axes(cells, "XYZ")), [])
         if worded and _is_header(worded[0][1]):
-            header = " ".join(worded.pop(0)[1])
+            words = worded.pop(0)[1]
+            header = " ".join(words)
             if _SYSTEM.search(header):
                 systems.insert(0, header)
             if known_crs(header) is None and '["' not in header:
-                titles = _titles(header)
-            elif worded and _is_header(worded[0][1]) and _are_axes(below := _titles(" ".join(worded[0][1]))):
+                titles = _titles(words)
+            elif worded and _is_header(worded[0][1]) and _are_axes(below := _titles(worded[0][1])):
                 titles = below
                 worded.pop(0)
+        if not systems and (
+            meant := [line for line in comments if _SYSTEM.search(line) and not re.search(r"(\s[\d.]+){2}", line)]
+        ):
+            notice(f"{path}: the comment {meant[0]} names no system that PROJ knows: write it as # EPSG:25832 alone.")
         known = {crs: system for system in systems if (crs := known_crs(system))}
         if len(known) > 1:
             raise SceneError(f"{path} names two systems, {' and '.join(known.values())}: leave out the wrong one")
@@ -104,12 +117,14 @@ class Table:
 
     def is_header(self, line: str) -> bool:
         """Whether a line names the system, or the columns."""
-        return names_system(line) or (bool(self.titles) and _titles(line) == self.titles)
+        return names_system(line) or (bool(self.titles) and _titles(line.split()) == self.titles)
 
     def columns(self, roles: Mapping[str, Sequence[str]], usual: Mapping[str, int]) -> dict[str, int]:
         """The column of each role: as the header calls them, or the usual ones if it calls none X or Y.
 
-        A name that no column is called is in the first one, or past the last if that is another.
+        X Y Z are those three beside one another, if any are: what else is called x is another's. A column's whole title
+        counts before its first word. A name that no column is called is in the first one, or past the last if that is
+        another.
 
         Args:
             roles: what columns may be called, besides :data:`COORDINATES`: ``x`` and ``y`` are those in a photograph,
@@ -119,15 +134,22 @@ class Table:
         Raises:
             SceneError: one is missing.
         """
-        called, found = [_called(title) for title in self.titles], dict[str, int]()
+        called, found = [_called(title) for title in self.titles], dict(self._position)
         if not self.names_axes:
+            if self.titles and not self.system:
+                order = " ".join(sorted(usual, key=lambda role: usual[role]))
+                notice(
+                    f"{self.path}: its header, {', '.join(self.titles)}, is not known: columns are taken as {order}."
+                )
             return dict(usual)
         for axis in {"x", "y"} & roles.keys():
             places = [k for k, names in enumerate(called) if names & {*COORDINATES[axis.upper()]}]
-            if len(places) > 1 and (own := [k for k in places if axis in called[k]]):
+            own = [k for k in places if axis in called[k] and k not in found.values()]
+            if len(places) > 1 and own:
                 found[axis] = min(own, key=lambda k: (self.titles[k].isupper(), -k))
         for role, known in {**roles, **COORDINATES}.items():
             places = [k for name in known for k, names in enumerate(called) if name in names]
+            places.sort(key=lambda k: self.titles[k].strip().lower() not in known)
             if left := [k for k in places if k not in found.values()]:
                 found.setdefault(role, left[0])
         needed = [role for role in usual if role != "name"]
@@ -159,7 +181,8 @@ class Table:
             row = next(
                 (row for row in both if are_numbers([row[role] for role in numeric]) and row.get("image") != ""), None
             )
-            if row is None or (width and len(separated) > width):
+            too_few = self.names_axes and separated == words and len(words) < len(self.titles)
+            if row is None or too_few or (width and len(separated) > width):
                 raise SceneError(f"{where}: expected {expected}")
             digits = list(takewhile(str.isdigit, separated[columns["X"] :]))
             if whole and not width and len(separated) > len(words) and len(digits) > len(numeric):
@@ -200,9 +223,22 @@ class Table:
         return converter(source, crs, f"{self.contents} of {self.path}")
 
     @cached_property
+    def _position(self) -> dict[str, int]:
+        """Columns of X Y Z, or Y X Z, beside one another, rather not in degrees; empty if there are none."""
+        called = [_called(title) for title in self.titles]
+        found = [
+            {first: k, second: k + 1, "Z": k + 2}
+            for k in range(len(called) - 2)
+            for first, second in ("XY", "YX")
+            if all(names & {*COORDINATES[axis]} for names, axis in zip(called[k:], (first, second, "Z"), strict=False))
+        ]
+        return min(found, key=lambda columns: bool(called[columns["X"]] & {*_LONGITUDE}), default={})
+
+    @cached_property
     def _are_degrees(self) -> bool:
-        """Whether the header calls columns latitude and longitude."""
-        names = {name for title in self.titles for name in _called(title)}
+        """Whether the header calls columns latitude and longitude, and no others X Y Z."""
+        places = self._position.values() or range(len(self.titles))
+        names = {name for k in places for name in _called(self.titles[k])}
         return bool(names & {*_LATITUDE} and names & {*_LONGITUDE})
 
 
@@ -244,14 +280,21 @@ def are_numbers(words: Sequence[str]) -> bool:
         return False
 
 
-def _titles(header: str) -> list[str]:
-    return cells_of(_UNIT.sub("", header).split())
+def _titles(words: Sequence[str]) -> list[str]:
+    """What a header's words call the columns, without units; blanks of quoted ones become underscores."""
+    return cells_of(_UNIT.sub("", " ".join(word.replace(" ", "_") for word in words)).split())
 
 
 def _called(title: str) -> set[str]:
-    """What a title may be called by: its first word, and all its letters, in lower case."""
+    """What a title, or each alternative between slashes, may be called by, in lower case; an accuracy by nothing.
+
+    These are its first word, and all its letters.
+    """
     title = title.strip().lower()
-    return {re.split("[^a-zäöü]", title)[0], re.sub("[^a-zäöü]", "", title)}
+    if _ACCURACY & {*re.split("[^a-zäöü]+", title)}:
+        return set()
+    parts = [title, *title.split("/")]
+    return {name for part in parts for name in (re.split("[^a-zäöü]", part)[0], re.sub("[^a-zäöü]", "", part))}
 
 
 def _are_axes(titles: Sequence[str], axes: str = "XY") -> bool:

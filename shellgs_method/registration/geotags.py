@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 from PIL import ExifTags, Image
-from pyproj import CRS
+from pyproj import CRS, Transformer
 
-from shellgs_method.files.crs import converter
 from shellgs_method.files.exif import exif_of
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import positions
@@ -24,6 +23,7 @@ REACH = 10.0
 """Median distance in metres of cameras from their geo-tags, beyond which an alignment is another: between houses,
 signals are reflected."""
 _LEAST = 3
+_SIGNS = {"N": 1, "E": 1, "S": -1, "W": -1}
 
 
 @dataclass(frozen=True)
@@ -40,22 +40,23 @@ class GeoTags:
 
     @staticmethod
     def of(views: Sequence[View], crs: str, survey_from_shell: Float64[np.ndarray, "4 4"]) -> GeoTags | None:
-        """Those of the photographs, if three or more have one.
+        """Those of the photographs, if three or more have one that can be converted to the shell's system.
 
         Args:
             views: the photographs.
             crs: coordinate reference system of the shell.
             survey_from_shell: motion and unit of the shell's frame in metres, which keeps the vertical.
-
-        Raises:
-            SceneError: they are outside the area of the shell's system.
         """
         tagged = [(view, place) for view in views if (place := _geo_tag(view.image))]
-        if len(tagged) < _LEAST:
+        if not tagged:
             return None
-        degrees = np.array([[*place, 0.0] for _, place in tagged])
-        shell = converter(CRS.from_epsg(4326), crs, "the geo-tags of the photographs")(degrees)
-        cameras = positions(view.camera for view, _ in tagged)
+        degrees = np.array([place for _, place in tagged], dtype=np.float64)
+        ground = np.stack(Transformer.from_crs(CRS.from_epsg(4326), crs, always_xy=True).transform(*degrees.T), axis=-1)
+        known = np.isfinite(ground).all(axis=1)
+        if known.sum() < _LEAST:
+            return None
+        cameras = positions(view.camera for view, _ in tagged)[known]
+        shell = np.pad(ground[known], ((0, 0), (0, 1)))
         return GeoTags(cameras, transformed(shell, survey_from_shell)[:, :2])
 
     def apart(self, survey_from_scene: Float64[np.ndarray, "4 4"]) -> float:
@@ -70,7 +71,8 @@ def _geo_tag(path: Path) -> tuple[float, float] | None:
         with Image.open(path) as image:
             gps = exif_of(image).get_ifd(ExifTags.IFD.GPSInfo)
         lon, lat = (
-            float(np.dot([float(part) for part in gps[tag]], [1, 1 / 60, 1 / 3600])) * (-1 if gps[ref] in "SW" else 1)
+            float(np.dot([float(part) for part in gps[tag]], [1, 1 / 60, 1 / 3600]))
+            * _SIGNS[str(gps[ref]).strip().upper()[:1]]
             for tag, ref in (
                 (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef),
                 (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef),

@@ -77,7 +77,8 @@ def propose(
         points: SfM points in the scene's frame.
         views: photographs, all taken from outside the building.
         scene_up: approximate up direction of the cameras.
-        tags: geo-tags of the photographs: only alignments that agree with them are looked at, if there are any.
+        tags: geo-tags of the photographs: only alignments near them are looked at, if there are any; of those that
+            fit well, only ones about as near as the nearest, since all tags may have a common bias.
 
     Raises:
         SceneError: the SfM points have no main wall, or it fits nowhere.
@@ -95,7 +96,8 @@ def propose(
     for turn in track(turns, "Trying orientations", len(turns)):
         starts += search.placed(turn)
     if tags is not None:
-        starts = [start for start in starts if tags.apart(start.survey_from_scene) < REACH] or starts
+        agreeing = [start for start in starts if tags.apart(start.survey_from_scene) < 3 * REACH]
+        starts, tags = (agreeing, tags) if agreeing else (starts, None)
     starts = _distinct(starts, spread, _MEASURED, search.cell)
     starts = [
         replace(start, score=sight.agreement(surface, start.survey_from_scene, _ROUGH))
@@ -123,6 +125,11 @@ def propose(
             f"no alignment of the shell was found, which is taken to be {size:.4g} m large: if it is not, give "
             "--metres-per-shell-unit (0.001 for millimetres); if it is, pick points in the photographs and use --picks"
         )
+    if tags is not None:
+        apart = [tags.apart(candidate.survey_from_scene) for candidate in polished]
+        least = AMBIGUOUS * max(candidate.score for candidate in polished)
+        nearest = min(off for off, candidate in zip(apart, polished, strict=True) if candidate.score >= least)
+        polished = [candidate for off, candidate in zip(apart, polished, strict=True) if off <= nearest + REACH]
     best, *others = _distinct(polished, spread, _POLISHED, different)
     return [best, *(replace(other, displacement=_displacement(best, other, spread)) for other in others)]
 

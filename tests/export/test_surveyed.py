@@ -53,6 +53,13 @@ def test_points_before_and_behind_the_surface_are_measured_in_metres(run):
         (",x,y,z\n0,1.5,2,3\n1,4,5,6,", {"0": [1.5, 2, 3], "1": [4, 5, 6]}),
         ("p1,12,5,0\np2,13,5,0", {"p1": [12, 5, 0], "p2": [13, 5, 0]}),
         ("N X Y Z\n7 1.5 2 3", {"7": [1.5, 2, 3]}),
+        ('"Point name" X Y Z acc\nP1 1.5 2 3 0.01', {"P1": [1.5, 2, 3]}),
+        ("code\tX\tY\tZ\tsd\nA\t1.5\t2\t3\t0.1\n\t4\t5\t6\t0.2", {"A": [1.5, 2, 3], "2": [4, 5, 6]}),
+        ("name,X_std,Y_std,Z_std,X,Y,Z\nP1,0.1,0.2,0.3,1.5,2,3", {"P1": [1.5, 2, 3]}),
+        ("name,x error,y error,z error,x,y,z\nP1,0.1,0.2,0.3,1.5,2,3", {"P1": [1.5, 2, 3]}),
+        ("Pt,Nord,Ost,Hoehe\nP1,2,1.5,3", {"P1": [1.5, 2, 3]}),
+        ("POINT_Y,POINT_X,POINT_Z,id\n2,1.5,3,P1", {"P1": [1.5, 2, 3]}),
+        ("name,x,y,z,lat,lon\nP1,1.5,2,3,48.1,11.5", {"P1": [1.5, 2, 3]}),
     ],
 )
 def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points):
@@ -83,9 +90,23 @@ def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points
         ("p1 1 2 3\np1 4 5 6", "line 2: there is a point p1 already"),
         ("# nothing", "holds no points"),
         ("name lat lon height\np1 47.1 8.2 400", "in degrees"),
+        ("code X Y Z sd\n1.5 2 3 0.1", "line 2: expected code, X, Y, Z, sd"),
     ],
 )
 def test_lists_that_cannot_be_read_are_refused_with_the_line(tmp_path, text, why):
     (tmp_path / "points.txt").write_text(text)
     with pytest.raises(SceneError, match=why):
         read_surveyed(tmp_path / "points.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("Pt,A,B,C\np1,1,2,3", "its header, Pt, A, B, C, is not known: columns are taken as name X Y Z"),
+        ("# measured in EPSG:4326\np1 1 2 3", "the comment measured in EPSG:4326 names no system that PROJ knows"),
+    ],
+)
+def test_headers_that_are_not_used_are_told(tmp_path, caplog, text, sentence):
+    (tmp_path / "points.txt").write_text(text)
+    assert read_surveyed(tmp_path / "points.txt", "EPSG:25832")["p1"].tolist() == [1, 2, 3]
+    assert sentence in caplog.text

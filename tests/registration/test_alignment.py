@@ -234,10 +234,11 @@ def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, surve
     assert error(surface, found, survey_from_scene) < 0.02
 
 
-def tagged(folder: Path, views: list[View], noise: float, seed: int = 0) -> list[View]:
-    """The views with photographs that say where they were taken, metres off in UTM 32."""
+def tagged(folder: Path, views: list[View], noise: float, seed: int = 0, bias: float = 0.0) -> list[View]:
+    """The views with photographs that say where they were taken, metres off in UTM 32, by a bias along the facade."""
     places = transformed(np.stack([v.camera.position.double().numpy() for v in views]), np.linalg.inv(TRUTH))
     places[:, :2] += np.random.default_rng(seed).normal(0, noise, (len(views), 2))
+    places += bias * AXES[:, 0]
     images = []
     for view, (lon, lat, _) in zip(views, degrees_of(places), strict=True):
         exif = Image.Exif()
@@ -262,9 +263,41 @@ def test_geo_tags_are_read_in_the_system_of_the_shell(tmp_path, views, surface, 
     assert GeoTags.of(some, "EPSG:25832", surface.survey_from_shell) is None
 
 
+@pytest.mark.parametrize(
+    ("change", "read"),
+    [
+        ({1: "north ", 3: "e"}, 10),
+        ({1: "", 3: "E"}, 9),
+        ({2: (0.0, 0.0, 0.0), 4: (99.0, 0.0, 0.0)}, 9),
+    ],
+)
+def test_a_geo_tag_that_cannot_be_used_is_left_out(tmp_path, views, surface, survey_from_scene, change, read):
+    shown = tagged(tmp_path, views, 0.0)
+    with Image.open(shown[4].image) as image:
+        exif = image.getexif()
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update(change)
+    Image.new("RGB", (96, 64)).save(shown[4].image, exif=exif)
+    tags = GeoTags.of(shown, "EPSG:25832", surface.survey_from_shell)
+    assert tags is not None
+    assert len(tags.places) == read
+    assert tags.apart(survey_from_scene) < 0.1
+
+
+def twins_of(mesh: ShellMesh, metres: float) -> ShellMesh:
+    """The shell, and another so far to the right."""
+    beside = mesh.vertices + metres * AXES[:, 0]
+    return ShellMesh(np.concatenate([mesh.vertices, beside]), np.concatenate([mesh.faces, mesh.faces + len(beside)]))
+
+
+def test_geo_tags_with_a_bias_leave_a_building_and_its_neighbour_ambiguous(tmp_path, mesh, views, points):
+    apart = float(np.ptp(mesh.vertices @ AXES[:, 0])) + 0.2
+    shown = tagged(tmp_path, views, 1.0, bias=0.75 * apart)
+    placement = place_by_guess(twins_of(mesh, apart), shown, points, ("s.ply",), 1.0, "EPSG:25832")
+    assert any(f"Ambiguous: an alignment {apart:.1f} m from this one" in sentence for sentence in placement.history)
+
+
 def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
-    beside = mesh.vertices + 40 * AXES[:, 0]
-    twins = ShellMesh(np.concatenate([mesh.vertices, beside]), np.concatenate([mesh.faces, mesh.faces + len(beside)]))
+    twins = twins_of(mesh, 40)
     placement = place_by_guess(twins, tagged(tmp_path, views, 3.0), points, ("s.ply",), 1.0, "EPSG:25832")
     assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
     assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m off it\.", placement.history[1])
@@ -1271,6 +1304,8 @@ def test_picks_in_another_zone_are_converted_and_those_in_the_shells_own_are_kep
         ("X,Y,Z,photo,u,v", "410000.5,5413000.25,251,images/1.png,30,40"),
         ("photo;name;u;v;Northing [m];Easting [m];Height [m]", "images/1.png;a;30;40;5413000.25;410000.5;251"),
         ("x y image X Y Z", "30 40 images/1.png 410000.5 5413000.25 251"),
+        ("image x y x y z", "images/1.png 30 40 410000.5 5413000.25 251"),
+        ("x y z X Y image", "410000.5 5413000.25 251 30 40 images/1.png"),
         ("E N H x y image", "410000.5 5413000.25 251 30 40 images/1.png"),
         ("image image_x image_y x y z", "images/1.png 30 40 410000.5 5413000.25 251"),
         ("# name X Y Z image u v", "a 410000.5 5413000.25 251 images/1.png 30 40"),
@@ -1287,7 +1322,12 @@ def test_a_header_of_picks_chooses_the_columns(rigged, tmp_path, header, line):
 
 @pytest.mark.parametrize(
     "text", ["name,lat,lon,height\n{image},{lat},{lon},{h}", "# EPSG:4326\n{image} {lon} {lat} {h}",
-             "EPSG:4326\nheight lon lat file\n{h} {lon} {lat} {image}"]
+             "EPSG:4326\nheight lon lat file\n{h} {lon} {lat} {image}",
+             "# coordinate system EPSG:4326\n{image} {lon} {lat} {h}",
+             "#Label,X/Longitude,Y/Latitude,Z/Altitude\n{image},{lon},{lat},{h}",
+             "# CoordinateSystem: " + pyproj.CRS("EPSG:4326").to_wkt("WKT1_GDAL") + "\n{image},{lon},{lat},{h}",
+             "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude\n{image},{lat},{lon},{h}",
+             "name,lat,lon,altitude_error,alt\n{image},{lat},{lon},0.2,{h}"]
 )  # fmt: skip
 def test_a_header_or_comment_of_positions_chooses_columns_and_system(tmp_path, text):
     view, truth = rig()[0][0], np.array([[410000.5, 5413000.25, 251.0]])
