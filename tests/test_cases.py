@@ -88,7 +88,8 @@ RIGHT: dict[str, dict[str, str | float]] = {
     },
     "12-heic": {
         # Read, and too small for SfM, or nearly.
-        "(allheic|mixed) ": r"cameras of only \d of 10 photographs were found|[6-9] of 10 photographs registered",
+        "(allheic|mixed) ": r"cameras of only \d of 10 photographs were found|[6-9] of 10 photographs registered"
+        r"|show too little to find cameras by",
         "raw": refused("are raw photographs"),
         "videos": refused("there are no photographs"),
     },

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import PurePosixPath
 
 import numpy as np
 import torch
@@ -63,13 +64,14 @@ class BoundCameras:
         return next((words for name, view in shared.items() if (words := self.camera_changed(name, view.camera))), None)
 
     def _shared(self, views: Sequence[View]) -> dict[str, View]:
-        """Photographs in common by the names recorded; if none is, those of another folder, such as ``images_4``."""
+        """Photographs in common by the names recorded; if none is, those of another folder (``images_4``) or format."""
         same = {view.name: view for view in views if view.name in self.cameras}
         if same:
             return same
-        recorded, there = Counter(map(_below, self.cameras)), {_below(view.name): view for view in views}
+        recorded, present = Counter(map(_stem, self.cameras)), Counter(_stem(view.name) for view in views)
+        there = {_stem(view.name): view for view in views if present[_stem(view.name)] == 1}
         return {
-            name: there[_below(name)] for name in self.cameras if _below(name) in there and recorded[_below(name)] == 1
+            name: there[_stem(name)] for name in self.cameras if _stem(name) in there and recorded[_stem(name)] == 1
         }
 
     def camera_changed(self, name: str, camera: Camera) -> str | None:
@@ -93,9 +95,9 @@ class BoundCameras:
         return float(np.linalg.norm(np.ptp(positions(self.cameras.values()), axis=0)))
 
 
-def _below(name: str) -> str:
-    """A photograph's path in its folder of the scene."""
-    return name.partition("/")[2] or name
+def _stem(name: str) -> PurePosixPath:
+    """A photograph's path in its folder of the scene, without the suffix of its format."""
+    return PurePosixPath(name.partition("/")[2] or name).with_suffix("")
 
 
 def _numbers(camera: Camera) -> list[float]:

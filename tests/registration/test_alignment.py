@@ -1116,6 +1116,9 @@ def test_photographs_in_another_folder_are_the_same(views):
     assert before.changed(smaller) is None
     smaller[3] = replace(smaller[3], camera=smaller[4].camera)
     assert "stood" in (before.changed(smaller) or "")
+    converted = [replace(view, name=view.name.replace(".png", ".heic")) for view in views]
+    assert {view.name for view in converted}.isdisjoint(before.cameras)
+    assert before.changed(converted) is None
     by_drones = [replace(view, name=f"drone_{k % 2}/{k // 2}.jpg") for k, view in enumerate(views)]
     assert "0 are in the scene" in (BoundCameras.of(by_drones).changed([replace(views[0], name="2/0.jpg")]) or "")
 
