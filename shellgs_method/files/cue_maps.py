@@ -38,9 +38,30 @@ from shellgs_method.files.map_files import (
 )
 from shellgs_method.geometry.camera import Camera
 
-__all__ = ["CueMap", "CueMaps", "Findings", "Manifest", "MapRecord", "find_cues", "relative_path", "source_hash"]
+__all__ = [
+    "CueMap",
+    "CueMaps",
+    "Findings",
+    "Manifest",
+    "MapRecord",
+    "find_cues",
+    "relative_path",
+    "source_hash",
+    "tolerated",
+]
 
 T = TypeVar("T")
+
+
+TOLERANCES = (0.05, 0.15)
+"""Smallest and largest error in metres that the shell is taken to have: with less, images of Herz-Jesu lost more than
+its surface gained."""
+
+
+def tolerated(error: float | None) -> float:
+    """The error in metres that the shell is taken to have, whatever its alignment says; None where it does not."""
+    low, high = TOLERANCES
+    return min(max(error or 0.0, low), high)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from shellgs_method.bounds import Bounds, Count, Weight
 from shellgs_method.evaluation.pixels import kept_pixels, photometric_pixels, reference_maps
+from shellgs_method.files.cue_maps import tolerated
 from shellgs_method.geometry.reference import Reference
 from shellgs_method.losses import (
     PAPER_ITERATIONS,
@@ -36,8 +37,6 @@ MAX_KEPT_PIXELS = 3_000_000
 """Most pixels of training views whose losses are cached, at some 80 bytes each."""
 SOLID = 0.5
 """Opacity that the shell must have where what is behind it may be seen through it."""
-TOLERANCES = (0.05, 0.15)
-"""Smallest and largest tolerance in metres: with less, images of Herz-Jesu lost more than its surface gained."""
 DISTORTION_FROM = 3000
 """First iteration of the distortion, as in 2DGS."""
 
@@ -81,10 +80,7 @@ class ExtraLossConfig:
 
     def tolerance_for(self, shell_error: float | None) -> float:
         """Tolerance for a shell with an error in metres, None if unknown."""
-        if self.tolerance is not None:
-            return self.tolerance
-        low, high = TOLERANCES
-        return min(max(shell_error or 0.0, low), high)
+        return tolerated(shell_error) if self.tolerance is None else self.tolerance
 
 
 class ViewLosses(NamedTuple):

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint
-from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest
+from shellgs_method.files.cue_maps import CueMap, CueMaps, Manifest, tolerated
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.machine.progress import track
@@ -39,8 +39,6 @@ from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sight
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
-ERRORS = (0.05, 0.15)
-"""Metres that the shell's place may be off at least, whatever its alignment says, and at most."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
 VERSION = 10
@@ -245,8 +243,7 @@ def _shell_view(view: View, cue: CueMap) -> ShellView:
 
 
 def _error(shell: Manifest) -> float:
-    low, high = ERRORS
-    return min(max(shell.error or 0.0, low), high) / shell.metres_per_unit if shell.metres_per_unit else 0.0
+    return tolerated(shell.error) / shell.metres_per_unit if shell.metres_per_unit else 0.0
 
 
 def _exposed(view: ShellView) -> Exposed:

@@ -104,6 +104,10 @@ class Sweep(NamedTuple):
     offset: Float16[Tensor, "h w"]
     """Relative excess of the inverse depth over the shell's, interpolated between those that were tried."""
 
+    def probability(self, threshold: float) -> Float[Tensor, "h w"]:
+        """Probability that it is right: 1/2 at a score of ``threshold`` times :data:`CONTRADICTED`."""
+        return torch.sigmoid((self.score.float() - threshold * CONTRADICTED) / 0.02)
+
 
 def neighbours(
     view: Camera, others: Sides, depth: float, offset: float, per_side: int = PER_SIDE
@@ -219,7 +223,7 @@ def _costs(
         neighbour = _Neighbour(pixels, others[index])
         visible = neighbour.visible
         if sweeps is not None:
-            visible = visible * (1 - neighbour.hidden(sweeps[index], neighbour.shell, 1.0))
+            visible = visible * (1 - _sampled(sweeps[index].probability(1.0), neighbour.shell.grid))
         shells = [neighbour.on_shell, *(neighbour.on_surface(offset) for offset in surfaces)]
         for step, side in asked:
             look = neighbour.look(offsets[step])
@@ -265,7 +269,8 @@ def agreement(view: ShellView, found: Sweep, others: Sequence[ShellView], found_
         neighbour = _Neighbour(pixels, other)
         look = neighbour.look(found.offset.float())
         hidden = (neighbour.visible == 0) | ~look.inside | (neighbour.kept(look) == 0)
-        of_shell, of_nearer = (neighbour.hidden(sweep_there, at, 0.4) for at in (neighbour.shell, look))
+        before = sweep_there.probability(0.4)
+        of_shell, of_nearer = (_sampled(before, at.grid) for at in (neighbour.shell, look))
         offset = _sampled(other.depth, look.grid, "nearest") / look.z - 1
         found_offset = _sampled(sweep_there.offset.float(), look.grid, "nearest")
         alike = (found_offset - offset).abs() < 0.3 * offset.abs() + 0.004
@@ -353,14 +358,6 @@ class _Neighbour:
     def kept(self, look: _Look) -> Float[Tensor, "h w"] | float:
         """1 where the other photograph counts at these positions."""
         return 1.0 if self._kept is None else _sampled(self._kept, look.grid, "nearest")
-
-    def hidden(self, found: Sweep, at: _Look, threshold: float) -> Float[Tensor, "h w"]:
-        """Probability, by the other view's sweep, that something stands before the shell at these positions.
-
-        It is 1/2 at a score of ``threshold`` times :data:`CONTRADICTED`.
-        """
-        probability = torch.sigmoid((found.score.float() - threshold * CONTRADICTED) / 0.02)
-        return _sampled(probability, at.grid)
 
     def on_surface(self, offset: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
         """Disagreement on another surface, which is computed only where it is not that of the shell."""
