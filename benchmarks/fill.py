@@ -24,7 +24,8 @@ from typing import Annotated
 import torch
 import tyro
 
-from benchmarks.grid import GRID, RESULTS, SHELL, SHELLS, SYNTHETIC, Cell, Setting
+from benchmarks.fewer import keep_every
+from benchmarks.grid import GENERATED, GRID, RESULTS, SHELL, SHELLS, Cell, Setting
 from shellgs_method.commands.common import console
 from shellgs_method.compare.measure import measure_shell
 from shellgs_method.compare.results import compare
@@ -98,7 +99,7 @@ def measure_cells(
         here: commit and machine, from :func:`origin`.
         results: folder of the files.
     """
-    scenes = {name: prepared(name, setting.size, work, data) for name in dict.fromkeys(cell.scene for cell in cells)}
+    scenes = {name: prepared(name, setting, work, data) for name in dict.fromkeys(cell.scene for cell in cells)}
     for cell in cells:
         if cell.method == SHELL:
             save(cell, measure_shell(ScenePaths().of(scenes[cell.scene])), {}, here, results)
@@ -156,20 +157,23 @@ def save(cell: Cell, metrics: Mapping[str, float], settings: Mapping, origin: Ma
         file.write((json.dumps(record, indent=1) + "\n").encode())
 
 
-def prepared(scene: str, size: int, work: Path, data: Path | None) -> Path:
-    """The folder of a scene in ``work``, with the maps of its shell at ``size``."""
-    folder = work / "scenes" / str(size) / scene
+def prepared(scene: str, setting: Setting, work: Path, data: Path | None) -> Path:
+    """The folder of a scene in ``work``, with the photographs of a setting and the maps of its shell at their size."""
+    size, every = setting.size, setting.every
+    folder = work / "scenes" / (str(size) if every == 1 else f"{size}-every-{every}") / scene
     folder.parent.mkdir(parents=True, exist_ok=True)
-    words = ["shellgs", "cast", str(folder)]
-    if scene == SYNTHETIC:
-        if not folder.exists():
-            write_scene(folder, FacadeConfig(width=size, height=size * 9 // 16))
-    else:
-        if not folder.exists():
+    if not folder.exists():
+        copy = unfinished(folder)
+        if scene in GENERATED:
+            write_scene(copy, FacadeConfig(width=size, height=size * 9 // 16, surroundings=GENERATED[scene]))
+        else:
             assert data is not None
-            copy = unfinished(folder)
             shutil.copytree((data / scene).resolve(), copy, copy_function=os.symlink)
-            copy.rename(folder)
+        if every > 1:
+            keep_every(copy, every)
+        copy.rename(folder)
+    words = ["shellgs", "cast", str(folder)]
+    if scene in SHELLS:
         words += ["--shell", str(folder / SHELLS[scene]), "--matrix", str(folder / "shell/shell_to_scene.txt")]
         words += ["--max-image-size", str(size)]
     follow([words], announce=lambda _: console.print(f"shellgs cast {scene}, {size} pixels", highlight=False))

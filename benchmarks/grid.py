@@ -7,9 +7,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 RESULTS = Path(__file__).parent / "results"
-SYNTHETIC = "synthetic"
+SYNTHETIC, COURT = "synthetic", "court"
+GENERATED: dict[str, Literal["street", "court"]] = {SYNTHETIC: "street", COURT: "court"}
+"""Surroundings of the synthetic facade in each generated scene; these have a truth."""
 SHELLS = {
     "herz-jesu-p25": "shell/herz_jesu_survey.ply",
     "south-building-26": "shell/south_building_survey.ply",
@@ -32,6 +35,8 @@ class Setting:
     scenes: tuple[str, ...]
     methods: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
+    every: int = 1
+    """Every n-th training photograph is kept."""
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
@@ -39,7 +44,7 @@ class Setting:
         runs = [
             Cell(self, scene, method, seed) for seed in self.seeds for scene in self.scenes for method in self.methods
         ]
-        return (*runs, *(Cell(self, scene, SHELL, 0) for scene in self.scenes if scene == SYNTHETIC))
+        return (*runs, *(Cell(self, scene, SHELL, 0) for scene in self.scenes if scene in GENERATED))
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,8 @@ class Cell:
 GRID = (
     Setting("demo", 320, 750, (SYNTHETIC,), PAIR),
     Setting("default", 320, 1500, SCENES, ("photo-gs", "2dgs", "shellgs", "shellgs-metric"), (0, 1, 2)),
+    Setting("halves", 320, 1500, (SYNTHETIC, COURT, *SHELLS), PAIR, (0, 1, 2), every=2),
+    Setting("thirds", 320, 1500, (SYNTHETIC, COURT, *SHELLS), PAIR, (0, 1, 2), every=3),
     Setting("larger", 480, 3000, SCENES, PAIR),
 )
 

