@@ -19,7 +19,7 @@ from torch import Tensor
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
-from shellgs_method.gaussians.initial import MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
+from shellgs_method.gaussians.initial import BEHIND_SPACING, MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.seeds import shell_seeds, view_behind_shell, view_of_shell, view_of_surface
 from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
@@ -98,7 +98,7 @@ class FacadePipeline(VanillaPipeline):
             shell = shell_seeds(*seed_views(view_of_shell, "shell"), SEED_SPACING, MAX_SEEDS)
             model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
             behind = seed_views(view_behind_shell, "shell")
-            model.add_seeds(shell_seeds(*behind, SEED_SPACING, MAX_SEEDS))
+            model.add_seeds(shell_seeds(*behind, BEHIND_SPACING, MAX_SEEDS))
         if config.init == "shell":
             points = data.sfm_points.double().numpy()
             model.add_seeds(skybox_seeds(*seed_views(view_of_sky), points, SKYBOX_SEEDS))

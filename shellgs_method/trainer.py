@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +26,8 @@ from tyro.conf import Suppress
 from shellgs_method.bounds import Rate
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.files.atomic import atomic_write
-from shellgs_method.gaussians.pruning import broken, unshaped
+from shellgs_method.gaussians.pruning import broken, hardly_shown, unshaped
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.progress import ITERATION, Lines, tell, track
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.runs.folders import held
@@ -158,6 +160,8 @@ class FacadeTrainer(Trainer):
             self._report_skipped(step, losses)
         if step % CHECK_EVERY == 0 or self.optimizers.skipped:
             self._remove_broken_gaussians(step)
+        if step == self.pipeline.model.strategy.refine_stop_iter and self.pipeline.model.config.init == "shell":
+            self._remove_hardly_shown_gaussians()
         if step >= self._last_step:
             self.stop_training = True
         return loss, losses, metrics
@@ -189,9 +193,19 @@ class FacadeTrainer(Trainer):
             CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were not finite, and are removed.")
         self._check_any_left(step, "none was finite: lower the learning rates")
 
+    def _remove_hardly_shown_gaussians(self) -> None:
+        """Remove, once densification is over, the seeds and copies that others have made superfluous."""
+        model = self.pipeline.model
+        if count := self._remove(hardly_shown(self._training_cameras("hardly shown"), model.coverage)):
+            CONSOLE.print(f"{count} Gaussians that training views hardly show are removed.")
+        self._check_any_left(self.step, "training views hardly show any: lower the learning rates")
+
+    def _training_cameras(self, what: str) -> Iterable[Camera]:
+        dataset = self.pipeline.datamanager.train_dataset
+        return track(map(dataset.camera, range(len(dataset))), f"Looking for {what} Gaussians", len(dataset))
+
     def _remove_unshaped_gaussians(self) -> None:
-        model, dataset = self.pipeline.model, self.pipeline.datamanager.train_dataset
-        cameras = track(map(dataset.camera, range(len(dataset))), "Looking for unshaped Gaussians", len(dataset))
+        model, cameras = self.pipeline.model, self._training_cameras("unshaped")
         if count := self._remove(unshaped(model.means.detach(), model.scales.detach().exp(), cameras, model.coverage)):
             CONSOLE.print(f"{count} Gaussians that the training views have not shaped are removed.")
         self._check_any_left(self.step, "training views show none of them: lower the learning rates")

@@ -432,3 +432,22 @@ def test_a_map_of_another_camera_ends_training_with_one_sentence(scene, tmp_path
 def test_a_load_dir_without_a_checkpoint_ends_with_one_sentence(pristine_scene, tmp_path):
     with pytest.raises(SystemExit, match="holds no checkpoint"):
         trainer_of(pristine_scene, tmp_path, load_dir=tmp_path)
+
+
+@pytest.mark.parametrize(("method", "steps"), [("shellgs_metric", [3]), ("photo_gs", [])])
+def test_what_is_hardly_shown_goes_once_when_densification_stops(method, steps, pristine_scene, tmp_path, monkeypatch):
+    trainer = trainer_of(pristine_scene, tmp_path, method, iterations=6)
+    counts, found = [], []
+
+    def five(cameras, coverage) -> torch.Tensor:
+        areas = torch.stack([coverage(camera)[0] for camera in cameras])
+        assert areas.shape == (len(data_of(trainer).train_dataset), model_of(trainer).num_points)
+        counts.append(model_of(trainer).num_points)
+        found.append(trainer.step)
+        return torch.arange(areas.shape[1]) < 5
+
+    monkeypatch.setattr(shellgs_method.trainer, "hardly_shown", five)
+    monkeypatch.setattr(shellgs_method.trainer, "unshaped", lambda means, *_: torch.zeros(len(means), dtype=torch.bool))
+    trainer.train()
+    assert found == steps
+    assert all(model_of(trainer).num_points == count - 5 for count in counts)

@@ -23,6 +23,8 @@ OPACITY: dict[Init, float] = {"sfm": 0.1, "shell": 0.5}
 """Opacity of the initial Gaussians: 0.1 as in 3DGS; with 0.5, what is beside the shell was sharper."""
 SEED_SPACING = 4.0
 """Spacing of the seeds, in pixels of the closest view."""
+BEHIND_SPACING = 12.0
+"""The same of seeds behind the shell: reflections are blurred, and no two views show the same."""
 MAX_SEEDS = 200_000
 """Most seeds; the spacing is increased where it would give more."""
 SKYBOX_SEEDS = 2500

@@ -1,8 +1,9 @@
-"""Gaussians that are removed besides those that densification prunes: broken ones, and those no view has shaped."""
+"""Gaussians that are removed besides those that densification prunes: broken, hardly shown, and shaped by no view."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import reduce
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +15,8 @@ ONE_VIEW = 1.5
 """Effective number of views that show a Gaussian, below which it counts as shown by one."""
 BARELY = 0.001
 """Share of an image below which a Gaussian of any size is barely visible in it."""
+HARDLY = 0.5
+"""Area in pixels below which, in every training view, a Gaussian is hardly shown."""
 
 
 def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, "N"]:
@@ -23,6 +26,21 @@ def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, "N"]:
         return torch.zeros(len(means), dtype=torch.bool, device=means.device)
     finite = [parameter.detach().flatten(1).isfinite().all(dim=1) for parameter in gaussians.values()]
     return ~torch.stack(finite).all(dim=0)
+
+
+def hardly_shown(
+    cameras: Iterable[Camera], coverage: Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]]
+) -> Bool[Tensor, "N"]:
+    """Gaussians that contribute less than :data:`HARDLY` to every training view, by the sum of compositing weights.
+
+    The largest contribution to a view decides, as in RadSplat (Niemeyer et al. 2024), which takes that to a pixel.
+
+    Args:
+        cameras: cameras of the training views, at least one.
+        coverage: area in pixels that each Gaussian covers of a view, and whether it reaches into the view.
+    """
+    areas = (coverage(camera)[0] for camera in cameras)
+    return reduce(torch.maximum, areas) < HARDLY
 
 
 def unshaped(

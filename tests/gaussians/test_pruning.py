@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from shellgs_method.gaussians.pruning import broken, unshaped
+from shellgs_method.gaussians.pruning import HARDLY, broken, hardly_shown, unshaped
 from shellgs_method.geometry.camera import Camera
 
 PIXELS = 100
@@ -40,6 +40,12 @@ def test_a_gaussian_that_reaches_a_camera_is_unshaped_if_all_views_barely_show_i
     assert removed((0.0009, 0.0009), deviations=4.9)
     assert not removed((0.0009, 0.0011), deviations=4.9)
     assert not removed((0.0009, 0.0009), deviations=5.1)
+
+
+def test_the_view_that_shows_a_gaussian_most_decides_whether_it_is_hardly_shown():
+    areas = iter(HARDLY * torch.tensor([[0.9, 0.0, 1.1], [0.9, 0.9, 0.0]]))
+    gone = hardly_shown(CAMERAS, lambda _: (next(areas), torch.ones(3, dtype=torch.bool)))
+    assert gone.tolist() == [True, True, False]
 
 
 def test_a_gaussian_with_any_parameter_that_is_not_finite_is_broken():
