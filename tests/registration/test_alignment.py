@@ -1042,8 +1042,14 @@ def test_a_shell_that_has_changed_is_used_once_it_is_validated_again(scene, shel
     with pytest.raises(SceneError, match=changed):
         _ = run_of(scene).shell
     assert re.search(changed, shellgs("cast", scene))
+    maps, view = CueMaps.open(scene, "shell"), scene_views(scene)[0]
+    first = r"facade\.ply has changed since: run `shellgs align .*` first, .*; run `shellgs cast"
+    with pytest.raises(SceneError, match=first):
+        maps.read(view.name, view.camera)
     assert "facade.ply has changed since it was aligned" in shellgs("align", scene)
     assert run_of(scene).shell is not None
+    with pytest.raises(SceneError, match=r"facade\.ply has changed since; run `shellgs cast"):
+        CueMaps.open(scene, "shell").read(view.name, view.camera)
     assert "views cast" in shellgs("cast", scene)
 
 
