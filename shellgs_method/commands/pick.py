@@ -40,6 +40,9 @@ def pick(
     """
     import webbrowser
 
+    from shellgs_method.machine.progress import tell
+
+    tell("Reading the scene")
     import numpy as np
 
     from dataparsers.facade import read_views
@@ -58,10 +61,12 @@ def pick(
     if len(views) < 2:
         raise SceneError(f"{scene} has {len(views)} photograph, and a point is picked in two or more")
     with PickServer(port) as server:
+        tell(f"Reading {', '.join(path.name for path in shell)}")
         place = ShellPlace(*shell)
         session = Session(picks, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(*shell))
         if session.state.picks:
             place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")
+        tell("Preparing it to be drawn and picked")
         scan = Scan(shell, place)
         console.print(f"Pick in a browser: {server.url} (Ctrl-C or the page's button ends it).", highlight=False)
         if open:
@@ -80,8 +85,7 @@ def pick(
     options += (f" --crs {shlex.quote(crs)}" if crs else "") + paths.flags
     files = " ".join(shlex.quote(str(path)) for path in (scene, *shell))
     console.print(
-        f"{fit['used']} of {fit['of']} picks are used; their residual is {fit['rms']:.3f} m (root mean square).\n"
-        f"Next: shellgs align {files} --picks {shlex.quote(str(picks))}{options}",
+        f"{fit['words']}\nNext: shellgs align {files} --picks {shlex.quote(str(picks))}{options}",
         highlight=False,
         soft_wrap=True,
     )

@@ -61,7 +61,7 @@ def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 
     columns = table.columns({"name": NAME}, usual)
     expected = ", ".join(table.titles) if table.names_axes else expected
     points: dict[str, np.ndarray] = {}
-    for where, row in table.rows(columns, f"{expected} in the shell's coordinates, with decimal points"):
+    for where, row in table.rows(columns, f"{expected} in the shell's coordinates"):
         name = row["name"] or str(len(points) + 1)
         if name in points:
             raise SceneError(f"{where}: there is a point {name} already")

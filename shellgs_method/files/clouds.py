@@ -23,6 +23,8 @@ _ACROSS = 1500  # voxels along the extent of a cloud that is first looked at: 2 
 _SAMPLE = 200_000
 _LARGE = 1 << 28  # bytes, of which reading takes long enough to be said
 
+Reader = Callable[[Path], Iterator[Points] | None]
+
 
 @dataclass(frozen=True)
 class VoxelCloud:
@@ -113,13 +115,14 @@ class Cloud:
     Args:
         path: the file.
         read: reader of its points.
+        read_coloured: reader of the points with their colours, which takes longer; None if the file's are not read.
 
     Raises:
         SceneError: while iterating: the file is damaged, or its reader is not installed.
     """
 
-    def __init__(self, path: Path, read: Callable[[Path], Iterator[Points] | None]) -> None:
-        self.path, self._read = path, read
+    def __init__(self, path: Path, read: Reader, read_coloured: Reader | None = None) -> None:
+        self.path, self._read, self._read_coloured = path, read, read_coloured or read
 
     @cached_property
     def whole(self) -> VoxelCloud:
@@ -127,12 +130,19 @@ class Cloud:
         return merged(self)
 
     def __iter__(self) -> Iterator[Points]:
+        return self._pieces(self._read)
+
+    def coloured(self) -> Iterator[Points]:
+        """The points once more, with their colours if the file has some that are read."""
+        return self._pieces(self._read_coloured)
+
+    def _pieces(self, read: Reader) -> Iterator[Points]:
         if self.path.is_file() and self.path.stat().st_size > _LARGE:
             tell(f"Reading {self.path.name}")
         total, missed = 0, 0
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         try:
-            for piece in self._read(self.path) or ():
+            for piece in read(self.path) or ():
                 total += len(piece.positions)
                 misses = piece.positions[:, 0] == 0
                 if misses.any() and (misses := misses & ~piece.positions.any(axis=1)).any():

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
@@ -115,8 +115,16 @@ def given_crs(text: str) -> str:
     return name_of(crs)
 
 
+def conversion(source: CRS, target: CRS) -> Callable[[np.ndarray], Float64[np.ndarray, "N D"]]:
+    """Conversion of coordinates, x (or longitude) first, from one system to another; infinite where there is none."""
+    if source.to_2d() == target.to_2d() and len(source.axis_info) <= len(target.axis_info):
+        return lambda points: points
+    transformer = Transformer.from_crs(source, target, always_xy=True)
+    return lambda points: np.stack(transformer.transform(*points.T), axis=-1)
+
+
 def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Float64[np.ndarray, "N 3"]]:
-    """Conversion of coordinates, x (or longitude) first, from one system to another.
+    """:func:`conversion` that refuses coordinates that have none, and latitudes that stand first.
 
     Args:
         source: their system.
@@ -127,18 +135,35 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
         SceneError: while converting, coordinates outside the target's area.
     """
     wanted = CRS.from_user_input(target)
-    if source.to_2d() == wanted.to_2d() and len(source.axis_info) <= len(wanted.axis_info):
-        return lambda points: points
-    transformer = Transformer.from_crs(source, wanted, always_xy=True)
+    convert = conversion(source, wanted)
 
-    def convert(points: np.ndarray) -> Float64[np.ndarray, "N 3"]:
-        converted = np.stack(transformer.transform(*points.T), axis=-1)
+    def checked(points: np.ndarray) -> Float64[np.ndarray, "N 3"]:
+        converted = convert(points)
+        inside, turned = _within(wanted, points), _within(wanted, points[:, [1, 0]])
+        if source.is_geographic and len(points) and not inside.any() and turned.all():
+            raise SceneError(
+                f"{where}: {_words(points[0])} is outside the area of {wanted.name}, and inside it with the latitude "
+                "as longitude: write the longitude first, or name the columns in a header"
+            )
         if not np.isfinite(converted).all():
             first = points[~np.isfinite(converted).all(axis=1)][0]
             raise SceneError(
-                f"{where}: {' '.join(f'{value:g}' for value in first)} cannot be converted from {source.name} to "
-                f"{wanted.name}: is the longitude first?"
+                f"{where}: {_words(first)} cannot be converted from {source.name} to {wanted.name}: is the longitude "
+                "first?"
             )
         return converted
 
-    return convert
+    return checked
+
+
+def _within(crs: CRS, degrees: np.ndarray) -> Bool[np.ndarray, " N"]:
+    """Whether longitudes and latitudes are in the area that a system is made for, where it is known."""
+    area, (longitude, latitude) = crs.area_of_use, degrees.T[:2]
+    if area is None:
+        return np.zeros(len(degrees), bool)
+    inside = (longitude >= area.west) & (longitude <= area.east)
+    return inside & (latitude >= area.south) & (latitude <= area.north)
+
+
+def _words(point: np.ndarray) -> str:
+    return " ".join(f"{value:g}" for value in point)

@@ -10,13 +10,13 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint, read_json, remove_leftovers
@@ -287,22 +287,34 @@ class CueMaps:
 
     @cached_property
     def _stale(self) -> str | None:
-        """The first source that has changed since the maps were made, in words; missing sources are ignored."""
+        """The first source that has changed since the maps were made, in words; missing sources are ignored.
+
+        A shell that is no longer the one that was aligned must be validated before it can be cast.
+        """
         for source, sha256 in self.manifest.sources.items():
             path = self.scene / source
             # Outside the scene only a file (a shell) is opened: a manifest may name anything.
             known = path.is_file() or (path.is_dir() and not Path(source).is_absolute())
             if known and sha256 not in (source_hash(path), content_hash(path)):
-                return f"{source} has changed since"
+                first = f"run `shellgs align {shlex.quote(str(self.scene))}` first, to validate it as it is now"
+                aligned = any(sha256 in str(fields.get("hashes")) for fields in self._alignments)
+                return f"{source} has changed since" + (f": {first}" if aligned else "")
         return None
 
     @cached_property
     def _aligned_to(self) -> BoundCameras:
         """Cameras that the shell's alignment, a source of the maps, was found for; none where that is unknown."""
-        for path in (self.scene / source for source in self.manifest.sources if source.endswith(".json")):
-            with suppress(OSError, KeyError, TypeError, ValueError):  # reported when the alignment is used
-                return BoundCameras.from_json(read_json(path)["cameras"])
+        for fields in self._alignments:
+            with suppress(KeyError, TypeError, ValueError):  # reported when the alignment is used
+                return BoundCameras.from_json(fields["cameras"])
         return BoundCameras()
+
+    @property
+    def _alignments(self) -> Iterator[dict[str, Any]]:
+        """Json files among the sources, of which alignments are some."""
+        for path in (self.scene / source for source in self.manifest.sources if source.endswith(".json")):
+            with suppress(OSError, SceneError):
+                yield read_json(path)
 
     @property
     def command(self) -> str:

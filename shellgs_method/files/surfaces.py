@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,10 @@ CLOUDS: dict[str, Callable[[Path], Iterator[Points]]] = {
     **dict.fromkeys((".las", ".laz"), read_las),
     ".e57": read_e57,
 }
+COLOURED: dict[str, Callable[[Path], Iterator[Points]]] = {
+    **dict.fromkeys((".las", ".laz"), partial(read_las, coloured=True)),
+    ".e57": partial(read_e57, coloured=True),
+}
 SPLATS = (".splat", ".ksplat", ".spz", ".sog", ".sogs")
 """Suffixes of formats that hold Gaussian splats only."""
 
@@ -65,7 +70,7 @@ def read_surface(path: Path) -> Geometry | Cloud:
     if suffix in SPLATS:
         raise splats(path)
     if suffix in CLOUDS:
-        return Cloud(path, CLOUDS[suffix])
+        return Cloud(path, CLOUDS[suffix], COLOURED.get(suffix))
     read = MESHES.get(suffix)
     if read is None:
         raise SceneError(
@@ -74,7 +79,7 @@ def read_surface(path: Path) -> Geometry | Cloud:
         )
     try:
         if suffix == ".ply" and ply_points(path) is not None:
-            return Cloud(path, ply_points)
+            return Cloud(path, ply_points, partial(ply_points, coloured=True))
         geometry = read(path)
     except SceneError:
         raise

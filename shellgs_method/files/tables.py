@@ -50,6 +50,7 @@ class Table:
         system: the coordinate reference system that a first line without numbers, or a comment, names; else empty.
         titles: what such a line, or one after it, calls the columns.
         lines: the words of each other line, after its position, for messages.
+        others: the lines that are none of these, such as comments.
     """
 
     path: Path
@@ -57,6 +58,7 @@ class Table:
     system: str
     titles: Sequence[str]
     lines: Sequence[tuple[str, list[str]]]
+    others: Sequence[str]
 
     @classmethod
     def read(cls, path: Path, contents: str) -> Table:
@@ -108,7 +110,9 @@ class Table:
         known = {crs: system for system in systems if (crs := known_crs(system))}
         if len(known) > 1:
             raise SceneError(f"{path} names two systems, {' and '.join(known.values())}: leave out the wrong one")
-        return cls(path, contents, systems[0] if systems else "", titles, worded)
+        rows = {where for where, _ in worded}
+        others = [line for where, line in lines if where not in rows and line.strip()]
+        return cls(path, contents, systems[0] if systems else "", titles, worded, others)
 
     @property
     def names_axes(self) -> bool:
@@ -163,6 +167,9 @@ class Table:
     def rows(self, columns: Mapping[str, int], expected: str) -> Iterator[tuple[str, dict[str, str]]]:
         """The cells of each line by their roles, after its position, for messages; those of coordinates are numbers.
 
+        A line of fewer words than the header has must end where all that is needed has been named, if that comes first:
+        which of the others are missing cannot be told.
+
         Args:
             columns: by :meth:`columns`.
             expected: what a line should hold, for messages.
@@ -171,6 +178,7 @@ class Table:
             SceneError: a line does not, or its commas may be decimal.
         """
         numeric = [role for role in columns if role in ("X", "Y", "Z", "x", "y")]
+        needed = sorted(columns[role] for role in columns if role != "name")
         width = max(len(self.titles), columns.get("name", 0) + 1) if self.names_axes else None
         split = [cells_of(words) for _, words in self.lines]
         whole = not any("." in cell for cells in split for cell in cells if are_numbers([cell]))
@@ -181,9 +189,14 @@ class Table:
             row = next(
                 (row for row in both if are_numbers([row[role] for role in numeric]) and row.get("image") != ""), None
             )
-            too_few = self.names_axes and separated == words and len(words) < len(self.titles)
-            if row is None or too_few or (width and len(separated) > width):
-                raise SceneError(f"{where}: expected {expected}")
+            fewer = self.names_axes and separated == words and len(words) < len(self.titles)
+            if row is None or (fewer and needed != [*range(len(words))]) or (width and len(separated) > width):
+                slip = ""
+                if _has_decimal_commas(" ".join(words)):
+                    slip = "; its commas are decimal: write decimal points"
+                elif fewer:
+                    slip = f"; it has {len(words)} words: put semicolons between cells of which some are empty"
+                raise SceneError(f"{where}: expected {expected}{slip}")
             digits = list(takewhile(str.isdigit, separated[columns["X"] :]))
             if whole and not width and len(separated) > len(words) and len(digits) > len(numeric):
                 raise SceneError(f"{where}: its commas separate columns, or are decimal: write decimal points")
@@ -265,11 +278,15 @@ def words_of(line: str, where: str) -> list[str]:
 def cells_of(words: Sequence[str]) -> list[str]:
     """The cells of a line, empty ones between commas or semicolons too; none if commas are decimal."""
     line = " ".join(words)
-    if any(_DECIMAL_COMMA.fullmatch(piece) for piece in re.split(r"[\s;]+", line)):
+    if _has_decimal_commas(line):
         return []
     separator = next((sign for sign in ";," if sign in line), None)
     cells = [cell.strip() for cell in line.split(separator)] if separator else [*words]
     return cells if any(cells[-1:]) else cells[:-1]
+
+
+def _has_decimal_commas(line: str) -> bool:
+    return any(_DECIMAL_COMMA.fullmatch(piece) for piece in re.split(r"[\s;]+", line))
 
 
 def are_numbers(words: Sequence[str]) -> bool:

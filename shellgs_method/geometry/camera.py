@@ -91,6 +91,12 @@ def positions(cameras: Iterable[Camera]) -> Float64[np.ndarray, "V 3"]:
     return np.array([camera.position.detach().cpu().double().numpy() for camera in cameras]).reshape(-1, 3)
 
 
+def world_rays(camera: Camera) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "height width 3"]]:
+    """Centre of a camera, and :meth:`Camera.rays` in the world, in double precision; t along them is z-depth."""
+    camera = camera.to("cpu", torch.float64)
+    return camera.position.numpy(), camera.rays().numpy() @ camera.viewmat[:3, :3].numpy()
+
+
 def project(
     camera: Camera, points: Float64[np.ndarray, "N 3"]
 ) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, " N"]]:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Bool, Float, Float16, Int64, UInt8
 from kornia.filters import guided_blur
-from scipy.ndimage import binary_fill_holes, maximum_filter, minimum_filter
+from scipy.ndimage import binary_fill_holes, maximum_filter, minimum_filter, uniform_filter
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -62,6 +62,7 @@ _COLOUR, _GRADIENT = 0.12, 0.06  # truncation of colour and gradient differences
 _WEIGHTS = (1 / (6 * _COLOUR), 1 / (4 * _GRADIENT))  # of a colour and a gradient: each mean is truncated at a half
 _APART = 0.004  # relative difference of the depths of two surfaces, less than a third of a step of offsets
 _SEEN = 0.5  # views that must see the shell on one side, at least
+_PLAIN = 0.1  # standard deviation of brightness in a window, relative to its mean: .07 on plaster, .25 on panes
 _SUPPORT = 0.2  # weight of the other views' scores relative to the photographs
 
 
@@ -165,7 +166,7 @@ def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[
 
     The photographs must agree better there than on any surface that the shell may have at a pixel if it is off by its
     error: at its edges, that is the nearest or the farthest surface around the pixel. Neighbours in which something
-    stands before the shell do not count.
+    stands before the shell do not count; nor do plain parts of the photograph, which agree with others at any depth.
 
     Args:
         view: the view.
@@ -184,7 +185,14 @@ def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[
     on_shell = torch.stack([_smooth(pixels, each) for each in shells]).amin(dim=0)
     inside = torch.from_numpy(minimum_filter((view.depth > 0).numpy(), window, mode="nearest"))
     found = _best(view, OFFSETS_BEHIND, on_shell - _smooth(pixels, behind))
-    return found._replace(score=found.score.where(inside, -1.0))
+    return found._replace(score=found.score.where(inside & ~_plain(view), -1.0))
+
+
+def _plain(view: ShellView) -> Bool[Tensor, "h w"]:
+    """Pixels around which brightness hardly varies, relative to its mean."""
+    grey = view.image.float().mean(dim=-1).numpy()
+    mean, squares = (uniform_filter(each, _WINDOW, mode="nearest") for each in (grey, grey**2))
+    return torch.from_numpy(squares - mean**2 < (_PLAIN * mean) ** 2)
 
 
 def _nothing(view: ShellView) -> Sweep:

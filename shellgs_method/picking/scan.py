@@ -148,7 +148,7 @@ class CloudPart:
         means = VoxelMeans(middle, max(cloud.whole.voxel for cloud in clouds), MOST, 3)
         count, coloured = 0, set()
         with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as tints:  # the maps keep them
-            for k, piece in ((k, piece) for k, cloud in enumerate(clouds) for piece in cloud):
+            for k, piece in ((k, piece) for k, cloud in enumerate(clouds) for piece in cloud.coloured()):
                 finite = np.isfinite(piece.positions).all(axis=1)
                 positions = piece.positions[finite]
                 cells = np.floor((positions - middle) / (_CELL * size or 1.0)).clip(-(1 << 9), (1 << 9) - 1)

@@ -14,6 +14,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View, from_camera, to_camera, upright_size
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.registration.correspondences import residuals_in_words
 from shellgs_method.registration.picks import Pick, PickedPoint, PicksFile, Triangulation, align_picks, triangulated
 
 _LINE = np.geomspace(1e-2, 1e3, 200)
@@ -161,7 +162,8 @@ class Session:
         ``points`` has for each its pixels, reprojection errors and residuals, or the problem with it; ``predicted``
         the pixels of the active point in the photographs where it is not picked yet, those first that see it from
         directions farthest apart; ``lines`` where it may be, while it has one photograph only; ``fit`` the number of
-        points used and their residual in metres (root mean square), or ``problem`` why there is no fit.
+        points used, of how many, and their residual in metres (root mean square), also in words, or ``problem`` why
+        there is no fit.
         """
         found, problems = {}, {}
         for pick in self.state.picks:
@@ -172,8 +174,14 @@ class Session:
         matrix, fitted, fit = None, {}, {}
         try:
             matrix, fitted = self._fit([pick for pick in self.state.picks if pick.name in found])
-            used = [point.residual for point in fitted.values() if point.is_used]
-            fit = {"used": len(used), "of": len(found), "rms": float(np.sqrt(np.mean(np.square(used))))}
+            taken = [point for name, point in fitted.items() if name not in self.state.left_out]
+            used = [point.residual for point in taken if point.is_used]
+            fit = {
+                "used": len(used),
+                "of": sum(not point.held_out for point in taken),
+                "rms": float(np.sqrt(np.mean(np.square(used)))),
+                "words": residuals_in_words(taken, "picks"),
+            }
         except SceneError as error:
             fit = {"problem": str(error)}
         determined = {name for name, point in fitted.items() if np.isfinite(point.left_out_residual)}

@@ -20,7 +20,7 @@ from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, adjusted
-from shellgs_method.registration.correspondences import Correspondence, measured_again
+from shellgs_method.registration.correspondences import Correspondence, measured_again, residuals_in_words
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
@@ -124,7 +124,7 @@ def place_by_picks(
     place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
     matrix, picked = align_picks(picks, views, metres_per_shell_unit)
     alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"picks in {path.name}")
-    return Placement(alignment, [_residuals_in_words(picked, "picks")], picked)
+    return Placement(alignment, [residuals_in_words(picked, "picks")], picked)
 
 
 def place_by_positions(
@@ -145,18 +145,12 @@ def place_by_positions(
     place.check_positions(surveyed.shell, f"the camera positions of {path}")
     matrix, cameras, play = align_positions(surveyed, metres_per_shell_unit)
     alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"camera positions in {path.name}")
-    history = [_residuals_in_words(cameras, "camera positions")]
+    history = [residuals_in_words(cameras, "camera positions")]
     if surveyed.unknown:
         history.append(f"In {path.name} but not in the scene: {', '.join(surveyed.unknown)}.")
     if play > _MAX_PLAY:
         history.append(f"The rotation about the cameras' path is uncertain by about {play:.1f}°: use --refine.")
     return Placement(alignment, history, cameras)
-
-
-def _residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
-    used = [point.residual for point in points if point.is_used]
-    mean = np.sqrt(np.mean(np.square(used)))
-    return f"{len(used)} of {len(points)} {called} are used; their residual is {mean:.3f} m (root mean square)."
 
 
 def unbent(placement: Placement, mesh: ShellMesh, layout: SceneLayout) -> tuple[Placement, Adjustment | None]:

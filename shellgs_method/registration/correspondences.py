@@ -110,6 +110,17 @@ def measured_again(points: Sequence[Point], alignment: Alignment) -> list[Point]
     return worst_first(again)
 
 
+def residuals_in_words(points: Sequence[Correspondence], called: str) -> str:
+    """How many points are fitted, out of those that may be, and how well."""
+    used = [point.residual for point in points if point.is_used]
+    held_out = sum(point.held_out for point in points)
+    measured = f"; {held_out} more only check{'s' * (held_out == 1)} them" if held_out else ""
+    return (
+        f"{len(used)} of {len(points) - held_out} {called} are used; their residual is "
+        f"{np.sqrt(np.mean(np.square(used))):.3f} m (root mean square){measured}."
+    )
+
+
 def worst_first(points: Sequence[Point]) -> list[Point]:
     """Sort points by residual, largest first."""
     return sorted(points, key=lambda point: -point.residual)

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 from PIL import ExifTags, Image
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
+from shellgs_method.files.crs import conversion
 from shellgs_method.files.exif import exif_of
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import positions
@@ -51,7 +52,7 @@ class GeoTags:
         if not tagged:
             return None
         degrees = np.array([place for _, place in tagged], dtype=np.float64)
-        ground = np.stack(Transformer.from_crs(CRS.from_epsg(4326), crs, always_xy=True).transform(*degrees.T), axis=-1)
+        ground = conversion(CRS.from_epsg(4326), CRS.from_user_input(crs))(degrees)
         known = np.isfinite(ground).all(axis=1)
         if known.sum() < _LEAST:
             return None

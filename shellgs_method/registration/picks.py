@@ -140,7 +140,7 @@ class PicksFile:
         table = Table.read(path, "picks")
         picks = _picks_of(table, views, crs)
         named, aside, others = {pick.name for pick in picks}, dict[str, Pick](), []
-        for line in path.read_text(encoding="utf-8-sig").splitlines():
+        for line in table.others:
             after = line.lstrip("# \t").rstrip()
             try:
                 (pick,) = _picks_of(replace(table, lines=[(str(path), words_of(after, str(path)))]), views, crs)
@@ -149,15 +149,13 @@ class PicksFile:
                 if not crs or after == crs if is_system else line.startswith("#") and not table.is_header(after):
                     others.append(line)
                 continue
-            if not line.lstrip().startswith("#"):
-                continue
             earlier = aside.setdefault(pick.name, pick)
             if pick.name in named or not np.array_equal(earlier.shell, pick.shell):
                 others.append(line)
             else:
                 aside[pick.name] = replace(earlier, pixels={**earlier.pixels, **pick.pixels})
         aside = [pick for name, pick in aside.items() if name not in named]
-        return PicksFile(picks, aside, [line for line in others if line.strip()])
+        return PicksFile(picks, aside, others)
 
     def write(self, path: Path, views: Sequence[View]) -> None:
         """Write the file, whose coordinates :func:`read_picks` reads as they are, to the last bit."""

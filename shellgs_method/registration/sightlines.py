@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float64, Int64
 
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints
-from shellgs_method.geometry.camera import Camera, in_view
+from shellgs_method.geometry.camera import in_view, world_rays
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.spread import spread
 from shellgs_method.shell.surface import ShellSurface
@@ -57,7 +56,8 @@ class Sightlines:
             grid = view.camera.shrunk(_COLUMNS)
             scale = [grid.width / view.camera.width, grid.height / view.camera.height]
             column, row = np.minimum((pixels[some] * scale).astype(int), [grid.width - 1, grid.height - 1]).T
-            centre, rays = _rays(grid)
+            centre, rays = world_rays(grid)
+            rays = rays.reshape(-1, 3)
             parts.append(
                 (
                     np.broadcast_to(centre, (len(some), 3)),
@@ -97,9 +97,3 @@ class Sightlines:
         supported[self.cells[on]] = True
         precision, recall = on.mean(), (supported & seen).sum() / max(seen.sum(), 1)
         return float(2 * precision * recall / max(precision + recall, 1e-9))
-
-
-def _rays(camera: Camera) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "G 3"]]:
-    """Centre of a camera, and the direction of the ray through each of its pixels, row by row."""
-    camera = camera.to("cpu", torch.float64)
-    return camera.position.numpy(), camera.rays().reshape(-1, 3).numpy() @ camera.viewmat[:3, :3].numpy()

@@ -65,7 +65,8 @@ LIMITS = {
     "pull": Limit(
         0.03,
         0.25,
-        "a shift of 5 cm sideways turns the normals at the shell's edges by 5.6° on average; --refine removes it",
+        "the shell is beside the SfM points: --refine moves it onto them; leave it where picks with small residuals "
+        "placed it, which tell more than points on frames and sills that it lacks",
     ),
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import map_coordinates
 
-from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.camera import Camera, world_rays
 from shellgs_method.synthetic.building import BAY, STOREY
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.street import CAR, HOUSE, KERB
@@ -149,9 +149,9 @@ def developed(
 
 
 def rays(camera: Camera) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "height width 3"]]:
-    """Origin and directions, in the world, of the rays through pixel centres; t along them is z-depth."""
-    directions = camera.rays().numpy() @ camera.viewmat[:3, :3].numpy()
-    return camera.position.numpy().astype(np.float32), directions.astype(np.float32)
+    """:func:`~shellgs_method.geometry.camera.world_rays` in single precision, as rays are cast."""
+    origin, directions = world_rays(camera)
+    return origin.astype(np.float32), directions.astype(np.float32)
 
 
 Noise = Callable[[np.ndarray, np.ndarray, float], np.ndarray]

@@ -60,6 +60,7 @@ def test_points_before_and_behind_the_surface_are_measured_in_metres(run):
         ("Pt,Nord,Ost,Hoehe\nP1,2,1.5,3", {"P1": [1.5, 2, 3]}),
         ("POINT_Y,POINT_X,POINT_Z,id\n2,1.5,3,P1", {"P1": [1.5, 2, 3]}),
         ("name,x,y,z,lat,lon\nP1,1.5,2,3,48.1,11.5", {"P1": [1.5, 2, 3]}),
+        ("X Y Z code name\n1.5 2 3\n4 5 6 55 b", {"1": [1.5, 2, 3], "b": [4, 5, 6]}),
     ],
 )
 def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points):
@@ -72,13 +73,13 @@ def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points
     [
         ("P1,12,5,0,25,3,125", "line 1: its commas separate columns, or are decimal: write decimal points"),
         ("name,x,y,z\nP1,12,5,0,25,3,125", "line 2: expected name, x, y, z"),
-        ("p1;1,5;2,0;3,0", "line 1: expected a name and X Y Z"),
+        ("p1;1,5;2,0;3,0", "line 1: expected a name and X Y Z.* commas are decimal: write decimal points"),
         ("p1 1 2", "line 1: expected a name and X Y Z"),
-        ("P1 12,5 0,25 3,125", "line 1: .*with decimal points"),
-        ("P1\t12,5\t0,25\t3,125", "line 1: .*with decimal points"),
-        ("12,5 0,25 3,125", "line 1: .*with decimal points"),
-        ("12,5, 0,25, 3,125", "line 1: .*with decimal points"),
-        ("7;8;9;12,5", "line 1: .*with decimal points"),
+        ("P1 12,5 0,25 3,125", "line 1: .*commas are decimal: write decimal points"),
+        ("P1\t12,5\t0,25\t3,125", "line 1: .*commas are decimal: write decimal points"),
+        ("12,5 0,25 3,125", "line 1: .*commas are decimal: write decimal points"),
+        ("12,5, 0,25, 3,125", "line 1: .*commas are decimal: write decimal points"),
+        ("7;8;9;12,5", "line 1: .*commas are decimal: write decimal points"),
         ("P1,1.5,,3.5,2", "line 1: expected a name and X Y Z"),
         ("7,1.5,2.5,3.5\n8,1,2,", "line 2: expected a name and X Y Z"),
         ("1.5 2 3 a\n4 5 z b", "line 2: expected X Y Z and perhaps a name"),
@@ -90,7 +91,8 @@ def test_lists_of_points_are_read_as_surveyors_write_them(tmp_path, text, points
         ("p1 1 2 3\np1 4 5 6", "line 2: there is a point p1 already"),
         ("# nothing", "holds no points"),
         ("name lat lon height\np1 47.1 8.2 400", "in degrees"),
-        ("code X Y Z sd\n1.5 2 3 0.1", "line 2: expected code, X, Y, Z, sd"),
+        ("code X Y Z sd\n1.5 2 3 0.1", "line 2: expected code, X, Y, Z, sd.* 4 words: put semicolons between cells"),
+        ("X Y Z code name\n1.5 2 3 b", "line 2: expected X, Y, Z, code, name.* 4 words: put semicolons between cells"),
     ],
 )
 def test_lists_that_cannot_be_read_are_refused_with_the_line(tmp_path, text, why):
@@ -110,3 +112,15 @@ def test_headers_that_are_not_used_are_told(tmp_path, caplog, text, sentence):
     (tmp_path / "points.txt").write_text(text)
     assert read_surveyed(tmp_path / "points.txt", "EPSG:25832")["p1"].tolist() == [1, 2, 3]
     assert sentence in caplog.text
+
+
+def test_a_latitude_that_stands_first_is_named(tmp_path):
+    (tmp_path / "points.txt").write_text("EPSG:4326\np1 48.1 11.5 500\np2 48.1 11.6 500")
+    with pytest.raises(
+        SceneError, match=r"48\.1 11\.5 500 is outside the area of ETRS89 .*: write the longitude first"
+    ):
+        read_surveyed(tmp_path / "points.txt", "EPSG:25832")
+    (tmp_path / "points.txt").write_text("EPSG:4326\np1 11.5 48.1 500")
+    assert read_surveyed(tmp_path / "points.txt", "EPSG:25832")["p1"] == pytest.approx(
+        [686_000, 5_330_000, 500], abs=2000
+    )

@@ -166,6 +166,13 @@ def test_what_a_mirror_shows_is_found_behind_the_wall(error: float):
     np.testing.assert_allclose(np.median(found.offset.numpy()[pane & shown]), -0.4, rtol=0.1)
 
 
+def test_what_hardly_varies_shows_nothing_behind_the_shell():
+    """A plain wall, as its photographs agree with one another at any depth."""
+    views = [view for view, _ in street(CAMERAS, mirror=1 / 0.6)]
+    plain = replace(views[MIDDLE], image=(190 + 0.1 * (views[MIDDLE].image - 190.0)).byte())
+    assert (behind([*views[:MIDDLE], plain, *views[MIDDLE + 1 :]], 0.1).score == -1).all()
+
+
 def test_a_view_that_shows_no_shell_has_nothing_before_or_behind_it_in_a_scene_of_any_unit():
     views = [view for view, _ in street(CAMERAS)]
     away = replace(views[MIDDLE], depth=torch.zeros_like(views[MIDDLE].depth))
@@ -212,8 +219,8 @@ def test_a_plain_wall_between_posts_is_not_behind_the_shell_where_they_hide_it_f
     sweeps = [sweep(view, [other for other in views if other is not view]) for view in views]
     unaware, aware = ((behind(views, 0.1, known).score > REFLECTED).numpy() for known in (None, sweeps))
     wall = ~posts[MIDDLE]
-    assert unaware[wall].mean() > 0.5, "the posts hide nothing"
-    assert aware[wall].mean() < 0.15
+    assert unaware[wall].mean() > 0.2, "the posts hide nothing"
+    assert aware[wall].mean() < 0.05
 
 
 @pytest.mark.parametrize(("known", "metres"), [(None, 0.05), (0.02, 0.05), (0.08, 0.08), (0.5, 0.15)])

@@ -9,6 +9,8 @@ import pytest
 import trimesh
 from scenes import house, scan
 
+from shellgs_method.files.clouds import Cloud
+from shellgs_method.files.surfaces import read_surface
 from shellgs_method.picking import scan as module
 from shellgs_method.picking.scan import Blocks, Scan, thinned
 from shellgs_method.registration.frames import ShellPlace
@@ -238,22 +240,31 @@ def test_a_cloud_without_colours_is_grey_beside_one_with_them(tmp_path: Path, co
         np.testing.assert_array_equal(np.unique(colours[~first], axis=0), [[200, 100, 50, 255]])
 
 
-def test_colours_of_16_bits_of_an_e57_are_drawn(tmp_path: Path):
+@pytest.mark.parametrize(("white", "limits"), [(65535, False), (65535, True), (4095, True), (1023, True)])
+def test_colours_of_an_e57_are_drawn_by_their_limits(tmp_path: Path, white: int, limits: bool):
     libe57 = pytest.importorskip("pye57").libe57
     points = scan(500)
     columns = {f"cartesian{axis}": np.ascontiguousarray(points[:, k]) for k, axis in enumerate("XYZ")}
-    columns |= {f"color{band}": np.full(500, 257.0 * v) for band, v in (("Red", 200), ("Green", 100), ("Blue", 50))}
+    columns |= {
+        f"color{band}": np.full(500, float(round(v / 255 * white)))
+        for band, v in (("Red", 200), ("Green", 100), ("Blue", 50))
+    }
     file = libe57.ImageFile(str(tmp_path / "a.e57"), "w")
     part, fields, parts = libe57.StructureNode(file), libe57.StructureNode(file), libe57.VectorNode(file, True)
     file.root().set("data3D", parts)
     buffers = libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
         coloured = name.startswith("color")
-        node = libe57.IntegerNode(file, 0, 0, 65535) if coloured else libe57.FloatNode(file, 0.0, libe57.E57_DOUBLE)
+        node = libe57.IntegerNode(file, 0, 0, white) if coloured else libe57.FloatNode(file, 0.0, libe57.E57_DOUBLE)
         fields.set(name, node)
         buffers.append(libe57.SourceDestBuffer(file, name, column, 500, True, True))
     rows = libe57.CompressedVectorNode(file, fields, libe57.VectorNode(file, True))
     part.set("points", rows)
+    if limits:
+        part.set("colorLimits", libe57.StructureNode(file))
+        for band in ("Red", "Green", "Blue"):
+            for end, value in (("Minimum", 0), ("Maximum", white)):
+                part["colorLimits"].set(f"color{band}{end}", libe57.IntegerNode(file, value, 0, white))
     parts.append(part)
     writer = rows.writer(buffers)
     writer.write(500)
@@ -262,6 +273,9 @@ def test_colours_of_16_bits_of_an_e57_are_drawn(tmp_path: Path):
     cloud = opened(tmp_path / "a.e57").cloud
     assert cloud is not None
     np.testing.assert_array_equal(np.unique(cloud.colours, axis=0), [[200, 100, 50, 255]])
+    surface = read_surface(tmp_path / "a.e57")
+    assert isinstance(surface, Cloud)
+    assert next(iter(surface)).colours is None  # read where they are wanted only
 
 
 def test_a_mesh_is_drawn_in_the_colours_of_its_vertices(tmp_path: Path):

@@ -194,8 +194,17 @@ def test_a_point_left_out_is_measured_and_changes_nothing(session):
     session.move("p5", CORNERS[4] + np.array([0.1, 0, 0]))
     session.leave_out("p5")
     said = session.said()
-    assert said["fit"] == {"used": 4, "of": 5, "rms": pytest.approx(before, abs=1e-6)}
+    fit = said["fit"]
+    assert (fit["used"], fit["of"]) == (4, 4)
+    assert fit["rms"] == pytest.approx(before, abs=1e-6)
     assert said["points"][4]["residual"] == pytest.approx(0.1, abs=1e-4)
+
+
+def test_check_points_are_counted_apart(session):
+    picked(session, 6)
+    session.rename("p6", "check")
+    assert session.said()["fit"]["words"].startswith("5 of 5 picks are used; their residual is 0.0")
+    assert session.said()["fit"]["words"].endswith("; 1 more only checks them.")
 
 
 @pytest.mark.parametrize("by", ["triangulation", "alignment"])

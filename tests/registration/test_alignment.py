@@ -49,8 +49,9 @@ from shellgs_method.shell.raycast import ShellCaster
 from shellgs_method.shell.surface import ShellSurface
 from shellgs_method.synthetic.building import BAY, STOREY, Layout, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING, scene_camera
+from shellgs_method.synthetic.geometry import merge
 from shellgs_method.synthetic.path import walk
-from shellgs_method.synthetic.scene import write_scan
+from shellgs_method.synthetic.scene import FacadeConfig, write_scan, write_scene
 
 OPAQUE = Path(__file__).parents[2] / "docs/picture.jpg"
 """Any photograph: validation looks whether it is transparent."""
@@ -236,16 +237,21 @@ def test_a_proposal_is_right_for_any_up_axis(mesh, surface, views, points, surve
 
 def tagged(folder: Path, views: list[View], noise: float, seed: int = 0, bias: float = 0.0) -> list[View]:
     """The views with photographs that say where they were taken, metres off in UTM 32, by a bias along the facade."""
+    images = [folder / f"{Path(view.name).stem}.jpg" for view in views]
+    for image, exif in zip(images, geo_tags(views, noise, seed, bias), strict=True):
+        Image.new("RGB", (96, 64)).save(image, exif=exif)
+    return [replace(view, image=image) for view, image in zip(views, images, strict=True)]
+
+
+def geo_tags(views: list[View], noise: float, seed: int = 0, bias: float = 0.0) -> list[Image.Exif]:
+    """EXIF data that say where photographs were taken, as :func:`tagged` writes them."""
     places = transformed(np.stack([v.camera.position.double().numpy() for v in views]), np.linalg.inv(TRUTH))
     places[:, :2] += np.random.default_rng(seed).normal(0, noise, (len(views), 2))
     places += bias * AXES[:, 0]
-    images = []
-    for view, (lon, lat, _) in zip(views, degrees_of(places), strict=True):
-        exif = Image.Exif()
+    tags = [Image.Exif() for _ in views]
+    for exif, (lon, lat, _) in zip(tags, degrees_of(places), strict=True):
         exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: minutes(lat), 3: "E", 4: minutes(lon), 6: 77.0})
-        images.append(folder / f"{Path(view.name).stem}.jpg")
-        Image.new("RGB", (96, 64)).save(images[-1], exif=exif)
-    return [replace(view, image=image) for view, image in zip(views, images, strict=True)]
+    return tags
 
 
 def minutes(degrees: float) -> tuple[float, float, float]:
@@ -302,6 +308,25 @@ def test_geo_tags_tell_a_building_from_its_twin(tmp_path, mesh, views, points):
     assert np.abs(placement.alignment.apply(mesh.vertices) - transformed(mesh.vertices, TRUTH)).max() < 0.1
     assert re.search(r"10 photographs have geo-tags, in the median [23]\.\d m off it\.", placement.history[1])
     assert not any("Ambiguous" in sentence for sentence in placement.history)
+
+
+def test_the_command_proposes_where_photographs_say_that_they_were_taken(tmp_path, shellgs):
+    """Of two facades that are the same, whose scan is in UTM 32."""
+    scene, scan = tmp_path / "scene", tmp_path / "twins.ply"
+    write_scene(scene, FacadeConfig(96, 64, 10, points=1500, supersampling=1, bays=3, storeys=2))
+    (scene / ALIGNMENT).unlink()
+    one = shell(Layout(3, 2))
+    write_scan(scan, merge([one, replace(one, vertices=one.vertices + np.array([40.0, 0, 0]))]))
+    views = scene_views(scene)
+    for view, exif in zip(views, geo_tags(views, 3.0), strict=True):
+        Image.open(view.image).save(view.image, exif=exif)
+    told = shellgs("align", scene, scan, "--crs", "EPSG:25832")
+    assert re.search(r"10 photographs have geo-tags, in the median [1-6]\.\d m off it\.", told), told
+    assert "Ambiguous" not in told
+    proposed = Alignment.load(scene / PROPOSAL)
+    there = transformed(one.vertices, SHELL_FROM_BUILDING)
+    assert np.abs(proposed.apply(there) - transformed(there, TRUTH)).max() < 0.1
+    assert "is refused" in shellgs("align", scene, scan)  # without the scan's system both facades are as likely
 
 
 @pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
@@ -1042,8 +1067,14 @@ def test_a_shell_that_has_changed_is_used_once_it_is_validated_again(scene, shel
     with pytest.raises(SceneError, match=changed):
         _ = run_of(scene).shell
     assert re.search(changed, shellgs("cast", scene))
+    maps, view = CueMaps.open(scene, "shell"), scene_views(scene)[0]
+    first = r"facade\.ply has changed since: run `shellgs align .*` first, .*; run `shellgs cast"
+    with pytest.raises(SceneError, match=first):
+        maps.read(view.name, view.camera)
     assert "facade.ply has changed since it was aligned" in shellgs("align", scene)
     assert run_of(scene).shell is not None
+    with pytest.raises(SceneError, match=r"facade\.ply has changed since; run `shellgs cast"):
+        CueMaps.open(scene, "shell").read(view.name, view.camera)
     assert "views cast" in shellgs("cast", scene)
 
 

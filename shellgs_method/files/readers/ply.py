@@ -65,8 +65,12 @@ def read_ply(path: Path) -> Geometry:
     return Geometry(vertices, np.concatenate(faces), colours=colours)
 
 
-def ply_points(path: Path) -> Iterator[Points] | None:
+def ply_points(path: Path, coloured: bool = False) -> Iterator[Points] | None:
     """Read the points of a PLY piece by piece; None if it holds something else, or points with lists.
+
+    Args:
+        path: the file.
+        coloured: whether to read their colours.
 
     Raises:
         Exception: it is damaged; of any kind.
@@ -84,7 +88,8 @@ def ply_points(path: Path) -> Iterator[Points] | None:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     at = names.index("vertex")
-    used = [[columns.index(name) for name in names if {*names} <= {*columns}] for names in ("xyz", _NORMAL, _COLOUR)]
+    roles = "xyz", _NORMAL, _COLOUR if coloured else ()
+    used = [[columns.index(name) for name in names if {*names} <= {*columns}] for names in roles]
     colours = Colours()
     if header.order is None:
         numbers = [element.count * len(element.properties) for element in there]

@@ -1,8 +1,8 @@
 """Read LAS, LAZ and E57: a script that runs in its own process, which a damaged file may end.
 
 It writes pieces on standard output: a line of json with the numbers of points, scanners and colours, then the points
-and the positions of the scanners as doubles, and the points' colours, if they have any, as floats. The last line says
-how many points were left out and why, or what went wrong.
+and the positions of the scanners as doubles, and the points' colours, if they have any and a second word asks for them,
+as floats. The last line says how many points were left out and why, or what went wrong.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ NOISE = (7, 18)
 """Classes of LAS: low and high noise."""
 NO_POINTS, NO_COLOURS = np.empty((0, 3)), np.empty((0, 3))
 Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Points, scanner positions, and colours of the points, if they have any."""
+"""Points, scanner positions, and colours of the points, if they have any that are wanted."""
+BANDS = "colorRed", "colorGreen", "colorBlue"
 
 
-def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
+def read_las(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piece]:
     """Read the points that are neither withheld nor classified as noise."""
     import laspy
 
@@ -35,7 +36,7 @@ def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
             points = np.stack([np.array(piece[axis]) for axis in "xyz"], axis=1)
             kept = ~(withheld | noisy)
             colours = NO_COLOURS
-            if {"red", "green", "blue"} <= {*file.header.point_format.dimension_names}:
+            if coloured and {"red", "green", "blue"} <= {*file.header.point_format.dimension_names}:
                 colours = np.stack([np.array(piece[band])[kept] for band in ("red", "green", "blue")], axis=1)
             yield points[kept], NO_POINTS, colours
             read += len(points)
@@ -46,7 +47,7 @@ def read_las(path: str, left_out: Counter[str]) -> Iterator[Piece]:
         raise ValueError(f"it holds {read} of {claimed} points")
 
 
-def read_e57(path: str, left_out: Counter[str]) -> Iterator[Piece]:
+def read_e57(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piece]:
     """Read the valid points of all scans, each moved by its pose; a scan without one tells nothing of its scanner."""
     import pye57
     from pye57.utils import convert_spherical_to_cartesian
@@ -60,13 +61,14 @@ def read_e57(path: str, left_out: Counter[str]) -> Iterator[Piece]:
         kind = "cartesian" if "cartesianX" in header.point_fields else "spherical"
         axes = [kind + axis for axis in ("XYZ" if kind == "cartesian" else ("Range", "Azimuth", "Elevation"))]
         flag = kind + "InvalidState"
-        bands = [band for band in ("colorRed", "colorGreen", "colorBlue") if band in header.point_fields]
+        bands = BANDS if coloured and {*BANDS} <= {*header.point_fields} else ()
         fields = [*axes, *([flag] if flag in header.point_fields else [])]
         capacity = min(PIECE, max(1, header.point_count))
         columns, buffers = file.make_buffers(fields, capacity)
         for band in bands:  # pye57's own buffers hold 8 bits
             columns[band] = np.empty(capacity, np.float32)
             buffers.append(pye57.libe57.SourceDestBuffer(file.image_file, band, columns[band], capacity, True, True))
+        scale = _colour_scale(header) if bands else 1.0
         reader = header.points.reader(buffers)
         while count := reader.read():
             points = np.stack([columns[axis][:count] for axis in axes], axis=1)
@@ -78,8 +80,8 @@ def read_e57(path: str, left_out: Counter[str]) -> Iterator[Piece]:
             left_out["points, which are flagged as invalid"] += count - len(points)
             left_out["points at 0 0 0, which are misses of the scanner"] += int(missed.sum())
             colours = NO_COLOURS
-            if len(bands) == 3:
-                colours = np.stack([columns[band][:count][kept][~missed] for band in bands], axis=1)
+            if bands:
+                colours = np.stack([columns[band][:count][kept][~missed] for band in bands], axis=1) * scale
             yield points[~missed] @ rotation.T + translation, NO_POINTS, colours
         reader.close()  # only one may be open
 
@@ -92,12 +94,24 @@ def _pose(header) -> tuple[np.ndarray, np.ndarray]:
     return header.rotation_matrix if turned else np.eye(3), np.asarray(header.translation, np.float64)
 
 
-def _main(path: str) -> None:
+def _colour_scale(header) -> float:
+    """What brings a scan's colours of 10 or 12 bits, by its limits of them, to 255; 1 for the usual whites.
+
+    Of these, files claim others than what is there.
+    """
+    if "colorLimits" not in header.scan_fields:
+        return 1.0
+    white = float(header["colorLimits"]["colorRedMaximum"].value())
+    return 1.0 if white in (0, 1, 255, 65535) else 255 / white
+
+
+def _main(path: str, *coloured: str) -> None:
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # libraries may print
     left_out: Counter[str] = Counter()
+    read = read_e57 if path.lower().endswith(".e57") else read_las
     try:
-        for points, scanners, colours in (read_e57 if path.lower().endswith(".e57") else read_las)(path, left_out):
+        for points, scanners, colours in read(path, bool(coloured), left_out):
             counts = {"points": len(points), "scanners": len(scanners), "colours": len(colours)}
             output.write(json.dumps(counts).encode() + b"\n")
             for array, kind in ((points, "<f8"), (scanners, "<f8"), (colours, "<f4")):
@@ -113,4 +127,4 @@ def _main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1])
+    _main(*sys.argv[1:])

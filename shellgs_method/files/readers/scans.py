@@ -23,8 +23,8 @@ from shellgs_method.machine.extras import import_extra
 _SCRIPT = Path(__file__).with_name("scan_script.py")  # run as a file, to import none of the package's libraries
 
 
-def read_las(path: Path) -> Iterator[Points]:
-    """Read a LAS or LAZ file.
+def read_las(path: Path, coloured: bool = False) -> Iterator[Points]:
+    """Read a LAS or LAZ file, and the points' colours if wanted.
 
     Raises:
         SceneError: laspy or its backend is not installed.
@@ -34,23 +34,24 @@ def read_las(path: Path) -> Iterator[Points]:
     if path.suffix.lower() == ".laz":  # laspy would not say which of its backends to install
         import_extra("lazrs", "lazrs", "las", f"the shell {path}")
     check_las(path)
-    yield from _read(path)
+    yield from _read(path, coloured)
 
 
-def read_e57(path: Path) -> Iterator[Points]:
-    """Read an E57 file, in the frame of its scans' poses.
+def read_e57(path: Path, coloured: bool = False) -> Iterator[Points]:
+    """Read an E57 file, in the frame of its scans' poses, and the points' colours if wanted.
 
     Raises:
         SceneError: pye57 is not installed.
         ValueError: the file is damaged.
     """
     import_extra("pye57", "pye57", "e57", f"the shell {path}")
-    yield from _read(path)
+    yield from _read(path, coloured)
 
 
-def _read(path: Path) -> Iterator[Points]:
+def _read(path: Path, coloured: bool) -> Iterator[Points]:
     """Take the pieces that the script hands over, which reads on meanwhile."""
-    command, read, about, scaled = [sys.executable, _SCRIPT, path.absolute()], 0, {}, Colours()
+    command = [sys.executable, _SCRIPT, path.absolute(), *(["coloured"] if coloured else [])]
+    read, about, scaled = 0, {}, Colours()
     with tempfile.TemporaryFile() as messages:
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=messages, bufsize=1 << 20) as process:
             assert process.stdout is not None
@@ -61,7 +62,9 @@ def _read(path: Path) -> Iterator[Points]:
                     break
                 read += len(points)
                 yield Points(
-                    points, scanners=scanners, colours=scaled.of(colours) if len(colours) == len(points) else None
+                    points,
+                    scanners=scanners,
+                    colours=scaled.of(colours) if coloured and len(colours) == len(points) else None,
                 )
         messages.seek(0)
         said = messages.read()
