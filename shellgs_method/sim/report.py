@@ -14,7 +14,7 @@ from shellgs_method.files.html import captioned, encoded, img, table, write_page
 from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collision.collider import Collider, leaks
+from shellgs_method.sim.collision.collider import Collider, Leaks
 from shellgs_method.sim.collision.distances import Distances
 from shellgs_method.sim.collision.parts import joined
 from shellgs_method.sim.deviations import Deviations
@@ -38,6 +38,7 @@ class Chapter:
         made: reconstruction.
         shell: shell, wound outwards; None if there is none.
         collider: collision geometry.
+        leaks: camera rays that pass it.
         facts: sizes of the visual mesh and its files.
         deviations: deviations from the shell; None if there is none.
         distances: distances between the collision geometry and other surfaces.
@@ -48,6 +49,7 @@ class Chapter:
     made: Reconstruction
     shell: Triangles | None
     collider: Collider
+    leaks: Leaks
     facts: dict
     deviations: Deviations | None
     distances: Mapping[str, Mapping[str, Distances]]
@@ -87,12 +89,11 @@ def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
     front = Front.of(surface, chapter.made.eyes)
     with warnings_kept() as warnings:
         walked = walk(world, surface, front)
-    sources = [part.source for part in collider.parts]
     made = {
         "scene": chapter.made.scene,
         "parts": len(collider.parts),
-        "parts_of_surfaces": sources.count("surface"),
         "filled_m3": collider.filled,
+        "leaks": asdict(chapter.leaks),
         "walk": asdict(walked),
         "visual": chapter.facts,
         "distances": {
@@ -100,14 +101,11 @@ def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
         },
     }
     sentences = [
-        f"{building.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; "
-        f"merging them to keep the budget filled {collider.filled:.2g} m³ of air.",
+        f"{building.name}: {len(collider.parts)} convex parts, which fill {collider.filled:.2g} m³ of air in front of the "
+        f"surface; {chapter.leaks.share:.2%} of the camera rays to the building pass them by 10 cm.",
         str(walked),
         *(f"MuJoCo warns: {warning}" for warning in warnings),
     ]
-    if chapter.shell is not None:
-        made["leaks"] = leaks(surface, chapter.shell, chapter.made.eyes)
-        sentences.append(f"{made['leaks']:.2%} of the camera rays to the shell pass the collision geometry by 10 cm.")
     if chapter.truth is not None:
         made["lidar"] = lidar_errors(world, surface, front, chapter.truth)
         sentences += [f"Lidar of the {name} against the truth: {text(e)}" for name, e in made["lidar"].items()]
