@@ -44,19 +44,21 @@ def asset_mjcf(asset: Asset) -> ET.Element:
 
 
 def world_mjcf(assets: Sequence[Asset]) -> ET.Element:
-    """Ground, light, and the assets, attached; each one's names then begin with its name and a slash.
-
-    The ground gives way to what stands on it: of two geoms the one of higher priority decides about a contact.
-    """
+    """Ground, light, and the assets, attached; each one's names then begin with its name and a slash."""
     root = ET.Element("mujoco", model="site")
     add(root, "option", timestep=TIMESTEP, integrator="implicitfast")
     add(add(root, "visual"), "map", znear=0.002)  # in units of the model's extent, which is that of the street
-    ground = add(add(add(root, "default"), "default", **{"class": "ground"}), "geom")
-    ground.attrib.update(group="3", priority="-1", friction=f"{FRICTION} 0.005 0.0001", rgba="0.4 0.4 0.4 1")
-    files, world = add(root, "asset"), add(root, "worldbody")
+    default, files, world = (add(root, section) for section in ("default", "asset", "worldbody"))
     add(world, "light", name="sun", type="directional", dir="-0.3 0.3 -0.9", castshadow="false", specular="0 0 0")
-    add(world, "geom", name="ground", type="plane", size="0 0 1", **{"class": "ground"})
+    _ground(default, world)
     for asset in assets:
         add(files, "model", name=asset.name, file=f"{asset.name}/{asset.name}.xml")
         add(world, "attach", model=asset.name, prefix=f"{asset.name}/")
     return root
+
+
+def _ground(default: ET.Element, world: ET.Element) -> None:
+    """Level ground, which gives way: of two geoms the one of higher priority decides about their contact."""
+    look = {"group": 3, "priority": -1, "rgba": "0.4 0.4 0.4 1"}
+    add(add(default, "default", **{"class": "ground"}), "geom", **look)
+    add(world, "geom", name="ground", type="plane", size="0 0 1", **{"class": "ground"})

@@ -80,14 +80,18 @@ def world_sdf(assets: Sequence[Asset], frame: SimFrame) -> ET.Element:
     sun = add(world, "light", name="sun", type="directional")
     for name, value in {"diffuse": "0.5 0.5 0.5 1", "specular": "0 0 0 1", "direction": "-0.3 0.3 -0.9"}.items():
         add(sun, name, value)
-    ground = add(_static(world, "ground"), "collision", name="ground")
-    plane = add(add(ground, "geometry"), "plane")
-    add(plane, "normal", "0 0 1")
-    add(plane, "size", f"{EXTENT:g} {EXTENT:g}")
-    _rub(ground)
+    _ground(world)
     for asset in assets:
         add(add(world, "include"), "uri", f"model://{asset.name}")
     return root
+
+
+def _ground(world: ET.Element) -> None:
+    collision = add(_static(world, "ground"), "collision", name="ground")
+    plane = add(add(collision, "geometry"), "plane")
+    add(plane, "normal", "0 0 1")
+    add(plane, "size", f"{EXTENT:g} {EXTENT:g}")
+    _rub(collision)
 
 
 def _place(frame: SimFrame) -> tuple[float, float, float, float] | None:

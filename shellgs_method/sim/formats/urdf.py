@@ -23,13 +23,16 @@ def world_urdf(assets: Sequence[Asset]) -> ET.Element:
     """The ground and the assets; URDF has no reference to another file, so that their links are here again."""
     root = ET.Element("robot", name="site")
     add(root, "link", name="world")
-    ground = _fixed(root, "ground")
-    slab = add(ground, "collision", name="ground")
-    add(slab, "origin", xyz=f"0 0 {-THICK / 2}", rpy="0 0 0")
-    add(add(slab, "geometry"), "box", size=f"{EXTENT} {EXTENT} {THICK}")
+    _ground(root)
     for asset in assets:
         _building(root, asset)
     return root
+
+
+def _ground(root: ET.Element) -> None:
+    slab = add(_fixed(root, "ground"), "collision", name="ground")
+    add(slab, "origin", xyz=f"0 0 {-THICK / 2}", rpy="0 0 0")
+    add(add(slab, "geometry"), "box", size=f"{EXTENT} {EXTENT} {THICK}")
 
 
 def package(asset: Asset) -> ET.Element:

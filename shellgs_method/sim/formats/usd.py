@@ -87,17 +87,21 @@ def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool) -> None:
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0, 0, -1))
         scene.CreateGravityMagnitudeAttr(9.81)
         pxr.UsdLux.DomeLight.Define(stage, "/World/light").CreateIntensityAttr(1000)  # for robots: buildings are unlit
-        ground = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
-        ground.CreateAxisAttr("Z")
-        ground.CreateWidthAttr(EXTENT)
-        ground.CreateLengthAttr(EXTENT)
-        ground.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
-        ground.CreateExtentAttr([(-EXTENT / 2, -EXTENT / 2, 0), (EXTENT / 2, EXTENT / 2, 0)])
-        pxr.UsdPhysics.CollisionAPI.Apply(ground.GetPrim())
-        _rub(pxr, ground, _friction(pxr, stage, "/World/friction"))
+        _ground(pxr, stage)
         for asset in assets:
             prim = stage.DefinePrim(f"/World/{asset.name}")
             prim.GetReferences().AddReference(f"./{asset.name}/{asset.name}.usda")
+
+
+def _ground(pxr: SimpleNamespace, stage) -> None:
+    ground = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
+    ground.CreateAxisAttr("Z")
+    ground.CreateWidthAttr(EXTENT)
+    ground.CreateLengthAttr(EXTENT)
+    ground.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
+    ground.CreateExtentAttr([(-EXTENT / 2, -EXTENT / 2, 0), (EXTENT / 2, EXTENT / 2, 0)])
+    pxr.UsdPhysics.CollisionAPI.Apply(ground.GetPrim())
+    _rub(pxr, ground, _friction(pxr, stage, "/World/friction"))
 
 
 def compliance_errors(stage: Path | Any) -> list[str]:
