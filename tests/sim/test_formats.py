@@ -195,6 +195,8 @@ def test_the_urdf_is_valid(world, collider):
     assert whole.validate()
     assert len(alone.link_map["facade"].collisions) == len(collider.parts)
     assert {*whole.link_map} - {*alone.link_map} == {"ground"}
+    assert len(alone.scene.geometry) == 2  # the visual meshes of two classes, found by their package
+    assert len(whole.scene.geometry) == 3
 
 
 @pytest.mark.skipif(not shutil.which("check_urdf"), reason="needs liburdfdom-tools")
@@ -228,7 +230,7 @@ def test_gazebos_parser_takes_the_sdf(world, name):
 def test_gazebos_parser_keeps_all_of_the_urdf(world, collider):
     kept = ET.fromstring(sdformat("cmdPrint", world / "world.urdf"))
     assert len(kept.findall(".//collision")) == len(collider.parts) + 1
-    assert len(kept.findall(".//visual")) == 2
+    assert len(kept.findall(".//visual")) == 3  # two classes, and the ground
     assert {joint.findtext("parent") for joint in kept.iter("joint")} == {"world"}
 
 

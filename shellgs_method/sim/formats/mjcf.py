@@ -59,6 +59,5 @@ def world_mjcf(assets: Sequence[Asset]) -> ET.Element:
 
 def _ground(default: ET.Element, world: ET.Element) -> None:
     """Level ground, which gives way: of two geoms the one of higher priority decides about their contact."""
-    look = {"group": 3, "priority": -1, "rgba": "0.4 0.4 0.4 1"}
-    add(add(default, "default", **{"class": "ground"}), "geom", **look)
+    add(add(default, "default", **{"class": "ground"}), "geom", priority=-1, rgba="0.4 0.4 0.4 1")
     add(world, "geom", name="ground", type="plane", size="0 0 1", **{"class": "ground"})

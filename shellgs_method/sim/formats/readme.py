@@ -55,7 +55,7 @@ or in the scene of a robot, from any folder:
 ```
 
 (`<include>` of the file works too, if MuJoCo is given the scene by its absolute path.) Looks are in group 2, collision
-geometry in group 3.
+geometry in group 3, the ground in group 0.
 
 ## Isaac Sim
 
@@ -84,6 +84,8 @@ import pybullet
 pybullet.connect(pybullet.DIRECT)
 pybullet.loadURDF("world.urdf", useFixedBase=True)   # or {first}/{first}.urdf, on a ground of your own
 ```
+
+In ROS, a building's folder is a package of its name: copy it into a workspace's `src/`.
 """
 
 

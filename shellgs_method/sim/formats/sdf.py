@@ -87,11 +87,17 @@ def world_sdf(assets: Sequence[Asset], frame: SimFrame) -> ET.Element:
 
 
 def _ground(world: ET.Element) -> None:
-    collision = add(_static(world, "ground"), "collision", name="ground")
-    plane = add(add(collision, "geometry"), "plane")
-    add(plane, "normal", "0 0 1")
-    add(plane, "size", f"{EXTENT:g} {EXTENT:g}")
+    """Level ground; Gazebo's cameras and lidars see its visual."""
+    link = _static(world, "ground")
+    collision, visual = add(link, "collision", name="ground"), add(link, "visual", name="ground_visual")
+    for each in (collision, visual):
+        plane = add(add(each, "geometry"), "plane")
+        add(plane, "normal", "0 0 1")
+        add(plane, "size", f"{EXTENT:g} {EXTENT:g}")
     _rub(collision)
+    material = add(visual, "material")
+    for light in ("ambient", "diffuse"):
+        add(material, light, "0.4 0.4 0.4 1")
 
 
 def _place(frame: SimFrame) -> tuple[float, float, float, float] | None:

@@ -15,7 +15,7 @@ def asset_urdf(asset: Asset) -> ET.Element:
     """A robot of one link, which is fixed to a link named ``world``: with that, sdformat's parser makes it static."""
     root = ET.Element("robot", name=asset.name)
     add(root, "link", name="world")
-    _building(root, asset)
+    _building(root, asset, f"package://{asset.name}")
     return root
 
 
@@ -25,14 +25,16 @@ def world_urdf(assets: Sequence[Asset]) -> ET.Element:
     add(root, "link", name="world")
     _ground(root)
     for asset in assets:
-        _building(root, asset)
+        _building(root, asset, asset.name)
     return root
 
 
 def _ground(root: ET.Element) -> None:
-    slab = add(_fixed(root, "ground"), "collision", name="ground")
-    add(slab, "origin", xyz=f"0 0 {-THICK / 2}", rpy="0 0 0")
-    add(add(slab, "geometry"), "box", size=f"{EXTENT} {EXTENT} {THICK}")
+    link = _fixed(root, "ground")
+    for kind in ("visual", "collision"):
+        slab = add(link, kind, name="ground")
+        add(slab, "origin", xyz=f"0 0 {-THICK / 2}", rpy="0 0 0")
+        add(add(slab, "geometry"), "box", size=f"{EXTENT} {EXTENT} {THICK}")
 
 
 def package(asset: Asset) -> ET.Element:
@@ -56,13 +58,13 @@ install(FILES package.xml DESTINATION share/ament_index/resource_index/packages 
 """
 
 
-def _building(root: ET.Element, asset: Asset) -> None:
+def _building(root: ET.Element, asset: Asset, folder: str) -> None:
     link = _fixed(root, asset.name)
     for kind, meshes in (("visual", asset.looks), ("collision", asset.colliders)):
         for name, file, *_ in meshes:
             mesh = add(link, kind, name=name)
             add(mesh, "origin", xyz="0 0 0", rpy="0 0 0")
-            add(add(mesh, "geometry"), "mesh", filename=f"package://{asset.name}/{file}")
+            add(add(mesh, "geometry"), "mesh", filename=f"{folder}/{file}")
 
 
 def _fixed(root: ET.Element, name: str) -> ET.Element:
