@@ -55,7 +55,7 @@ def main(
         coacd: also decompose the shell with CoACD.
     """
     console, started = Console(width=150), time.perf_counter()
-    metrics, (chapter,) = simulate([config], out, SimSettings(), console.print, truths=[true_building])
+    metrics, (chapter,) = simulate([config], out, SimSettings(test=True), console.print, truths=[true_building])
     console.print(f"{time.perf_counter() - started:.0f} s")
     for sentence in metrics["summary"]:
         console.print(sentence, highlight=False)
@@ -76,7 +76,7 @@ def _fans(console: Console, out: Path, chapter: Chapter) -> None:
     assert chapter.truth is not None
     front, usual = Front.of(chapter.collider.surface, chapter.made.eyes), engine.BEAMS
     for name, engine.BEAMS in FANS.items():
-        for group, errors in lidar_errors(out / "facade.xml", chapter.collider.surface, front, chapter.truth).items():
+        for group, errors in lidar_errors(out / "world.xml", chapter.collider.surface, front, chapter.truth).items():
             console.print(f"{name}, {group}: {text(errors)}", highlight=False)
     engine.BEAMS = usual
 

@@ -18,8 +18,8 @@ GATE = 8.5, 1.0, 2.2
 def wall_with_bays(cell: float) -> Triangles:
     """A wall along x whose front is y = 0, seen from y < 0, as a grid of ``cell`` metres: no triangle is exact.
 
-    From left to right: a bay that is half a cylinder, a column, an arched niche, a column, an arched gate, a column, two
-    windows, a column, a bay that is half a sphere.
+    From left to right: a bay that is half a cylinder, a column, an arched niche, a column, an arched gate, a column,
+    two windows, a column, a bay that is half a sphere.
     """
     x, z = np.meshgrid(np.arange(0, LENGTH + cell / 2, cell), np.arange(0, HEIGHT + cell / 2, cell))
     y = np.zeros_like(x)

@@ -23,3 +23,5 @@ class SimSettings:
     """Maximum size of visual.glb; its texture is scaled down to fit."""
     ground: Optional[float] = None
     """Height of the ground in the shell's coordinates. If not set: the shell's lower edge."""
+    test: bool = False
+    """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""

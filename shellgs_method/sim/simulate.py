@@ -14,6 +14,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.machine.progress import tell
@@ -22,10 +23,10 @@ from shellgs_method.sim.collision.collider import GROUND, LEAKY, Collider, Leaks
 from shellgs_method.sim.collision.distances import both_ways
 from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.deviations import Deviations, find_deviations
+from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
-from shellgs_method.sim.formats.semantics import write_semantics
-from shellgs_method.sim.formats.usd import write_usd_layers, write_usd_world
-from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
+from shellgs_method.sim.formats.usd import write_usd_asset
+from shellgs_method.sim.formats.world import write_asset, write_world
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
@@ -65,25 +66,22 @@ def simulate(
     import_mujoco()  # fail before hours of work
     out.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
-    buildings, chapters, home = [], [], None
+    chapters, home = [], None
     for number, config in enumerate(configs):
         run = TrainedRun.load(config)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
         made.warn_if_unaligned(log)
         names.append(_name(made.scene, names) if len(configs) > 1 else "facade")
-        folder = names[-1] if len(configs) > 1 else ""
         truth = truths[number](np.linalg.inv(made.frame.to_scene)) if number < len(truths) else None
-        chapter = _building(made, out / folder, settings, log, truth)
-        chapters.append(chapter)
-        buildings.append(Building(names[-1], folder, len(chapter.collider.parts)))
+        chapters.append(_building(made, out / names[-1], settings, log, truth))
     assert home is not None
-    write_worlds(out, buildings)
-    write_usd_world(out / "facade.usda", buildings, home.metric, all(chapter.with_splats for chapter in chapters))
+    assets = [chapter.asset for chapter in chapters]
+    write_world(out, assets, home)
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
-    tell("Throwing, walking and drawing in MuJoCo")
-    metrics = write_report(out, buildings, chapters, log)
-    write_readme(out, buildings, home, metrics)
+    tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
+    metrics = write_report(out, chapters, settings.test, log)
+    write_readme(out, assets, home, metrics)
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
     return metrics, chapters
@@ -92,7 +90,7 @@ def simulate(
 def _building(
     made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None], truth: Triangles | None
 ) -> Chapter:
-    """Write the files of one building."""
+    """Write the files of one building, to a folder of its name."""
     folder.mkdir(parents=True, exist_ok=True)
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
@@ -116,11 +114,12 @@ def _building(
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
     tell("Baking the texture")
     textured = bake(fused, colours, made.photos, settings.texel)
-    facts = write_visual(folder, textured, settings.megabytes)
-    write_splats(folder / "splats.ply", made.splats)
     classes = made.classes_at(textured.vertices[textured.faces].mean(axis=1))
-    with_splats = write_usd_layers(folder, textured, classes, collider.parts, made.splats, made.frame.metric)
-    write_semantics(folder, classes)
+    facts = write_visual(folder, textured, classes, settings.megabytes)
+    write_splats(folder / "splats.ply", made.splats)
+    asset = Asset(folder.name, len(collider.parts), [SurfaceClass(each) for each in np.unique(classes)])
+    write_asset(folder, asset)
+    write_usd_asset(folder, asset.name, textured, classes, collider.parts, made.splats, made.frame.metric)
     deviations: Deviations | None = None
     if shell is not None:
         views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]
@@ -137,7 +136,7 @@ def _building(
         for name, other in surfaces.items()
         if other is not None
     }
-    return Chapter(made, shell, collider, leaking, facts, deviations, distances, truth, with_splats)
+    return Chapter(asset, made, shell, collider, leaking, facts, deviations, distances, truth)
 
 
 def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> None:

@@ -15,7 +15,6 @@ import torch
 import trimesh
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
-
 from walls import ARCH, GATE, eyes_before, wall_with_bays
 
 from shellgs_method.errors import SceneError

@@ -1,7 +1,7 @@
 """Cluster the triangles of a surface into few pieces whose convex hulls hold little air.
 
-Hierarchical clustering as of faces (Garland, Willmott and Heckbert, "Hierarchical face clustering on polygonal surfaces",
-I3D 2001), with another cost: the air that the hull of a piece adds in front of its triangles. On a plane that is the
+Hierarchical face clustering (Garland, Willmott and Heckbert, "Hierarchical face clustering on polygonal surfaces", I3D
+2001), with another cost: the air that the hull of a piece adds in front of its triangles. On a plane that is the
 convex decomposition of Hertel and Mehlhorn (1983), and around convex corners merging is free.
 """
 
@@ -21,8 +21,8 @@ from shellgs_method.geometry.triangles import Triangles
 WELDED = 1e-3
 """Vertices in the same cube of this size, in metres, are one."""
 DEEP = 0.25
-"""Depth of the air, in metres, that a hull is taken to fill where a piece has no triangles: in openings, say. Of a piece
-that is deeper itself, all is taken for air: its open sides may be in front of other pieces."""
+"""Depth of the air, in metres, that a hull is taken to fill where a piece has no triangles: in openings, say. Of a
+piece that is deeper itself, all is taken for air: its open sides may be in front of other pieces."""
 FREE = 1e-4
 """Cubic metres of air that a merge may add however many parts there may be."""
 ROUND = 0.3

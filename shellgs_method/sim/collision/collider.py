@@ -74,7 +74,7 @@ def make_collider(
         shell: shell, wound outwards; None if the scene has none.
         fused: reconstructed surface, wound outwards.
         standing: mask of its triangles in front of the shell, from :func:`standing_before`.
-        outside: mask of the shell's triangles that are seen from outside, from :func:`~shellgs_method.sim.collision.outside.from_outside`; None for all.
+        outside: mask of the shell's triangles that are seen from outside; None for all.
         density: maximum number of convex parts for 100 square metres of surface.
 
     Raises:

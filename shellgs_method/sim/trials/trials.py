@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.formats.mjcf import STIFF
 from shellgs_method.sim.front import Front
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
 
@@ -101,7 +102,10 @@ def throw(
         kind = mujoco.mjtGeom.mjGEOM_SPHERE if number % 2 else mujoco.mjtGeom.mjGEOM_BOX
         contype, conaffinity = PROJECTILES
         size = rng.uniform(0.05, 0.15, 3)
-        body.add_geom(type=kind, size=size, density=300, contype=contype, conaffinity=conaffinity, group=1)
+        body.add_geom(
+            type=kind, size=size, density=300, contype=contype, conaffinity=conaffinity, group=1,
+            solref=[STIFF, 1],  # for the ground, which leaves contacts to bodies; buildings have their own
+        )  # fmt: skip
     model = compiled(spec, path)
     data = mujoco.MjData(model)
     bodies = np.array([model.body(f"thrown_{number}").id for number in range(count)])
