@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError
 
+from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.triangles import Triangles
 
 WELDED = 1e-3
@@ -136,7 +137,7 @@ def _shared_edges(
 def _nearest(pieces: list[_Piece]) -> Int64[np.ndarray, "E 2"]:
     """Pairs of each piece and the nearest others, by the middles of their corners."""
     middles = np.stack([piece.points.mean(axis=0) for piece in pieces])
-    _, near = cKDTree(middles).query(middles, min(NEIGHBOURS + 1, len(pieces)))
+    _, near = point_tree(middles).query(middles, min(NEIGHBOURS + 1, len(pieces)))
     pairs = np.stack([np.repeat(np.arange(len(pieces)), near.shape[1]), near.ravel()], axis=1)
     return np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
 
@@ -177,7 +178,8 @@ def _merged(
         common.append({})
         for k in (one.keys() | other.keys()) - {a, b}:
             known = [near[k] for near in (one, other) if k in near]
-            common[k].pop(a, None), common[k].pop(b, None)
+            for gone in (a, b):
+                common[k].pop(gone, None)
             link(new, k, sum(length for length, _ in known), min(price for _, price in known))
     return list(pieces.values())
 

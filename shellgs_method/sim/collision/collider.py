@@ -24,9 +24,11 @@ THICKNESS = 0.3
 """Depth of parts behind a surface in metres, unless the building is known to be thinner."""
 THINNEST = 0.03
 """Minimum thickness in metres: fast bodies pass through thinner parts between two time steps."""
-SKIN = 0.005
+SKIN = 0.002
 """Distance in metres inside a surface from which rays look for its back."""
-COVERED = 0.01
+GRAZING = 0.05
+"""Cosine between a ray and a normal below which the ray passes along a surface, and not through it."""
+COVERED = 0.005
 """Parts that protrude from the others by no more than this, in metres, are left out."""
 GROUND = 0.1
 """Height in metres above the ground up to which the fused surface is the ground's."""
@@ -148,8 +150,8 @@ def depths(
         corners: corners of the triangles, a little inside.
         normal: their mean unit normal.
     """
-    t, _, normals = solid.cast(0.9 * corners + 0.1 * corners.mean(axis=1, keepdims=True), -normal)
-    return np.where(np.abs(normals @ normal) > 0.2, np.minimum(t, THICKNESS), THICKNESS)
+    t, _, normals = solid.cast(0.99 * corners + 0.01 * corners.mean(axis=1, keepdims=True), -normal)
+    return np.where(np.abs(normals @ normal) > GRAZING, np.minimum(t, THICKNESS), THICKNESS)
 
 
 def standing_before(

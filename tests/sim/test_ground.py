@@ -1,0 +1,78 @@
+"""The ground in front of a building."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from shellgs_method.sim.ground import CELL, Ground
+
+EYES = np.stack([np.linspace(-5, 5, 12), np.full(12, -4.0), np.full(12, 1.6)], axis=1)
+
+
+def street(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A street that falls by 3 % along x, with a pavement 12 cm above it and two stairs of 18 cm at the wall."""
+    kerb = np.where(y > -2, 0.12, 0.0) + np.where(y > -0.6, 0.18, 0.0) + np.where(y > -0.3, 0.18, 0.0)
+    return -0.03 * x + kerb
+
+
+def points_of_street(count: int = 60_000, noise: float = 0.01) -> np.ndarray:
+    """Points of it with noise, with a gap, and those of a wall, a flower box and a car's roof."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-8, 8, count), rng.uniform(-8, 0, count)
+    ground = np.stack([x, y, street(x, y) + rng.normal(0, noise, count)], axis=1)
+    ground = ground[np.hypot(x - 2, y + 6) > 1.0]
+    wall = np.stack([rng.uniform(-8, 8, 8000), rng.normal(0.05, 0.01, 8000), rng.uniform(0.4, 6, 8000)], axis=1)
+    flowers = np.stack([rng.uniform(3, 4, 2000), rng.uniform(-1.5, -1, 2000), rng.normal(0.7, 0.01, 2000)], axis=1)
+    under = (ground[:, 0] > 3) & (ground[:, 0] < 4) & (ground[:, 1] > -1.5) & (ground[:, 1] < -1)
+    car = np.stack([rng.uniform(-4, 0, 4000), rng.uniform(-7, -5.5, 4000), rng.normal(1.4, 0.02, 4000)], axis=1)
+    return np.concatenate([ground[~under], wall, flowers, car])
+
+
+@pytest.fixture(scope="module")
+def ground() -> Ground:
+    return Ground.of(points_of_street(), EYES)
+
+
+def test_the_ground_has_the_heights_kerbs_and_steps_of_a_street(ground):
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-7, 7, 71), np.linspace(-7.5, -0.1, 75)))
+    edge = np.min([np.abs(y + 2), np.abs(y + 0.6), np.abs(y + 0.3)], axis=0) < 1.5 * CELL
+    away = ~edge & (np.hypot(x - 2, y + 6) > 1) & (np.abs([x - 3.5, y + 1.25]).max(axis=0) > 0.6)
+    error = np.abs(ground.at(np.stack([x, y], axis=1)) - street(x, y))[away]
+    assert np.quantile(error, 0.95) < 0.02
+    assert error.max() < 0.05
+
+
+def test_what_stands_on_the_ground_is_not_ground(ground):
+    """A flower box 60 cm high: the ground goes on below it. A car's roof above the street: the same."""
+    assert ground.at(np.array([3.5, -1.25])) == pytest.approx(street(np.array(3.5), np.array(-1.25)), abs=0.05)
+    assert ground.at(np.array([-2.0, -6.2])) == pytest.approx(street(np.array(-2.0), np.array(-6.2)), abs=0.02)
+
+
+def test_the_ground_is_a_plane_where_nothing_is_known(ground):
+    rows, columns = np.indices(ground.heights.shape)
+    x, y = ground.origin[0] + ground.cell * columns, ground.origin[1] + ground.cell * rows
+    assert not ground.known[np.hypot(x - 2, y + 6) < 0.5].any()
+    far = (np.abs(x) > 16) | (y < -16)
+    assert not ground.known[far].any()
+    design = np.stack([x[far], y[far], np.ones(far.sum())], axis=1)
+    plane, *_ = np.linalg.lstsq(design, ground.heights[far], rcond=None)
+    assert np.abs(design @ plane - ground.heights[far]).max() < 0.01
+    assert plane[0] == pytest.approx(-0.03, abs=0.01)
+
+
+def test_without_points_the_ground_is_level_and_nothing_is_known():
+    for points in (np.empty((0, 3)), np.array([[0.0, 0, 9], [1, 0, 9], [0, 1, 9]])):
+        made = Ground.of(points, EYES)
+        assert made.is_level
+        assert not made.known.any()
+        assert made.at(np.array([[3.0, 4.0]])) == 0
+
+
+def test_the_surface_has_the_heights(ground):
+    places = np.random.default_rng(1).uniform(-7, -0.5, (500, 2))
+    origins = np.insert(places, 2, 5.0, axis=1)
+    met = 5 - ground.surface.cast(origins, np.array([0.0, 0, -1])).t
+    error = np.abs(met - ground.at(places))
+    assert np.quantile(error, 0.9) < 0.005  # at kerbs a cell's two triangles are not its bilinear patch
+    assert (ground.surface.normals[:, 2] > 0).all()
