@@ -14,7 +14,7 @@ from shellgs_method.files.html import captioned, encoded, img, table, write_page
 from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collision.collider import Collider, leaks
+from shellgs_method.sim.collision.collider import Collider, Leaks
 from shellgs_method.sim.collision.distances import Distances
 from shellgs_method.sim.collision.parts import joined
 from shellgs_method.sim.deviations import Deviations
@@ -39,6 +39,7 @@ class Chapter:
         made: reconstruction.
         shell: shell, wound outwards; None if there is none.
         collider: collision geometry.
+        leaks: camera rays that pass it.
         facts: sizes of the visual mesh and its files.
         deviations: deviations from the shell; None if there is none.
         distances: distances between the collision geometry and other surfaces.
@@ -49,6 +50,7 @@ class Chapter:
     made: Reconstruction
     shell: Triangles | None
     collider: Collider
+    leaks: Leaks
     facts: dict
     deviations: Deviations | None
     distances: Mapping[str, Mapping[str, Distances]]
@@ -90,24 +92,20 @@ def write_report(out: Path, chapters: Sequence[Chapter], test: bool, log: Callab
 def _metrics(world: Path, chapter: Chapter, test: bool) -> tuple[dict, list[str]]:
     """A building's metrics, and sentences that summarize them."""
     collider, surface = chapter.collider, chapter.collider.surface
-    sources = [part.source for part in collider.parts]
     made = {
         "scene": chapter.made.scene,
         "parts": len(collider.parts),
-        "parts_of_surfaces": sources.count("surface"),
         "filled_m3": collider.filled,
+        "leaks": asdict(chapter.leaks),
         "visual": chapter.facts,
         "distances": {
             name: {way: asdict(metrics) for way, metrics in ways.items()} for name, ways in chapter.distances.items()
         },
     }
     sentences = [
-        f"{chapter.asset.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; "
-        f"merging them to keep the budget filled {collider.filled:.2g} m³ of air."
+        f"{chapter.asset.name}: {len(collider.parts)} convex parts, which fill {collider.filled:.2g} m³ of air before "
+        f"the surface; {chapter.leaks.share:.2%} of the camera rays to the building pass them by 10 cm."
     ]
-    if chapter.shell is not None:
-        made["leaks"] = leaks(surface, chapter.shell, chapter.made.eyes)
-        sentences.append(f"{made['leaks']:.2%} of the camera rays to the shell pass the collision geometry by 10 cm.")
     front = Front.of(surface, chapter.made.eyes)
     if test:
         with warnings_kept() as warnings:

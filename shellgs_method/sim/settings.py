@@ -10,8 +10,8 @@ from typing import Optional
 class SimSettings:
     """Settings of a simulation folder."""
 
-    parts: int = 256
-    """Maximum number of convex collision parts of each building."""
+    parts: float = 200
+    """Maximum number of convex collision parts for 100 square metres of surface."""
     faces: int = 50_000
     """Number of triangles to decimate the reconstruction to."""
     voxel: Optional[float] = None

@@ -19,8 +19,9 @@ from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.machine.progress import tell
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collision.collider import GROUND, Collider, make_collider, standing_before
+from shellgs_method.sim.collision.collider import GROUND, LEAKY, Collider, Leaks, leaks, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
+from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.deviations import Deviations, find_deviations
 from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
@@ -94,19 +95,21 @@ def _building(
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
     fused, seen = outward(Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
-    shell, standing, beside = None, seen & (fused.centres[:, 2] > GROUND), np.zeros(len(seen), bool)
+    shell, outside, standing, beside = None, None, seen & (fused.centres[:, 2] > GROUND), np.zeros(len(seen), bool)
     if made.shell is not None:
-        shell, _ = outward(made.shell, eyes)
+        shell, outside = from_outside(made.shell, eyes)
         standing = standing_before(shell, fused, eyes, ahead)
         beside = (shell.signed_distance(fused.centres) > ahead) & ~standing
     tell("Making the collision geometry")
-    collider = make_collider(shell, fused, standing, settings.parts)
+    collider = make_collider(shell, fused, standing, outside, settings.parts)
     # The reconstruction continues beside the shell's outline and below its foot: leave that out from here on.
     mesh = made.fused
     mesh.update_faces(~beside)
     mesh.remove_unreferenced_vertices()
     fused, _ = outward(Triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
     _report_gaps(collider, made.scene, log)
+    leaking = leaks(collider.surface, shell or fused, eyes)
+    _report_leaks(leaking, made, log)
     write_parts(folder, collider.parts)
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
     tell("Baking the texture")
@@ -133,7 +136,7 @@ def _building(
         for name, other in surfaces.items()
         if other is not None
     }
-    return Chapter(asset, made, shell, collider, facts, deviations, distances, truth)
+    return Chapter(asset, made, shell, collider, leaking, facts, deviations, distances, truth)
 
 
 def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> None:
@@ -147,6 +150,16 @@ def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> 
         group[np.isin(group, near)] = near.min()
     if (count := len(np.unique(group))) > 1:
         log(f"The collision geometry of {scene} is in {count} pieces, more than {MAX_GAP:g} m apart.")
+
+
+def _report_leaks(found: Leaks, made: Reconstruction, log: Callable[[str], None]) -> None:
+    """Report a hole in the collision geometry."""
+    if found.share > LEAKY and found.place is not None:
+        x, y, z = found.place
+        log(
+            f"{found.share:.1%} of the camera rays to {made.scene} pass its collision geometry, most of them at "
+            f"{x:.1f} {y:.1f} {z:.1f} m, seen in {made.views[found.eye].name}: bodies may get through there."
+        )
 
 
 def _name(scene: str, taken: Sequence[str]) -> str:

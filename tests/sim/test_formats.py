@@ -403,7 +403,7 @@ def test_there_is_an_obj_for_each_class_of_surface(world, collider):
 
 def test_two_buildings_are_one_world(collider, tmp_path):
     away = Collider(
-        [part for part in (Part.hull(p.vertices + np.array([20, 0, 0]), p.source) for p in collider.parts) if part], 0
+        [part for part in (Part.hull(p.vertices + np.array([20, 0, 0])) for p in collider.parts) if part], 0
     )
     assets = [write_building(tmp_path, one, name) for one, name in ((collider, "left"), (away, "right"))]
     write_world(tmp_path, assets, frame_at())

@@ -238,7 +238,7 @@ def test_a_run_without_a_shell_reports_its_frame(config, monkeypatch):
     assert built.shell is None
     assert not built.frame.metric
     fused, seen = outward(Triangles(np.asarray(built.fused.vertices), np.asarray(built.fused.faces)), built.eyes)
-    assert len(make_collider(None, fused, seen, most=20).parts) <= 20
+    assert len(make_collider(None, fused, seen, density=5).parts) <= 20
 
 
 def test_a_missing_config_or_folder_is_refused(tmp_path):
@@ -250,7 +250,7 @@ def test_a_missing_config_or_folder_is_refused(tmp_path):
 def test_walls_far_apart_are_reported(collider):
     from shellgs_method.sim.simulate import _report_gaps
 
-    away = [part for part in (Part.hull(p.vertices + np.array([30, 0, 0]), p.source) for p in collider.parts) if part]
+    away = [part for part in (Part.hull(p.vertices + np.array([30, 0, 0])) for p in collider.parts) if part]
     said: list[str] = []
     _report_gaps(Collider(collider.parts, 0.0), "street", said.append)
     assert not said
