@@ -31,6 +31,10 @@ GAP = 0.3
 """Distance in metres from what is known up to which the ground between is taken for known."""
 FADE = 1.0
 """Distance in metres over which the ground passes into the plane where it is not known."""
+NEAR = 0.1
+"""Distance from the ground in metres up to which a triangle may be of it."""
+FLAT = 0.8
+"""Cosine between the vertical and the normal of a triangle above which it may be of the ground."""
 LOW = 0.25
 """Quantile of the heights of a cell's points that is the ground's: others are of what stands there."""
 
@@ -85,11 +89,20 @@ class Ground:
         known = _joined(measured, max(round(GAP / cell), 1))
         if not known.any():
             return cls.level()
-        gap, (row, column) = distance_transform_edt(~known, return_indices=True)
+        gap, (row, column) = distance_transform_edt(~known, return_indices=True)  # pyright: ignore
         smooth = median_filter(measured[row, column], size=3)
         away = gap * cell
         heights = level + smooth[row, column] * np.exp(-np.maximum(away - GAP, 0) / FADE)
         return cls(heights, cell, low, away <= GAP)
+
+    def __str__(self) -> str:
+        if not self.known.any():
+            return "The ground is a level plane: nothing is measured of it, or its height was given."
+        area = self.known.sum() * self.cell**2
+        return (
+            f"The ground is a height field, measured on {area:.0f} m² "
+            f"({np.ptp(self.heights[self.known]):.2f} m between its lowest and highest point); elsewhere it is a plane."
+        )
 
     @property
     def is_level(self) -> bool:
@@ -102,6 +115,11 @@ class Ground:
         inside = [np.clip(places[..., k], axis[0], axis[-1]) for k, axis in zip((1, 0), axes, strict=True)]
         return RegularGridInterpolator(axes, self.heights)(np.stack(inside, axis=-1))
 
+    def has(self, surface: Triangles) -> Bool[np.ndarray, " F"]:
+        """Which triangles of a surface are of the ground: level, and and less than 10 cm above or below it."""
+        off = surface.vertices[:, 2] - self.at(surface.vertices)
+        return (np.abs(off[surface.faces]).max(axis=1) < NEAR) & (np.abs(surface.normals[:, 2]) > FLAT)
+
     @property
     def surface(self) -> Triangles:
         """Two triangles for each cell, wound upwards."""
@@ -113,6 +131,9 @@ class Ground:
         a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
         faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
         return Triangles(vertices.reshape(-1, 3), faces)
+
+
+LEVEL = Ground.level()
 
 
 def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:

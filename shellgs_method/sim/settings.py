@@ -22,6 +22,6 @@ class SimSettings:
     megabytes: float = 30.0
     """Maximum size of visual.glb; its texture is scaled down to fit."""
     ground: Optional[float] = None
-    """Height of the ground in the shell's coordinates. If not set: the shell's lower edge."""
+    """Height of level ground in the shell's coordinates. If not set: the ground as scan and photographs show it."""
     test: bool = False
     """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""

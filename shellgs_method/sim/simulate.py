@@ -27,6 +27,7 @@ from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.usd import write_usd_asset
 from shellgs_method.sim.formats.world import write_asset, write_world
+from shellgs_method.sim.ground import LEVEL, Ground
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
@@ -77,7 +78,10 @@ def simulate(
         chapters.append(_building(made, out / names[-1], settings, log, truth))
     assert home is not None
     assets = [chapter.asset for chapter in chapters]
-    write_world(out, assets, home)
+    points, eyes = ([getattr(chapter.made, name) for chapter in chapters] for name in ("ground_points", "eyes"))
+    ground = Ground.of(np.concatenate(points), np.concatenate(eyes)) if settings.ground is None else LEVEL
+    log(str(ground))
+    write_world(out, assets, home, ground)
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
     metrics = write_report(out, chapters, settings.test, log)
@@ -95,10 +99,13 @@ def _building(
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
     fused, seen = outward(Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
-    shell, outside, standing, beside = None, None, seen & (fused.centres[:, 2] > GROUND), np.zeros(len(seen), bool)
+    ground = Ground.of(made.ground_points, eyes) if settings.ground is None else LEVEL
+    low = ground.at(fused.centres) + GROUND
+    shell, outside, standing, beside = None, None, seen & (fused.centres[:, 2] > low), np.zeros(len(seen), bool)
     if made.shell is not None:
         shell, outside = from_outside(made.shell, eyes)
-        standing = standing_before(shell, fused, eyes, ahead)
+        outside &= ~ground.has(shell)
+        standing = standing_before(shell, fused, eyes, ahead, ground)
         beside = (shell.signed_distance(fused.centres) > ahead) & ~standing
     tell("Making the collision geometry")
     collider = make_collider(shell, fused, standing, outside, settings.parts)

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
 import numpy as np
 import pytest
+from worlds import frame_at
 
-from shellgs_method.sim.ground import CELL, Ground
+from shellgs_method.files.usd import import_pxr
+from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.formats.ground import MESH
+from shellgs_method.sim.formats.usd import compliance_errors
+from shellgs_method.sim.formats.world import write_world
+from shellgs_method.sim.ground import CELL, LEVEL, Ground
+from shellgs_method.sim.trials.engine import lidar
 
 EYES = np.stack([np.linspace(-5, 5, 12), np.full(12, -4.0), np.full(12, 1.6)], axis=1)
 
@@ -76,3 +86,53 @@ def test_the_surface_has_the_heights(ground):
     error = np.abs(met - ground.at(places))
     assert np.quantile(error, 0.9) < 0.005  # at kerbs a cell's two triangles are not its bilinear patch
     assert (ground.surface.normals[:, 2] > 0).all()
+
+
+def test_triangles_of_the_ground_are_told_from_others(ground):
+    x, y = np.array([-5.0, -4, -5]), np.array([-5.0, -5, -4])
+    street_, sill = np.stack([x, y, street(x, y)], axis=1), np.stack([x, y, street(x, y) + 0.5], axis=1)
+    wall = np.array([[-5.0, -4, 0.12], [-4, -4, 0.12], [-5, -4, 1]])
+    corners = np.concatenate([street_, sill, wall])
+    np.testing.assert_array_equal(ground.has(Triangles(corners, np.arange(9).reshape(3, 3))), [True, False, False])
+    np.testing.assert_array_equal(LEVEL.has(Triangles(corners, np.arange(9).reshape(3, 3))), [False, False, False])
+
+
+@pytest.fixture(scope="module")
+def folder(ground, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("street")
+    write_world(out, [], frame_at(), ground)
+    return out
+
+
+PLACES = np.random.default_rng(2).uniform([-7, -7.5], [7, -0.4], (300, 2))
+
+
+def test_mujocos_height_field_is_the_ground(ground, folder):
+    down = lidar(folder / "world.xml", np.insert(PLACES, 2, 5.0, axis=1), np.array([[0.0, 0, -1]]), group=0)
+    error = np.abs(5 - down[:, 0] - ground.at(PLACES))
+    assert np.quantile(error, 0.9) < 0.005
+    assert error.max() < 0.1
+
+
+def test_the_mesh_of_the_other_formats_is_the_ground(ground, folder):
+    """And they refer to it: PyBullet's rays meet it."""
+    pybullet = pytest.importorskip("pybullet")
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.loadURDF(str(folder / "world.urdf"), useFixedBase=True, physicsClientId=client)
+    high, deep = (np.insert(PLACES, 2, z, axis=1).tolist() for z in (5.0, -5.0))
+    met = np.array([hit[3][2] for hit in pybullet.rayTestBatch(high, deep, physicsClientId=client)])
+    pybullet.disconnect(client)
+    error = np.abs(met - ground.at(PLACES))
+    assert np.median(error) < 0.01
+    assert np.quantile(error, 0.9) < 0.03
+    stage = import_pxr("sim").Usd.Stage.Open(str(folder / "world.usda"))
+    assert stage.GetPrimAtPath("/World/ground").GetTypeName() == "Mesh"
+    assert compliance_errors(stage) == []
+    assert ET.parse(folder / "world.sdf").getroot().findtext(".//collision[@name='ground']//uri") == MESH
+
+
+def test_files_of_a_ground_are_removed_with_it(ground, tmp_path):
+    write_world(tmp_path, [], frame_at(), ground)
+    write_world(tmp_path, [], frame_at())
+    assert not [*tmp_path.glob("ground.*")]
+    assert "hfield" not in (tmp_path / "world.xml").read_text()

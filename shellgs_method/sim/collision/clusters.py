@@ -137,7 +137,7 @@ def _shared_edges(
 def _nearest(pieces: list[_Piece]) -> Int64[np.ndarray, "E 2"]:
     """Pairs of each piece and the nearest others, by the middles of their corners."""
     middles = np.stack([piece.points.mean(axis=0) for piece in pieces])
-    _, near = point_tree(middles).query(middles, min(NEIGHBOURS + 1, len(pieces)))
+    near = np.asarray(point_tree(middles).query(middles, min(NEIGHBOURS + 1, len(pieces)))[1])
     pairs = np.stack([np.repeat(np.arange(len(pieces)), near.shape[1]), near.ravel()], axis=1)
     return np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
 

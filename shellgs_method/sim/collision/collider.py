@@ -15,6 +15,7 @@ from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.machine.open3d import import_open3d
 from shellgs_method.sim.collision.clusters import ROUND, clusters, connected, flattest
 from shellgs_method.sim.collision.parts import Part, joined
+from shellgs_method.sim.ground import LEVEL, Ground
 
 DENSITY = 200.0
 """Convex parts that there may be for 100 square metres of surface."""
@@ -96,7 +97,7 @@ def make_collider(
         raise SceneError(
             "there is nothing to collide with: neither shell nor reconstruction has a surface that cameras see"
         )
-    coarse = _decimated(surface, FINENESS * most)
+    coarse = decimated(surface, FINENESS * most)
     found, filled = clusters(coarse, most)
     if coarse is not surface:  # each triangle belongs to the cluster that is nearest
         cluster = np.full(len(coarse.faces), -1)
@@ -113,7 +114,7 @@ def _together(one: Triangles, other: Triangles) -> Triangles:
     return Triangles(vertices, np.concatenate([one.faces, other.faces + len(one.vertices)]))
 
 
-def _decimated(surface: Triangles, faces: int) -> Triangles:
+def decimated(surface: Triangles, faces: int) -> Triangles:
     """About ``faces`` triangles by quadric error (Garland and Heckbert 1997); the surface itself if it has no more."""
     if len(surface.faces) <= faces:
         return surface
@@ -155,7 +156,12 @@ def depths(
 
 
 def standing_before(
-    shell: Triangles, fused: Triangles, eyes: Float64[np.ndarray, "E 3"], least: float, count: int = 24
+    shell: Triangles,
+    fused: Triangles,
+    eyes: Float64[np.ndarray, "E 3"],
+    least: float,
+    ground: Ground = LEVEL,
+    count: int = 24,
 ) -> Bool[np.ndarray, " F"]:
     """Mask of a surface's triangles that are visible, above the ground and over ``least`` metres in front of the shell.
 
@@ -167,9 +173,11 @@ def standing_before(
         fused: reconstructed surface, wound outwards.
         eyes: camera positions.
         least: distance in metres up to which a reconstruction is noisy.
+        ground: the ground.
         count: number of cameras to test.
     """
-    near = np.flatnonzero((shell.signed_distance(fused.centres) > least) & (fused.centres[:, 2] > GROUND))
+    above = fused.centres[:, 2] > ground.at(fused.centres) + GROUND
+    near = np.flatnonzero((shell.signed_distance(fused.centres) > least) & above)
     places = fused.centres[near]
     seeing, backed = np.zeros(len(near)), np.zeros(len(near))
     for eye in eyes[spread(len(eyes), count)]:

@@ -10,8 +10,10 @@ from pyproj import CRS, Geod, Transformer
 
 from shellgs_method.errors import notice
 from shellgs_method.sim.formats.asset import EXTENT, FRICTION, Asset, add
+from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.formats.mjcf import TIMESTEP
 from shellgs_method.sim.frame import SimFrame
+from shellgs_method.sim.ground import Ground
 
 VERSION = "1.9"
 """Version of the format: what all Gazebo since Fortress reads."""
@@ -56,7 +58,7 @@ def manifest(asset: Asset) -> ET.Element:
     return root
 
 
-def world_sdf(assets: Sequence[Asset], frame: SimFrame) -> ET.Element:
+def world_sdf(assets: Sequence[Asset], frame: SimFrame, ground: Ground) -> ET.Element:
     """Physics, systems, light, ground, the place on Earth where it is known, and the assets."""
     root = ET.Element("sdf", version=VERSION)
     world = add(root, "world", name="site")
@@ -80,17 +82,20 @@ def world_sdf(assets: Sequence[Asset], frame: SimFrame) -> ET.Element:
     sun = add(world, "light", name="sun", type="directional")
     for name, value in {"diffuse": "0.5 0.5 0.5 1", "specular": "0 0 0 1", "direction": "-0.3 0.3 -0.9"}.items():
         add(sun, name, value)
-    _ground(world)
+    _ground(world, ground)
     for asset in assets:
         add(add(world, "include"), "uri", f"model://{asset.name}")
     return root
 
 
-def _ground(world: ET.Element) -> None:
-    """Level ground; Gazebo's cameras and lidars see its visual."""
+def _ground(world: ET.Element, ground: Ground) -> None:
+    """The ground; Gazebo's cameras and lidars see its visual."""
     link = _static(world, "ground")
     collision, visual = add(link, "collision", name="ground"), add(link, "visual", name="ground_visual")
     for each in (collision, visual):
+        if not ground.is_level:
+            _mesh(each, MESH)
+            continue
         plane = add(add(each, "geometry"), "plane")
         add(plane, "normal", "0 0 1")
         add(plane, "size", f"{EXTENT:g} {EXTENT:g}")

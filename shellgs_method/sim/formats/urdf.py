@@ -6,6 +6,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 
 from shellgs_method.sim.formats.asset import EXTENT, FRICTION, Asset, add
+from shellgs_method.sim.formats.ground import MESH
+from shellgs_method.sim.ground import Ground
 
 THICK = 1.0
 """Depth of the ground in metres: URDF has no plane."""
@@ -19,20 +21,25 @@ def asset_urdf(asset: Asset) -> ET.Element:
     return root
 
 
-def world_urdf(assets: Sequence[Asset]) -> ET.Element:
+def world_urdf(assets: Sequence[Asset], ground: Ground) -> ET.Element:
     """The ground and the assets; URDF has no reference to another file, so that their links are here again."""
     root = ET.Element("robot", name="site")
     add(root, "link", name="world")
-    _ground(root)
+    _ground(root, ground)
     for asset in assets:
         _building(root, asset, asset.name)
     return root
 
 
-def _ground(root: ET.Element) -> None:
+def _ground(root: ET.Element, ground: Ground) -> None:
+    """A slab, or a mesh; PyBullet takes its hull unless told that it is concave, and others pass over the attribute."""
     link = _fixed(root, "ground")
     for kind in ("visual", "collision"):
         slab = add(link, kind, name="ground")
+        if not ground.is_level:
+            slab.set("concave", "yes")
+            add(add(slab, "geometry"), "mesh", filename=MESH)
+            continue
         add(slab, "origin", xyz=f"0 0 {-THICK / 2}", rpy="0 0 0")
         add(add(slab, "geometry"), "box", size=f"{EXTENT} {EXTENT} {THICK}")
 

@@ -14,6 +14,7 @@ from jaxtyping import UInt8
 from shellgs_method.export.splats import Splats
 from shellgs_method.files.usd import add_mesh, import_pxr, make_collider, new_stage
 from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.asset import EXTENT, FRICTION, Asset
 from shellgs_method.sim.look.texture import TexturedMesh
@@ -77,8 +78,8 @@ def write_usd_asset(
         looks.SetVariantSelection("mesh")
 
 
-def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool) -> None:
-    """Write the stage that has gravity, level ground and a light, and refers to the assets."""
+def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool, ground: Triangles | None) -> None:
+    """Write the stage that has gravity, ground (level if there is no mesh) and light, and refers to the assets."""
     pxr = import_pxr("sim")
     with new_stage(pxr, path, "z", metric) as stage:
         world = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
@@ -87,20 +88,24 @@ def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool) -> None:
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0, 0, -1))
         scene.CreateGravityMagnitudeAttr(9.81)
         pxr.UsdLux.DomeLight.Define(stage, "/World/light").CreateIntensityAttr(1000)  # for robots: buildings are unlit
-        _ground(pxr, stage)
+        _ground(pxr, stage, ground)
         for asset in assets:
             prim = stage.DefinePrim(f"/World/{asset.name}")
             prim.GetReferences().AddReference(f"./{asset.name}/{asset.name}.usda")
 
 
-def _ground(pxr: SimpleNamespace, stage) -> None:
-    ground = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
-    ground.CreateAxisAttr("Z")
-    ground.CreateWidthAttr(EXTENT)
-    ground.CreateLengthAttr(EXTENT)
+def _ground(pxr: SimpleNamespace, stage, mesh: Triangles | None) -> None:
+    if mesh is None:
+        ground = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
+        ground.CreateAxisAttr("Z")
+        ground.CreateWidthAttr(EXTENT)
+        ground.CreateLengthAttr(EXTENT)
+        ground.CreateExtentAttr([(-EXTENT / 2, -EXTENT / 2, 0), (EXTENT / 2, EXTENT / 2, 0)])
+        pxr.UsdPhysics.CollisionAPI.Apply(ground.GetPrim())
+    else:
+        ground = add_mesh(pxr, stage, "/World/ground", mesh.vertices, mesh.faces)
+        make_collider(pxr, ground, "none")
     ground.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
-    ground.CreateExtentAttr([(-EXTENT / 2, -EXTENT / 2, 0), (EXTENT / 2, EXTENT / 2, 0)])
-    pxr.UsdPhysics.CollisionAPI.Apply(ground.GetPrim())
     _rub(pxr, ground, _friction(pxr, stage, "/World/friction"))
 
 

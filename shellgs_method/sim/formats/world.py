@@ -8,8 +8,10 @@ from pathlib import Path
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.sim.formats import mjcf, sdf, urdf
 from shellgs_method.sim.formats.asset import Asset, write_xml
+from shellgs_method.sim.formats.ground import write_ground
 from shellgs_method.sim.formats.usd import write_usd_world
 from shellgs_method.sim.frame import SimFrame
+from shellgs_method.sim.ground import LEVEL, Ground
 
 
 def write_asset(folder: Path, asset: Asset) -> None:
@@ -23,9 +25,10 @@ def write_asset(folder: Path, asset: Asset) -> None:
         file.write(urdf.cmake(asset).encode())
 
 
-def write_world(out: Path, assets: Sequence[Asset], frame: SimFrame) -> None:
-    """Write ``world.xml`` (MJCF), ``.urdf``, ``.sdf`` and ``.usda``: level ground at z = 0, light, physics, assets."""
-    write_xml(out / "world.xml", mjcf.world_mjcf(assets))
-    write_xml(out / "world.urdf", urdf.world_urdf(assets))
-    write_xml(out / "world.sdf", sdf.world_sdf(assets, frame))
-    write_usd_world(out / "world.usda", assets, frame.metric)
+def write_world(out: Path, assets: Sequence[Asset], frame: SimFrame, ground: Ground = LEVEL) -> None:
+    """Write ``world.xml`` (MJCF), ``.urdf``, ``.sdf`` and ``.usda``: ground, light, physics, assets."""
+    mesh = write_ground(out, ground)
+    write_xml(out / "world.xml", mjcf.world_mjcf(assets, ground))
+    write_xml(out / "world.urdf", urdf.world_urdf(assets, ground))
+    write_xml(out / "world.sdf", sdf.world_sdf(assets, frame, ground))
+    write_usd_world(out / "world.usda", assets, frame.metric, mesh)
