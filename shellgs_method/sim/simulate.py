@@ -27,6 +27,7 @@ from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.usd import write_usd_asset
 from shellgs_method.sim.formats.world import write_asset, write_world
+from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
@@ -77,10 +78,11 @@ def simulate(
         chapters.append(_building(made, out / names[-1], settings, log, truth))
     assert home is not None
     assets = [chapter.asset for chapter in chapters]
+    ground = Ground.level()
     write_world(out, assets, home)
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
-    metrics = write_report(out, chapters, settings.test, log)
+    metrics = write_report(out, chapters, ground, settings.test, log)
     write_readme(out, assets, home, metrics)
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
