@@ -20,6 +20,7 @@ from shellgs_method.sim.collision.parts import joined
 from shellgs_method.sim.deviations import Deviations
 from shellgs_method.sim.formats.asset import Asset
 from shellgs_method.sim.front import Front, places_before
+from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import overlaid, rendered, shown
 from shellgs_method.sim.trials.engine import beams, lidar, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
@@ -57,12 +58,15 @@ class Chapter:
     truth: Triangles | None
 
 
-def write_report(out: Path, chapters: Sequence[Chapter], test: bool, log: Callable[[str], None]) -> dict:
+def write_report(
+    out: Path, chapters: Sequence[Chapter], ground: Ground, test: bool, log: Callable[[str], None]
+) -> dict:
     """Render the world in MuJoCo, write ``report.html``, and return the metrics.
 
     Args:
         out: folder of the world.
         chapters: what the report covers of each building.
+        ground: the world's ground.
         test: also throw bodies at the world, and walk along each building.
         log: called with each message for the user.
 
@@ -75,12 +79,12 @@ def write_report(out: Path, chapters: Sequence[Chapter], test: bool, log: Callab
         everything = Triangles(*joined([part for chapter in chapters for part in chapter.collider.parts]))
         eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
         with warnings_kept() as warnings:
-            thrown = throw(world, everything, eyes)
+            thrown = throw(world, everything, ground, eyes)
         summary += [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
         metrics |= {"throws": asdict(thrown), "warnings": warnings}
     sections: list[str] = []
     for chapter in chapters:
-        made, sentences = _metrics(world, chapter, test)
+        made, sentences = _metrics(world, chapter, ground, test)
         metrics["buildings"][chapter.asset.name] = made
         summary += sentences
         sections += _section(world, chapter, log)
@@ -89,7 +93,7 @@ def write_report(out: Path, chapters: Sequence[Chapter], test: bool, log: Callab
     return metrics
 
 
-def _metrics(world: Path, chapter: Chapter, test: bool) -> tuple[dict, list[str]]:
+def _metrics(world: Path, chapter: Chapter, ground: Ground, test: bool) -> tuple[dict, list[str]]:
     """A building's metrics, and sentences that summarize them."""
     collider, surface = chapter.collider, chapter.collider.surface
     made = {
@@ -109,7 +113,7 @@ def _metrics(world: Path, chapter: Chapter, test: bool) -> tuple[dict, list[str]
     front = Front.of(surface, chapter.made.eyes)
     if test:
         with warnings_kept() as warnings:
-            walked = walk(world, surface, front)
+            walked = walk(world, surface, ground, front)
         made["walk"] = asdict(walked)
         sentences += [str(walked), *(f"MuJoCo warns: {warning}" for warning in warnings)]
     if chapter.truth is not None:
@@ -121,10 +125,11 @@ def _metrics(world: Path, chapter: Chapter, test: bool) -> tuple[dict, list[str]
 def lidar_errors(world: Path, collider: Triangles, front: Front, truth: Triangles) -> dict[str, dict]:
     """Errors of a lidar in MuJoCo at 20 places in front of a building, over the rays that hit the true building."""
     places, rays = places_before(collider, front), beams()
+    high = places + np.array([0, 0, 9])
+    places[:, 2] += high[:, 2] - lidar(world, high, np.array([[0.0, 0, -1]]), 0)[:, 0]  # the ground's height there
     origins = np.repeat(places, len(rays), axis=0)
     true = truth.cast(origins, np.tile(rays, (len(places), 1))).t
-    with np.errstate(divide="ignore"):
-        ground = np.where(rays[:, 2] < 0, np.repeat(places[:, 2:], len(rays), axis=1) / -rays[:, 2], np.inf).ravel()
+    ground = lidar(world, places, rays, 0).ravel()
     meets = true < ground
     found = {}
     for name, group in (("collider", 3), ("visual mesh", 2)):

@@ -84,7 +84,7 @@ def simulate(
     write_world(out, assets, home, ground)
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
-    metrics = write_report(out, chapters, settings.test, log)
+    metrics = write_report(out, chapters, ground, settings.test, log)
     write_readme(out, assets, home, metrics)
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())

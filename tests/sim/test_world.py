@@ -29,6 +29,7 @@ from shellgs_method.sim.collision.collider import Collider, make_collider
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.front import Front
+from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import rendered
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import simulate
@@ -56,7 +57,7 @@ def test_warnings_of_a_simulation_are_still_kept_after_compiling_a_model(tmp_pat
 
 def test_no_thrown_body_gets_through_sticks_or_gains_energy(world, collider, eyes):
     with warnings_kept() as warnings:
-        thrown = throw(world / "world.xml", collider.surface, eyes, count=60, seconds=2.5)
+        thrown = throw(world / "world.xml", collider.surface, Ground.level(), eyes, count=60, seconds=2.5)
     assert not warnings
     assert thrown.hits > 50
     assert (thrown.through, thrown.stuck, thrown.gained) == (0, 0, 0)
@@ -67,7 +68,7 @@ def test_throwing_finds_a_hole_in_the_wall(collider, eyes, tmp_path):
     """Parts are missing from the model, but not from the surface that must not be crossed."""
     holed = [part for part in collider.parts if np.ptp(part.vertices, axis=0).max() < 2]
     write_folder(tmp_path, Collider(holed, 0.0))
-    assert throw(tmp_path / "world.xml", collider.surface, eyes, count=30, seconds=1).through > 3
+    assert throw(tmp_path / "world.xml", collider.surface, Ground.level(), eyes, count=30, seconds=1).through > 3
 
 
 def test_the_facades_front_is_its_wall(collider, eyes):
@@ -78,7 +79,7 @@ def test_the_facades_front_is_its_wall(collider, eyes):
 
 def test_a_capsule_walks_along_the_facade_and_touches_it(world, collider, eyes):
     front = Front.of(collider.surface, eyes)
-    walked = walk(world / "world.xml", collider.surface, front)
+    walked = walk(world / "world.xml", collider.surface, Ground.level(), front)
     assert walked.metres > 0.8 * front.length
     assert walked.touching > 0.02
     assert walked.deepest < 0.03

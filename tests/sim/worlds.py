@@ -54,7 +54,7 @@ def write_building(out: Path, collider: Collider, name: str = "facade", metric: 
     folder.mkdir(parents=True)
     write_parts(folder, collider.parts)
     write_visual(folder, look, classes_of(look), 30)
-    asset = Asset(name, len(collider.parts), (SurfaceClass.WALL, SurfaceClass.DOOR))
+    asset = Asset(name, len(collider.parts), [SurfaceClass(each) for each in np.unique(classes_of(look))])
     write_asset(folder, asset)
     write_usd_asset(folder, name, look, classes_of(look), collider.parts, some_splats(), metric)
     return asset

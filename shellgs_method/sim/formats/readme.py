@@ -11,7 +11,7 @@ from shellgs_method.sim.frame import SimFrame
 
 _TEXT = """# {title}
 
-{frame} z points up, and the ground is the plane z = 0. `frame.json` has the matrices to the
+{frame} z points up, from the foot of the facade. `frame.json` has the matrices to the
 scene's cameras (`to_scene`) and to national coordinates (`to_national`), whose shift is `offset`.
 
 | file | what it is |

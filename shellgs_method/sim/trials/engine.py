@@ -80,7 +80,7 @@ def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarr
         path: model file.
         places: positions of the lidar.
         rays: unit directions.
-        group: group of the geoms to hit, beside the ground: 3 for collision geometry, 2 for visual meshes.
+        group: group of the geoms to hit, beside the ground: 3 for collision geometry, 2 for visual meshes, 0 for none.
     """
     mujoco, model = import_mujoco(), load(path)
     data = mujoco.MjData(model)
