@@ -24,6 +24,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import Collider, leaks, make_collider
 from shellgs_method.sim.collision.distances import both_ways
+from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.deviations import EDGE, along_normals
 from shellgs_method.sim.front import Front
@@ -36,7 +37,7 @@ from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.scene import FacadeConfig
 
-BUDGETS = 256, 128, 64, 32, 16
+BUDGETS = 200, 20, 10, 5
 FANS = {"Ouster OS1, ±22.5°": (-22.5, 22.5), "Velodyne VLP-16, ±15°": (-15, 15), "Livox Mid-360, -7 to 52°": (-7, 52)}
 BEFORE = 0.03
 """Metres in front of the shell from which the true building deviates from it."""
@@ -54,7 +55,7 @@ def main(
         coacd: also decompose the shell with CoACD.
     """
     console, started = Console(width=150), time.perf_counter()
-    metrics, (chapter,) = simulate([config], out, SimSettings(), console.print, truths=[true_building])
+    metrics, (chapter,) = simulate([config], out, SimSettings(test=True), console.print, truths=[true_building])
     console.print(f"{time.perf_counter() - started:.0f} s")
     for sentence in metrics["summary"]:
         console.print(sentence, highlight=False)
@@ -75,7 +76,7 @@ def _fans(console: Console, out: Path, chapter: Chapter) -> None:
     assert chapter.truth is not None
     front, usual = Front.of(chapter.collider.surface, chapter.made.eyes), engine.BEAMS
     for name, engine.BEAMS in FANS.items():
-        for group, errors in lidar_errors(out / "facade.xml", chapter.collider.surface, front, chapter.truth).items():
+        for group, errors in lidar_errors(out / "world.xml", chapter.collider.surface, front, chapter.truth).items():
             console.print(f"{name}, {group}: {text(errors)}", highlight=False)
     engine.BEAMS = usual
 
@@ -85,7 +86,7 @@ def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
     shell, eyes = chapter.shell, chapter.made.eyes
     assert shell is not None
     table = Table("collision geometry", "parts", "s", "m³ of air", "to it, 95 % (cm)", "from it, 95 % (cm)", "leaks")
-    makers = {f"planes, --parts {most}": partial(_of_planes, shell, most) for most in BUDGETS}
+    makers = {f"clusters, --parts {density}": partial(_of_clusters, shell, eyes, density) for density in BUDGETS}
     if coacd:
         makers |= {f"CoACD, resolution {k}": partial(_of_coacd, shell, k) for k in (50, 100)}
     for name, make in makers.items():
@@ -94,13 +95,14 @@ def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
         seconds = time.perf_counter() - started
         ways = both_ways(made.surface, shell, shell, chapter.made.cameras, 0.05)
         errors = [f"{100 * ways[way].p95:.1f}" for way in ("to the collider", "from the collider")]
-        share = f"{leaks(made.surface, shell, eyes):.2%}"
+        share = f"{leaks(made.surface, shell, eyes).share:.2%}"
         table.add_row(name, str(len(made.parts)), f"{seconds:.1f}", f"{made.filled:.2f}", *errors, share)
     console.print(table)
 
 
-def _of_planes(shell: Triangles, most: int) -> Collider:
-    return make_collider(shell, shell, np.zeros(len(shell.faces), bool), most)
+def _of_clusters(shell: Triangles, eyes: np.ndarray, density: float) -> Collider:
+    shell, outside = from_outside(shell, eyes)
+    return make_collider(shell, shell, np.zeros(len(shell.faces), bool), outside, density)
 
 
 def _of_coacd(shell: Triangles, resolution: int) -> Collider:
@@ -109,7 +111,7 @@ def _of_coacd(shell: Triangles, resolution: int) -> Collider:
     coacd.set_log_level("error")
     mesh = coacd.Mesh(shell.vertices, shell.faces.astype(np.int32))
     hulls = coacd.run_coacd(mesh, threshold=0.05, max_convex_hull=256, preprocess_resolution=resolution)
-    parts = [Part.hull(np.asarray(vertices), "surface") for vertices, _ in hulls]
+    parts = [Part.hull(np.asarray(vertices)) for vertices, _ in hulls]
     return Collider([part for part in parts if part is not None], float("nan"))
 
 

@@ -25,7 +25,8 @@ def import_pxr(extra: Literal["usd", "sim"], what: str = "USD") -> SimpleNamespa
     Raises:
         SceneError: usd-core is not installed, or too old.
     """
-    names = "Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdSemantics", "UsdShade", "UsdValidation", "UsdVol", "Vt"
+    schemas = "UsdGeom", "UsdLux", "UsdPhysics", "UsdSemantics", "UsdShade", "UsdVol"
+    names = "Gf", "Sdf", "Usd", "UsdValidation", "Vt", *schemas
     return SimpleNamespace(**{name: import_extra(f"pxr.{name}", "usd-core", extra, what) for name in names})
 
 

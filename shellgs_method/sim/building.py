@@ -19,6 +19,7 @@ from shellgs_method.export.splats import Splats
 from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.depth_normals import normals_from_depth
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
@@ -35,6 +36,12 @@ MARGIN = 0.5
 """Margin around the shell, in metres, within which the fused surface is kept."""
 HIDDEN_SIZE = 800
 """Longer side of the occlusion masks, in pixels."""
+LEVEL = 0.8
+"""Cosine between the vertical and a surface's normal above which it may be ground."""
+GROUND_STEP = 2
+"""Pixels between the points of a view that are taken for the ground."""
+PER_SQUARE_METRE, MOST_SAMPLES = 400.0, 500_000
+"""Number of points of the shell that are, for each square metre and in all."""
 MAX_SEPARATION = 5000.0
 """Largest distance between buildings of one world, in metres: coordinates in files are float32."""
 
@@ -55,6 +62,7 @@ class Reconstruction:
         views: training and held-out views.
         hidden: for each view, mask of reconstructed objects well in front of the shell: poles, trees, cars.
         held_out: names of the held-out views.
+        ground_points: points of the ground and of other things, in the simulation frame.
         log_gains: exposures of the views' photographs, of which a texture has the mean.
     """
 
@@ -69,6 +77,7 @@ class Reconstruction:
     views: list[View]
     hidden: list[Bool[np.ndarray, "h w"]]
     held_out: set[str]
+    ground_points: Float64[np.ndarray, "P 3"]
     log_gains: Float64[np.ndarray, "V 3"]
 
     @classmethod
@@ -89,7 +98,8 @@ class Reconstruction:
         """
         views = [view for dataset in run.datasets for view in dataset.views]
         hidden: list[np.ndarray] = []
-        surface = run.surface(MARGIN, voxel, _views_and_occlusions(run, hidden))
+        below: list[np.ndarray] = [run.sfm_points]
+        surface = run.surface(MARGIN, voxel, _views_and_occlusions(run, hidden, below))
         tell("Simplifying the surface")
         fused = decimate(surface, faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
@@ -110,6 +120,7 @@ class Reconstruction:
             views,
             hidden,
             {view.name for view in run.datasets[1].views},
+            transformed(np.concatenate([*below, *([] if run.shell is None else [_level_points(run)])]), motion),
             run.log_gains(),
         )
 
@@ -187,8 +198,11 @@ class _Photos(Sequence[Photo]):
         return self.made.photo(range(len(self))[index])  # an index beyond the end must raise, or iteration never ends
 
 
-def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray]) -> Iterator[DepthView]:
-    """Yield the run's views; append to ``hidden`` the mask of what is well in front of the shell in each."""
+def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray], below: list[np.ndarray]) -> Iterator[DepthView]:
+    """Yield the run's views; append to ``hidden`` the mask of what is well in front of the shell in each.
+
+    Append to ``below`` the points of its depth that are on level surfaces lower than the camera.
+    """
     caster = ShellCaster(run.shell_in_frame, np.eye(4)) if run.shell else None
     for view in run.views():
         step = view.camera.thinning(HIDDEN_SIZE)
@@ -199,7 +213,29 @@ def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray]) -> Iterator
             nearer = shell.mask & (depth > 0) & (depth < shell.depth - MARGIN)
             occluded = binary_dilation(nearer, iterations=2)[::step, ::step]
         hidden.append(occluded)
+        below.append(_level_below(view, run.frame.up))
         yield view
+
+
+def _level_below(view: DepthView, up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "P 3"]:
+    """Points of a view's depth on level surfaces below its camera, one in ``GROUND_STEP`` x ``GROUND_STEP`` pixels."""
+    camera, depth = view.camera.to(torch.float64), view.depth.double()
+    to_world = np.linalg.inv(camera.viewmat.numpy())
+    every = slice(None, None, GROUND_STEP)
+    normals = normals_from_depth(depth, camera)[every, every].numpy() @ to_world[:3, :3].T
+    points = transformed((depth * camera.rays())[every, every].reshape(-1, 3).numpy(), to_world)
+    level = (normals @ up > LEVEL).ravel() & ((points - to_world[:3, 3]) @ up < 0)
+    return points[level]
+
+
+def _level_points(run: TrainedRun) -> Float64[np.ndarray, "P 3"]:
+    """Points of the shell's level surfaces."""
+    shell = Triangles(run.shell_in_frame.vertices, run.shell_in_frame.faces)
+    level = np.abs(shell.normals @ run.frame.up) > LEVEL
+    if not level.any():
+        return np.empty((0, 3))
+    flat = Triangles(shell.vertices, shell.faces[level])
+    return flat.samples(int(np.clip(PER_SQUARE_METRE * flat.areas.sum(), 1, MOST_SAMPLES)))[0]
 
 
 def moved_into(

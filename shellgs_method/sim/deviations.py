@@ -16,7 +16,7 @@ from shellgs_method.geometry.camera import Camera, in_view
 from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass, classes_of
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.shell.mesh import NO_SOURCES, sources_of
-from shellgs_method.sim.collision.collider import connected
+from shellgs_method.sim.collision.clusters import connected
 
 EDGE = 0.15
 """Longest edge in metres of the triangles into which the shell is subdivided."""

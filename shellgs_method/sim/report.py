@@ -14,12 +14,13 @@ from shellgs_method.files.html import captioned, encoded, img, table, write_page
 from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collision.collider import Collider, leaks
+from shellgs_method.sim.collision.collider import Collider, Leaks
 from shellgs_method.sim.collision.distances import Distances
 from shellgs_method.sim.collision.parts import joined
 from shellgs_method.sim.deviations import Deviations
-from shellgs_method.sim.formats.world import Building
+from shellgs_method.sim.formats.asset import Asset
 from shellgs_method.sim.front import Front, places_before
+from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import overlaid, rendered, shown
 from shellgs_method.sim.trials.engine import beams, lidar, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
@@ -35,79 +36,86 @@ class Chapter:
     """What the report covers of a building.
 
     Attributes:
+        asset: the building's names.
         made: reconstruction.
         shell: shell, wound outwards; None if there is none.
         collider: collision geometry.
+        leaks: camera rays that pass it.
         facts: sizes of the visual mesh and its files.
         deviations: deviations from the shell; None if there is none.
         distances: distances between the collision geometry and other surfaces.
         truth: true geometry, if known.
-        with_splats: whether the USD has the splats.
     """
 
+    asset: Asset
     made: Reconstruction
     shell: Triangles | None
     collider: Collider
+    leaks: Leaks
     facts: dict
     deviations: Deviations | None
     distances: Mapping[str, Mapping[str, Distances]]
     truth: Triangles | None
-    with_splats: bool
 
 
 def write_report(
-    out: Path, buildings: Sequence[Building], chapters: Sequence[Chapter], log: Callable[[str], None]
+    out: Path, chapters: Sequence[Chapter], ground: Ground, test: bool, log: Callable[[str], None]
 ) -> dict:
-    """Test and render the world in MuJoCo, write ``report.html``, and return the metrics.
+    """Render the world in MuJoCo, write ``report.html``, and return the metrics.
+
+    Args:
+        out: folder of the world.
+        chapters: what the report covers of each building.
+        ground: the world's ground.
+        test: also throw bodies at the world, and walk along each building.
+        log: called with each message for the user.
 
     Raises:
         SceneError: MuJoCo refuses the world.
     """
-    world = out / "facade.xml"
-    everything = Triangles(*joined([part for chapter in chapters for part in chapter.collider.parts]))
-    eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
-    with warnings_kept() as warnings:
-        thrown = throw(world, everything, eyes)
-    summary = [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
-    metrics = {"summary": summary, "throws": asdict(thrown), "warnings": warnings, "buildings": {}}
+    world, summary = out / "world.xml", []
+    metrics = {"summary": summary, "buildings": {}}
+    if test:
+        everything = Triangles(*joined([part for chapter in chapters for part in chapter.collider.parts]))
+        eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
+        with warnings_kept() as warnings:
+            thrown = throw(world, everything, ground, eyes)
+        summary += [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
+        metrics |= {"throws": asdict(thrown), "warnings": warnings}
     sections: list[str] = []
-    for building, chapter in zip(buildings, chapters, strict=True):
-        made, sentences = _metrics(world, building, chapter)
-        metrics["buildings"][building.name] = made
+    for chapter in chapters:
+        made, sentences = _metrics(world, chapter, ground, test)
+        metrics["buildings"][chapter.asset.name] = made
         summary += sentences
-        sections += _section(world, building, chapter, made, log)
+        sections += _section(world, chapter, log)
     title = f"Simulation of {', '.join(chapter.made.scene for chapter in chapters)}"
     write_page(out / "report.html", title, [*(f"<p>{escape(sentence)}</p>" for sentence in summary), *sections])
     return metrics
 
 
-def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, list[str]]:
+def _metrics(world: Path, chapter: Chapter, ground: Ground, test: bool) -> tuple[dict, list[str]]:
     """A building's metrics, and sentences that summarize them."""
     collider, surface = chapter.collider, chapter.collider.surface
-    front = Front.of(surface, chapter.made.eyes)
-    with warnings_kept() as warnings:
-        walked = walk(world, surface, front)
-    sources = [part.source for part in collider.parts]
     made = {
         "scene": chapter.made.scene,
         "parts": len(collider.parts),
-        "parts_of_surfaces": sources.count("surface"),
         "filled_m3": collider.filled,
-        "walk": asdict(walked),
+        "leaks": asdict(chapter.leaks),
         "visual": chapter.facts,
         "distances": {
             name: {way: asdict(metrics) for way, metrics in ways.items()} for name, ways in chapter.distances.items()
         },
     }
     sentences = [
-        f"{building.name}: {len(collider.parts)} convex parts, {sources.count('plane')} of them behind planes; "
-        f"merging them to keep the budget filled {collider.filled:.2g} m³ of air.",
-        str(walked),
-        *(f"MuJoCo warns: {warning}" for warning in warnings),
+        f"{chapter.asset.name}: {len(collider.parts)} convex parts, which fill {collider.filled:.2g} m³ of air before "
+        f"the surface; {chapter.leaks.share:.2%} of the camera rays to the building pass them by 10 cm."
     ]
-    if chapter.shell is not None:
-        made["leaks"] = leaks(surface, chapter.shell, chapter.made.eyes)
-        sentences.append(f"{made['leaks']:.2%} of the camera rays to the shell pass the collision geometry by 10 cm.")
+    front = Front.of(surface, chapter.made.eyes)
+    if test:
+        with warnings_kept() as warnings:
+            walked = walk(world, surface, ground, front)
+        made["walk"] = asdict(walked)
+        sentences += [str(walked), *(f"MuJoCo warns: {warning}" for warning in warnings)]
     if chapter.truth is not None:
         made["lidar"] = lidar_errors(world, surface, front, chapter.truth)
         sentences += [f"Lidar of the {name} against the truth: {text(e)}" for name, e in made["lidar"].items()]
@@ -117,10 +125,11 @@ def _metrics(world: Path, building: Building, chapter: Chapter) -> tuple[dict, l
 def lidar_errors(world: Path, collider: Triangles, front: Front, truth: Triangles) -> dict[str, dict]:
     """Errors of a lidar in MuJoCo at 20 places in front of a building, over the rays that hit the true building."""
     places, rays = places_before(collider, front), beams()
+    high = places + np.array([0, 0, 9])
+    places[:, 2] += high[:, 2] - lidar(world, high, np.array([[0.0, 0, -1]]), 0)[:, 0]  # the ground's height there
     origins = np.repeat(places, len(rays), axis=0)
     true = truth.cast(origins, np.tile(rays, (len(places), 1))).t
-    with np.errstate(divide="ignore"):
-        ground = np.where(rays[:, 2] < 0, np.repeat(places[:, 2:], len(rays), axis=1) / -rays[:, 2], np.inf).ravel()
+    ground = lidar(world, places, rays, 0).ravel()
     meets = true < ground
     found = {}
     for name, group in (("collider", 3), ("visual mesh", 2)):
@@ -147,10 +156,8 @@ def text(errors: Mapping[str, float]) -> str:
     )
 
 
-def _section(
-    world: Path, building: Building, chapter: Chapter, metrics: dict, log: Callable[[str], None]
-) -> Iterator[str]:
-    yield f"<h2>{escape(building.name)}</h2>"
+def _section(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:
+    yield f"<h2>{escape(chapter.asset.name)}</h2>"
     width, height = chapter.facts["texture"]
     yield f"<p>{chapter.facts['triangles']} triangles with a texture of {width} x {height} pixels; "
     yield f"visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB.</p>"

@@ -10,8 +10,8 @@ from typing import Optional
 class SimSettings:
     """Settings of a simulation folder."""
 
-    parts: int = 256
-    """Maximum number of convex collision parts of each building."""
+    parts: float = 200
+    """Maximum number of convex collision parts for 100 square metres of surface."""
     faces: int = 50_000
     """Number of triangles to decimate the reconstruction to."""
     voxel: Optional[float] = None
@@ -22,4 +22,6 @@ class SimSettings:
     megabytes: float = 30.0
     """Maximum size of visual.glb; its texture is scaled down to fit."""
     ground: Optional[float] = None
-    """Height of the ground in the shell's coordinates. If not set: the shell's lower edge."""
+    """Height of level ground in the shell's coordinates. If not set: the ground as scan and photographs show it."""
+    test: bool = False
+    """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""

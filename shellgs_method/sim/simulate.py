@@ -14,17 +14,20 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.machine.progress import tell
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collision.collider import GROUND, Collider, make_collider, standing_before
+from shellgs_method.sim.collision.collider import GROUND, LEAKY, Collider, Leaks, leaks, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
+from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.deviations import Deviations, find_deviations
+from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
-from shellgs_method.sim.formats.semantics import write_semantics
-from shellgs_method.sim.formats.usd import write_usd_layers, write_usd_world
-from shellgs_method.sim.formats.world import Building, write_parts, write_worlds
+from shellgs_method.sim.formats.usd import write_usd_asset
+from shellgs_method.sim.formats.world import write_asset, write_world
+from shellgs_method.sim.ground import LEVEL, Ground
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
@@ -64,25 +67,25 @@ def simulate(
     import_mujoco()  # fail before hours of work
     out.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
-    buildings, chapters, home = [], [], None
+    chapters, home = [], None
     for number, config in enumerate(configs):
         run = TrainedRun.load(config)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
         made.warn_if_unaligned(log)
         names.append(_name(made.scene, names) if len(configs) > 1 else "facade")
-        folder = names[-1] if len(configs) > 1 else ""
         truth = truths[number](np.linalg.inv(made.frame.to_scene)) if number < len(truths) else None
-        chapter = _building(made, out / folder, settings, log, truth)
-        chapters.append(chapter)
-        buildings.append(Building(names[-1], folder, len(chapter.collider.parts)))
+        chapters.append(_building(made, out / names[-1], settings, log, truth))
     assert home is not None
-    write_worlds(out, buildings)
-    write_usd_world(out / "facade.usda", buildings, home.metric, all(chapter.with_splats for chapter in chapters))
+    assets = [chapter.asset for chapter in chapters]
+    points, eyes = ([getattr(chapter.made, name) for chapter in chapters] for name in ("ground_points", "eyes"))
+    ground = Ground.of(np.concatenate(points), np.concatenate(eyes)) if settings.ground is None else LEVEL
+    log(str(ground))
+    write_world(out, assets, home, ground)
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
-    tell("Throwing, walking and drawing in MuJoCo")
-    metrics = write_report(out, buildings, chapters, log)
-    write_readme(out, buildings, home, metrics)
+    tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
+    metrics = write_report(out, chapters, ground, settings.test, log)
+    write_readme(out, assets, home, metrics)
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
     return metrics, chapters
@@ -91,33 +94,39 @@ def simulate(
 def _building(
     made: Reconstruction, folder: Path, settings: SimSettings, log: Callable[[str], None], truth: Triangles | None
 ) -> Chapter:
-    """Write the files of one building."""
+    """Write the files of one building, to a folder of its name."""
     folder.mkdir(parents=True, exist_ok=True)
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
     fused, seen = outward(Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
-    shell, standing, beside = None, seen & (fused.centres[:, 2] > GROUND), np.zeros(len(seen), bool)
+    ground = Ground.of(made.ground_points, eyes) if settings.ground is None else LEVEL
+    low = ground.at(fused.centres) + GROUND
+    shell, outside, standing, beside = None, None, seen & (fused.centres[:, 2] > low), np.zeros(len(seen), bool)
     if made.shell is not None:
-        shell, _ = outward(made.shell, eyes)
-        standing = standing_before(shell, fused, eyes, ahead)
+        shell, outside = from_outside(made.shell, eyes)
+        outside &= ~ground.has(shell)
+        standing = standing_before(shell, fused, eyes, ahead, ground)
         beside = (shell.signed_distance(fused.centres) > ahead) & ~standing
     tell("Making the collision geometry")
-    collider = make_collider(shell, fused, standing, settings.parts)
+    collider = make_collider(shell, fused, standing, outside, settings.parts)
     # The reconstruction continues beside the shell's outline and below its foot: leave that out from here on.
     mesh = made.fused
     mesh.update_faces(~beside)
     mesh.remove_unreferenced_vertices()
     fused, _ = outward(Triangles(np.asarray(mesh.vertices), np.asarray(mesh.faces)), eyes)
     _report_gaps(collider, made.scene, log)
+    leaking = leaks(collider.surface, shell or fused, eyes)
+    _report_leaks(leaking, made, log)
     write_parts(folder, collider.parts)
     colours = np.asarray(mesh.visual.vertex_colors[:, :3], np.float64)  # pyright: ignore
     tell("Baking the texture")
     textured = bake(fused, colours, made.photos, settings.texel)
-    facts = write_visual(folder, textured, settings.megabytes)
-    write_splats(folder / "splats.ply", made.splats)
     classes = made.classes_at(textured.vertices[textured.faces].mean(axis=1))
-    with_splats = write_usd_layers(folder, textured, classes, collider.parts, made.splats, made.frame.metric)
-    write_semantics(folder, classes)
+    facts = write_visual(folder, textured, classes, settings.megabytes)
+    write_splats(folder / "splats.ply", made.splats)
+    asset = Asset(folder.name, len(collider.parts), [SurfaceClass(each) for each in np.unique(classes)])
+    write_asset(folder, asset)
+    write_usd_asset(folder, asset.name, textured, classes, collider.parts, made.splats, made.frame.metric)
     deviations: Deviations | None = None
     if shell is not None:
         views = [(view.name, camera) for view, camera in zip(made.views, made.cameras, strict=True)]
@@ -134,7 +143,7 @@ def _building(
         for name, other in surfaces.items()
         if other is not None
     }
-    return Chapter(made, shell, collider, facts, deviations, distances, truth, with_splats)
+    return Chapter(asset, made, shell, collider, leaking, facts, deviations, distances, truth)
 
 
 def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> None:
@@ -148,6 +157,16 @@ def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> 
         group[np.isin(group, near)] = near.min()
     if (count := len(np.unique(group))) > 1:
         log(f"The collision geometry of {scene} is in {count} pieces, more than {MAX_GAP:g} m apart.")
+
+
+def _report_leaks(found: Leaks, made: Reconstruction, log: Callable[[str], None]) -> None:
+    """Report a hole in the collision geometry."""
+    if found.share > LEAKY and found.place is not None:
+        x, y, z = found.place
+        log(
+            f"{found.share:.1%} of the camera rays to {made.scene} pass its collision geometry, most of them at "
+            f"{x:.1f} {y:.1f} {z:.1f} m, seen in {made.views[found.eye].name}: bodies may get through there."
+        )
 
 
 def _name(scene: str, taken: Sequence[str]) -> str:

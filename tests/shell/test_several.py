@@ -19,7 +19,6 @@ from shellgs_method.geometry.camera import in_view
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellCaster, ShellMesh, load_shell
 from shellgs_method.sim.settings import SimSettings
-from shellgs_method.sim.trials.trials import throw
 
 
 def ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Path:
@@ -119,12 +118,11 @@ def split(scene: Path) -> list[Path]:
 
 def test_two_files_go_through_all_commands(scene: Path, tmp_path: Path, shellgs, monkeypatch, capsys):
     """Aligned by the matrix of the whole, they are cast like it, and a simulation knows them."""
-    from shellgs_method.sim import report, simulate
+    from shellgs_method.sim import simulate
 
     asked = []
     find = simulate.find_deviations
     monkeypatch.setattr(simulate, "find_deviations", lambda *args, **of: asked.append(of) or find(*args, **of))
-    monkeypatch.setattr(report, "throw", lambda *args: throw(*args, count=2, seconds=0.2))
     true, files = Alignment.load(scene / ALIGNMENT), split(scene)
     views = read_views(FacadeDataParserConfig(data=scene))
     whole = ShellCaster(load_shell(scene / true.shells[0]), true.shell_to_scene)
@@ -150,6 +148,7 @@ def test_two_files_go_through_all_commands(scene: Path, tmp_path: Path, shellgs,
     done = [line.removesuffix(" ...") for line in capsys.readouterr().out.splitlines() if line.endswith(" ...")]
     assert done.index("Loading the run") < done.index("Baking the texture") < len(done) - 1
     assert (tmp_path / "sim" / "report.html").is_file()
+    assert "throws" not in json.loads((tmp_path / "sim" / "metrics.json").read_text())  # only with --test
     (of,) = asked
     assert list(of["files"]) == names
     np.testing.assert_array_equal(of["sources"], load_shell(*files).source)

@@ -15,6 +15,7 @@ import torch
 import trimesh
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
+from walls import ARCH, GATE, eyes_before, wall_with_bays
 
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.colours import GREY
@@ -26,11 +27,11 @@ from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.building import moved_into
-from shellgs_method.sim.collision.collider import Collider, leaks, make_collider, standing_before, thickness
-from shellgs_method.sim.collision.convex import convex_pieces, fewer_pieces
+from shellgs_method.sim.collision.clusters import clusters
+from shellgs_method.sim.collision.collider import Collider, depths, leaks, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
+from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.collision.planes import find_planes
 from shellgs_method.sim.deviations import find_deviations
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo, bake
@@ -80,54 +81,117 @@ def collider(facade, nothing) -> Collider:
     return make_collider(facade, nothing, np.array([False]))
 
 
-def test_planes_cover_exactly_a_building_without_noise(facade):
-    planes, rest = find_planes(facade.vertices, facade.faces)
-    assert len(rest) == 0
-    points, face = facade.samples(2000)
-    for plane in planes:
-        np.testing.assert_allclose(plane.axes @ plane.axes.T, np.eye(3), atol=1e-9)
-        of_plane = (points[np.isin(face, plane.faces)] - plane.origin) @ plane.axes.T
-        assert np.abs(of_plane[:, 2]).max(initial=0) < 1e-6
-        assert shapely.contains_xy(plane.outline.buffer(1e-6), of_plane[:, :2]).all()
-        assert plane.outline.area <= facade.areas[plane.faces].sum() + 1e-6
+def test_the_air_in_a_niche_is_its_volume():
+    """Two faces of a square groove of 30 x 30 cm, 2 m long: the hull fills half of the square. None around the edge."""
+    corners = np.array([[0.3, 0, 0], [0.3, 2, 0], [0, 0, 0], [0, 2, 0], [0, 0, 0.3], [0, 2, 0.3]])
+    faces = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    groove, edge = Triangles(corners, faces), Triangles(corners, faces[:, ::-1])
+    assert clusters(groove, 1)[1] == pytest.approx(0.09, rel=1e-6)
+    assert len(clusters(groove, 4)[0]) == 2
+    assert clusters(edge, 4)[1] == pytest.approx(0.0, abs=1e-9)
+    assert len(clusters(edge, 4)[0]) == 1
 
 
-def test_planes_are_found_in_noise():
-    """A corner of two walls with 5 mm of noise: two planes, at the right angle."""
-    rng = np.random.default_rng(0)
-    one = trimesh.creation.box(bounds=[[0, 0, 0], [4, 1e-9, 3]]).subdivide_to_size(0.3)
-    other = trimesh.creation.box(bounds=[[0, 0, 0], [1e-9, 4, 3]]).subdivide_to_size(0.3)
-    walls = surface_of(trimesh.util.concatenate([one, other]))
-    noisy = walls.vertices + rng.normal(0, 0.005, walls.vertices.shape)
-    planes, _ = find_planes(noisy, walls.faces)
-    assert abs(planes[0].normal @ planes[1].normal) < 0.02
-    assert all(plane.outline.area == pytest.approx(12, rel=0.05) for plane in planes[:2])
-
-
-def test_convex_pieces_are_convex_and_cover_the_outline_once():
-    holes = [shapely.box(x, y, x + 1, y + 1.5) for x in (1, 3, 5) for y in (1, 4)]
+def test_clusters_of_a_wall_with_windows_are_convex_and_fill_none():
+    holes = [shapely.box(x, z, x + 1, z + 1.5) for x in (1, 3, 5) for z in (1, 4)]
     outline = shapely.Polygon([(0, 0), (7, 0), (7, 6), (3.5, 8), (0, 6)]).difference(shapely.union_all(holes))
-    assert isinstance(outline, shapely.Polygon)
-    pieces = convex_pieces(shapely.MultiPolygon([outline]))
-    assert shapely.union_all(pieces).symmetric_difference(outline).area < 1e-6
-    assert sum(piece.area for piece in pieces) == pytest.approx(outline.area, abs=1e-3)
-    assert all(piece.convex_hull.area - piece.area < 1e-3 for piece in pieces)
-    assert len(pieces) < len(shapely.get_coordinates(outline)) / 2  # triangles would be more than corners
+    points, faces = trimesh.creation.triangulate_polygon(outline, engine="earcut")
+    wall = Triangles(np.insert(points, 1, 0.0, axis=1), faces)
+    found, air = clusters(wall, len(faces))
+    assert air < 1e-3
+    assert len(found) < len(faces) / 2
+    hulls = [shapely.MultiPoint(points[faces[group]].reshape(-1, 2)).convex_hull for group in found]
+    assert sum(hull.area for hull in hulls) == pytest.approx(outline.area, abs=1e-3)
+    assert shapely.union_all(hulls).symmetric_difference(outline).area < 1e-3
 
 
-def test_the_cost_of_fewer_pieces_is_the_area_that_they_cover():
-    row = [[shapely.box(x, 0, x + 1, 1) for x in (0, 1.1, 4, 7)]]
-    pieces, cost = fewer_pieces(row, 3, lambda _, covered: float(shapely.area(covered)))
-    assert [len(plane) for plane in pieces] == [3]
-    assert cost == pytest.approx(0.1)
-    assert fewer_pieces(row, 4, lambda _, covered: float(shapely.area(covered)))[1] == 0
+@pytest.mark.parametrize("most", [1, 7, 40])
+def test_pieces_that_do_not_touch_are_merged_and_none_is_cut_off(most):
+    panes = [box([3 * k, 0, 3 * m], [3 * k + 1, 0.1, 3 * m + 1]) for k in range(8) for m in range(5)]
+    first = np.cumsum([0] + [len(pane.vertices) for pane in panes[:-1]])
+    faces = np.concatenate([pane.faces + offset for pane, offset in zip(panes, first, strict=True)])
+    found, _ = clusters(Triangles(np.concatenate([pane.vertices for pane in panes]), faces), most)
+    assert len(found) <= most
+    np.testing.assert_array_equal(np.sort(np.concatenate(found)), np.arange(len(faces)))
+
+
+def test_hulls_have_few_corners_and_lose_little():
+    ball = np.random.default_rng(0).normal(size=(3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    part = Part.hull(ball)
+    assert part is not None
+    assert len(part.vertices) <= 64
+    assert part.contains(ball, 0.13).all()
+
+
+def test_rooms_are_not_seen_from_outside():
+    """A room in a house of 20 cm thick walls, some of whose triangles are wound wrongly."""
+    house, room = box([0, 0, 0], [8, 6, 5], subdivided=1.0), box([0.2, 0.2, 0.2], [7.8, 5.8, 4.8], subdivided=1.0)
+    faces = np.concatenate([house.faces, room.faces[:, ::-1] + len(house.vertices)])
+    wrong = np.arange(len(faces)) % 3 == 0
+    faces[wrong] = faces[wrong, ::-1]
+    wound, seen = from_outside(
+        Triangles(np.concatenate([house.vertices, room.vertices]), faces), np.array([[4.0, -9, 2], [1, -7, 2]])
+    )
+    inside = np.arange(len(faces)) >= len(house.faces)
+    assert not seen[inside].any()
+    level = wound.centres[:, 2] > 1e-6
+    assert seen[~inside & level].all()
+    outwards = np.einsum("fc,fc->f", wound.normals, wound.centres - [4, 3, 2.5])
+    assert (outwards[~inside & level] > 0).all()
+
+
+@pytest.fixture(scope="module")
+def bays() -> Triangles:
+    return wall_with_bays(0.1)
+
+
+@pytest.fixture(scope="module")
+def of_bays(bays, nothing) -> Collider:
+    return make_collider(bays, nothing, np.array([False]))
+
+
+def test_a_wall_with_bays_arches_and_columns_has_no_hole(bays, of_bays):
+    assert leaks(of_bays.surface, bays, eyes_before()).share < 1e-3
+    assert len(of_bays.parts) <= 2 * bays.areas.sum()
+    assert max(len(part.vertices) for part in of_bays.parts) <= 64
+
+
+def test_rays_meet_the_collider_where_they_meet_the_wall(bays, of_bays):
+    """In front of it by no more, either: bays, niche, windows and gate stay what they are."""
+    points, _ = bays.samples(6000)
+    origins = eyes_before()[np.arange(len(points)) % 16]
+    wall, made = (surface.cast(origins, points - origins) for surface in (bays, of_bays.surface))
+    steep = np.abs(np.einsum("nc,nc->n", points - origins, wall.normal)) > 0.2 * np.linalg.norm(
+        points - origins, axis=1
+    )
+    error = np.abs((wall.t - made.t) * np.linalg.norm(points - origins, axis=1))[steep]
+    assert np.quantile(error, 0.95) < 0.02
+    assert (error > 0.1).mean() < 0.01
+    middle, half, springing = GATE
+    through = np.array([[middle + x, -3, z] for x in (-0.8 * half, 0, 0.8 * half) for z in (0.2, springing)])
+    assert np.isinf(of_bays.surface.cast(through, np.array([0.0, 1, 0])).t).all()
+    in_niche = np.array([[ARCH[0], -3, 1.5]])
+    assert of_bays.surface.cast(in_niche, np.array([0.0, 1, 0])).t == pytest.approx(3.4, abs=0.01)
+
+
+def test_a_hole_is_found_where_it_is(bays, of_bays):
+    wall = np.array([8.5, 0, 5.0])
+    holed = Collider([part for part in of_bays.parts if not part.contains(wall[None], 0.3).any()], 0.0)
+    found = leaks(holed.surface, bays, eyes_before())
+    assert found.share > 1e-3
+    assert found.place is not None
+    assert bays.distance(np.array([found.place])) < 0.1
+    eye = eyes_before()[found.eye]
+    away = np.array(found.place) - eye
+    assert holed.surface.cast(eye[None], away[None]).t > 1
 
 
 def test_a_part_contains_the_points_inside_its_hull():
     """Against the Delaunay triangulation of its corners."""
     rng = np.random.default_rng(1)
     corners, points = rng.normal(size=(30, 3)), rng.normal(size=(2000, 3))
-    part = Part.hull(corners, "surface")
+    part = Part.hull(corners)
     assert part is not None
     np.testing.assert_array_equal(part.contains(points, 0.0), Delaunay(corners).find_simplex(points) >= 0)
     mesh = trimesh.Trimesh(part.vertices, part.faces)
@@ -136,16 +200,16 @@ def test_a_part_contains_the_points_inside_its_hull():
 
 
 def test_flat_points_have_no_hull():
-    assert Part.hull(np.eye(3), "surface") is None
+    assert Part.hull(np.eye(3)) is None
 
 
 def test_the_collider_matches_the_visible_shell(collider, facade, eyes):
     both = collider.surface.distance(visible(facade, eyes)), facade.distance(visible(collider.surface, eyes))
     assert np.quantile(both[0], 0.95) < 1e-4
-    assert np.quantile(both[1], 0.95) < 1e-4
+    assert np.quantile(both[1], 0.95) < 3e-3
     assert np.quantile(np.concatenate(both), 0.995) < 0.011  # parts that protrude by up to a centimetre are left out
-    assert leaks(collider.surface, facade, eyes) == 0
-    assert collider.filled == 0
+    assert leaks(collider.surface, facade, eyes).share < 1e-3
+    assert collider.filled < 0.01
 
 
 def test_windows_stay_recesses(collider):
@@ -154,19 +218,20 @@ def test_windows_stay_recesses(collider):
     assert collider.surface.cast(place, np.array([[0, 1.0, 0]])).t == pytest.approx(5 + RECESS, abs=1e-4)
 
 
-@pytest.mark.parametrize("most", [40, 12])
-def test_a_budget_of_parts_is_kept_and_leaves_no_hole(most, facade, nothing, eyes):
-    small = make_collider(facade, nothing, np.array([False]), most)
-    assert len(small.parts) <= most
-    assert leaks(small.surface, facade, eyes) == 0
+@pytest.mark.parametrize("density", [10, 3])
+def test_a_budget_of_parts_is_kept_and_leaves_no_hole(density, facade, nothing, eyes):
+    small = make_collider(facade, nothing, np.array([False]), density=density)
+    assert len(small.parts) <= np.ceil(density * facade.areas.sum() / 100)
+    assert leaks(small.surface, facade, eyes).share == 0
 
 
 def test_parts_stay_inside_the_wall():
     wall = box([0, 0, 0], [4, 0.1, 3])
     made = make_collider(wall, wall, np.zeros(len(wall.faces), bool))
     assert np.abs(made.surface.vertices - [2, 0.05, 1.5]).max(axis=0) == pytest.approx([2, 0.05, 1.5], abs=0.011)
-    plane = find_planes(wall.vertices, wall.faces)[0][0]
-    assert thickness(plane, wall) == pytest.approx(0.1, abs=0.011)
+    front = wall.faces[wall.normals[:, 1] < -0.9]
+    inside = wall.vertices[front] + [0, 0.01, 0]
+    np.testing.assert_allclose(depths(wall, inside, np.array([0.0, -1, 0])), 0.09, atol=1e-6)
 
 
 def test_surfaces_in_front_of_the_shell_are_in_the_collider_but_not_those_beside_it(facade, eyes):
@@ -191,16 +256,16 @@ def test_surfaces_in_front_of_the_shell_are_in_the_collider_but_not_those_beside
 def test_surfaces_without_planes_become_parts_too(eyes):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0).apply_translation([3, 2, 2])
     fused, seen = outward(surface_of(ball), eyes)
-    made = make_collider(None, fused, seen, most=60)
-    assert 20 < len(made.parts) <= 60
+    made = make_collider(None, fused, seen, density=500)
+    assert 20 < len(made.parts) <= 63
     assert np.quantile(made.surface.distance(visible(fused, eyes)), 0.95) < 0.03
 
 
 def test_an_empty_collider_is_refused(nothing):
     with pytest.raises(SceneError, match="there is nothing to collide with"):
         make_collider(None, nothing, np.array([False]))
-    with pytest.raises(SceneError, match="cannot have 0 parts"):
-        make_collider(None, nothing, np.array([True]), most=0)
+    with pytest.raises(SceneError, match="cannot have 0 parts for 100"):
+        make_collider(None, nothing, np.array([True]), density=0)
 
 
 def cameras_of_scene() -> list[Camera]:
@@ -488,13 +553,13 @@ def test_photographs_take_precedence_over_the_reconstruction():
 
 
 def test_a_turned_building_has_the_same_collider(facade, nothing, collider):
-    """Planes and parts do not depend on the axes."""
+    """Parts hardly depend on the axes: among merges that cost nothing, the order is that of rounding."""
     turn = Rotation.from_euler("z", 31, degrees=True).as_matrix()
     turned = Triangles(facade.vertices @ turn.T, facade.faces)
     made = make_collider(turned, nothing, np.array([False]))
-    assert len(made.parts) == len(collider.parts)
+    assert abs(len(made.parts) - len(collider.parts)) <= 0.1 * len(collider.parts)
     points, _ = collider.surface.samples(500)
-    assert np.quantile(made.surface.distance(points @ turn.T), 0.99) < 1e-3
+    assert np.quantile(made.surface.distance(points @ turn.T), 0.95) < 0.011
 
 
 def test_details_of_the_true_building_are_found_in_front_of_its_shell(facade, eyes):

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
-import shapely
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import ConvexHull, QhullError
 
-from shellgs_method.sim.collision.planes import Plane
+MOST_VERTICES = 64
+"""Maximum number of a part's corners: PhysX, in Isaac Sim, cooks no larger hulls."""
+FINEST = 1e-3
+"""Metres by which points may stick out of a part, and as many times twice as it takes to have few corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,33 +20,40 @@ class Part:
     """A convex solid.
 
     Attributes:
-        vertices: its corners, in metres.
+        vertices: its corners, in metres, at most 64.
         faces: triangles between them, counter-clockwise seen from outside.
-        source: origin of the part: a plane of the shell, or a surface that is not planar.
         planes: planes of its faces: n · x + d <= 0 inside.
     """
 
     vertices: Float64[np.ndarray, "V 3"]
     faces: Int64[np.ndarray, "F 3"]
-    source: Literal["plane", "surface"]
     planes: Float64[np.ndarray, "P 4"] = field(repr=False)
 
     @classmethod
-    def hull(cls, points: Float64[np.ndarray, "N 3"], source: Literal["plane", "surface"]) -> Part | None:
-        """The convex hull of points; None if they have no volume."""
+    def hull(cls, points: Float64[np.ndarray, "N 3"]) -> Part | None:
+        """The convex hull of points, of which those that stick out little are left out; None if it has no volume.
+
+        Quickhull takes the farthest points first, and stops at those nearer than Qhull's option ``W``.
+        """
+        corners, out = np.arange(len(points)), 0.0
         try:
             hull = ConvexHull(points)
+            while len(hull.vertices) > MOST_VERTICES:
+                out = max(2 * out, FINEST)
+                corners = ConvexHull(points, qhull_options=f"Qt W{out}").vertices
+                hull = ConvexHull(points[corners])
         except (QhullError, ValueError):
             return None
         if hull.volume < 1e-7:
             return None
+        points = points[corners]
         vertices, faces = points[hull.vertices], np.searchsorted(hull.vertices, hull.simplices)
         corners = vertices[faces]
         inwards = np.einsum(
             "fc,fc->f", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), hull.equations[:, :3]
         )
         faces = np.where(inwards[:, None] < 0, faces[:, ::-1], faces)
-        return cls(vertices, faces, source, np.unique(hull.equations.round(9), axis=0))
+        return cls(vertices, faces, np.unique(hull.equations.round(9), axis=0))
 
     def contains(self, points: Float64[np.ndarray, "N 3"], margin: float) -> Bool[np.ndarray, " N"]:
         """Whether points are in the part or closer than about ``margin`` to it."""
@@ -53,12 +61,6 @@ class Part:
         inside = np.zeros(len(points), bool)
         inside[near] = (points[near] @ self.planes[:, :3].T + self.planes[:, 3] <= margin).all(axis=1)
         return inside
-
-
-def prism(plane: Plane, polygon: shapely.Polygon, thickness: float) -> Part | None:
-    """Extrude a convex polygon of a plane against its normal."""
-    flat = np.array(polygon.exterior.coords)[:-1]
-    return Part.hull(np.concatenate([plane.to_space(flat), plane.to_space(flat, thickness)]), "plane")
 
 
 def joined(parts: Sequence[Part]) -> tuple[Float64[np.ndarray, "V 3"], Int64[np.ndarray, "F 3"]]:

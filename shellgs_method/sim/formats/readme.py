@@ -6,27 +6,34 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shellgs_method.files.atomic import atomic_write
-from shellgs_method.sim.formats.world import Building
+from shellgs_method.sim.formats.asset import Asset
 from shellgs_method.sim.frame import SimFrame
 
 _TEXT = """# {title}
 
-{frame} z points up, and the ground is the plane z = 0. `frame.json` has the matrices to the
+{frame} z points up, from the foot of the facade. `frame.json` has the matrices to the
 scene's cameras (`to_scene`) and to national coordinates (`to_national`), whose shift is `offset`.
 
 | file | what it is |
 |---|---|
-| `facade.xml` | MuJoCo's model (MJCF) |
-| `facade.urdf`, `facade.sdf` | the same for URDF readers and for Gazebo |
-| `facade.usda` | the same for Isaac Sim and other USD readers: visual mesh, colliders, splats (variant `look`) |
-| `{folder}collision/part_*.obj` | {parts} convex parts, which are their own convex hulls |
-| `{folder}visual.obj`, `.mtl`, `.png` | the visual mesh, with a texture from the photographs |
-| `{folder}visual.glb` | the same for browsers; y-up, as glTF requires |
-| `{folder}semantics.json` | the class (wall, window, …) of each face of `visual.obj`, if the shell has them; in \
-the USD, labels of its parts |
-| `{folder}splats.ply` | the Gaussians |
-| `{folder}deviations.ply`, `.json` | the shell: red where the building is in front of it, blue behind, grey unseen |
+| `world.xml`, `.usda`, `.sdf`, `.urdf` | ground, light and physics; they refer to the building{plural} |
 | `report.html`, `metrics.json` | the accuracy of all this, and images |
+{assets}
+
+A building's folder can be copied anywhere, and has no ground, light or physics scene of its own:
+
+| file | what it is |
+|---|---|
+| `NAME.xml` | MuJoCo's model (MJCF); all names and classes begin with the building's |
+| `NAME.usda` | for Isaac Sim and other USD readers; the variant `look` shows the mesh, the splats, or both |
+| `model.config`, `model.sdf` | for Gazebo |
+| `NAME.urdf`, `package.xml`, `CMakeLists.txt` | for URDF readers, and a ROS package of the building's name |
+| `collision/part_*.obj` | the convex parts, which are their own convex hulls |
+| `visual.obj`, `.mtl`, `.png` | the visual mesh, with a texture from the photographs |
+| `visual_wall.obj`, … | its walls, windows, …, where the shell knows them: cameras that segment tell them apart |
+| `visual.glb` | the same for browsers; y-up, as glTF requires |
+| `splats.ply` | the Gaussians |
+| `deviations.ply`, `.json` | the shell: red where the building is in front of it, blue behind, grey unseen |
 
 {summary}
 
@@ -34,49 +41,67 @@ the USD, labels of its parts |
 
 ```python
 import mujoco
-model = mujoco.MjModel.from_xml_path("facade.xml")
-data = mujoco.MjData(model)
+world = mujoco.MjSpec.from_file("world.xml")
+robot = mujoco.MjSpec.from_file("…/unitree_go2/go2.xml")
+world.attach(robot, prefix="go2/", frame=world.worldbody.add_frame(pos=[0, 0, 0.1]))
+model = world.compile()
 ```
 
-To add a robot: `spec = mujoco.MjSpec.from_file("facade.xml")`, then `spec.attach(...)`.
+or in the scene of a robot, from any folder:
+
+```xml
+<asset><model name="{first}" file="…/{first}/{first}.xml"/></asset>
+<worldbody><attach model="{first}" prefix="{first}/"/></worldbody>
+```
+
+(`<include>` of the file works too, if MuJoCo is given the scene by its absolute path.) Looks are in group 2, collision
+geometry in group 3, the ground in group 0.
 
 ## Isaac Sim
 
 ```python
 from isaacsim.core.utils.stage import add_reference_to_stage
-add_reference_to_stage("facade.usda", "/World/facade")
+add_reference_to_stage("{first}/{first}.usda", "/World/{first}")   # in a scene with ground and physics of its own
 ```
+
+or open `world.usda`. Of the look `both`, the mesh has the purpose *proxy* and the splats *render*. The mesh is unlit:
+UsdPreviewSurface has no unit of emission, and RTX shows it dark until `inputs:scale` of `visual/material/texture` is
+raised (by some thousands).
 
 ## Gazebo
 
 ```sh
 export GZ_SIM_RESOURCE_PATH=$PWD
-gz sim facade.sdf
+gz sim world.sdf
 ```
+
+Harmonic or later collides with the parts' convex hulls, earlier versions with their triangles.
 
 ## PyBullet and other readers of URDF
 
 ```python
 import pybullet
 pybullet.connect(pybullet.DIRECT)
-pybullet.loadURDF("facade.urdf", useFixedBase=True)
+pybullet.loadURDF("world.urdf", useFixedBase=True)   # or {first}/{first}.urdf, on a ground of your own
 ```
+
+In ROS, a building's folder is a package of its name: copy it into a workspace's `src/`.
 """
 
 
-def write_readme(out: Path, buildings: Sequence[Building], frame: SimFrame, metrics: dict) -> None:
+def write_readme(out: Path, assets: Sequence[Asset], frame: SimFrame, metrics: dict) -> None:
     """Write a README with the folder's contents and how each simulator loads it."""
     where = (
         "Coordinates are metres along the shell's axes; the origin is on the ground in front of the facade."
         if frame.metric
         else "The scene has no aligned shell: the unit of length is unknown, and the files state the metre."
     )
-    several = len(buildings) > 1
     text = _TEXT.format(
-        title=", ".join(building.name for building in buildings),
+        title=", ".join(asset.name for asset in assets),
         frame=where,
-        folder="BUILDING/" if several else "",
-        parts=" and ".join(str(building.parts) for building in buildings),
+        plural="s" if len(assets) > 1 else "",
+        assets="\n".join(f"| `{asset.name}/` | a building of {asset.parts} convex parts |" for asset in assets),
+        first=assets[0].name,
         summary="\n".join(f"* {sentence}" for sentence in metrics["summary"]),
     )
     with atomic_write(out / "README.md") as file:

@@ -1,4 +1,4 @@
-"""Write a world of buildings as USD: visual mesh, colliders with physics, and splats as UsdVol's particle fields."""
+"""USD: a building as an asset with visual mesh, colliders and splats (UsdVol's particle fields), and its world."""
 
 from __future__ import annotations
 
@@ -14,35 +14,40 @@ from jaxtyping import UInt8
 from shellgs_method.export.splats import Splats
 from shellgs_method.files.usd import add_mesh, import_pxr, make_collider, new_stage
 from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.formats.world import Building
+from shellgs_method.sim.formats.asset import EXTENT, FRICTION, Asset
 from shellgs_method.sim.look.texture import TexturedMesh
 from shellgs_method.sim.look.visual import TEXTURE
 
 LAYERS = "usd"
-"""Folder of the binary layers that ``facade.usda`` refers to, beside the building's other files."""
+"""Folder of the binary layers that an asset refers to, in the asset's."""
+LOOKS = {"mesh": ("visual",), "splats": ("splats",), "both": ("visual", "splats")}
+"""What each variant of the set ``look`` shows."""
 
 
-def write_usd_layers(
+def write_usd_asset(
     folder: Path,
+    name: str,
     mesh: TexturedMesh,
     classes: UInt8[np.ndarray, " F"],
     parts: Sequence[Part],
     splats: Splats,
     metric: bool,
-) -> bool:
-    """Write visual mesh, colliders and splats of a building, each as a layer.
+) -> None:
+    """Write a building as ``NAME.usda`` and binary layers: static, without scene, ground or light.
+
+    Mesh and splats show the same surface. Of the look ``both``, the mesh has the purpose *proxy*, for depth sensors,
+    and the splats have *render*, for cameras.
 
     Args:
-        folder: folder of the building; the layers are in its folder ``usd``.
+        folder: folder of the asset; the layers are in its folder ``usd``.
+        name: name of the asset and its prim.
         mesh: visual mesh, with one texture coordinate for each vertex.
         classes: class of each of its triangles.
         parts: convex parts.
         splats: Gaussians in the frame of the mesh.
         metric: whether the frame's unit is the metre; otherwise it is unknown.
-
-    Returns:
-        Whether this USD supports splats: their schema is standard since 26.03.
     """
     pxr = import_pxr("sim")
     (folder / LAYERS).mkdir(exist_ok=True)
@@ -50,42 +55,58 @@ def write_usd_layers(
         _visual(pxr, stage, mesh, classes)
     with new_stage(pxr, folder / LAYERS / "collision.usdc", "z", metric) as stage:
         _colliders(pxr, stage, parts)
-    if not hasattr(pxr.UsdVol, "ParticleField3DGaussianSplat"):
-        return False
     with new_stage(pxr, folder / LAYERS / "splats.usdc", "z", metric) as stage:
         _particles(pxr, stage, splats)
-    return True
+    with new_stage(pxr, folder / f"{name}.usda", "z", metric) as stage:
+        root = pxr.UsdGeom.Xform.Define(stage, f"/{name}").GetPrim()
+        model = pxr.Usd.ModelAPI(root)
+        model.SetKind("component")
+        model.SetAssetName(name)
+        model.SetAssetIdentifier(f"./{name}.usda")
+        _label(pxr, root, "building")
+        _refer(stage, root, "collision")
+        looks = root.GetVariantSets().AddVariantSet("look")
+        for look, children in LOOKS.items():
+            looks.AddVariant(look)
+            looks.SetVariantSelection(look)
+            with looks.GetVariantEditContext():
+                made = [pxr.UsdGeom.Imageable(_refer(stage, root, child)) for child in children]
+                if look == "both":
+                    made[0].CreatePurposeAttr(pxr.UsdGeom.Tokens.proxy)
+                    made[1].CreatePurposeAttr(pxr.UsdGeom.Tokens.render)
+                    made[1].SetProxyPrim(made[0])
+        looks.SetVariantSelection("mesh")
 
 
-def write_usd_world(path: Path, buildings: Sequence[Building], metric: bool, with_splats: bool) -> None:
-    """Write the stage that places the buildings' layers on level ground, with gravity.
-
-    Mesh and splats show the same surface: a variant set ``look`` of each building selects one of them.
-    """
+def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool, ground: Triangles | None) -> None:
+    """Write the stage that has gravity, ground (level if there is no mesh) and light, and refers to the assets."""
     pxr = import_pxr("sim")
     with new_stage(pxr, path, "z", metric) as stage:
-        pxr.UsdGeom.Xform.Define(stage, "/World")
+        world = pxr.UsdGeom.Xform.Define(stage, "/World").GetPrim()
+        pxr.Usd.ModelAPI(world).SetKind("assembly")
         scene = pxr.UsdPhysics.Scene.Define(stage, "/World/physics")
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0, 0, -1))
         scene.CreateGravityMagnitudeAttr(9.81)
+        pxr.UsdLux.DomeLight.Define(stage, "/World/light").CreateIntensityAttr(1000)  # for robots: buildings are unlit
+        _ground(pxr, stage, ground)
+        for asset in assets:
+            prim = stage.DefinePrim(f"/World/{asset.name}")
+            prim.GetReferences().AddReference(f"./{asset.name}/{asset.name}.usda")
+
+
+def _ground(pxr: SimpleNamespace, stage, mesh: Triangles | None) -> None:
+    if mesh is None:
         ground = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
         ground.CreateAxisAttr("Z")
-        ground.CreateWidthAttr(200.0)
-        ground.CreateLengthAttr(200.0)
-        ground.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
-        ground.CreateExtentAttr([(-100, -100, 0), (100, 100, 0)])
+        ground.CreateWidthAttr(EXTENT)
+        ground.CreateLengthAttr(EXTENT)
+        ground.CreateExtentAttr([(-EXTENT / 2, -EXTENT / 2, 0), (EXTENT / 2, EXTENT / 2, 0)])
         pxr.UsdPhysics.CollisionAPI.Apply(ground.GetPrim())
-        for building in buildings:
-            prim = pxr.UsdGeom.Xform.Define(stage, f"/World/{building.name}").GetPrim()
-            for child in ("collision",):
-                _refer(pxr, stage, prim, building, child)
-            looks = prim.GetVariantSets().AddVariantSet("look")
-            for look, child in (("mesh", "visual"), ("splats", "splats"))[: 1 + with_splats]:
-                looks.AddVariant(look)
-                looks.SetVariantSelection(look)
-                with looks.GetVariantEditContext():
-                    _refer(pxr, stage, prim, building, child)
-            looks.SetVariantSelection("mesh")
+    else:
+        ground = add_mesh(pxr, stage, "/World/ground", mesh.vertices, mesh.faces)
+        make_collider(pxr, ground, "none")
+    ground.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
+    _rub(pxr, ground, _friction(pxr, stage, "/World/friction"))
 
 
 def compliance_errors(stage: Path | Any) -> list[str]:
@@ -99,10 +120,26 @@ def compliance_errors(stage: Path | Any) -> list[str]:
     return [f"{error.GetName()}: {error.GetMessage()}" for error in errors]
 
 
-def _refer(pxr: SimpleNamespace, stage, prim, building: Building, child: str) -> None:
-    kind = "Xform" if child != "splats" else "ParticleField3DGaussianSplat"
-    made = stage.DefinePrim(prim.GetPath().AppendChild(child), kind)
-    made.GetReferences().AddReference(f"./{building.path(f'{LAYERS}/{child}.usdc')}")
+def _refer(stage, root, child: str):
+    made = stage.DefinePrim(root.GetPath().AppendChild(child))
+    made.GetReferences().AddReference(f"./{LAYERS}/{child}.usdc")
+    return made
+
+
+def _friction(pxr: SimpleNamespace, stage, path: str):
+    """Add a physics material, and return it."""
+    material = pxr.UsdShade.Material.Define(stage, path)
+    friction = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    friction.CreateStaticFrictionAttr(FRICTION)
+    friction.CreateDynamicFrictionAttr(FRICTION)
+    friction.CreateRestitutionAttr(0.0)
+    return material
+
+
+def _rub(pxr: SimpleNamespace, collider, material) -> None:
+    """Bind a physics material to the collider itself: UsdPhysics' own parser does not look at the prims above it."""
+    binding = pxr.UsdShade.MaterialBindingAPI.Apply(collider.GetPrim())
+    binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
 def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"]) -> None:
@@ -122,22 +159,22 @@ def _visual(pxr: SimpleNamespace, stage, mesh: TexturedMesh, classes: UInt8[np.n
     where = reader.CreateOutput("result", pxr.Sdf.ValueTypeNames.Float2)
     texture.CreateInput("st", pxr.Sdf.ValueTypeNames.Float2).ConnectToSource(where)
     surface = _shader(pxr, stage, "/visual/material/surface", "UsdPreviewSurface")
-    surface.CreateInput("roughness", pxr.Sdf.ValueTypeNames.Float).Set(1.0)
+    # Unlit, since the light is in the photographs: it emits, and reflects nothing.
     colour = texture.CreateOutput("rgb", pxr.Sdf.ValueTypeNames.Float3)
-    surface.CreateInput("diffuseColor", pxr.Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+    surface.CreateInput("emissiveColor", pxr.Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+    surface.CreateInput("useSpecularWorkflow", pxr.Sdf.ValueTypeNames.Int).Set(1)
+    for name in ("diffuseColor", "specularColor"):
+        surface.CreateInput(name, pxr.Sdf.ValueTypeNames.Color3f).Set((0, 0, 0))
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", pxr.Sdf.ValueTypeNames.Token))
     pxr.UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
-    if classes.any():
-        _label(pxr, prim, classes)
-
-
-def _label(pxr: SimpleNamespace, mesh: Any, classes: UInt8[np.ndarray, " F"]) -> None:
-    """Partition a mesh by class, each part with a semantic label."""
-    for each in map(SurfaceClass, np.unique(classes)):
+    for each in map(SurfaceClass, np.unique(classes) if classes.any() else ()):
         faces = pxr.Vt.IntArray.FromNumpy(np.flatnonzero(classes == each).astype(np.int32))
         kinds = pxr.UsdGeom.Tokens.face, faces, "semantics", pxr.UsdGeom.Tokens.partition
-        subset = pxr.UsdGeom.Subset.CreateGeomSubset(mesh, each.word, *kinds)
-        pxr.UsdSemantics.LabelsAPI.Apply(subset.GetPrim(), "class").CreateLabelsAttr([each.word])
+        _label(pxr, pxr.UsdGeom.Subset.CreateGeomSubset(prim, each.word, *kinds).GetPrim(), each.word)
+
+
+def _label(pxr: SimpleNamespace, prim, label: str) -> None:
+    pxr.UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([label])
 
 
 def _shader(pxr: SimpleNamespace, stage, path: str, kind: str):
@@ -150,9 +187,11 @@ def _colliders(pxr: SimpleNamespace, stage, parts: Sequence[Part]) -> None:
     """Add static colliders, as convex hulls, which the parts already are."""
     root = pxr.UsdGeom.Xform.Define(stage, "/collision")
     pxr.UsdGeom.Imageable(root).CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
+    material = _friction(pxr, stage, "/collision/friction")
     for number, part in enumerate(parts):
         prim = add_mesh(pxr, stage, f"/collision/part_{number:03d}", part.vertices, part.faces)
         make_collider(pxr, prim, "convexHull")
+        _rub(pxr, prim, material)
 
 
 def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from jaxtyping import Int64, UInt8
 from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.look.texture import TexturedMesh
 
 TEXTURE = "visual.png"
@@ -20,12 +22,20 @@ Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turns z-up coordinates into y-up ones."""
 
 
-def write_visual(folder: Path, mesh: TexturedMesh, megabytes: float) -> dict:
-    """Write ``visual.glb`` (y-up, as glTF requires), and ``visual.obj`` with ``visual.mtl`` and ``visual.png``.
+def visual_file(each: SurfaceClass) -> str:
+    """The obj of the triangles of a class; all are OTHER where no classes are known."""
+    return f"visual_{each.word}.obj" if each else "visual.obj"
+
+
+def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"], megabytes: float) -> dict:
+    """Write ``visual.glb`` (y-up, as glTF requires), and objs with ``visual.mtl`` and ``visual.png``.
+
+    There is an obj for each class of surface: simulators segment images by object. Those of an earlier run are removed.
 
     Args:
         folder: output folder.
         mesh: textured mesh, z up.
+        classes: class of each triangle.
         megabytes: maximum size of the glb; the texture is scaled down to fit.
 
     Returns:
@@ -45,8 +55,11 @@ def write_visual(folder: Path, mesh: TexturedMesh, megabytes: float) -> dict:
         image.save(file, "PNG")
     with atomic_write(folder / "visual.mtl") as file:
         file.write(f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {TEXTURE}\n".encode())
-    with atomic_write(folder / "visual.obj") as file:
-        file.write(_obj(mesh).encode())
+    for stale in folder.glob("visual*.obj"):
+        stale.unlink()
+    for each in map(SurfaceClass, np.unique(classes)):
+        with atomic_write(folder / visual_file(each)) as file:
+            file.write(_obj(mesh, mesh.faces[classes == each]).encode())
     return {"glb_bytes": len(content), "texture": list(image.size), "triangles": len(mesh.faces)}
 
 
@@ -64,10 +77,11 @@ def _glb(mesh: TexturedMesh, image: Image.Image) -> bytes:
     return content
 
 
-def _obj(mesh: TexturedMesh) -> str:
-    """The obj, with one texture coordinate for each vertex."""
+def _obj(mesh: TexturedMesh, faces: Int64[np.ndarray, "F 3"]) -> str:
+    """The obj of some of the faces, with one texture coordinate for each vertex."""
+    used, faces = np.unique(faces, return_inverse=True)
     lines = ["mtllib visual.mtl", "o visual", "usemtl visual"]
-    lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"vt {u:.6f} {v:.6f}" for u, v in mesh.uv.tolist()]
-    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
+    lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.vertices[used].tolist()]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in mesh.uv[used].tolist()]
+    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in (faces.reshape(-1, 3) + 1).tolist()]
     return "\n".join(lines) + "\n"

@@ -80,13 +80,13 @@ def lidar(path: Path, places: Float64[np.ndarray, "P 3"], rays: Float64[np.ndarr
         path: model file.
         places: positions of the lidar.
         rays: unit directions.
-        group: group of the geoms to hit: 3 for collision geometry, 2 for visual meshes.
+        group: group of the geoms to hit, beside the ground: 3 for collision geometry, 2 for visual meshes, 0 for none.
     """
     mujoco, model = import_mujoco(), load(path)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     groups = np.zeros(6, np.uint8)
-    groups[group] = 1
+    groups[[0, group]] = 1
     distances = np.empty((len(places), len(rays)))
     geoms, normals = np.empty(len(rays), np.int32), np.empty((len(rays), 3))
     for place, row in zip(places, distances, strict=True):

@@ -11,7 +11,9 @@ from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.formats.mjcf import STIFF
 from shellgs_method.sim.front import Front
+from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
 
 GRAVITY = 9.81
@@ -81,27 +83,36 @@ class Walk:
 
 
 def throw(
-    path: Path, surface: Triangles, eyes: Float64[np.ndarray, "E 3"], count: int = 200, seconds: float = 4
+    path: Path,
+    surface: Triangles,
+    ground: Ground,
+    eyes: Float64[np.ndarray, "E 3"],
+    count: int = 200,
+    seconds: float = 4,
 ) -> Throws:
     """Throw spheres and boxes at 5 to 15 m/s at the visible surface of a world: half at any point, half at corners.
 
     Args:
         path: model file.
         surface: its collision geometry.
+        ground: its ground.
         eyes: positions outside, such as those of cameras.
         count: number of bodies, which do not collide with each other.
         seconds: simulated time.
     """
     mujoco, spec = import_mujoco(), read_spec(path)
     rng = np.random.default_rng(0)
-    starts, velocities = _launches(surface, eyes, count, rng)
+    starts, velocities = _launches(surface, ground, eyes, count, rng)
     for number, start in enumerate(starts):
         body = spec.worldbody.add_body(pos=start, name=f"thrown_{number}")
         body.add_freejoint()
         kind = mujoco.mjtGeom.mjGEOM_SPHERE if number % 2 else mujoco.mjtGeom.mjGEOM_BOX
         contype, conaffinity = PROJECTILES
         size = rng.uniform(0.05, 0.15, 3)
-        body.add_geom(type=kind, size=size, density=300, contype=contype, conaffinity=conaffinity, group=1)
+        body.add_geom(
+            type=kind, size=size, density=300, contype=contype, conaffinity=conaffinity, group=1,
+            solref=[STIFF, 1],  # for the ground, which leaves contacts to bodies; buildings have their own
+        )  # fmt: skip
     model = compiled(spec, path)
     data = mujoco.MjData(model)
     bodies = np.array([model.body(f"thrown_{number}").id for number in range(count)])
@@ -110,13 +121,13 @@ def throw(
     mujoco.mj_forward(model, data)
     launched, energy = _energy(model, data, bodies), np.zeros(count)
     hit, through, deepest = np.zeros(count, bool), np.zeros(count, bool), 0.0
-    ground, before = model.geom("ground").id, data.xpos[bodies].copy()
+    floor, before = model.geom("ground").id, data.xpos[bodies].copy()
     depth, support = np.zeros(count), np.zeros((count, 3))
     for _ in range(round(seconds / model.opt.timestep)):
         mujoco.mj_step(model, data)
         energy = np.maximum(energy, _energy(model, data, bodies) - launched)
         now = data.xpos[bodies].copy()
-        through |= (surface.cast(before, now - before).t <= 1) | (now[:, 2] < 0)
+        through |= (surface.cast(before, now - before).t <= 1) | (now[:, 2] < ground.at(now))
         before = now
         depth[:], support[:] = 0, 0
         touching = model.geom_bodyid[data.contact.geom]
@@ -124,28 +135,32 @@ def throw(
         towards = np.where(touching[:, :1] < touching[:, 1:], 1, -1) * data.contact.frame[:, :3]
         np.maximum.at(depth, mover, into)
         np.add.at(support, mover, towards)
-        building = (data.contact.geom != ground).all(axis=1)
+        building = (data.contact.geom != floor).all(axis=1)
         hit[mover[building]] = True
         deepest = max([deepest, *into[building]])
     speed = np.linalg.norm(data.qvel.reshape(-1, 6)[:, :3], axis=1)
-    held = (speed < 0.05) & (before[:, 2] > 0.3) & (support[:, 2] < 0.3 * np.linalg.norm(support, axis=1))
+    above = before[:, 2] - ground.at(before)
+    held = (speed < 0.05) & (above > 0.3) & (support[:, 2] < 0.3 * np.linalg.norm(support, axis=1))
     gained = energy > GAIN * launched
     return Throws(
         count, int(hit.sum()), int(through.sum()), int((held | (depth > SINKING)).sum()), int(gained.sum()), deepest
     )
 
 
-def walk(path: Path, surface: Triangles, front: Front, speed: float = 1.4) -> Walk:
+def walk(path: Path, surface: Triangles, ground: Ground, front: Front, speed: float = 1.4) -> Walk:
     """Push an upright capsule against a facade and along it; where something stops it, it steps back.
 
     Args:
         path: model file.
         surface: its collision geometry.
+        ground: its ground.
         front: facade.
         speed: target speed along the facade, in metres per second; towards it, it is 0.5.
     """
     mujoco, spec = import_mujoco(), read_spec(path)
-    body = spec.worldbody.add_body(pos=front.before(surface, 0.05, 0.35, 0.91), name="walker")
+    start = front.before(surface, 0.05, 0.35, 0.91)
+    start[2] += ground.at(start).item()
+    body = spec.worldbody.add_body(pos=start, name="walker")
     for name, axis in (("along", front.along), ("out", front.outwards), ("up", np.array([0.0, 0, 1]))):
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, name=name)
     capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -153,7 +168,7 @@ def walk(path: Path, surface: Triangles, front: Front, speed: float = 1.4) -> Wa
     model = compiled(spec, path)
     data = mujoco.MjData(model)
     steps = round(2 * front.length / speed / model.opt.timestep)
-    ground, touching, deepest, back = model.geom("ground").id, 0, 0.0, 0
+    floor, touching, deepest, back = model.geom("ground").id, 0, 0.0, 0
     stepping, done = 0.0, 0
     for step in range(steps):
         along, out, _ = data.qvel
@@ -166,7 +181,7 @@ def walk(path: Path, surface: Triangles, front: Front, speed: float = 1.4) -> Wa
         mujoco.mj_step(model, data)
         stepping += time.perf_counter() - started
         done += 1
-        others = (data.contact.geom != ground).all(axis=1)
+        others = (data.contact.geom != floor).all(axis=1)
         touching += bool(others.any())
         deepest = max(deepest, *(-data.contact.dist[others]), 0.0)
         if data.qpos[0] > 0.9 * front.length:
@@ -186,7 +201,7 @@ def _energy(model, data, bodies: np.ndarray) -> Float64[np.ndarray, " N"]:
 
 
 def _launches(
-    surface: Triangles, eyes: np.ndarray, count: int, rng: np.random.Generator
+    surface: Triangles, ground: Ground, eyes: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, "N 3"]]:
     """Positions to throw from, 1.5 to 4 m from a visible target, and velocities."""
     starts, velocities = [], []
@@ -199,12 +214,12 @@ def _launches(
         weights = np.eye(3)[rng.integers(3)] if corner else rng.dirichlet(np.ones(3))
         target = weights @ surface.vertices[surface.faces[face]]
         eye = eyes[rng.integers(len(eyes))]
-        if target[2] < 0.1 or not surface.sees(eye[None], target[None], 0.02)[0]:
+        if target[2] - ground.at(target) < 0.1 or not surface.sees(eye[None], target[None], 0.02)[0]:
             continue
         towards = (eye - target) / np.linalg.norm(eye - target) + rng.normal(0, 0.5, 3)
         start = target + rng.uniform(1.5, 4) * towards / np.linalg.norm(towards)
         if (
-            start[2] > 0.3
+            start[2] - ground.at(start) > 0.3
             and surface.sees(start[None], target[None], 0.02)[0]
             and surface.distance(start[None])[0] > 0.3
         ):

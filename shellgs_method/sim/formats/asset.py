@@ -1,0 +1,76 @@
+"""The asset that a building is in every format: what all of its files are named, and its convex parts."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.sim.collision.parts import Part
+from shellgs_method.sim.look.visual import visual_file
+
+FRICTION = 0.7
+"""Coefficient of friction of walls and ground: that of rubber on concrete or stone is 0.6 to 0.85."""
+EXTENT = 200.0
+"""Side of the ground in metres, where a format has no infinite plane."""
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A building as a folder that each format's world refers to.
+
+    Attributes:
+        name: name of the folder, of the files in it, and of the model, link or prim; other names begin with it.
+        parts: number of its convex parts.
+        classes: classes of surface that it has, with a visual mesh for each.
+    """
+
+    name: str
+    parts: int
+    classes: Sequence[SurfaceClass] = (SurfaceClass.OTHER,)
+
+    @property
+    def colliders(self) -> list[tuple[str, str]]:
+        """Name and file of each convex part; files are relative to the asset's folder."""
+        return [(f"{self.name}_{number:03d}", part_file(number)) for number in range(self.parts)]
+
+    @property
+    def looks(self) -> list[tuple[str, str, SurfaceClass]]:
+        """Name, file and class of each visual mesh."""
+        return [(f"{self.name}_{Path(visual_file(each)).stem}", visual_file(each), each) for each in self.classes]
+
+
+def part_file(number: int) -> str:
+    """The file of a part, relative to its asset's folder."""
+    return f"collision/part_{number:03d}.obj"
+
+
+def write_parts(folder: Path, parts: Sequence[Part]) -> None:
+    """Write each convex part as an obj; those of an earlier run are removed."""
+    (folder / "collision").mkdir(parents=True, exist_ok=True)
+    for stale in (folder / "collision").glob("part_*.obj"):
+        stale.unlink()
+    for number, part in enumerate(parts):
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        with atomic_write(folder / part_file(number)) as file:
+            file.write(str(mesh.export(file_type="obj", include_normals=False, header=None)).encode())
+
+
+def write_xml(path: Path, tree: ET.Element) -> None:
+    """Write an indented XML file."""
+    ET.indent(tree)
+    with atomic_write(path) as file:
+        file.write(b'<?xml version="1.0"?>\n' + ET.tostring(tree) + b"\n")
+
+
+def add(parent: ET.Element, tag: str, value: object = None, /, **attributes: object) -> ET.Element:
+    """Add an element with attributes, and a text if a value is given."""
+    child = ET.SubElement(parent, tag, {name: str(each) for name, each in attributes.items()})
+    if value is not None:
+        child.text = str(value)
+    return child

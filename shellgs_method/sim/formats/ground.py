@@ -1,0 +1,35 @@
+"""The files of a ground that is not level: a height field for MuJoCo, a mesh for all others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.collision.collider import decimated
+from shellgs_method.sim.ground import Ground
+
+FIELD, MESH = "ground.bin", "ground.obj"
+FACES = 50_000
+"""Number of triangles that the mesh is decimated to: engines are slower on large ones."""
+
+
+def write_ground(out: Path, ground: Ground) -> Triangles | None:
+    """Write a ground's files, and return its mesh; of level ground there is none, and those of another are removed.
+
+    MuJoCo's own format of height fields is the numbers of rows and columns, and the heights, row by row.
+    """
+    for stale in (FIELD, MESH):
+        (out / stale).unlink(missing_ok=True)
+    if ground.is_level:
+        return None
+    surface = decimated(ground.surface, FACES)
+    with atomic_write(out / FIELD) as file:
+        file.write(np.array(ground.heights.shape, np.int32).tobytes() + ground.heights.astype(np.float32).tobytes())
+    with atomic_write(out / MESH) as file:
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+        file.write(str(mesh.export(file_type="obj", include_normals=False, header=None)).encode())
+    return surface

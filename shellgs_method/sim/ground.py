@@ -1,0 +1,185 @@
+"""The ground in front of a building: a height field where it is known, a plane where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import distance_transform_edt, median_filter
+from scipy.optimize import least_squares
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from shellgs_method.geometry.nearest import point_tree
+from shellgs_method.geometry.triangles import Triangles
+
+CELL = 0.1
+"""Side of a cell in metres: kerbs are 10 to 15 cm high."""
+CELLS = 200_000
+"""Number of cells above which they are larger."""
+REACH = 15.0
+"""Horizontal distance from the cameras, in metres, up to which points are taken for ground."""
+BEYOND = 20.0
+"""Width of the ground around the cameras and what is known of it, in metres."""
+BAND = 1.0
+"""Distance from a plane, in metres, within which the ground is."""
+STEP = 0.25
+"""Largest step between neighbouring cells, in metres: stairs have 20 cm, and the tops of walls and cars are higher."""
+GAP = 0.3
+"""Distance in metres from what is known up to which the ground between is taken for known."""
+FADE = 1.0
+"""Distance in metres over which the ground passes into the plane where it is not known."""
+NEAR = 0.1
+"""Distance from the ground in metres up to which a triangle may be of it."""
+FLAT = 0.8
+"""Cosine between the vertical and the normal of a triangle above which it may be of the ground."""
+LOW = 0.25
+"""Quantile of the heights of a cell's points that is the ground's: others are of what stands there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Heights on a grid, in the simulation frame; between them they are interpolated.
+
+    Attributes:
+        heights: in metres; rows along y, columns along x.
+        cell: distance between rows and between columns, in metres.
+        origin: x and y of the first row and column.
+        known: where the heights are measured; elsewhere they pass into a plane.
+    """
+
+    heights: Float64[np.ndarray, "R C"]
+    cell: float
+    origin: Float64[np.ndarray, " 2"]
+    known: Bool[np.ndarray, "R C"]
+
+    @classmethod
+    def level(cls, height: float = 0.0, extent: float = 200.0) -> Ground:
+        """Level ground around the origin, of which nothing is measured."""
+        return cls(np.full((2, 2), height), extent, np.full(2, -extent / 2), np.zeros((2, 2), bool))
+
+    @classmethod
+    def of(cls, points: Float64[np.ndarray, "N 3"], eyes: Float64[np.ndarray, "E 3"]) -> Ground:
+        """The ground that points show: those below the cameras, on cells joined by small steps.
+
+        Level, at height 0, if no points are there.
+
+        Args:
+            points: points of the ground and of other things, in the simulation frame.
+            eyes: camera positions.
+        """
+        away, nearest = point_tree(eyes[:, :2]).query(points[:, :2]) if len(points) else (np.empty(0), np.empty(0, int))
+        points = points[(away < REACH) & (points[:, 2] < eyes[nearest, 2])]
+        if len(points) < 3:
+            return cls.level()
+        plane = _plane(points)
+        points = points[np.abs(points @ [*-plane[:2], 1.0] - plane[2]) < BAND]
+        low, high = (
+            end(np.concatenate([points[:, :2], eyes[:, :2]]), axis=0) + sign * BEYOND
+            for end, sign in ((np.min, -1), (np.max, 1))
+        )
+        cell = max(CELL, float(np.sqrt(np.prod(high - low) / CELLS)))
+        shape = tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 1)
+        rows, columns = np.indices(shape)
+        flat = low[0] + cell * columns, low[1] + cell * rows
+        level = plane[0] * flat[0] + plane[1] * flat[1] + plane[2]
+        measured = _lowest(points, low, cell, shape) - level
+        known = _joined(measured, max(round(GAP / cell), 1))
+        if not known.any():
+            return cls.level()
+        gap, (row, column) = distance_transform_edt(~known, return_indices=True)  # pyright: ignore
+        smooth = median_filter(measured[row, column], size=3)
+        away = gap * cell
+        heights = level + smooth[row, column] * np.exp(-np.maximum(away - GAP, 0) / FADE)
+        return cls(heights, cell, low, away <= GAP)
+
+    def __str__(self) -> str:
+        if not self.known.any():
+            return "The ground is a level plane: nothing is measured of it, or its height was given."
+        area = self.known.sum() * self.cell**2
+        return (
+            f"The ground is a height field, measured on {area:.0f} m² "
+            f"({np.ptp(self.heights[self.known]):.2f} m between its lowest and highest point); elsewhere it is a plane."
+        )
+
+    @property
+    def is_level(self) -> bool:
+        """Whether it is a level plane."""
+        return bool(np.ptp(self.heights) == 0)
+
+    def at(self, places: Float64[np.ndarray, "*N C"]) -> Float64[np.ndarray, " *N"]:
+        """Height below places, given by x, y and any more coordinates; beyond the edge, that of the edge."""
+        axes = [self.origin[k] + self.cell * np.arange(self.heights.shape[1 - k]) for k in (1, 0)]
+        inside = [np.clip(places[..., k], axis[0], axis[-1]) for k, axis in zip((1, 0), axes, strict=True)]
+        return RegularGridInterpolator(axes, self.heights)(np.stack(inside, axis=-1))
+
+    def has(self, surface: Triangles) -> Bool[np.ndarray, " F"]:
+        """Which triangles of a surface are of the ground: level, and and less than 10 cm above or below it."""
+        off = surface.vertices[:, 2] - self.at(surface.vertices)
+        return (np.abs(off[surface.faces]).max(axis=1) < NEAR) & (np.abs(surface.normals[:, 2]) > FLAT)
+
+    @property
+    def surface(self) -> Triangles:
+        """Two triangles for each cell, wound upwards."""
+        rows, columns = np.indices(self.heights.shape)
+        vertices = np.stack(
+            [self.origin[0] + self.cell * columns, self.origin[1] + self.cell * rows, self.heights], axis=-1
+        )
+        number = np.arange(self.heights.size).reshape(self.heights.shape)
+        a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+        faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+        return Triangles(vertices.reshape(-1, 3), faces)
+
+
+LEVEL = Ground.level()
+
+
+def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:
+    """Slopes along x and y, and height at the origin, of the plane of most of the points that are lowest."""
+    squares, square = np.unique(np.floor(points[:, :2]), axis=0, return_inverse=True)
+    order = np.lexsort((points[:, 2], square.ravel()))
+    first = np.searchsorted(square.ravel()[order], np.arange(len(squares)))
+    size = np.diff(np.append(first, len(points)))
+    low = points[order[first + (LOW * size).astype(int)]]
+    middle = np.median(low, axis=0)
+    spread = low - middle
+
+    def off(plane: np.ndarray) -> np.ndarray:
+        steady = 0.1 * np.sqrt(len(low)) * plane[:2]  # few points do not show a slope
+        return np.concatenate([spread[:, 2] - spread[:, :2] @ plane[:2] - plane[2], steady])
+
+    slope = least_squares(off, np.zeros(3), loss="cauchy", f_scale=0.1).x
+    return np.array([slope[0], slope[1], middle[2] + slope[2] - slope[:2] @ middle[:2]])
+
+
+def _lowest(
+    points: Float64[np.ndarray, "N 3"], low: Float64[np.ndarray, " 2"], cell: float, shape: tuple[int, ...]
+) -> Float64[np.ndarray, "R C"]:
+    """A low quantile of the heights of each cell's points; NaN where there are none."""
+    column, row = np.round((points[:, :2] - low) / cell).astype(int).T
+    index = row * shape[1] + column
+    order = np.lexsort((points[:, 2], index))
+    cells, first, size = np.unique(index[order], return_index=True, return_counts=True)
+    heights = np.full(shape[0] * shape[1], np.nan)
+    heights[cells] = points[order[first + (LOW * (size - 1)).astype(int)], 2]
+    return heights.reshape(shape)
+
+
+def _joined(heights: Float64[np.ndarray, "R C"], reach: int) -> Bool[np.ndarray, "R C"]:
+    """The largest group of cells with heights that are joined by small steps, at most ``reach`` cells apart."""
+    number = np.arange(heights.size).reshape(heights.shape)
+    pairs = []
+    for step in range(1, reach + 1):
+        for one, other in (
+            ((slice(None), slice(None, -step)), (slice(None), slice(step, None))),
+            ((slice(None, -step), slice(None)), (slice(step, None), slice(None))),
+        ):
+            joined = np.abs(heights[one] - heights[other]) < STEP
+            pairs.append(np.stack([number[one][joined], number[other][joined]]))
+    rows, columns = np.concatenate(pairs, axis=1)
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(heights.size, heights.size))
+    label = connected_components(graph, directed=False)[1].reshape(heights.shape)
+    known = np.isfinite(heights)
+    return known & (label == np.bincount(label[known]).argmax())

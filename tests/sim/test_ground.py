@@ -1,0 +1,138 @@
+"""The ground in front of a building."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from worlds import frame_at
+
+from shellgs_method.files.usd import import_pxr
+from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.formats.ground import MESH
+from shellgs_method.sim.formats.usd import compliance_errors
+from shellgs_method.sim.formats.world import write_world
+from shellgs_method.sim.ground import CELL, LEVEL, Ground
+from shellgs_method.sim.trials.engine import lidar
+
+EYES = np.stack([np.linspace(-5, 5, 12), np.full(12, -4.0), np.full(12, 1.6)], axis=1)
+
+
+def street(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A street that falls by 3 % along x, with a pavement 12 cm above it and two stairs of 18 cm at the wall."""
+    kerb = np.where(y > -2, 0.12, 0.0) + np.where(y > -0.6, 0.18, 0.0) + np.where(y > -0.3, 0.18, 0.0)
+    return -0.03 * x + kerb
+
+
+def points_of_street(count: int = 60_000, noise: float = 0.01) -> np.ndarray:
+    """Points of it with noise, with a gap, and those of a wall, a flower box and a car's roof."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-8, 8, count), rng.uniform(-8, 0, count)
+    ground = np.stack([x, y, street(x, y) + rng.normal(0, noise, count)], axis=1)
+    ground = ground[np.hypot(x - 2, y + 6) > 1.0]
+    wall = np.stack([rng.uniform(-8, 8, 8000), rng.normal(0.05, 0.01, 8000), rng.uniform(0.4, 6, 8000)], axis=1)
+    flowers = np.stack([rng.uniform(3, 4, 2000), rng.uniform(-1.5, -1, 2000), rng.normal(0.7, 0.01, 2000)], axis=1)
+    under = (ground[:, 0] > 3) & (ground[:, 0] < 4) & (ground[:, 1] > -1.5) & (ground[:, 1] < -1)
+    car = np.stack([rng.uniform(-4, 0, 4000), rng.uniform(-7, -5.5, 4000), rng.normal(1.4, 0.02, 4000)], axis=1)
+    return np.concatenate([ground[~under], wall, flowers, car])
+
+
+@pytest.fixture(scope="module")
+def ground() -> Ground:
+    return Ground.of(points_of_street(), EYES)
+
+
+def test_the_ground_has_the_heights_kerbs_and_steps_of_a_street(ground):
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-7, 7, 71), np.linspace(-7.5, -0.1, 75)))
+    edge = np.min([np.abs(y + 2), np.abs(y + 0.6), np.abs(y + 0.3)], axis=0) < 1.5 * CELL
+    away = ~edge & (np.hypot(x - 2, y + 6) > 1) & (np.abs([x - 3.5, y + 1.25]).max(axis=0) > 0.6)
+    error = np.abs(ground.at(np.stack([x, y], axis=1)) - street(x, y))[away]
+    assert np.quantile(error, 0.95) < 0.02
+    assert error.max() < 0.05
+
+
+def test_what_stands_on_the_ground_is_not_ground(ground):
+    """A flower box 60 cm high: the ground goes on below it. A car's roof above the street: the same."""
+    assert ground.at(np.array([3.5, -1.25])) == pytest.approx(street(np.array(3.5), np.array(-1.25)), abs=0.05)
+    assert ground.at(np.array([-2.0, -6.2])) == pytest.approx(street(np.array(-2.0), np.array(-6.2)), abs=0.02)
+
+
+def test_the_ground_is_a_plane_where_nothing_is_known(ground):
+    rows, columns = np.indices(ground.heights.shape)
+    x, y = ground.origin[0] + ground.cell * columns, ground.origin[1] + ground.cell * rows
+    assert not ground.known[np.hypot(x - 2, y + 6) < 0.5].any()
+    far = (np.abs(x) > 16) | (y < -16)
+    assert not ground.known[far].any()
+    design = np.stack([x[far], y[far], np.ones(far.sum())], axis=1)
+    plane, *_ = np.linalg.lstsq(design, ground.heights[far], rcond=None)
+    assert np.abs(design @ plane - ground.heights[far]).max() < 0.01
+    assert plane[0] == pytest.approx(-0.03, abs=0.01)
+
+
+def test_without_points_the_ground_is_level_and_nothing_is_known():
+    for points in (np.empty((0, 3)), np.array([[0.0, 0, 9], [1, 0, 9], [0, 1, 9]])):
+        made = Ground.of(points, EYES)
+        assert made.is_level
+        assert not made.known.any()
+        assert made.at(np.array([[3.0, 4.0]])) == 0
+
+
+def test_the_surface_has_the_heights(ground):
+    places = np.random.default_rng(1).uniform(-7, -0.5, (500, 2))
+    origins = np.insert(places, 2, 5.0, axis=1)
+    met = 5 - ground.surface.cast(origins, np.array([0.0, 0, -1])).t
+    error = np.abs(met - ground.at(places))
+    assert np.quantile(error, 0.9) < 0.005  # at kerbs a cell's two triangles are not its bilinear patch
+    assert (ground.surface.normals[:, 2] > 0).all()
+
+
+def test_triangles_of_the_ground_are_told_from_others(ground):
+    x, y = np.array([-5.0, -4, -5]), np.array([-5.0, -5, -4])
+    street_, sill = np.stack([x, y, street(x, y)], axis=1), np.stack([x, y, street(x, y) + 0.5], axis=1)
+    wall = np.array([[-5.0, -4, 0.12], [-4, -4, 0.12], [-5, -4, 1]])
+    corners = np.concatenate([street_, sill, wall])
+    np.testing.assert_array_equal(ground.has(Triangles(corners, np.arange(9).reshape(3, 3))), [True, False, False])
+    np.testing.assert_array_equal(LEVEL.has(Triangles(corners, np.arange(9).reshape(3, 3))), [False, False, False])
+
+
+@pytest.fixture(scope="module")
+def folder(ground, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("street")
+    write_world(out, [], frame_at(), ground)
+    return out
+
+
+PLACES = np.random.default_rng(2).uniform([-7, -7.5], [7, -0.4], (300, 2))
+
+
+def test_mujocos_height_field_is_the_ground(ground, folder):
+    down = lidar(folder / "world.xml", np.insert(PLACES, 2, 5.0, axis=1), np.array([[0.0, 0, -1]]), group=0)
+    error = np.abs(5 - down[:, 0] - ground.at(PLACES))
+    assert np.quantile(error, 0.9) < 0.005
+    assert error.max() < 0.1
+
+
+def test_the_mesh_of_the_other_formats_is_the_ground(ground, folder):
+    """And they refer to it: PyBullet's rays meet it."""
+    pybullet = pytest.importorskip("pybullet")
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.loadURDF(str(folder / "world.urdf"), useFixedBase=True, physicsClientId=client)
+    high, deep = (np.insert(PLACES, 2, z, axis=1).tolist() for z in (5.0, -5.0))
+    met = np.array([hit[3][2] for hit in pybullet.rayTestBatch(high, deep, physicsClientId=client)])
+    pybullet.disconnect(client)
+    error = np.abs(met - ground.at(PLACES))
+    assert np.median(error) < 0.01
+    assert np.quantile(error, 0.9) < 0.03
+    stage = import_pxr("sim").Usd.Stage.Open(str(folder / "world.usda"))
+    assert stage.GetPrimAtPath("/World/ground").GetTypeName() == "Mesh"
+    assert compliance_errors(stage) == []
+    assert ET.parse(folder / "world.sdf").getroot().findtext(".//collision[@name='ground']//uri") == MESH
+
+
+def test_files_of_a_ground_are_removed_with_it(ground, tmp_path):
+    write_world(tmp_path, [], frame_at(), ground)
+    write_world(tmp_path, [], frame_at())
+    assert not [*tmp_path.glob("ground.*")]
+    assert "hfield" not in (tmp_path / "world.xml").read_text()
