@@ -9,13 +9,14 @@ from pathlib import Path
 import av
 import av.container
 import av.error
+import cv2
 import numpy as np
 from av.stream import Disposition
 from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
 from PIL import Image
 from rich.progress import Progress
-from scipy.ndimage import laplace, median_filter, uniform_filter1d
+from scipy.ndimage import median_filter, uniform_filter1d
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.transfer import HDR, Transfer, tone_mapped
@@ -81,7 +82,7 @@ def first_frame(video: Path) -> av.VideoFrame | None:
 
 def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
     """Variance of the Laplacian."""
-    return float(laplace(grey.astype(np.float32)).var())
+    return float(cv2.Laplacian(grey, cv2.CV_32F, borderType=cv2.BORDER_REFLECT).var())
 
 
 def shift(before: UInt8[np.ndarray, "H W"], after: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, " 2"]:

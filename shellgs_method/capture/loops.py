@@ -7,6 +7,7 @@ model, from neighbours alone, does: it drifts by centimetres, and a bay is metre
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -14,6 +15,8 @@ import numpy as np
 
 DRIFT = 0.05
 """Largest error of a coarse model, in focal lengths: 35 cm at 7 m; a bay of 3 m at 30 m is twice as much."""
+ASTRAY = 0.05
+"""Offset of matches, in widths of the picture, from which they are of another window: a bay of 3 m at 30 m is 0.07."""
 _SAMPLE = 200  # points of a view that are projected into all others
 _RATIO, _COSINE = 3.0, 0.75  # of distances and between directions, within which features match
 _LEAST_SHARE = 0.25  # of a view's points
@@ -93,6 +96,22 @@ def agree(first: View, second: View, points: np.ndarray, matches: np.ndarray) ->
         offsets.append(np.where(depth > 0, offset, np.inf))
     together = np.concatenate(offsets)
     return len(together) > 0 and float(np.median(together)) < DRIFT
+
+
+def astray(steps: Sequence[np.ndarray], first: np.ndarray, second: np.ndarray, width: int) -> bool:
+    """Whether matches lie elsewhere, in the median, than where the steps between their photographs move them.
+
+    Args:
+        steps: homographies (3, 3) from each photograph to the next, in pixels.
+        first: pixels (M, 2) in the first photograph.
+        second: the same in the last.
+        width: width of the last in pixels.
+    """
+    moved = np.column_stack([first, np.ones(len(first))])
+    for H in steps:
+        moved = moved @ (H / H[2, 2]).T
+    x = moved[:, :2] / np.where(moved[:, 2:] > 0, moved[:, 2:], np.inf)
+    return float(np.median(np.linalg.norm(x - second, axis=1))) > ASTRAY * width
 
 
 def bridges(groups: list[list[str]], count: int) -> list[tuple[str, str]]:

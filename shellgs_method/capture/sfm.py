@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pycolmap
 
-from loops import DRIFT, View, agree, bridges, loops, shared  # pyright: ignore[reportMissingImports]  isort: skip
+from loops import DRIFT, View, agree, astray, bridges, loops, shared  # pyright: ignore[reportMissingImports]  isort: skip
 
 SEED = 0
 _RIGID_DEGREES, _RIGID_STEPS = 3.0, 0.5  # most that cameras which are mounted together move against each other
@@ -28,6 +28,7 @@ _CALIBRATED = "SIMPLE_PINHOLE"  # model of cameras whose focal length is known, 
 _BRIDGES = 16  # views of a model that are matched with those of another, if there are two
 _MIN_JOINING = 30  # matches of points that join two models
 _RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
+_PLANAR = 8.0  # pixels, within which a step's matches are of one plane
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 
 
@@ -121,6 +122,42 @@ def match(database: str, pairs: list[list[str]]) -> None:
         pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
         verification_options=verification,
     )
+
+
+def follow(database: str, passes: list[list[str]]) -> list[list[str]]:
+    """Pairs of names, apart in a pass, whose matches the photographs between them contradict.
+
+    As soon as a window has left the picture, the next one matches as well. What is one step apart is matched rightly;
+    the homographies of these steps, composed, tell where points of a facade are after several.
+
+    Args:
+        database: COLMAP's database.
+        passes: names of photographs in the order they were taken in.
+    """
+    at = {name: (k, number) for k, names in enumerate(passes) for number, name in enumerate(names)}
+    options = pycolmap.RANSACOptions(max_error=_PLANAR, random_seed=SEED)
+    with pycolmap.Database.open(database) as opened:
+        images = {image.image_id: image for image in opened.read_all_images() if image.name in at}
+        xy = {number: opened.read_keypoints(number)[:, :2].astype(float) for number in images}
+        width = {number: opened.read_camera(image.camera_id).width for number, image in images.items()}
+        pairs = []
+        for a, b, matches in _verified(opened):
+            if a in images and b in images and len(matches):
+                if at[images[a].name] > at[images[b].name]:
+                    a, b, matches = b, a, matches[:, ::-1]
+                pairs.append((images[a].name, images[b].name, xy[a][matches[:, 0]], xy[b][matches[:, 1]], width[b]))
+    steps = {}
+    for a, b, x, y, _ in pairs:
+        if at[b] == (at[a][0], at[a][1] + 1) and (found := pycolmap.estimate_homography_matrix(x, y, options)):
+            steps[a] = found["H"]
+    contradicted = []
+    for a, b, x, y, size in pairs:
+        between = passes[at[a][0]][at[a][1] : at[b][1]]
+        if at[a][0] != at[b][0] or len(between) < 2 or not all(name in steps for name in between):
+            continue
+        if astray([steps[name] for name in between], x, y, size):
+            contradicted.append([a, b])
+    return contradicted
 
 
 def find_bridges(models: str) -> list[list[str]]:
@@ -379,7 +416,7 @@ def main() -> None:
     job = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.set_random_seed(SEED)
-    steps = extract, match, find_bridges, join, find_loops, settle, reconstruct, mount, undistort
+    steps = extract, match, follow, find_bridges, join, find_loops, settle, reconstruct, mount, undistort
     step = {step.__name__: step for step in steps}[job.pop("step")]
     print(json.dumps(step(**job)), flush=True)
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import combinations
+from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
 
@@ -275,15 +275,22 @@ class _Capture:
     def _close_loops(self, database: Path, pairs: list[Pair]) -> tuple[list[Any], list[Any] | None]:
         """Match neighbours, then photographs that see the same by a coarse model from neighbours alone.
 
+        Neighbours are no longer so where other windows match.
+
         Returns the models that did not join the largest and, if neighbours are all that matches, the coarse models.
         """
         coarse, joined = self.work.folder / "coarse", self.work.folder / "joined"
         if not self.work.has("coarse", self.model_key):
             self._match(database, pairs, "matching neighbours")
+            astray = {frozenset(pair) for pair in self._astray(database)}
+            if astray:
+                pairs = [pair for pair in pairs if frozenset(pair) not in astray]
+                self._match(database, pairs, "leaving out identical windows")
             with self.work.making("coarse", self.model_key) as folder:
                 models = self._reconstruct(database, folder, "finding cameras by neighbours")
-                (folder / "models.json").write_text(json.dumps({"models": models}))
-        models = read_json(coarse / "models.json")["models"]
+                (folder / "models.json").write_text(json.dumps({"models": models, "pairs": pairs}))
+        found = read_json(coarse / "models.json")
+        models, pairs = found["models"], found.get("pairs", pairs)
         if not models:
             return [], models
         bridges = self._step("find_bridges", "looking for bridges", 1, None, models=str(coarse))
@@ -303,6 +310,13 @@ class _Capture:
         where = {"database": str(database), "models": str(joined), "trusted": pairs}
         kept = self._step("settle", "checking loops", 1, None, **where)
         return apart, None if kept else models
+
+    def _astray(self, database: Path) -> list[Pair]:
+        """Neighbours whose matches contradict those of the photographs between them."""
+        if self.rig or any(map(is_face, self.names)):
+            return []
+        order = [list(names) for _, names in groupby(self.names, key=lambda name: name.rpartition("/")[0])]
+        return self._step("follow", "following the walk", 1, None, database=str(database), passes=order)
 
     def _match(self, database: Path, pairs: list[Pair], description: str) -> None:
         done = partial(_rows, database, "two_view_geometries")

@@ -633,6 +633,7 @@ def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch,
     near, far = [f"a/{k}.jpg" for k in range(5)], [f"b/{k}.jpg" for k in range(5, 8)]
     answers: dict[str, Any] = {
         "reconstruct": [{"names": near, **model}, {"names": far, **model}],
+        "follow": [],
         "find_bridges": [[near[0], far[0]]],
         "join": [{"names": far, "fault": "nobody knows why"}],
         "find_loops": [],

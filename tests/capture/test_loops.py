@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from shellgs_method.capture.loops import DRIFT, View, agree, bridges, loops, shared
+from shellgs_method.capture.loops import DRIFT, View, agree, astray, bridges, loops, shared
 
 BAY = 3.0
 EXTENT = np.array([0.65, 0.4])
@@ -86,3 +89,23 @@ def test_groups_are_bridged_by_views_that_are_spread_over_each():
 
 def test_a_view_of_two_groups_is_not_matched_with_itself():
     assert bridges([["a", "b"], ["b", "c"]], 2) == [("a", "b"), ("a", "c"), ("b", "c")]
+
+
+@pytest.mark.parametrize("distance", [7.0, 30.0])
+def test_a_window_that_is_a_bay_off_is_not_where_the_steps_between_move_it(distance: float):
+    """Ten steps of 0.6 m along a wall with windows every 3 m, in pictures of 960 pixels that shake a little."""
+    focal, bay, random = 720.0, 3.0, np.random.default_rng(0)
+    K = np.array([[focal, 0, 480], [0, focal, 270], [0, 0, 1]])
+    shake = [Rotation.from_rotvec(random.normal(0, 0.01, 3)).as_matrix() for _ in range(11)]
+    cameras = [K @ turn @ np.array([[1, 0, -0.6 * k], [0, 1, 0], [0, 0, distance]]) for k, turn in enumerate(shake)]
+    steps = [after @ np.linalg.inv(before) for before, after in pairwise(cameras)]
+    X = np.column_stack([random.uniform(2, 6, 50), random.uniform(-2, 2, 50), np.ones(50)])
+
+    def seen(camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+        x = points @ camera.T
+        return x[:, :2] / x[:, 2:]
+
+    first = seen(cameras[0], X)
+    relief = seen(cameras[-1], X) * [1.01, 1.0]
+    assert not astray(steps, first, relief, 960)
+    assert astray(steps, first, seen(cameras[-1], X + np.array([bay, 0, 0])), 960)
