@@ -24,13 +24,12 @@ from shellgs_method.synthetic.building import STOREY, Layout, Opening
 from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
 from shellgs_method.synthetic.scene import FacadeConfig, settings_of, write_scene
 
-REACH = 0.12
-"""Metres from a true edge within which it is looked for."""
-BEHIND = -0.09
-"""Distance before the wall, in metres, between it and the window's frame."""
+REACH = 0.06
+"""Metres from a true edge within which it is looked for: less than the breadth of a frame."""
+BEHIND = -0.03
+"""Distance before the wall, in metres, from which the surface has left it; the frame is 18 cm behind."""
 RAILED = 1.15
 """Metres above an opening's lower edge up to which a railing with flowers may hide its sides."""
-
 STEP = 0.002
 """Metres between samples across an edge."""
 
@@ -63,8 +62,10 @@ def main(
         words = ["--max-num-iterations", str(iterations), "--timestamp", str(iterations), "--vis", "tensorboard"]
         words += ["--output-dir", str(work / "runs"), "--steps-per-eval-all-images", "0"]
         subprocess.run(["ns-train", method, "--data", str(scene), *words], check=True)
-    subprocess.run(["shellgs", "elevation", str(run / "config.yml")], check=True)
-    openings = Layout(*(settings_of(scene)[name] for name in ("bays", "storeys"))).openings
+    if not (run / "elevation").exists():
+        subprocess.run(["shellgs", "elevation", str(run / "config.yml")], check=True)
+    settings = FacadeConfig(**settings_of(scene))
+    openings = Layout(settings.bays, settings.storeys).openings
     for file, edge in (("wall-1-depth.tif", falling), ("wall-1.png", rising)):
         corners = corners_of(Drawing.read(run / "elevation", file), openings, edge)
         found = np.isfinite(corners).all(axis=(1, 2))
@@ -91,7 +92,7 @@ class Drawing:
 
     @classmethod
     def read(cls, folder: Path, file: str) -> Drawing:
-        """Read a map; of colours, blue, in which white frames differ most from plaster."""
+        """Read a map; of colours, blue less red, by which a frame differs from plaster in sun and shadow."""
         about = json.loads((folder / "walls.json").read_text())
         wall = about["wall-1"]
         corner = np.array(wall["upper_left"]) + about["offset"]
@@ -99,7 +100,7 @@ class Drawing:
         to_pixels = np.column_stack([axes, -axes @ corner]) @ SHELL_FROM_BUILDING
         to_pixels[:, 3] -= 0.5
         values = np.asarray(Image.open(folder / file), np.float64)
-        return cls(values[..., 2] if values.ndim == 3 else values, to_pixels)
+        return cls(values[..., 2] - values[..., 0] if values.ndim == 3 else values, to_pixels)
 
     def at(self, x: Float[np.ndarray, "*N"], z: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
         """Values at points of the wall, interpolated between pixels."""
@@ -135,7 +136,7 @@ def falling(rows: Float[np.ndarray, "L A"]) -> float:
 
 
 def rising(rows: Float[np.ndarray, "L A"]) -> float:
-    """Where colours rise most from the plaster to the frame, which is white, in the mean of the rows."""
+    """Where values rise most from plaster to frame, in the mean of the rows."""
     blurred = gaussian_filter1d(rows.mean(axis=0), 0.004 / STEP)
     return float(np.diff(blurred).argmax()) + 0.5
 

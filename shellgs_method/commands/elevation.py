@@ -23,9 +23,9 @@ def elevation(
     Args:
         config: The run's config.yml.
         output: Folder. If not set: elevation beside the config.
-        pixel: Size of a pixel in metres. If not set: that of the photographs' on the facade.
+        pixel: Size of a pixel in metres. If not set: a third of the photographs' on the facade, or 5 mm.
     """
-    from shellgs_method.export.elevation import MARGIN, draw, shell_and_walls, write_elevation
+    from shellgs_method.export.elevation import MARGIN, draw, shell_and_walls, usual_pixel, write_elevation
     from shellgs_method.export.runs import TrainedRun
     from shellgs_method.geometry.triangles import Triangles
     from shellgs_method.machine.progress import track
@@ -34,7 +34,7 @@ def elevation(
         raise SceneError("--pixel must be above 0")
     output, run = output or config.with_name("elevation"), TrainedRun.load(config)
     (shell, walls), mesh = shell_and_walls(run), run.surface(MARGIN)
-    surface, pixel, facts = Triangles(mesh.vertices, mesh.faces), pixel or run.resolution(run.box(MARGIN)) or 0.01, {}
+    surface, pixel, facts = Triangles(mesh.vertices, mesh.faces), pixel or usual_pixel(run, walls), {}
     for number, wall in enumerate(track(walls, "Drawing wall", len(walls)), 1):
         name = f"wall-{number}"
         write_elevation(output, name, draw(run, wall, surface, shell, pixel))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,6 +36,10 @@ MARGIN = 0.3
 """Metres around a wall that its elevation shows too."""
 LARGEST = 20_000
 """Pixels along the longer side of an elevation."""
+FINEST = 0.005
+"""Metres: a tenth of a millimetre in a drawing 1 : 50. Pixels are smaller only where the photographs' are."""
+WITHIN = 3
+"""Pixels of an elevation along one of the photographs, in which edges are found to a fraction of a pixel."""
 SCALES = 10, 20, 25, 50, 100, 200, 250, 500, 1000
 """Usual scales of drawings, 1 to …"""
 PAPER = 0.42, 0.297
@@ -99,6 +104,16 @@ def shell_and_walls(run: TrainedRun) -> tuple[Triangles, list[Wall]]:
     if not walls:
         raise SceneError("the photographs see no upright surface of the shell: there is nothing to draw")
     return surface, [wall.widened(MARGIN) for wall in walls]
+
+
+def usual_pixel(run: TrainedRun, walls: Sequence[Wall]) -> float:
+    """Size of a pixel in metres by what the photographs resolve, and for at most :data:`LARGEST` pixels along a wall.
+
+    In pixels as large as theirs, an edge would be half a pixel off.
+    """
+    resolved = run.resolution(run.box(MARGIN)) or 2 * FINEST
+    longest = max(float(wall.size[:2].max()) for wall in walls)
+    return max(min(resolved, max(resolved / WITHIN, FINEST)), longest / (LARGEST - 1))
 
 
 def draw(run: TrainedRun, wall: Wall, surface: Triangles, shell: Triangles, pixel: float) -> Elevation:

@@ -12,7 +12,8 @@ import torch
 from PIL import Image
 from training_runs import data_of, model_of, trainer_of
 
-from shellgs_method.export.elevation import draw, shell_and_walls
+from shellgs_method.export import elevation
+from shellgs_method.export.elevation import MARGIN, draw, shell_and_walls, usual_pixel
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.synthetic.building import Layout
@@ -80,6 +81,14 @@ def test_a_gaussian_is_drawn_where_it_is_at_every_distance_before_the_wall(run):
         assert near.max() > 128
         found = np.array([(near * columns).sum(), (near * rows).sum()]) / near.sum()
         np.testing.assert_allclose(found, [column, row], atol=0.1)
+
+
+def test_pixels_are_finer_than_the_photographs_but_not_too_many(run, monkeypatch):
+    _, walls = shell_and_walls(run)
+    resolved = run.resolution(run.box(MARGIN))
+    assert usual_pixel(run, walls) == pytest.approx(resolved / 3)
+    monkeypatch.setattr(elevation, "LARGEST", 20)
+    assert np.ceil(max(wall.size[:2].max() for wall in walls) / usual_pixel(run, walls)) <= 20
 
 
 def test_the_command_writes_images_with_world_files_and_a_drawing(run, trained, shellgs, tmp_path, caplog):

@@ -322,11 +322,10 @@ def test_the_command_proposes_where_photographs_say_that_they_were_taken(tmp_pat
         Image.open(view.image).save(view.image, exif=exif)
     told = shellgs("align", scene, scan, "--crs", "EPSG:25832")
     assert re.search(r"10 photographs have geo-tags, in the median [1-6]\.\d m off it\.", told), told
-    assert "Ambiguous" not in told
+    assert "Ambiguous" not in told  # as it is without them: the other facade scores 100 %
     proposed = Alignment.load(scene / PROPOSAL)
     there = transformed(one.vertices, SHELL_FROM_BUILDING)
     assert np.abs(proposed.apply(there) - transformed(there, TRUTH)).max() < 0.1
-    assert "is refused" in shellgs("align", scene, scan)  # without the scan's system both facades are as likely
 
 
 @pytest.mark.parametrize(("axis", "within"), [("z", 0.0), ("y", 0.0), ("x", 0.0), ("none", 5.0)])
