@@ -29,7 +29,7 @@ SKIN = 0.002
 """Distance in metres inside a surface from which rays look for its back."""
 GRAZING = 0.05
 """Cosine between a ray and a normal below which the ray passes along a surface, and not through it."""
-COVERED = 0.005
+COVERED = 0.001
 """Parts that protrude from the others by no more than this, in metres, are left out."""
 GROUND = 0.1
 """Height in metres above the ground up to which the fused surface is the ground's."""
