@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worlds import LAYOUT, write_folder
+from worlds import LAYOUT, uneven, write_folder
 
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.collision.collider import Collider, make_collider
 from shellgs_method.sim.front import Front, places_before
+from shellgs_method.sim.ground import LEVEL, Ground
 from shellgs_method.sim.trials.engine import beams
 from shellgs_method.synthetic.building import shell
 from shellgs_method.synthetic.path import walk
@@ -39,3 +40,11 @@ def lidar_rays(collider, eyes) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions of a lidar's rays at three places."""
     places, rays = places_before(collider.surface, Front.of(collider.surface, eyes), count=3), beams(6, 40)
     return np.repeat(places, len(rays), axis=0), np.tile(rays, (len(places), 1))
+
+
+@pytest.fixture(scope="package", params=["level", "uneven"])
+def street(request, collider, world, tmp_path_factory) -> tuple[Path, Ground]:
+    """The world on level ground, and on ground as it is."""
+    if request.param == "level":
+        return world, LEVEL
+    return write_folder(tmp_path_factory.mktemp("street"), collider, ground=uneven()), uneven()

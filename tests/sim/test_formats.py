@@ -15,7 +15,7 @@ import torch
 import trimesh
 import yourdfpy
 from PIL import Image
-from worlds import check_rays, frame_at, painted, some_splats, write_building, write_folder
+from worlds import check_rays, frame_at, painted, some_splats, uneven, write_building, write_folder
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.usd import import_pxr
@@ -122,15 +122,15 @@ def test_a_robots_foot_decides_about_its_contact_with_the_ground_and_a_wall_abou
     assert all(contact.solref[0] == pytest.approx(STIFF, rel=0.05) for contact in of["ball"])
 
 
-def test_a_lidar_in_mujoco_agrees_with_ray_casting(world, collider, lidar_rays):
-    origins, rays = lidar_rays
+def test_a_lidar_in_mujoco_agrees_with_ray_casting(street, collider, lidar_rays):
+    (world, ground), (origins, rays) = street, lidar_rays
     measured = lidar(world / "world.xml", origins[::240], rays[:240], group=3).ravel()
-    check_rays(measured, collider.surface, origins, rays)
+    check_rays(measured, collider.surface, ground, origins, rays)
 
 
-def test_a_lidar_in_pybullet_agrees_with_ray_casting(world, collider, lidar_rays):
+def test_a_lidar_in_pybullet_agrees_with_ray_casting(street, collider, lidar_rays):
     bullet = pytest.importorskip("pybullet", reason="it has no wheel for this Python")
-    origins, rays = lidar_rays
+    (world, ground), (origins, rays) = street, lidar_rays
     client = bullet.connect(bullet.DIRECT)
     try:
         body = bullet.loadURDF(str(world / "world.urdf"), useFixedBase=True)
@@ -143,15 +143,15 @@ def test_a_lidar_in_pybullet_agrees_with_ray_casting(world, collider, lidar_rays
     finally:
         bullet.disconnect(client)
     share = np.array([hit[2] for hit in hits])
-    check_rays(np.where(share < 1, 90 * share, np.inf), collider.surface, origins, rays)
+    check_rays(np.where(share < 1, 90 * share, np.inf), collider.surface, ground, origins, rays)
 
 
 @pytest.mark.slow
-def test_a_lidar_in_newton_agrees_with_ray_casting(world, collider, lidar_rays):
+def test_a_lidar_in_newton_agrees_with_ray_casting(street, collider, lidar_rays):
     """From the USD; ``pip install newton newton-usd-schemas``, and a minute the first time, for its kernels."""
     newton = pytest.importorskip("newton")
     warp = pytest.importorskip("warp")
-    origins, rays = lidar_rays
+    (world, ground), (origins, rays) = street, lidar_rays
     builder = newton.ModelBuilder()
     builder.add_usd(str(world / "world.usda"), load_visual_shapes=False, force_show_colliders=True)
     model = builder.finalize(device="cpu")
@@ -164,7 +164,7 @@ def test_a_lidar_in_newton_agrees_with_ray_casting(world, collider, lidar_rays):
     home = warp.array([warp.transform_identity()], dtype=warp.transformf, device="cpu")
     camera.update(model.state(), home, warp.array(bundle, dtype=warp.vec3f, device="cpu"), depth_image=depth)
     measured = depth.numpy()[0, 0]
-    check_rays(np.where(measured > 0, measured, np.inf), collider.surface, origins, rays)
+    check_rays(np.where(measured > 0, measured, np.inf), collider.surface, ground, origins, rays)
 
 
 def files_named(path: Path) -> set[Path]:
@@ -406,7 +406,7 @@ def test_two_buildings_are_one_world(collider, tmp_path):
         [part for part in (Part.hull(p.vertices + np.array([20, 0, 0])) for p in collider.parts) if part], 0
     )
     assets = [write_building(tmp_path, one, name) for one, name in ((collider, "left"), (away, "right"))]
-    write_world(tmp_path, assets, frame_at())
+    write_world(tmp_path, assets, frame_at(), uneven())
     model = load(tmp_path / "world.xml")
     assert {model.body(k).name for k in range(1, model.nbody)} == {"left/left", "right/right"}
     assert {*yourdfpy.URDF.load(str(tmp_path / "world.urdf")).link_map} == {"world", "ground", "left", "right"}

@@ -55,9 +55,10 @@ def test_warnings_of_a_simulation_are_still_kept_after_compiling_a_model(tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_no_thrown_body_gets_through_sticks_or_gains_energy(world, collider, eyes):
+def test_no_thrown_body_gets_through_sticks_or_gains_energy(street, collider, eyes):
+    world, ground = street
     with warnings_kept() as warnings:
-        thrown = throw(world / "world.xml", collider.surface, Ground.level(), eyes, count=60, seconds=2.5)
+        thrown = throw(world / "world.xml", collider.surface, ground, eyes, count=60, seconds=2.5)
     assert not warnings
     assert thrown.hits > 50
     assert (thrown.through, thrown.stuck, thrown.gained) == (0, 0, 0)
@@ -77,9 +78,10 @@ def test_the_facades_front_is_its_wall(collider, eyes):
     assert front.length == pytest.approx(LAYOUT.length + 0.8, rel=0.1)
 
 
-def test_a_capsule_walks_along_the_facade_and_touches_it(world, collider, eyes):
+def test_a_capsule_walks_along_the_facade_and_touches_it(street, collider, eyes):
+    world, ground = street
     front = Front.of(collider.surface, eyes)
-    walked = walk(world / "world.xml", collider.surface, Ground.level(), front)
+    walked = walk(world / "world.xml", collider.surface, ground, front)
     assert walked.metres > 0.8 * front.length
     assert walked.touching > 0.02
     assert walked.deepest < 0.03

@@ -17,6 +17,7 @@ from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.usd import write_usd_asset
 from shellgs_method.sim.formats.world import write_asset, write_world
 from shellgs_method.sim.frame import SimFrame
+from shellgs_method.sim.ground import LEVEL, Ground
 from shellgs_method.sim.look.texture import TexturedMesh
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.synthetic.building import Layout
@@ -66,21 +67,29 @@ def frame_at(offset=(0.0, 0.0, 0.0), crs: str = "", metric: bool = True) -> SimF
     return SimFrame("shell", np.eye(4), np.array(offset), metric, Z, to_national, crs=crs)
 
 
-def write_folder(out: Path, collider: Collider, frame: SimFrame | None = None) -> Path:
+def uneven() -> Ground:
+    """A street that falls along x and waves, with a kerb of 12 cm, off the middle."""
+    cell, origin = 0.2, np.array([-16.0, -14.0])
+    y, x = np.meshgrid(origin[1] + cell * np.arange(120), origin[0] + cell * np.arange(200), indexing="ij")
+    heights = -0.02 * x + 0.05 * np.sin(x) * np.cos(y) + np.where(y > -2, 0.12, 0.0) - 0.3
+    return Ground(heights, cell, origin, np.ones(heights.shape, bool))
+
+
+def write_folder(out: Path, collider: Collider, frame: SimFrame | None = None, ground: Ground | None = None) -> Path:
     """Write the world of one building."""
     frame = frame or frame_at()
-    write_world(out, [write_building(out, collider, metric=frame.metric)], frame)
+    write_world(out, [write_building(out, collider, metric=frame.metric)], frame, ground or LEVEL)
     return out
 
 
-def check_rays(measured: np.ndarray, surface: Triangles, origins: np.ndarray, rays: np.ndarray) -> None:
-    """Compare distances with those to the collider, or to the ground at z = 0: equal to a centimetre."""
+def check_rays(measured: np.ndarray, surface: Triangles, ground: Ground, origins: np.ndarray, rays: np.ndarray) -> None:
+    """Compare distances with those to the collider, or to the ground: equal to a centimetre."""
     aside = np.cross(rays, [0.3, 0.5, 0.8])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     shifts = [np.zeros(3), *(sign * BLUR * axis for sign in (1, -1) for axis in (aside, np.cross(rays, aside)))]
-    near = [surface.cast(origins + shift, rays).t for shift in shifts]
-    with np.errstate(divide="ignore"):
-        ground = np.where(rays[:, 2] < 0, origins[:, 2] / -rays[:, 2], np.inf)
-    assert np.isfinite(near[0]).mean() > 0.15
-    assert (measured >= np.minimum(np.min(near, axis=0), ground) - 0.01).all()
-    assert (measured <= np.minimum(np.max(near, axis=0), ground) + 0.01).all()
+    both = surface, ground.surface
+    met = [np.min([each.cast(origins + shift, rays).t for each in both], axis=0) for shift in shifts]
+    assert np.isfinite(surface.cast(origins, rays).t).mean() > 0.15
+    assert np.isfinite(met[0]).mean() > 0.5
+    assert (measured >= np.min(met, axis=0) - 0.01).all()
+    assert (measured <= np.max(met, axis=0) + 0.01).all()

@@ -122,12 +122,14 @@ def throw(
     launched, energy = _energy(model, data, bodies), np.zeros(count)
     hit, through, deepest = np.zeros(count, bool), np.zeros(count, bool), 0.0
     floor, before = model.geom("ground").id, data.xpos[bodies].copy()
+    solid = surface, ground.surface
     depth, support = np.zeros(count), np.zeros((count, 3))
     for _ in range(round(seconds / model.opt.timestep)):
         mujoco.mj_step(model, data)
         energy = np.maximum(energy, _energy(model, data, bodies) - launched)
         now = data.xpos[bodies].copy()
-        through |= (surface.cast(before, now - before).t <= 1) | (now[:, 2] < ground.at(now))
+        for each in solid:
+            through |= each.cast(before, now - before).t <= 1
         before = now
         depth[:], support[:] = 0, 0
         touching = model.geom_bodyid[data.contact.geom]
