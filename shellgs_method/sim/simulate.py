@@ -36,6 +36,8 @@ from shellgs_method.sim.trials.engine import import_mujoco
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
+OUTDATED = "facade.xml"
+"""A file that version 0.2.0 wrote, which knew no folder for each building."""
 MAX_GAP = 2.0
 """Gap in metres from which the pieces of a building's collision geometry are reported as separate."""
 
@@ -64,6 +66,11 @@ def simulate(
     """
     if not configs or out.suffix in (".yml", ".yaml") or out.is_file():
         raise SceneError(f"give the config.yml of at least one run, then an output folder (last was {out})")
+    if (out / OUTDATED).exists():
+        raise SceneError(
+            f"{out} is of an earlier version, whose files ({OUTDATED} and others) would stay beside the new ones: "
+            "remove it, or give another folder"
+        )
     import_mujoco()  # fail before hours of work
     out.mkdir(parents=True, exist_ok=True)
     names: list[str] = []

@@ -32,7 +32,7 @@ from shellgs_method.sim.front import Front
 from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import rendered
 from shellgs_method.sim.settings import SimSettings
-from shellgs_method.sim.simulate import simulate
+from shellgs_method.sim.simulate import OUTDATED, simulate
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, load, warnings_kept
 from shellgs_method.sim.trials.trials import throw, walk
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
@@ -248,6 +248,13 @@ def test_a_missing_config_or_folder_is_refused(tmp_path):
     for configs, out in (((), tmp_path), ((), tmp_path / "config.yml")):
         with pytest.raises(SceneError, match=r"give the config\.yml"):
             simulate(configs, out, SMALL)
+
+
+def test_a_folder_of_an_earlier_version_is_refused_and_stays(tmp_path):
+    (tmp_path / OUTDATED).write_text("<mujoco/>")
+    with pytest.raises(SceneError, match=r"earlier version.*give another folder"):
+        simulate([tmp_path / "config.yml"], tmp_path, SMALL)
+    assert [path.name for path in tmp_path.iterdir()] == [OUTDATED]
 
 
 def test_walls_far_apart_are_reported(collider):
