@@ -229,13 +229,14 @@ def _level_below(view: DepthView, up: Float64[np.ndarray, " 3"]) -> Float64[np.n
 
 
 def _level_points(run: TrainedRun) -> Float64[np.ndarray, "P 3"]:
-    """Points of the shell's level surfaces."""
+    """Points of the shell's level surfaces below the sky: not those of cellars."""
     shell = Triangles(run.shell_in_frame.vertices, run.shell_in_frame.faces)
     level = np.abs(shell.normals @ run.frame.up) > LEVEL
     if not level.any():
         return np.empty((0, 3))
     flat = Triangles(shell.vertices, shell.faces[level])
-    return flat.samples(int(np.clip(PER_SQUARE_METRE * flat.areas.sum(), 1, MOST_SAMPLES)))[0]
+    points = flat.samples(int(np.clip(PER_SQUARE_METRE * flat.areas.sum(), 1, MOST_SAMPLES)))[0]
+    return points[~shell.blocked(points + 1e-3 * run.frame.up, run.frame.up)]
 
 
 def moved_into(

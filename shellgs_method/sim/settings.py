@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Optional
+
+from shellgs_method.errors import SceneError
 
 
 @dataclass(frozen=True)
@@ -25,3 +28,8 @@ class SimSettings:
     """Height of level ground in the shell's coordinates. If not set: the ground as scan and photographs show it."""
     test: bool = False
     """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""
+
+    def __post_init__(self) -> None:
+        """Refuse a number of parts that no collision geometry has."""
+        if not 0 < self.parts < math.inf:
+            raise SceneError(f"collision geometry cannot have {self.parts:g} parts for 100 m²: give --parts above 0")

@@ -27,7 +27,7 @@ from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.usd import write_usd_asset
 from shellgs_method.sim.formats.world import write_asset, write_world
-from shellgs_method.sim.ground import LEVEL, Ground
+from shellgs_method.sim.ground import LEVEL, STEP, Ground
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
@@ -36,6 +36,8 @@ from shellgs_method.sim.trials.engine import import_mujoco
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
+RESERVED = ("world", "site", "ground", "physics", "light", "sun", "friction")
+"""Names of parts of a world, in one format or another."""
 OUTDATED = "facade.xml"
 """A file that version 0.2.0 wrote, which knew no folder for each building."""
 MAX_GAP = 2.0
@@ -88,6 +90,8 @@ def simulate(
     points, eyes = ([getattr(chapter.made, name) for chapter in chapters] for name in ("ground_points", "eyes"))
     ground = Ground.of(np.concatenate(points), np.concatenate(eyes)) if settings.ground is None else LEVEL
     log(str(ground))
+    for chapter in chapters:
+        _report_steps(chapter.made, settings.ground is None, ground, log)
     write_world(out, assets, home, ground)
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
@@ -176,8 +180,21 @@ def _report_leaks(found: Leaks, made: Reconstruction, log: Callable[[str], None]
         )
 
 
+def _report_steps(made: Reconstruction, measured: bool, ground: Ground, log: Callable[[str], None]) -> None:
+    """Report a building that does not stand on the ground of its world."""
+    own = Ground.of(made.ground_points, made.eyes) if measured else LEVEL
+    below = float(np.median(own.at(made.eyes) - ground.at(made.eyes)))
+    if abs(below) > STEP:
+        log(
+            f"The ground of the world is {abs(below):.1f} m {'below' if below > 0 else 'above'} that before "
+            f"{made.scene}: the buildings stand at different heights, and only one street is measured. Export them one "
+            "by one."
+        )
+
+
 def _name(scene: str, taken: Sequence[str]) -> str:
-    """A unique name for a building that is valid in XML, USD and file systems."""
+    """A unique name for a building that is valid in XML, USD and file systems, and no part of a world."""
     name = re.sub(r"\W", "_", scene, flags=re.ASCII)
-    name = name if re.match(r"[A-Za-z]", name) else f"building_{name}"
-    return next(made for made in (name, *(f"{name}_{k}" for k in range(2, 100))) if made not in taken)
+    name = name if re.match(r"[A-Za-z]", name) and name.lower() not in RESERVED else f"building_{name}"
+    lower = [other.lower() for other in taken]
+    return next(made for made in (name, *(f"{name}_{k}" for k in range(2, 100))) if made.lower() not in lower)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
-from shellgs_method.sim.building import moved_into
+from shellgs_method.sim.building import _level_points, moved_into
 from shellgs_method.sim.collision.clusters import clusters
 from shellgs_method.sim.collision.collider import Collider, depths, leaks, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
@@ -35,6 +37,8 @@ from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.deviations import find_deviations
 from shellgs_method.sim.frame import SimFrame, sim_frame
 from shellgs_method.sim.look.texture import Photo, bake
+from shellgs_method.sim.settings import SimSettings
+from shellgs_method.sim.simulate import _name
 from shellgs_method.synthetic.building import RECESS, Layout, building, shell
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk
@@ -264,8 +268,49 @@ def test_surfaces_without_planes_become_parts_too(eyes):
 def test_an_empty_collider_is_refused(nothing):
     with pytest.raises(SceneError, match="there is nothing to collide with"):
         make_collider(None, nothing, np.array([False]))
-    with pytest.raises(SceneError, match="cannot have 0 parts for 100"):
-        make_collider(None, nothing, np.array([True]), density=0)
+
+
+@pytest.mark.parametrize("parts", [0, -1, math.nan, math.inf])
+def test_a_number_of_parts_that_nothing_has_is_refused_at_once(parts):
+    with pytest.raises(SceneError, match=r"cannot have .* parts for 100"):
+        SimSettings(parts=parts)
+
+
+def test_a_surface_that_a_file_has_twice_keeps_its_door(nothing):
+    """Many exports have each side of a wall as triangles of its own."""
+    once = wall_with_bays(0.25)
+    twice = Triangles(
+        np.tile(once.vertices, (2, 1)), np.concatenate([once.faces, once.faces[:, ::-1] + len(once.vertices)])
+    )
+    eyes = eyes_before()
+    made = [
+        make_collider(wound, nothing, np.array([False]), outside)
+        for wound, outside in (from_outside(surface, eyes) for surface in (once, twice))
+    ]
+    assert len(made[0].parts) == len(made[1].parts)
+    middle, _, springing = GATE
+    through = [each.surface.blocked(np.array([[middle, -3, springing / 2]]), np.array([[0, 1.0, 0]])) for each in made]
+    assert not np.any(through)
+
+
+def test_a_cellar_is_no_ground():
+    floors = [box([0, 0, height], [8, 6, height + 0.01]) for height in (-3.0, 0.3)]
+    vertices = np.concatenate([floor.vertices for floor in floors])
+    faces = np.concatenate([floor.faces + 8 * k for k, floor in enumerate(floors)])
+    shell = SimpleNamespace(vertices=vertices, faces=faces)
+    run = SimpleNamespace(shell_in_frame=shell, frame=SimpleNamespace(up=np.array([0, 0, 1.0])))
+    points = _level_points(run)  # pyright: ignore[reportArgumentType]
+    assert len(points) > 50
+    assert points[:, 2].min() > 0.29
+
+
+def test_a_building_is_never_named_as_a_part_of_the_world_or_another():
+    assert [_name(scene, ["Town_hall"]) for scene in ("ground", "World", "town hall", "7 b")] == [
+        "building_ground",
+        "building_World",
+        "town_hall_2",
+        "building_7_b",
+    ]
 
 
 def cameras_of_scene() -> list[Camera]:

@@ -78,13 +78,11 @@ def make_collider(
         fused: reconstructed surface, wound outwards.
         standing: mask of its triangles in front of the shell, from :func:`standing_before`.
         outside: mask of the shell's triangles that are seen from outside; None for all.
-        density: maximum number of convex parts for 100 square metres of surface.
+        density: maximum number of convex parts for 100 square metres of surface, above 0.
 
     Raises:
-        SceneError: there is no surface to collide with, or ``density`` is not above 0.
+        SceneError: there is no surface to collide with.
     """
-    if density <= 0:
-        raise SceneError(f"collision geometry cannot have {density:g} parts for 100 m²: give --parts above 0")
     groups = connected(fused.faces, np.flatnonzero(standing))
     built = [np.empty(0, np.int64), *(group for group in groups if fused.areas[group].sum() >= SPECK)]
     built = Triangles(fused.vertices, fused.faces[np.concatenate(built)])

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float64
 
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
+from shellgs_method.sim.collision.clusters import WELDED
 
 RAYS = 16
 """Number of random points of a triangle whose centre no camera sees, each with a ray to a camera and one to the sky."""
@@ -20,6 +21,8 @@ open back of a shell, the sky behind sees the wrong side."""
 def from_outside(surface: Triangles, eyes: Float64[np.ndarray, "E 3"]) -> tuple[Triangles, Bool[np.ndarray, " F"]]:
     """Wind triangles outwards, and return which are seen by cameras or from the sky: not rooms, or what is in walls.
 
+    Of triangles at the same place, as in files that have each side of a surface, one is.
+
     Args:
         surface: surface of any winding.
         eyes: camera positions.
@@ -28,7 +31,7 @@ def from_outside(surface: Triangles, eyes: Float64[np.ndarray, "E 3"]) -> tuple[
     surface, seen = outward(surface, eyes)
     rest = np.flatnonzero(~seen)
     if not len(rest) or not seen.any():
-        return surface, np.ones(len(seen), bool)
+        return surface, _first(surface)
     front = eyes.mean(axis=0) - np.average(surface.centres[seen], axis=0, weights=surface.areas[seen])
     rng = np.random.default_rng(0)
     agreement = 1 - 2 * (surface.faces[seen] != given[seen]).any(axis=1).mean()
@@ -52,4 +55,11 @@ def from_outside(surface: Triangles, eyes: Float64[np.ndarray, "E 3"]) -> tuple[
     faces = surface.faces.copy()
     faces[rest[votes < 0]] = faces[rest[votes < 0], ::-1]
     seen[rest] = shown
-    return Triangles(surface.vertices, faces), seen
+    return Triangles(surface.vertices, faces), seen & _first(surface)
+
+
+def _first(surface: Triangles) -> Bool[np.ndarray, " F"]:
+    """The first of triangles at the same place, whichever way they are wound."""
+    _, vertex = np.unique(np.round(surface.vertices / WELDED).astype(np.int64), axis=0, return_inverse=True)
+    _, first = np.unique(np.sort(vertex.ravel()[surface.faces], axis=1), axis=0, return_index=True)
+    return np.isin(np.arange(len(surface.faces)), first)
