@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from shellgs_method.errors import SceneError
 from shellgs_method.export.frame import Frame, Z
 from shellgs_method.geometry.axes import turn
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
 
+MAX_STEP = 20.0
+"""Largest distance in metres of a given ground from the lower edge of the surface: a hill, no mistake."""
 LOWEST = 0.002
 """Share of a shell's points that may lie below the ground: its lower edge is never quite even."""
 
@@ -50,6 +53,9 @@ def sim_frame(
         surface: points of the shell, or else of the reconstruction, in that frame.
         cameras: cameras of the photographs, in the scene.
         ground: ground height in the shell's own coordinates, in metres; the surface's lower edge if None.
+
+    Raises:
+        SceneError: the ground is far from the surface's lower edge.
     """
     from_scene = np.linalg.inv(frame.to_scene)
     upright = np.eye(4)
@@ -57,7 +63,13 @@ def sim_frame(
     offset = upright[:3, :3] @ frame.offset
     points = transformed(surface, upright) + offset
     origin = np.median(transformed(transformed(positions(cameras), from_scene), upright), axis=0) + offset
-    origin[2] = np.quantile(points[:, 2], LOWEST) if ground is None else ground
+    lowest = float(np.quantile(points[:, 2], LOWEST))
+    if ground is not None and abs(ground - lowest) > MAX_STEP:
+        raise SceneError(
+            f"--ground {ground:g} is {abs(ground - lowest):.0f} m from the lower edge of the shell, which is at "
+            f"{lowest:.2f} in its own coordinates: give the height of the ground in these"
+        )
+    origin[2] = lowest if ground is None else ground
     origin[:2] = np.round(origin[:2]) if frame.metric else origin[:2]
     motion = upright.copy()
     motion[:3, 3] = offset - origin

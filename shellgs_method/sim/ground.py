@@ -37,6 +37,11 @@ FLAT = 0.8
 """Cosine between the vertical and the normal of a triangle above which it may be of the ground."""
 LOW = 0.25
 """Quantile of the heights of a cell's points that is the ground's: others are of what stands there."""
+STEADY = 100.0
+"""Spread of the ground that halves a slope, as the sum over its square metres of their squared distance from its middle
+along an axis: that of 10 square metres over 10 metres."""
+LEAST = 5.0
+"""Area in square metres, measured, below which the ground is taken for level at height 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +69,7 @@ class Ground:
     def of(cls, points: Float64[np.ndarray, "N 3"], eyes: Float64[np.ndarray, "E 3"]) -> Ground:
         """The ground that points show: those below the cameras, on cells joined by small steps.
 
-        Level, at height 0, if no points are there.
+        Level, at height 0, if hardly any points are there.
 
         Args:
             points: points of the ground and of other things, in the simulation frame.
@@ -87,7 +92,7 @@ class Ground:
         level = plane[0] * flat[0] + plane[1] * flat[1] + plane[2]
         measured = _lowest(points, low, cell, shape) - level
         known = _joined(measured, max(round(GAP / cell), 1))
-        if not known.any():
+        if known.sum() * cell**2 < LEAST:
             return cls.level()
         gap, (row, column) = distance_transform_edt(~known, return_indices=True)  # pyright: ignore
         smooth = median_filter(measured[row, column], size=3)
@@ -97,7 +102,7 @@ class Ground:
 
     def __str__(self) -> str:
         if not self.known.any():
-            return "The ground is a level plane: nothing is measured of it, or its height was given."
+            return f"The ground is a level plane at height 0: less than {LEAST:g} m² are measured of it."
         area = self.known.sum() * self.cell**2
         return (
             f"The ground is a height field, measured on {area:.0f} m² "
@@ -147,10 +152,10 @@ def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:
     spread = low - middle
 
     def off(plane: np.ndarray) -> np.ndarray:
-        steady = 0.1 * np.sqrt(len(low)) * plane[:2]  # few points do not show a slope
-        return np.concatenate([spread[:, 2] - spread[:, :2] @ plane[:2] - plane[2], steady])
+        return spread[:, 2] - spread[:, :2] @ plane[:2] - plane[2]
 
     slope = least_squares(off, np.zeros(3), loss="cauchy", f_scale=0.1).x
+    slope[:2] *= 1 / (1 + STEADY / np.square(spread[:, :2]).sum(axis=0).clip(1e-9))  # few points do not show a slope
     return np.array([slope[0], slope[1], middle[2] + slope[2] - slope[:2] @ middle[:2]])
 
 

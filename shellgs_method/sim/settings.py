@@ -30,6 +30,10 @@ class SimSettings:
     """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""
 
     def __post_init__(self) -> None:
-        """Refuse a number of parts that no collision geometry has."""
-        if not 0 < self.parts < math.inf:
-            raise SceneError(f"collision geometry cannot have {self.parts:g} parts for 100 m²: give --parts above 0")
+        """Refuse numbers that nothing can be made with, before hours of work."""
+        for name in ("parts", "faces", "voxel", "texel", "megabytes"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise SceneError(f"--{name} {value:g} cannot be: give a number above 0")
+        if self.ground is not None and not math.isfinite(self.ground):
+            raise SceneError(f"--ground {self.ground:g} is no height: give it in the shell's coordinates, in metres")

@@ -89,7 +89,8 @@ def simulate(
     assets = [chapter.asset for chapter in chapters]
     points, eyes = ([getattr(chapter.made, name) for chapter in chapters] for name in ("ground_points", "eyes"))
     ground = Ground.of(np.concatenate(points), np.concatenate(eyes)) if settings.ground is None else LEVEL
-    log(str(ground))
+    log(str(ground) if settings.ground is None else f"The ground is level, {settings.ground:g} m high, as given.")
+    tell("Writing the world")
     for chapter in chapters:
         _report_steps(chapter.made, settings.ground is None, ground, log)
     write_world(out, assets, home, ground)

@@ -14,7 +14,7 @@ from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.formats.world import write_world
-from shellgs_method.sim.ground import CELL, LEVEL, Ground
+from shellgs_method.sim.ground import CELL, LEAST, LEVEL, Ground
 from shellgs_method.sim.trials.engine import lidar
 
 EYES = np.stack([np.linspace(-5, 5, 12), np.full(12, -4.0), np.full(12, 1.6)], axis=1)
@@ -69,6 +69,16 @@ def test_the_ground_is_a_plane_where_nothing_is_known(ground):
     plane, *_ = np.linalg.lstsq(design, ground.heights[far], rcond=None)
     assert np.abs(design @ plane - ground.heights[far]).max() < 0.01
     assert plane[0] == pytest.approx(-0.03, abs=0.01)
+
+
+@pytest.mark.parametrize("size", [1.5, 4.0])
+def test_a_small_slope_beside_the_wall_does_not_tilt_the_street(size):
+    """A gutter, or noise: 8 % over a few metres would bury the doors at the other end."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, size, (2, 4000))
+    made = Ground.of(np.stack([x, y - 4, 0.08 * x + rng.normal(0, 0.005, 4000)], axis=1), EYES)
+    assert np.abs(made.at(np.array([[-15.0, -4], [15, -4], [0, -20]]))).max() < 0.35
+    assert made.is_level == (size**2 < LEAST)
 
 
 def test_without_points_the_ground_is_level_and_nothing_is_known():

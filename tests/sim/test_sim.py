@@ -270,10 +270,16 @@ def test_an_empty_collider_is_refused(nothing):
         make_collider(None, nothing, np.array([False]))
 
 
-@pytest.mark.parametrize("parts", [0, -1, math.nan, math.inf])
-def test_a_number_of_parts_that_nothing_has_is_refused_at_once(parts):
-    with pytest.raises(SceneError, match=r"cannot have .* parts for 100"):
-        SimSettings(parts=parts)
+@pytest.mark.parametrize("name", ["parts", "faces", "voxel", "texel", "megabytes"])
+@pytest.mark.parametrize("value", [0, -1, math.nan, math.inf])
+def test_a_setting_that_nothing_can_be_made_with_is_refused_at_once(name, value):
+    with pytest.raises(SceneError, match=rf"--{name} .* cannot be"):
+        SimSettings(**{name: value})
+
+
+def test_a_ground_that_is_no_height_is_refused():
+    with pytest.raises(SceneError, match="is no height"):
+        SimSettings(ground=math.nan)
 
 
 def test_a_surface_that_a_file_has_twice_keeps_its_door(nothing):
