@@ -17,6 +17,7 @@ from training_runs import data_of, held_out, model_of, render, trainer_of
 
 import benchmarks.step
 import shellgs_method.render.view
+import shellgs_method.trainer
 from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
