@@ -250,6 +250,7 @@ def geo_tags(views: list[View], noise: float, seed: int = 0, bias: float = 0.0) 
     places += bias * AXES[:, 0]
     tags = [Image.Exif() for _ in views]
     for exif, (lon, lat, _) in zip(tags, degrees_of(places), strict=True):
+        exif[ExifTags.Base.Make] = "phone"  # Pillow writes none into a PNG that has GPS alone
         exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: minutes(lat), 3: "E", 4: minutes(lon), 6: 77.0})
     return tags
 
