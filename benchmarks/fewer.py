@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.files.colmap import Model, Points, read_model, write_model
 
-HELD_OUT = 8
-"""Every 8th photograph is held out, as by default."""
+HELD_OUT = FacadeDataParserConfig.eval_interval
+"""Every 8th photograph is held out."""
 
 
 def keep_every(scene: Path, n: int) -> None:

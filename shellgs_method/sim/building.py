@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +31,13 @@ from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.shell import ShellCaster
 from shellgs_method.shell.mesh import NO_SOURCES
 from shellgs_method.sim.frame import SimFrame, sim_frame
+from shellgs_method.sim.ground import FLAT, Ground
 from shellgs_method.sim.look.texture import Photo
 
 MARGIN = 0.5
 """Margin around the shell, in metres, within which the fused surface is kept."""
 HIDDEN_SIZE = 800
 """Longer side of the occlusion masks, in pixels."""
-LEVEL = 0.8
-"""Cosine between the vertical and a surface's normal above which it may be ground."""
 GROUND_STEP = 2
 """Pixels between the points of a view that are taken for the ground."""
 PER_SQUARE_METRE, MOST_SAMPLES = 400.0, 500_000
@@ -62,7 +62,7 @@ class Reconstruction:
         views: training and held-out views.
         hidden: for each view, mask of reconstructed objects well in front of the shell: poles, trees, cars.
         held_out: names of the held-out views.
-        ground_points: points of the ground and of other things, in the simulation frame.
+        ground_points: points of the ground and of other things, in the simulation frame; none of a given ground.
         log_gains: exposures of the views' photographs, of which a texture has the mean.
     """
 
@@ -100,6 +100,8 @@ class Reconstruction:
         hidden: list[np.ndarray] = []
         below: list[np.ndarray] = [run.sfm_points]
         surface = run.surface(MARGIN, voxel, _views_and_occlusions(run, hidden, below))
+        if ground is None and run.shell is not None:
+            below.append(_level_points(run))
         tell("Simplifying the surface")
         fused = decimate(surface, faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
@@ -120,7 +122,7 @@ class Reconstruction:
             views,
             hidden,
             {view.name for view in run.datasets[1].views},
-            transformed(np.concatenate([*below, *([] if run.shell is None else [_level_points(run)])]), motion),
+            transformed(np.concatenate(below), motion) if ground is None else np.empty((0, 3)),
             run.log_gains(),
         )
 
@@ -133,6 +135,11 @@ class Reconstruction:
     def eyes(self) -> Float64[np.ndarray, "V 3"]:
         """Camera positions in the simulation frame."""
         return transformed(positions(view.camera for view in self.views), np.linalg.inv(self.frame.to_scene))
+
+    @cached_property
+    def ground(self) -> Ground:
+        """The ground before the building; level if its height is given."""
+        return Ground.of(self.ground_points, self.eyes)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -224,14 +231,14 @@ def _level_below(view: DepthView, up: Float64[np.ndarray, " 3"]) -> Float64[np.n
     every = slice(None, None, GROUND_STEP)
     normals = normals_from_depth(depth, camera)[every, every].numpy() @ to_world[:3, :3].T
     points = transformed((depth * camera.rays())[every, every].reshape(-1, 3).numpy(), to_world)
-    level = (normals @ up > LEVEL).ravel() & ((points - to_world[:3, 3]) @ up < 0)
+    level = (normals @ up > FLAT).ravel() & ((points - to_world[:3, 3]) @ up < 0)
     return points[level]
 
 
 def _level_points(run: TrainedRun) -> Float64[np.ndarray, "P 3"]:
     """Points of the shell's level surfaces below the sky: not those of cellars."""
     shell = Triangles(run.shell_in_frame.vertices, run.shell_in_frame.faces)
-    level = np.abs(shell.normals @ run.frame.up) > LEVEL
+    level = np.abs(shell.normals @ run.frame.up) > FLAT
     if not level.any():
         return np.empty((0, 3))
     flat = Triangles(shell.vertices, shell.faces[level])

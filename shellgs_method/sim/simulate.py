@@ -27,7 +27,7 @@ from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.usd import write_usd_asset
 from shellgs_method.sim.formats.world import write_asset, write_world
-from shellgs_method.sim.ground import LEVEL, STEP, Ground
+from shellgs_method.sim.ground import STEP, Ground
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
@@ -87,12 +87,11 @@ def simulate(
         chapters.append(_building(made, out / names[-1], settings, log, truth))
     assert home is not None
     assets = [chapter.asset for chapter in chapters]
-    points, eyes = ([getattr(chapter.made, name) for chapter in chapters] for name in ("ground_points", "eyes"))
-    ground = Ground.of(np.concatenate(points), np.concatenate(eyes)) if settings.ground is None else LEVEL
+    ground = _common_ground([chapter.made for chapter in chapters])
     log(str(ground) if settings.ground is None else f"The ground is level, {settings.ground:g} m high, as given.")
     tell("Writing the world")
     for chapter in chapters:
-        _report_steps(chapter.made, settings.ground is None, ground, log)
+        _report_steps(chapter.made, ground, log)
     write_world(out, assets, home, ground)
     home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
@@ -111,7 +110,7 @@ def _building(
     ahead = max(AHEAD, 2 * made.fused.metadata["voxel"]) if made.frame.metric else 2 * made.fused.metadata["voxel"]
     eyes = made.eyes
     fused, seen = outward(Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)), eyes)
-    ground = Ground.of(made.ground_points, eyes) if settings.ground is None else LEVEL
+    ground = made.ground
     low = ground.at(fused.centres) + GROUND
     shell, outside, standing, beside = None, None, seen & (fused.centres[:, 2] > low), np.zeros(len(seen), bool)
     if made.shell is not None:
@@ -181,10 +180,17 @@ def _report_leaks(found: Leaks, made: Reconstruction, log: Callable[[str], None]
         )
 
 
-def _report_steps(made: Reconstruction, measured: bool, ground: Ground, log: Callable[[str], None]) -> None:
+def _common_ground(buildings: Sequence[Reconstruction]) -> Ground:
+    """The ground of a world, by the points of all its buildings."""
+    if len(buildings) == 1:
+        return buildings[0].ground
+    points, eyes = ([getattr(made, name) for made in buildings] for name in ("ground_points", "eyes"))
+    return Ground.of(np.concatenate(points), np.concatenate(eyes))
+
+
+def _report_steps(made: Reconstruction, ground: Ground, log: Callable[[str], None]) -> None:
     """Report a building that does not stand on the ground of its world."""
-    own = Ground.of(made.ground_points, made.eyes) if measured else LEVEL
-    below = float(np.median(own.at(made.eyes) - ground.at(made.eyes)))
+    below = float(np.median(made.ground.at(made.eyes) - ground.at(made.eyes)))
     if abs(below) > STEP:
         log(
             f"The ground of the world is {abs(below):.1f} m {'below' if below > 0 else 'above'} that before "

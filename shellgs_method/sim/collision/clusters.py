@@ -119,14 +119,19 @@ def clusters(surface: Triangles, most: int) -> tuple[list[Int64[np.ndarray, " _"
     return [np.concatenate(piece.faces) for piece in pieces], sum(piece.air for piece in pieces)
 
 
+def welded(surface: Triangles) -> Int64[np.ndarray, " V"]:
+    """A number of each vertex, the same for those at the same place (:data:`WELDED`)."""
+    _, number = np.unique(np.round(surface.vertices / WELDED).astype(np.int64), axis=0, return_inverse=True)
+    return number.ravel()
+
+
 def _shared_edges(
     surface: Triangles, kept: Int64[np.ndarray, " K"]
 ) -> tuple[Int64[np.ndarray, "E 2"], Float64[np.ndarray, " E"]]:
     """Pairs of triangles with a common edge, and the lengths of these edges."""
-    _, welded = np.unique(np.round(surface.vertices / WELDED).astype(np.int64), axis=0, return_inverse=True)
     corners = surface.faces[kept]
     ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    keys = np.sort(welded.ravel()[ends], axis=1)
+    keys = np.sort(welded(surface)[ends], axis=1)
     order = np.lexsort(keys.T)
     same = np.flatnonzero((keys[order[1:]] == keys[order[:-1]]).all(axis=1))
     pairs = np.stack([order[same], order[same + 1]], axis=1)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float64
 
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
-from shellgs_method.sim.collision.clusters import WELDED
+from shellgs_method.sim.collision.clusters import welded
 
 RAYS = 16
 """Number of random points of a triangle whose centre no camera sees, each with a ray to a camera and one to the sky."""
@@ -60,6 +60,5 @@ def from_outside(surface: Triangles, eyes: Float64[np.ndarray, "E 3"]) -> tuple[
 
 def _first(surface: Triangles) -> Bool[np.ndarray, " F"]:
     """The first of triangles at the same place, whichever way they are wound."""
-    _, vertex = np.unique(np.round(surface.vertices / WELDED).astype(np.int64), axis=0, return_inverse=True)
-    _, first = np.unique(np.sort(vertex.ravel()[surface.faces], axis=1), axis=0, return_index=True)
+    _, first = np.unique(np.sort(welded(surface)[surface.faces], axis=1), axis=0, return_index=True)
     return np.isin(np.arange(len(surface.faces)), first)

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import trimesh
+from jaxtyping import Float64, Int64
 
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -56,9 +58,14 @@ def write_parts(folder: Path, parts: Sequence[Part]) -> None:
     for stale in (folder / "collision").glob("part_*.obj"):
         stale.unlink()
     for number, part in enumerate(parts):
-        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
-        with atomic_write(folder / part_file(number)) as file:
-            file.write(str(mesh.export(file_type="obj", include_normals=False, header=None)).encode())
+        write_obj(folder / part_file(number), part.vertices, part.faces)
+
+
+def write_obj(path: Path, vertices: Float64[np.ndarray, "V 3"], faces: Int64[np.ndarray, "F 3"]) -> None:
+    """Write a mesh as an obj without looks."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    with atomic_write(path) as file:
+        file.write(str(mesh.export(file_type="obj", include_normals=False, header=None)).encode())
 
 
 def write_xml(path: Path, tree: ET.Element) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import decimated
+from shellgs_method.sim.formats.asset import write_obj
 from shellgs_method.sim.ground import Ground
 
 FIELD, MESH = "ground.bin", "ground.obj"
@@ -29,7 +29,5 @@ def write_ground(out: Path, ground: Ground) -> Triangles | None:
     surface = decimated(ground.surface, FACES)
     with atomic_write(out / FIELD) as file:
         file.write(np.array(ground.heights.shape, np.int32).tobytes() + ground.heights.astype(np.float32).tobytes())
-    with atomic_write(out / MESH) as file:
-        mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-        file.write(str(mesh.export(file_type="obj", include_normals=False, header=None)).encode())
+    write_obj(out / MESH, surface.vertices, surface.faces)
     return surface
