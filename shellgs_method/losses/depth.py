@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import unfold
 
-from shellgs_method.losses.windows import in_windows, shifted, window_sums
+from shellgs_method.losses.windows import window_sums, windows
 from shellgs_method.machine.elementwise import Value, elementwise
 
 
@@ -93,21 +93,20 @@ class _Ncc(torch.autograd.Function):
 
 def _row_sums(
     x: Float[Tensor, "H+2r W+2r"], y: Float[Tensor, "H+2r W+2r"], valid: Float[Tensor, "H+2r W+2r"], size: int
-) -> list[Float[Tensor, "H W 1"]]:
+) -> list[Float[Tensor, "H W size"]]:
     """Sums over the rows of each patch, as arguments of :func:`_moments`."""
     half = size // 2
-    sums = (each[..., 0] for each in elementwise(_of_row, *shifted([x, y, valid], size, dim=1)))
+    sums = (each[..., 0] for each in elementwise(_of_row, *windows([x, y, valid], size, dim=1)))
     inside = slice(half, x.shape[1] - half)
-    return [*shifted([x[:, inside], y[:, inside], *sums], size, dim=0)]
+    return [*windows([x[:, inside], y[:, inside], *sums], size, dim=0)]
 
 
-def _of_row(*values: Sequence[Value]) -> list[list[Value]]:
+def _of_row(xs: Sequence[Value], ys: Sequence[Value], valid: Sequence[Value]) -> list[list[Value]]:
     """Number of valid pixels of a row, and sums of x, y, x² and x y relative to its central value.
 
     E[x²] - E[x]² of nearly equal values loses all digits in float32. To keep the summands small, each row of a patch is
     summed relative to its central value, and the rows relative to the central value of the patch.
     """
-    xs, ys, valid = in_windows(values, len(values) // 3)
     x0, y0 = xs[len(xs) // 2], ys[len(ys) // 2]
     terms = []
     for x, y, m in zip(xs, ys, valid, strict=True):
@@ -118,8 +117,7 @@ def _of_row(*values: Sequence[Value]) -> list[list[Value]]:
 
 def _moments(*values: Sequence[Value]) -> list[list[Value]]:
     """Means of x and y, variance of x, and covariance, over the valid pixels of a patch, from its rows' sums."""
-    *rows, (per_pixel,) = values
-    xs, ys, *sums = in_windows(rows, len(rows) // 7)
+    xs, ys, *sums, (per_pixel,) = values
     x0, y0 = xs[len(xs) // 2], ys[len(ys) // 2]
     terms = []
     for x, y, n, sum_x, sum_y, sum_xx, sum_xy in zip(xs, ys, *sums, strict=True):

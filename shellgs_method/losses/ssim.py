@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from shellgs_method.losses.windows import window_sums
-from shellgs_method.machine.elementwise import Value, elementwise, in_cpp
+from shellgs_method.machine.elementwise import Value, elementwise, in_loops
 
 RADIUS = 5
 _GAUSSIAN = [math.exp(-0.5 * (i / 1.5) ** 2) for i in range(-RADIUS, RADIUS + 1)]
@@ -101,7 +101,7 @@ def _similarity(
 
 def _blur(*images: Float[Tensor, "H+10 X+30"]) -> Sequence[Float[Tensor, "H X"]]:
     """Gaussian means of the windows inside images: loops in C++, or kornia's convolutions."""
-    if in_cpp(*images):
+    if in_loops(*images):
         return window_sums(images, TAPS, channels=3)
     taps = images[0].new_tensor([TAPS])
     stacked = torch.stack(images).unflatten(2, (-1, 3)).permute(0, 3, 1, 2)

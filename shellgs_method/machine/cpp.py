@@ -8,23 +8,16 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
-import itertools
 import os
 import platform
 import shlex
 import subprocess
 import sys
-import tempfile
-from contextlib import suppress
 from pathlib import Path
-
-from filelock import FileLock
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.machine import system
-from shellgs_method.machine.cache import cache_folder
-from shellgs_method.machine.progress import tell
+from shellgs_method.machine.cache import cache_folder, compiled
 
 # The vectors are written out in the sources: -O3 compiles four times as long for a twentieth of the speed.
 _FLAGS = (
@@ -37,11 +30,15 @@ _FLAGS = (
 _LIBRARY = ("-fPIC", "-shared", "-mcpu=native" if sys.platform == "darwin" else "-march=native")
 
 _SWITCH = {"0": False, "no": False, "off": False, "false": False, "1": True, "yes": True, "on": True, "true": True}
-_count = itertools.count(1)
 
 
 def compiles() -> bool:
-    """Whether there is a C++ compiler that can be used, and compiling is not switched off.
+    """Whether there is a C++ compiler that can be used, and compiling is not switched off."""
+    return switched_on() and compiler_works()
+
+
+def switched_on() -> bool:
+    """Whether compiling is not switched off.
 
     Raises:
         SceneError: ``SHELLGS_COMPILE`` says neither that it is nor that it is not.
@@ -49,25 +46,17 @@ def compiles() -> bool:
     switch = os.environ.get("SHELLGS_COMPILE") or "1"
     if switch.lower() not in _SWITCH:
         raise SceneError(f"SHELLGS_COMPILE is {switch!r}: set it to 0, which switches compiling off, or to 1")
-    return _SWITCH[switch.lower()] and compiler_works()
+    return _SWITCH[switch.lower()]
 
 
 @functools.cache
 def load_library(source: str) -> ctypes.CDLL | None:
-    """Compile C++, unless that was done on this machine before, and load it; None, which is told, where that fails.
-
-    Of several processes that need the same library, one compiles it, and the others wait.
-    """
+    """Compile C++, unless that was done on this machine before, and load it; None, which is told, where that fails."""
     try:
         if (compiler := system.compiler()) is None:
             raise FileNotFoundError("there is no C++ compiler (what CXX names, g++ or clang++)")
-        key = hashlib.sha256("\n".join([source, compiler, *_FLAGS, *_LIBRARY, _processor()]).encode()).hexdigest()[:24]
-        library = cache_folder() / f"{key}.so"
-        library.parent.mkdir(parents=True, exist_ok=True)
-        if not _is_whole(library):
-            with FileLock(library.with_suffix(".lock")):
-                if not _is_whole(library):
-                    _compile(compiler, source, library)
+        made_of = [source, compiler, *_FLAGS, *_LIBRARY, _processor()]
+        library = compiled(made_of, ".so", lambda made: _compile(compiler, source, made))
         return ctypes.CDLL(str(library))
     except OSError as error:
         notice(
@@ -77,32 +66,15 @@ def load_library(source: str) -> ctypes.CDLL | None:
         return None
 
 
-def _is_whole(library: Path) -> bool:
-    """Whether a library is there as it was compiled: loading one that is cut off ends the process."""
-    with suppress(FileNotFoundError):
-        return _digest_of(library).read_bytes() == hashlib.sha256(library.read_bytes()).digest()
-    return False
-
-
-def _digest_of(library: Path) -> Path:
-    return library.with_suffix(".sha256")
-
-
-def _compile(compiler: str, source: str, library: Path) -> None:
-    tell(f"Compiling kernel {next(_count)}, once for all runs")
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        made, code = Path(folder) / library.name, Path(folder) / "kernel.cpp"
-        code.write_text(source)
-        # The first is GCC's; without OpenMP, which clang may lack, loops run in one thread.
-        for options in (("-fvect-cost-model=dynamic", "-fopenmp"), ("-fopenmp",), ("-Wno-unknown-pragmas",)):
-            command = [*shlex.split(compiler), *_FLAGS, *options, *_LIBRARY, str(code), "-o", str(made)]
-            result = subprocess.run(command, capture_output=True, text=True, check=False)
-            if result.returncode == 0 and made.exists():
-                digest = _digest_of(made)
-                digest.write_bytes(hashlib.sha256(made.read_bytes()).digest())
-                os.replace(digest, _digest_of(library))
-                os.replace(made, library)
-                return
+def _compile(compiler: str, source: str, made: Path) -> None:
+    code = made.with_suffix(".cpp")
+    code.write_text(source)
+    # The first is GCC's; without OpenMP, which clang may lack, loops run in one thread.
+    for options in (("-fvect-cost-model=dynamic", "-fopenmp"), ("-fopenmp",), ("-Wno-unknown-pragmas",)):
+        command = [*shlex.split(compiler), *_FLAGS, *options, *_LIBRARY, str(code), "-o", str(made)]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.returncode == 0 and made.exists():
+            return
     lines = result.stderr.strip().splitlines()
     telling = (line for words in ("No space left", "error", "") for line in lines if words in line)
     raise OSError(f"{compiler} fails ({next(telling, f'exit status {result.returncode}')})")

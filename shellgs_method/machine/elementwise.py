@@ -1,4 +1,4 @@
-"""Functions of the coordinates of each element, such as a splat or a pixel: one loop in C++, or torch's operations."""
+"""Functions of the coordinates of each element, such as a splat or a pixel: a C++ loop, a CUDA kernel, or torch."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from shellgs_method.machine import cpp
-from shellgs_method.machine.symbols import PRELUDE, Symbol, gradients, literal, statements
+from shellgs_method.machine import cpp, nvrtc
+from shellgs_method.machine.symbols import CUDA_PRELUDE, PRELUDE, Symbol, gradients, literal, statements
 
 Value: TypeAlias = Any
 """A tensor, or a symbol."""
@@ -33,15 +33,17 @@ def elementwise(function: Function, *inputs: Float[Tensor, "*#elements k"]) -> t
             compiled once, so it must be the same object in each call.
         inputs: coordinates, along the last dimension, of elements in one or two dimensions, which are broadcast.
     """
-    shape = torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
-    if in_cpp(*inputs) and min(shape) and shape[-1] >= LANES and (loop := _loop_of(function, inputs)):
+    if in_loops(*inputs) and (loop := _loop_over(function, inputs)):
         return _Elementwise.apply(function, loop, *inputs)
     return _in_torch(function, inputs)
 
 
-def in_cpp(*tensors: Tensor) -> bool:
-    """Whether loops over tensors are in C++: of float32 on a CPU, with a compiler."""
-    return all(each.dtype == torch.float32 and each.device.type == "cpu" for each in tensors) and cpp.compiles()
+def in_loops(*tensors: Tensor) -> bool:
+    """Whether functions of tensors are compiled: of float32 on one device, a CPU or CUDA, with a compiler."""
+    device = tensors[0].device
+    if not all([each.dtype == torch.float32 and each.device == device for each in tensors]):
+        return False
+    return cpp.compiles() if device.type == "cpu" else device.type == "cuda" and nvrtc.compiles(device.index)
 
 
 def dot(a: Sequence[Value], b: Sequence[Value | float]) -> Value:
@@ -76,16 +78,22 @@ class _Elementwise(torch.autograd.Function):
         wanted = ctx.needs_input_grad[2:]
         function = _gradient(ctx.function, len(inputs), given, wanted)
         arguments = [*inputs, *(each for each in grad_outputs if each is not None)]
-        loop = _loop_of(function, arguments)
+        loop = _loop_over(function, arguments)
         if loop is None:  # the disk is full, …
             return None, None, *_gradients_in_torch(ctx.function, inputs, grad_outputs, wanted)
         grads = iter(loop(arguments))
-        found = (next(grads) if want else None for want in wanted)
         return (
             None,
             None,
-            *(None if each is None else each.sum_to_size(x.shape) for each, x in zip(found, inputs, strict=True)),
+            *(_of_shape(next(grads), x) if want else None for x, want in zip(inputs, wanted, strict=True)),
         )
+
+
+def _of_shape(gradient: Tensor, like: Tensor) -> Tensor:
+    """Sum over the elements that an input was broadcast to."""
+    if gradient.shape == like.shape:
+        return gradient
+    return gradient.view(like.shape) if gradient.numel() == like.numel() else gradient.sum_to_size(like.shape)
 
 
 def _gradients_in_torch(
@@ -117,72 +125,124 @@ def _gradient(function: Function, n_inputs: int, given: tuple[bool, ...], wanted
 
 
 class _Loop(NamedTuple):
-    """A function's loop over inputs of one layout, and the numbers of coordinates of its outputs."""
+    """A function's loop: takes the number of elements and the structure ``Arguments``, an array of 64-bit words."""
 
-    library: ctypes.CDLL
+    run: Callable[[int, ctypes.Array], object]
+    arguments: type[ctypes.Array]
     widths: list[int]
+    """Numbers of coordinates of the outputs."""
+
+
+class _LoopOver(NamedTuple):
+    """A loop over inputs of given shapes."""
+
+    loop: _Loop
+    shape: tuple[int, ...]
+    rows: int
+    columns: int
+    strides: list[int]
 
     def __call__(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        views, shape = _in_rows(inputs), torch.broadcast_shapes(*(each.shape[:-1] for each in inputs))
-        rows, columns = views[0].shape[:2]
-        outputs = tuple(inputs[0].new_empty(*shape, width) for width in self.widths)
-        self.library.run(
-            min(torch.get_num_threads(), 1 + rows * columns // 4096),
-            ctypes.c_int64(rows),
-            ctypes.c_int64(columns),
-            (ctypes.c_void_p * len(views))(*(view.data_ptr() for view in views)),
-            (ctypes.c_int64 * len(views))(*(view.stride(0) for view in views)),
-            (ctypes.c_void_p * len(outputs))(*(output.data_ptr() for output in outputs)),
-        )
+        run, arguments, widths = self.loop
+        outputs = tuple([inputs[0].new_empty((*self.shape, width)) for width in widths])
+        at, to = [each.data_ptr() for each in inputs], [each.data_ptr() for each in outputs]
+        run(self.rows * self.columns, arguments(self.rows, self.columns, *at, *self.strides, *to))
         return outputs
 
 
-def _in_rows(inputs: Sequence[Tensor]) -> list[Float[Tensor, "rows columns k"]]:
-    """Broadcast views with two dimensions of elements."""
-    rows, columns = (1, *torch.broadcast_shapes(*(each.shape[:-1] for each in inputs)))[-2:]
-    return [each[(None,) * (3 - each.dim())].expand(rows, columns, -1) for each in inputs]
-
-
-def _loop_of(function: Function, inputs: Sequence[Tensor]) -> _Loop | None:
-    return _loop(function, tuple((view.shape[2], *view.stride()[1:]) for view in _in_rows(inputs)))
+def _loop_over(function: Function, inputs: Sequence[Tensor]) -> _LoopOver | None:
+    """The loop over inputs; None where it is not worth it, where they do not fit, or where it does not compile."""
+    shapes, steps = [(1, 1, *each.shape)[-3:] for each in inputs], [(0, 0, *each.stride())[-3:] for each in inputs]
+    dims, device = max([each.dim() for each in inputs]), inputs[0].device.index
+    sizes = [{shape[dim] for shape in shapes} - {1} or {1} for dim in (0, 1)]
+    if dims > 3 or len(sizes[0]) > 1 or len(sizes[1]) > 1:
+        return None  # torch says what is wrong
+    (rows,), (columns,) = sizes
+    if not rows or columns < (LANES if device is None else 1) or rows * columns >= 2**31:
+        return None
+    layouts, strides = [], []
+    for (n_rows, n_columns, width), (row, column, apart) in zip(shapes, steps, strict=True):
+        layouts.append((width, column if n_columns > 1 else 0, apart == 1 or width == 1))
+        strides += (row if n_rows > 1 else 0, apart)
+    loop = _loop(function, device, tuple(layouts))
+    return None if loop is None else _LoopOver(loop, (rows, columns)[3 - dims :], rows, columns, strides)
 
 
 @functools.cache
-def _loop(function: Function, layouts: tuple[tuple[int, int, int], ...]) -> _Loop | None:
-    """The compiled loop; None where it does not compile.
+def _loop(function: Function, device: int | None, layouts: tuple[tuple[int, int, bool], ...]) -> _Loop | None:
+    """The compiled loop on a CPU, or a CUDA device; None where it does not compile.
 
-    ``layouts`` are each input's number of coordinates, and the strides of the columns and of the coordinates.
+    ``layouts`` are each input's number of coordinates, the stride of the columns, and whether that of the coordinates
+    is 1.
     """
+    source, widths = written(function, layouts, on_cuda=device is not None)
+    run = _on_cpu(source) if device is None else nvrtc.load_kernel(source, device)
+    return None if run is None else _Loop(run, ctypes.c_int64 * (2 + 3 * len(layouts) + len(widths)), widths)
+
+
+def _on_cpu(source: str) -> Callable[[int, ctypes.Array], object] | None:
+    library = cpp.load_library(source)
+    if library is None:
+        return None
+    return lambda elements, arguments: library.run(min(torch.get_num_threads(), 1 + elements // 4096), arguments)
+
+
+def written(
+    function: Function, layouts: Sequence[tuple[int, int, bool]], on_cuda: bool = False
+) -> tuple[str, list[int]]:
+    """Source of a function's loop in C++ or in CUDA, and its outputs' numbers of coordinates."""
     inputs = [
-        [Symbol(f"load<{column}>(x{i} + {k * coordinate})") for k in range(width)]
-        for i, (width, column, coordinate) in enumerate(layouts)
+        [Symbol(f"load<{column}>(x{i} + {k}{'' if adjacent else f' * a.strides[{i}][1]'})") for k in range(width)]
+        for i, (width, column, adjacent) in enumerate(layouts)
     ]
     outputs = function(*inputs)
+    widths = [len(output) for output in outputs]
     results = {
-        f"store<{len(output)}>(y{i} + {k}, {{}})": each if isinstance(each, Symbol) else literal(each)
-        for i, output in enumerate(outputs)
+        f"store<{width}>(y{i} + {k}, {{}})": each if isinstance(each, Symbol) else literal(each)
+        for i, (width, output) in enumerate(zip(widths, outputs, strict=True))
         for k, each in enumerate(output)
     }
     pointers = [
         *(
-            f"const float *x{i} = inputs[{i}] + row * strides[{i}] + column * {column};"
+            f"const float *x{i} = a.inputs[{i}] + row * a.strides[{i}][0] + column * {column};"
             for i, (_, column, _) in enumerate(layouts)
         ),
-        *(f"float *y{i} = outputs[{i}] + (row * columns + column) * {len(out)};" for i, out in enumerate(outputs)),
+        *(f"float *y{i} = a.outputs[{i}] + (row * a.columns + column) * {width};" for i, width in enumerate(widths)),
     ]
     body = textwrap.indent("\n".join([*pointers, statements(results)]), 8 * " ")
-    library = cpp.load_library(PRELUDE.format(lanes=LANES) + _SOURCE.format(body=body))
-    return None if library is None else _Loop(library, [len(output) for output in outputs])
+    source = CUDA_PRELUDE + _ARGUMENTS + _CUDA if on_cuda else PRELUDE + _ARGUMENTS + _CPP
+    return source.format(
+        lanes=LANES, inputs=len(layouts), outputs=len(outputs), threads=nvrtc.THREADS, body=body
+    ), widths
 
 
-_SOURCE = """
-extern "C" void run(int threads, int64_t rows, int64_t columns, const float *const *inputs, const int64_t *strides,
-                    float *const *outputs) {{
-    const int64_t blocks = (columns + V - 1) / V;
+_ARGUMENTS = """
+struct Arguments {{
+    long long rows, columns;
+    const float *inputs[{inputs}];
+    long long strides[{inputs}][2];  // of the rows and of the coordinates
+    float *outputs[{outputs}];
+}};
+"""
+
+_CPP = """
+extern "C" void run(int threads, const Arguments *arguments) {{
+    const Arguments a = *arguments;
+    const int64_t blocks = (a.columns + V - 1) / V;
 #pragma omp parallel for num_threads(threads)
-    for (int64_t i = 0; i < rows * blocks; ++i) {{
+    for (int64_t i = 0; i < a.rows * blocks; ++i) {{
         // The last vector of a row overlaps with the one before.
-        const int64_t row = i / blocks, start = i % blocks * V, column = start < columns - V ? start : columns - V;
+        const int64_t row = i / blocks, start = i % blocks * V, column = start < a.columns - V ? start : a.columns - V;
+{body}
+    }}
+}}
+"""
+
+_CUDA = """
+extern "C" __global__ void __launch_bounds__({threads}) run(const Arguments a) {{
+    const unsigned int element = blockIdx.x * {threads}u + threadIdx.x, columns = a.columns;
+    if (element < a.rows * a.columns) {{
+        const long long row = element / columns, column = element % columns;
 {body}
     }}
 }}

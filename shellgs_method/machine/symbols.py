@@ -1,4 +1,4 @@
-"""Symbols in place of tensors: what is computed with them is differentiated, and written as C++."""
+"""Symbols in place of tensors: what is computed with them is differentiated, and written as C++, which CUDA is too."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 
 class Symbol:
-    """A vector of floats in C++: a name or a literal, or an expression of other symbols.
+    """A vector of floats (one float in CUDA): a name or a literal, or an expression of other symbols.
 
     Args:
         template: the expression, with a pair of braces for each part.
@@ -96,11 +96,11 @@ def _where(condition: Condition, a: Symbol | float, b: Symbol | float) -> Symbol
 
 
 def _sqrt(x: Symbol) -> Symbol:
-    return Symbol("each<std::sqrt>({})", x, partials=lambda s, g: (0.5 * g / s,))
+    return Symbol("each<sqrtf>({})", x, partials=lambda s, g: (0.5 * g / s,))
 
 
 def _log(x: Symbol) -> Symbol:
-    return Symbol("each<std::log>({})", x, partials=lambda s, g: (g / s.parts[0],))
+    return Symbol("each<logf>({})", x, partials=lambda s, g: (g / s.parts[0],))
 
 
 _FUNCTIONS: dict[Callable[..., Any], Callable[..., Symbol]] = {
@@ -114,8 +114,8 @@ _FUNCTIONS: dict[Callable[..., Any], Callable[..., Symbol]] = {
     torch.sqrt: _sqrt,
     torch.log: _log,
     torch.log2: lambda x: _log(x) * (1 / math.log(2)),
-    torch.floor: lambda x: Symbol("each<std::floor>({})", x, partials=lambda *_: (None,)),
-    torch.ceil: lambda x: Symbol("each<std::ceil>({})", x, partials=lambda *_: (None,)),
+    torch.floor: lambda x: Symbol("each<floorf>({})", x, partials=lambda *_: (None,)),
+    torch.ceil: lambda x: Symbol("each<ceilf>({})", x, partials=lambda *_: (None,)),
 }
 
 
@@ -199,4 +199,22 @@ template <float (*function)(float)> static inline vec each(vec x) {{
     return x;
 }}
 """
-"""Start of a source: vectors of the given number of lanes, and what symbols are made of."""
+"""Start of a source in C++: vectors of the given number of lanes, and what symbols are made of."""
+
+CUDA_PRELUDE = """
+typedef float vec;
+typedef bool mask;
+
+#ifndef INFINITY
+#define INFINITY __int_as_float(0x7f800000)
+#endif
+
+inline vec all(float value) {{ return value; }}
+
+template <int stride = 1> inline vec load(const float *from) {{ return __ldg(from); }}
+
+template <int stride = 1> inline void store(float *to, vec stored) {{ *to = stored; }}
+
+template <float (*function)(float)> inline vec each(vec x) {{ return function(x); }}
+"""
+"""The same in CUDA, whose threads have one lane each."""

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from shellgs_method.machine import cpp
-from shellgs_method.machine.elementwise import in_cpp
+from shellgs_method.machine.elementwise import in_loops
 from shellgs_method.machine.symbols import PRELUDE, Symbol, statements
 from shellgs_method.render.rasterizer.binning import TILE
 from shellgs_method.render.rasterizer.kernels import (
@@ -165,7 +165,7 @@ def _at(*tensors: Tensor) -> list[ctypes.c_void_p]:
 
 def _compiled(loops: Loops, table: Tensor) -> ctypes.CDLL | None:
     """The loops in C++, where these run."""
-    return _library(loops) if in_cpp(table) else None
+    return _library(loops) if table.is_cpu and in_loops(table) else None
 
 
 @functools.cache
