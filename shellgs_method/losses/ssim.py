@@ -100,7 +100,7 @@ def _similarity(
 
 
 def _blur(*images: Float[Tensor, "H+10 X+30"]) -> Sequence[Float[Tensor, "H X"]]:
-    """Gaussian means of the windows inside images: loops in C++, or kornia's convolutions."""
+    """Gaussian means of the windows inside images: compiled loops, or kornia's convolutions."""
     if in_loops(*images):
         return window_sums(images, TAPS, channels=3)
     taps = images[0].new_tensor([TAPS])
