@@ -3,8 +3,8 @@
 L = R + α(t) D + β N + γ C, with R photometric, D depth, N normal and C normal smoothness; the others are off in the
 paper's setting. Masks are true where a pixel counts; an empty mask gives a differentiable zero.
 
-A class ``…Loss`` is the loss of many renders of one view: what depends on the view alone is computed once. On a CPU
-all run as loops in C++ on a CPU, as one kernel each on CUDA, see :mod:`shellgs_method.machine.elementwise`.
+A class ``…Loss`` is the loss of many renders of one view: what depends on the view alone is computed once.
+All run as loops in C++ on a CPU, as one kernel each on CUDA, see :mod:`shellgs_method.machine.elementwise`.
 """
 
 from shellgs_method.losses.depth import NccLoss, vid2sim_ncc_loss
