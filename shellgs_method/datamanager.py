@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -47,6 +47,8 @@ MIN_REPORTED_BYTES = 1e9
 """Bytes in memory from which their sum is reported."""
 MAX_MEMORY_SHARE = 0.6
 """Share of the free memory that photographs and maps may take."""
+MAX_GPU_SHARE = 1 / 3
+"""Share of the GPU's free memory that training views may take: Gaussians, and what a step needs, take the rest."""
 
 
 class FacadeDataset(InputDataset):
@@ -353,9 +355,44 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return self.train_dataparser_outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
-        """The next training view, with its maps."""
+        """The next training view, with its maps; on a GPU both are there, as far as its memory allows."""
         camera, batch = super().next_train(step)
-        return camera, self._with_maps(batch)
+        if torch.device(self.device).type != "cuda":
+            return camera, self._with_maps(batch)
+        return camera, self._on_gpu(batch)
+
+    def _on_gpu(self, batch: dict) -> dict:
+        """A training view on the GPU, where it is kept from its first step on while there is room."""
+        index = batch["image_idx"]
+        if index in self._kept_on_gpu:
+            return batch
+        view = {key: _moved(value, self.device) for key, value in self._with_maps(batch).items()}
+        size = sum(value.nbytes for value in view.values() if isinstance(value, Tensor))
+        if size <= self._room_on_gpu:
+            self._room_on_gpu -= size
+            self._kept_on_gpu.add(index)
+            self.cached_train[index] = dict(view)
+        elif self.train_dataset.held:  # the next copy need not wait
+            self.cached_train[index] = {key: _pinned(value) for key, value in self.cached_train[index].items()}
+        return view
+
+    @cached_property
+    def _kept_on_gpu(self) -> set[int]:
+        """Training views that are on the GPU with their maps."""
+        return set()
+
+    @cached_property
+    def _room_on_gpu(self) -> float:
+        """Bytes of the GPU that photographs and maps may take besides those there already."""
+        free, needed = torch.cuda.mem_get_info(self.device)[0], self.train_dataset.nbytes(self.config.cache_images_type)
+        room = MAX_GPU_SHARE * free
+        if needed > min(room, MIN_REPORTED_BYTES):
+            share = min(1.0, room / needed)
+            CONSOLE.print(
+                f"The training views' photographs and maps take {needed / 1e9:.1f} GB: {share:.0%} of them are kept on "
+                f"the GPU, which has {free / 1e9:.1f} GB free{'' if share == 1 else '; the rest is copied each step'}."
+            )
+        return room
 
     def _with_maps(self, batch: dict) -> dict:
         return batch if self.train_dataset.held else batch | self.train_dataset.get_metadata(batch)
@@ -381,6 +418,16 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             if split == "train":
                 self._hold_maps_if_they_fit()
             return super()._load_images(split, cache_images_device if torch.cuda.is_available() else "gpu")
+
+
+def _moved(value: Any, device: torch.device | str) -> Any:
+    """A tensor on the device, anything else as it is."""
+    return value.to(device, non_blocking=True) if isinstance(value, Tensor) else value
+
+
+def _pinned(value: Any) -> Any:
+    """A tensor in page-locked memory, anything else as it is."""
+    return value.pin_memory() if isinstance(value, Tensor) and value.device.type == "cpu" else value
 
 
 def _scaled(outputs: DataparserOutputs, factor: float) -> DataparserOutputs:

@@ -37,6 +37,7 @@ from shellgs_method.machine.threads import ThreadsByLoad
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.render.maps import DepthKind, Geometry, Primitive
 from shellgs_method.render.panorama import is_pinhole, render_around
+from shellgs_method.render.rasterizer.gsplat_backend import Backend
 from shellgs_method.render.view import ViewRenderer
 from shellgs_method.runs.host import NO_FIELD, NO_RAYS, NO_RGBA, refuse
 
@@ -81,6 +82,10 @@ class FacadeModelConfig(SplatfactoModelConfig):
     # A value, not a factory: an older config.yml without this setting finds it on the class.
     extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
     """Terms beyond the paper."""
+
+    backend: Backend = "auto"
+    """Rasterizer: gsplat's CUDA kernels, torch, or auto, which is gsplat where its kernels load. With gsplat, training
+    refuses to start where they do not; a trained run is rendered there too."""
 
     background_color: Literal["random", "black", "white"] = "black"
     sh_degree: Annotated[int, Bounds(0, 3, int)] = 3
@@ -155,7 +160,12 @@ class FacadeModel(SplatfactoModel):
         self.objective = Objective(
             config.cues, config.trust, config.geometry, config.extra, self.metres_per_unit, metadata.get("shell_error")
         )
-        self.renderer = ViewRenderer(config.primitive, config.depth, moments=config.extra.empty_space > 0)
+        self.renderer = ViewRenderer(
+            config.primitive,
+            config.depth,
+            moments=config.extra.empty_space > 0,
+            backend="torch" if config.backend == "torch" else "auto",
+        )
         self.info: dict[str, Any] = {}
         self.geometry: Geometry | None = None
         self.surface_weights: SurfaceWeights | None = None

@@ -155,6 +155,7 @@ class FacadePipeline(VanillaPipeline):
             "views": list(data.train_unseen_cameras),
             "order": order and list(map(_listed, order.getstate())),
             "random": torch.get_rng_state(),
+            "random_cuda": torch.cuda.get_rng_state(self.model.device) if self.model.device.type == "cuda" else None,
         }
 
     def set_extra_state(self, state: Any) -> None:
@@ -183,6 +184,8 @@ class FacadePipeline(VanillaPipeline):
                 version, numbers, gauss = state["order"]
                 data.random_generator.setstate((version, tuple(numbers), gauss))
             torch.set_rng_state(state["random"])
+            if model.device.type == "cuda" and (on_cuda := state.get("random_cuda")) is not None:
+                torch.cuda.set_rng_state(on_cuda, model.device)
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise SceneError(f"the checkpoint's training state is damaged ({error}): train again") from error
 
@@ -196,9 +199,9 @@ class FacadePipeline(VanillaPipeline):
             output_path.mkdir(parents=True, exist_ok=True)
         views = []
         for index, (camera, batch) in enumerate(track(data_loader, "Evaluating view", len(data_loader))):
-            start = perf_counter()
+            start = _now(self.model.device)
             outputs = self.model.get_outputs_for_camera(camera)
-            seconds = perf_counter() - start
+            seconds = _now(self.model.device) - start
             metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
             rays = int(camera.height) * int(camera.width)
             views.append(metrics | {"num_rays_per_sec": rays / seconds, "fps": 1 / seconds})
@@ -208,6 +211,13 @@ class FacadePipeline(VanillaPipeline):
                     torchvision.utils.save_image(image.permute(2, 0, 1).cpu(), path)
         self.train()
         return mean_over_views(views, deviation=get_std)
+
+
+def _now(device: torch.device) -> float:
+    """Seconds on a clock, once the device has done all that it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return perf_counter()
 
 
 def _listed(value: Any) -> Any:

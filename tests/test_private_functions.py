@@ -33,6 +33,7 @@ PRIVATE = [
     ("shellgs_method/trainer.py", "nerfstudio.engine.trainer", "Trainer._load_checkpoint", "self"),
     ("shellgs_method/trainer.py", "nerfstudio.engine.trainer", "Trainer._after_train", "self"),
     ("shellgs_method/model.py", "nerfstudio.models.splatfacto", "SplatfactoModel._get_background_color", "self"),
+    ("shellgs_method/machine/gsplat_kernels.py", "torch.utils.cpp_extension", "_get_build_directory", "name verbose"),
     ("shellgs_method/viewer.py", "nerfstudio.viewer.viewer_elements", "ViewerControl._setup", "self viewer"),
     *(
         ("shellgs_method/gaussians/densification.py", "gsplat.strategy.default", f"DefaultStrategy.{name}", parameters)

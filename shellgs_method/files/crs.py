@@ -6,13 +6,15 @@ import mmap
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from pyproj import CRS, Transformer
-from pyproj.exceptions import ProjError
 
 from shellgs_method.errors import SceneError, notice
+
+if TYPE_CHECKING:  # training needs no PROJ
+    from pyproj import CRS
 
 _NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
 """How a system is named; PROJ would find one for nearly any word."""
@@ -34,6 +36,9 @@ def known_crs(text: str) -> CRS | None:
     It may be a code (EPSG:25832), urn, PROJ string, WKT, PROJ's full name (ETRS89 / UTM zone 32N), or OpenDroneMap's
     ``WGS84 UTM 32N``.
     """
+    from pyproj import CRS
+    from pyproj.exceptions import ProjError
+
     text = _INTRODUCED.sub("", text.strip())
     if utm := _UTM.fullmatch(text):
         text = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
@@ -117,6 +122,8 @@ def given_crs(text: str) -> str:
 
 def conversion(source: CRS, target: CRS) -> Callable[[np.ndarray], Float64[np.ndarray, "N D"]]:
     """Conversion of coordinates, x (or longitude) first, from one system to another; infinite where there is none."""
+    from pyproj import Transformer
+
     if source.to_2d() == target.to_2d() and len(source.axis_info) <= len(target.axis_info):
         return lambda points: points
     transformer = Transformer.from_crs(source, target, always_xy=True)
@@ -134,6 +141,8 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
     Raises:
         SceneError: while converting, coordinates outside the target's area.
     """
+    from pyproj import CRS
+
     wanted = CRS.from_user_input(target)
     convert = conversion(source, wanted)
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from pyproj import CRS
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.crs import converter, known_crs
@@ -212,6 +211,8 @@ class Table:
             SceneError: the file names a system that PROJ does not know, or it is in degrees and the shell's system is
                 unknown; while converting, coordinates are outside the shell's system.
         """
+        from pyproj import CRS
+
         named = self.system or ", ".join(self.titles)
         source = known_crs(self.system)
         if self._are_degrees:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import mapbox_earcut
 import numpy as np
 from jaxtyping import Bool, Float64, Int, Int64
 
@@ -81,6 +80,8 @@ def _cut(
     vertices: Float64[np.ndarray, "V 3"], rings: list[Int64[np.ndarray, " N"]]
 ) -> tuple[Int64[np.ndarray, "F 3"], bool]:
     """Triangles of a ring with holes, and whether they cover it once."""
+    import mapbox_earcut  # training needs none
+
     corners = np.concatenate(rings)
     placed = vertices[corners] - vertices[corners[0]]
     ends = np.cumsum([len(ring) for ring in rings])

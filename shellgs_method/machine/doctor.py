@@ -5,10 +5,11 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Iterator
+from importlib import metadata
 from typing import NamedTuple
 
 from shellgs_method.errors import SceneError
-from shellgs_method.machine import system
+from shellgs_method.machine import gsplat_kernels, system
 from shellgs_method.machine.open3d import import_open3d
 
 
@@ -24,7 +25,7 @@ class Finding(NamedTuple):
 
 def examine() -> Iterator[Finding]:
     """Check everything that a wheel or a package index cannot guarantee."""
-    for check in (_torch, _torchvision, _open3d, _compiler, _cuda, _lpips):
+    for check in (_torch, _torchvision, _open3d, _compiler, _cuda, _gsplat, _lpips):
         yield check()
 
 
@@ -60,10 +61,28 @@ def _compiler() -> Finding:
 def _cuda() -> Finding:
     import torch
 
-    works = torch.cuda.is_available()
-    return Finding(
-        "CUDA", works, torch.cuda.get_device_name() if works else "no device: training runs on the CPU", False
-    )
+    if not torch.cuda.is_available():
+        return Finding("CUDA", False, "no device: training runs on the CPU", needed=False)
+    capability = ".".join(map(str, torch.cuda.get_device_capability()))
+    detail = f"{torch.cuda.get_device_name()}, compute capability {capability}; torch is of CUDA {torch.version.cuda}"
+    return Finding("CUDA", True, detail, needed=False)
+
+
+def _gsplat() -> Finding:
+    """Load gsplat's kernels on a GPU, but do not compile them here: it takes long."""
+    import torch
+
+    subject = f"gsplat {metadata.version('gsplat')}"
+    if not torch.cuda.is_available():
+        return Finding(subject, False, "its kernels need a CUDA device: the rasterizer is torch's", needed=False)
+    if gsplat_kernels.are_compiled():
+        fault = gsplat_kernels.kernels_fault()
+        detail = f"{fault}: a step is {gsplat_kernels.TORCH_COSTS} without them" if fault else "its kernels load"
+        return Finding(subject, fault is None, detail, needed=False)
+    if lacking := gsplat_kernels.lacking_to_compile():
+        detail = f"its kernels are not compiled ({'; '.join(lacking)}): a step is {gsplat_kernels.TORCH_COSTS} without"
+        return Finding(subject, False, detail, needed=False)
+    return Finding(subject, True, f"the first run compiles its kernels: {gsplat_kernels.compiling()}", needed=False)
 
 
 def lpips_weights() -> tuple[str, str]:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 from PIL import ExifTags, Image
-from pyproj import CRS
 
 from shellgs_method.files.crs import conversion
 from shellgs_method.files.exif import exif_of
@@ -48,6 +47,8 @@ class GeoTags:
             crs: coordinate reference system of the shell.
             survey_from_shell: motion and unit of the shell's frame in metres, which keeps the vertical.
         """
+        from pyproj import CRS
+
         tagged = [(view, place) for view in views if (place := _geo_tag(view.image))]
         if not tagged:
             return None

@@ -22,6 +22,7 @@ from shellgs_method.render.maps import (
     squared_depths,
 )
 from shellgs_method.render.rasterizer import rasterize, spherical_harmonics
+from shellgs_method.render.rasterizer.gsplat_backend import Backend
 
 Gaussians = Mapping[str, Tensor]
 """The parameters, and ``surface``, the weight of each Gaussian in depth and normals, if they differ in it."""
@@ -50,6 +51,8 @@ class ViewRenderer:
     depth: DepthKind
     moments: bool = False
     """Whether geometry has the moments of the splats' depths."""
+    backend: Backend = "auto"
+    """Of the rasterizer."""
 
     def __call__(
         self,
@@ -154,6 +157,7 @@ class ViewRenderer:
             features,
             camera,
             self.primitive,
+            self.backend,
             n_densifying=n_densifying,
         )
 

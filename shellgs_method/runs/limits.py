@@ -17,6 +17,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.bounds import COUNT, FROM_ONE, LENGTH, RATE, TINY, WEIGHT, Bounds, bounds_of
 from shellgs_method.errors import SceneError
+from shellgs_method.machine.gsplat_kernels import TORCH_COSTS, kernels_fault
 
 PORT, SEED = Bounds(1, 65535, int), Bounds(0, 2**32 - 1, int)
 
@@ -161,6 +162,20 @@ def check_training(config: TrainerConfig) -> None:
         check_viewer(config.viewer)
     elif config.start_paused:
         raise SceneError(f"start_paused needs the viewer, whose button starts the training: --vis viewer+{config.vis}")
+    _check_backend(config)
+
+
+def _check_backend(config: TrainerConfig) -> None:
+    """Refuse gsplat where its kernels do not load; looked at last, because they may be compiled first."""
+    if getattr(config.pipeline.model, "backend", "auto") != "gsplat":
+        return
+    device = config.machine.device_type
+    fault = kernels_fault() if device == "cuda" else f"its kernels need a CUDA device, and this run is on {device}"
+    if fault:
+        raise SceneError(
+            f"pipeline.model.backend cannot be gsplat here: {fault}; see `shellgs doctor`, or leave it out: in plain "
+            f"torch a step is {TORCH_COSTS}"
+        )
 
 
 def _check_scene(config: TrainerConfig) -> None:

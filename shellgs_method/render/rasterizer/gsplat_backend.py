@@ -9,12 +9,9 @@ and how large the others are; tiles are found, and densification measures, by co
 
 from __future__ import annotations
 
-import functools
-import importlib
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import Literal
 
 import torch
 from gsplat import (
@@ -30,12 +27,12 @@ from torch import Tensor
 
 from shellgs_method.errors import notice
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine.gsplat_kernels import TORCH_COSTS, kernels_fault
 from shellgs_method.render.rasterizer import discs as disc_projection
 from shellgs_method.render.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs, three_sigmas
 from shellgs_method.render.rasterizer.renders import Renders
 
 Backend = Literal["auto", "torch", "gsplat"]
-_Result = TypeVar("_Result")
 
 TILE = 16  # pixels along the side of a tile; gsplat tests no other size
 
@@ -54,11 +51,11 @@ def runs_on_gsplat(backend: Backend, means: Tensor) -> bool:
     if not on_cuda or means.dtype != torch.float32:
         fault = f"its kernels take float32 tensors on a CUDA device, and these are {means.dtype} on {means.device}"
     else:
-        fault = _kernels_fault()
+        fault = kernels_fault()
     if backend == "gsplat" and fault:
         raise ValueError(f'backend="gsplat" cannot run here; use "auto" or "torch": {fault}.')
     if on_cuda and fault:
-        notice(f"The rasterizer runs on {means.device} in plain torch, slower than gsplat: {fault}.")
+        notice(f"The rasterizer runs on {means.device} in plain torch, {TORCH_COSTS} than on gsplat: {fault}.")
     return fault is None and means.shape[0] > 0
 
 
@@ -334,35 +331,3 @@ def _stack(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "B 4 4"], Float[Ten
     """Viewmats, Ks, and the common width and height."""
     viewmats = torch.stack([camera.viewmat for camera in cameras])
     return viewmats, torch.stack([camera.K for camera in cameras]), cameras[0].width, cameras[0].height
-
-
-def _uninterrupted(function: Callable[[], _Result]) -> Callable[[], _Result]:
-    """Make a function run without the trace hook of its thread, by which nerfstudio's viewer interrupts a render.
-
-    The hook raises at any line, also at those of the compiling, whose errors are explained.
-    """
-
-    @functools.wraps(function)
-    def call() -> _Result:
-        hook = sys.gettrace()
-        sys.settrace(None)
-        try:
-            return function()
-        finally:
-            sys.settrace(hook)
-
-    return call
-
-
-@functools.cache
-@_uninterrupted
-def _kernels_fault() -> str | None:
-    """Why gsplat's kernels do not load, None if they do; the first call may compile them, which takes minutes."""
-    try:
-        kernels = importlib.import_module("gsplat.cuda._backend")._C
-    except Exception as error:  # of nvcc, of the C++ compiler, of a library for another CUDA or torch, …
-        reason = next(iter(str(error).strip().splitlines()), "")
-        return f"its kernels neither load nor compile ({type(error).__name__}: {reason})"
-    return (
-        None if kernels is not None else "it came without compiled kernels, and there is no nvcc to compile them with"
-    )

@@ -14,6 +14,7 @@ from random_splats import make_camera, make_discs, make_splats, orbit
 from torch import Tensor
 
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine import gsplat_kernels
 from shellgs_method.render.rasterizer import gsplat_backend, rasterize
 from shellgs_method.render.rasterizer.gsplat_backend import runs_on_gsplat
 from shellgs_method.render.rasterizer.projection import three_sigmas
@@ -37,12 +38,13 @@ def _twins(monkeypatch) -> None:
 @pytest.fixture
 def kernels(monkeypatch) -> Iterator[ModuleType]:
     """Replace gsplat's module that loads the kernels by one without kernels."""
+    monkeypatch.setattr(gsplat_kernels, "are_compiled", lambda: True)
     module = ModuleType("gsplat.cuda._backend")
     setattr(module, "_C", None)  # noqa: B010
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    gsplat_backend._kernels_fault.cache_clear()
+    gsplat_backend.kernels_fault.cache_clear()
     yield module
-    gsplat_backend._kernels_fault.cache_clear()
+    gsplat_backend.kernels_fault.cache_clear()
 
 
 def gradients(splats: list[Tensor], maps: list[Tensor], means2d: Tensor) -> list[Tensor]:

@@ -19,7 +19,7 @@ MARGIN = 1e-3  # relative distance of a decision from its threshold within which
 
 @pytest.fixture
 def _kernels() -> None:
-    if fault := gsplat_backend._kernels_fault():
+    if fault := gsplat_backend.kernels_fault():
         pytest.skip(f"gsplat cannot run: {fault}")
 
 
