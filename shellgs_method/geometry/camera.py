@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from shellgs_method.machine.constants import constant
 from shellgs_method.machine.elementwise import Value, elementwise
 
 
@@ -56,7 +57,7 @@ class Camera:
         """Camera of the photograph resized to ``width`` x ``height`` pixels."""
         if (width, height) == (self.width, self.height):
             return self
-        stretch = self.K.new_tensor([width / self.width, height / self.height, 1.0])
+        stretch = constant(width / self.width, height / self.height, 1.0, like=self.K)
         return Camera(self.viewmat, stretch[:, None] * self.K, width, height)
 
     def thinning(self, max_image_size: int) -> int:
