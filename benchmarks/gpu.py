@@ -1,115 +1,243 @@
-"""Time an iteration on a CUDA device: ShellGS's two backends against gsplat called as splatfacto calls it.
+"""Time training steps on a CUDA device: the methods, on both backends, against splatfacto's on the same scene.
 
-Forward and backward from the parameters to an image: SH of degree 3, and for ShellGS also normals and depth. The
-contenders take turns; the results are medians, and ratios to splatfacto's.
+    python -m benchmarks.gpu scene/ --n 100000 1000000
 
-    python -m benchmarks.gpu --n 200000 --width 960 --height 540
+All train the photographs of a scene whose shell is cast, at the size of its maps, with the same number of Gaussians at
+the same places, while they densify and afterwards. They take turns; a time is the median of blocks of steps, each
+waited for at its end. Launches, waits and the time that the device is busy are those of torch's profiler.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import copy
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Annotated
+from unittest import mock
 
 import torch
-import torch.nn.functional as F
 import tyro
-from gsplat import rasterization
-from torch import Tensor
+from nerfstudio.configs import method_configs as nerfstudio_methods
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import profiler, writer
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor, nn
 
-from benchmarks.scenes import Scene, make_camera, make_scene
-from shellgs_method.geometry.camera import Camera
-from shellgs_method.render.rasterizer import quats_to_rotations, rasterize, spherical_harmonics
-from shellgs_method.render.rasterizer.gsplat_backend import Backend
+import method_configs
+from dataparsers.facade import FacadeDataParserConfig
+from shellgs_method.gaussians.initial import InitialGaussians
+from shellgs_method.gaussians.seeds import Seeds, view_of_shell
 
-
-def parameters(scene: Scene) -> dict[str, Tensor]:
-    """The splats of a scene as splatfacto's parameters, on the device."""
-    held = {
-        "means": scene.means,
-        "quats": scene.quats,
-        "scales": scene.scales.log(),
-        "opacities": scene.opacities.logit(),
-        "harmonics": scene.sh,
-    }
-    return {name: values.cuda().requires_grad_() for name, values in held.items()}
-
-
-def splatfacto(splats: dict[str, Tensor], camera: Camera) -> Tensor:
-    """Colours and expected depth."""
-    image, alpha, _ = rasterization(
-        *(splats["means"], splats["quats"], splats["scales"].exp(), splats["opacities"].sigmoid()),
-        *(splats["harmonics"], camera.viewmat[None], camera.K[None], camera.width, camera.height),
-        packed=False,
-        render_mode="RGB+ED",
-        sh_degree=3,
-        absgrad=True,
-    )
-    return torch.cat([image[0], alpha[0]], dim=-1)
+METHODS = {"photo-gs": "photo_gs", "shellgs": "shellgs", "shellgs-metric": "shellgs_metric", "2dgs": "two_dgs"}
+PHASES = {"densifying": 0.3, "after": 0.7}
+"""Shares of the run at which steps are timed."""
+PEER = "splatfacto"
+BLOCK = 10
+"""Steps between two waits for the device."""
 
 
-def shellgs(backend: Backend, splats: dict[str, Tensor], camera: Camera) -> Tensor:
-    """Colours, normals and depth."""
-    means, scales = splats["means"], splats["scales"]
-    rotation, translation = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    points = means @ rotation.T + translation
-    axes = quats_to_rotations(splats["quats"])
-    normals = axes[torch.arange(len(axes), device=axes.device), :, scales.argmin(dim=-1)] @ rotation.T
-    normals = torch.where((normals * points).sum(-1, keepdim=True) > 0, -normals, normals)
-    colours = (spherical_harmonics(3, F.normalize(means - camera.position, dim=-1), splats["harmonics"]) + 0.5).relu()
-    composited, alpha, _ = rasterize(
-        *(means, splats["quats"], scales.exp(), splats["opacities"].sigmoid()),
-        features=torch.cat([colours, normals, points[:, 2:]], dim=-1),
-        camera=camera,
-        backend=backend,
-    )
-    return torch.cat([composited, alpha], dim=-1)
+@dataclass(frozen=True)
+class Benchmark:
+    """What to time.
 
-
-def milliseconds(
-    render: Callable[[dict[str, Tensor], Camera], Tensor], splats: dict[str, Tensor], camera: Camera
-) -> float:
-    """Duration of one iteration, between two CUDA events."""
-    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    for parameter in splats.values():
-        parameter.grad = None
-    start.record()
-    image = render(splats, camera)
-    image.backward(torch.ones_like(image))
-    end.record()
-    end.synchronize()
-    return start.elapsed_time(end)
-
-
-def main(n: int = 200_000, width: int = 960, height: int = 540, rounds: int = 20) -> None:
-    """Time the contenders in turns.
-
-    Args:
-        n: number of splats.
-        width: image width in pixels.
-        height: image height in pixels.
-        rounds: timed iterations of each contender, after two that are not timed.
+    Attributes:
+        scene: scene whose shell is cast.
+        methods: methods against splatfacto; with ``/torch`` behind the name, on the torch backend.
+        n: numbers of Gaussians.
+        rounds: blocks of steps of each method.
+        out: file for the results (JSON).
     """
-    if not torch.cuda.is_available():
-        raise SystemExit("This benchmark needs a CUDA device.")
-    camera, splats = make_camera(width, height).to("cuda"), parameters(make_scene(n))
-    contenders = {
-        "splatfacto": splatfacto,
-        "shellgs, gsplat": partial(shellgs, "gsplat"),
-        "shellgs, torch": partial(shellgs, "torch"),
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    methods: tuple[str, ...] = ("photo-gs", "shellgs", "shellgs-metric", "2dgs", "photo-gs/torch")
+    n: tuple[int, ...] = (100_000, 1_000_000)
+    rounds: int = 8
+    out: Path | None = None
+
+
+class NoLpips(nn.Identity):
+    """In place of LPIPS, whose weights splatfacto fetches when it is built."""
+
+
+@dataclass
+class Timed:
+    """A trainer, and what was measured of its steps in each phase."""
+
+    trainer: Trainer
+    milliseconds: dict[str, list[float]] = field(default_factory=lambda: {phase: [] for phase in PHASES})
+    profile: dict[str, dict[str, float]] = field(default_factory=dict)
+    peak: float = 0.0
+
+
+def main(benchmark: Benchmark) -> None:
+    """Time the methods with each number of Gaussians."""
+    cuda, results = torch.cuda.is_available(), []
+    names = ((PEER,) if cuda else ()) + benchmark.methods
+    for n in benchmark.n:
+        with TemporaryDirectory() as folder:
+            timed = {name: Timed(trainer_of(name, benchmark.scene, Path(folder) / name)) for name in names}
+            splats = seeds(next(each.trainer for name, each in timed.items() if name != PEER), n)
+            for each in timed.values():
+                replace_gaussians(each.trainer, splats)
+                measure_once(each)
+            for _ in range(benchmark.rounds):
+                for each in timed.values():
+                    for phase in PHASES:
+                        each.milliseconds[phase].append(block(each.trainer, phase))
+            results += [row(n, name, each, timed.get(PEER)) for name, each in timed.items()]
+            del timed
+        Console(width=160).print(tabulate([each for each in results if each["n"] == n], benchmark.scene))
+    if benchmark.out is not None:
+        benchmark.out.write_text(json.dumps({"device": _device(), "rows": results}, indent=1) + "\n")
+
+
+def trainer_of(name: str, scene: Path, folder: Path) -> Trainer:
+    """A trainer set up as ns-train does it."""
+    method, _, backend = name.partition("/")
+    for leftovers in (writer.EVENT_WRITERS, writer.EVENT_STORAGE):
+        leftovers.clear()
+    if method == PEER:
+        config = copy.deepcopy(nerfstudio_methods.method_configs[PEER])
+        config.pipeline.datamanager.dataparser = FacadeDataParserConfig(data=scene)
+    else:
+        config = copy.deepcopy(getattr(method_configs, METHODS[method]).config)
+        if backend:
+            config.pipeline.model.backend = backend
+    assert isinstance(config, TrainerConfig)
+    config.pipeline.datamanager.data = scene
+    config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
+    config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
+    config.logging.local_writer.enable = False
+    profiler.setup_profiler(config.logging, str(folder / "profile"))
+    with mock.patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", NoLpips):
+        trainer = config.setup()
+        trainer.setup()
+    trainer.pipeline.train()
+    return trainer
+
+
+def seeds(trainer: Trainer, n: int) -> dict[str, Tensor]:
+    """Parameters of n Gaussians of degree 3 at pixels of the training views, on the shell."""
+    data = trainer.pipeline.datamanager
+    before, data.train_dataset.kinds = data.train_dataset.kinds, ("shell",)
+    dataset = data.train_dataset
+    views = [view_of_shell(dataset.camera(k), dataset.get_data(k, "uint8")) for k in range(len(dataset))]
+    data.train_dataset.kinds = before
+    generator, parts = torch.Generator().manual_seed(0), []
+    for view in views:
+        pixels = view.shell.mask[..., 0].nonzero()
+        pixels = pixels[torch.randint(len(pixels), (-(-n // len(views)),), generator=generator)]
+        v, u = pixels.unbind(-1)
+        rotation, depth = view.camera.viewmat[:3, :3], view.shell.depth[v, u]
+        points = view.camera.position + (view.camera.rays()[v, u] * depth).to(rotation) @ rotation
+        spacing = depth[:, 0] / view.camera.K[0, 0] * (sum(float(each.shell.mask.sum()) for each in views) / n) ** 0.5
+        parts.append((points, view.shell.normal[v, u].to(rotation) @ rotation, view.image[v, u], spacing))
+    points, normals, colours, spacing = (torch.cat(each)[:n].double().numpy() for each in zip(*parts, strict=True))
+    return InitialGaussians("3d", 3, 0.5).at_seeds(Seeds(points, normals, colours, spacing))
+
+
+def replace_gaussians(trainer: Trainer, splats: dict[str, Tensor]) -> None:
+    """Give a trainer these Gaussians and new optimizers."""
+    model = trainer.pipeline.model
+    for name, old in list(model.gauss_params.items()):
+        model.gauss_params[name] = nn.Parameter(splats[name].to(old).view(-1, *old.shape[1:]).contiguous())
+    trainer.optimizers = trainer.setup_optimizers()
+    model.optimizers = trainer.optimizers.optimizers
+    if getattr(model, "surface_weights", None) is not None:
+        model.surface = None
+
+
+def measure_once(timed: Timed) -> None:
+    """Warm up, see each view, and profile some steps."""
+    trainer = timed.trainer
+    for phase in PHASES:
+        for _ in range(len(trainer.pipeline.datamanager.train_dataset) // BLOCK + 2):
+            block(trainer, phase)
+        if torch.cuda.is_available():
+            timed.profile[phase] = profiled(trainer, phase)
+    if torch.cuda.is_available():
+        held = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        block(trainer, "densifying")
+        own = sum(each.nbytes for each in trainer.pipeline.model.parameters())
+        timed.peak = torch.cuda.max_memory_allocated() - held + 4 * own  # gradients are freed; Adam holds two moments
+
+
+def block(trainer: Trainer, phase: str, steps: int = BLOCK) -> float:
+    """Milliseconds of a step, in the mean of a block."""
+    first = round(PHASES[phase] * 30_000) + 20  # not one that refines or resets
+    _wait()
+    start = time.perf_counter()
+    for step in range(first, first + steps):
+        one_step(trainer, step)
+    _wait()
+    return 1e3 * (time.perf_counter() - start) / steps
+
+
+def one_step(trainer: Trainer, step: int) -> None:
+    """Train one step, as nerfstudio's loop does."""
+    trainer.step = step
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+    trainer.train_iteration(step)
+    for callback in trainer.callbacks:
+        callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+
+
+def profiled(trainer: Trainer, phase: str) -> dict[str, float]:
+    """Launches, waits, bytes copied from the host and busy milliseconds of a step."""
+    from torch.profiler import ProfilerActivity, profile
+
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA], acc_events=True) as made:
+        block(trainer, phase)
+    events = made.events() or []
+    on_device = [each for each in events if each.device_type == torch.autograd.DeviceType.CUDA]
+    named = lambda *words: sum(any(word in each.name for word in words) for each in events)  # noqa: E731
+    return {
+        "launches": named("cudaLaunchKernel", "cuLaunchKernel") / BLOCK,
+        "copies": named("cudaMemcpyAsync") / BLOCK,
+        "waits": named("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize") / BLOCK,
+        "busy": sum(each.device_time_total for each in on_device) / 1e3 / BLOCK,
     }
-    times: dict[str, list[float]] = {name: [] for name in contenders}
-    for i in range(rounds + 2):
-        for name, render in contenders.items():
-            time = milliseconds(render, splats, camera)
-            if i >= 2:
-                times[name].append(time)
-    medians = {name: sorted(each)[len(each) // 2] for name, each in times.items()}
-    print(f"{torch.cuda.get_device_name()}, {n} splats, {width} x {height}, median of {rounds}")
-    for name, median in medians.items():
-        ratio = median / medians["splatfacto"]
-        print(f"{name:16} {median:9.2f} ms  {ratio:6.2f}  (min {min(times[name]):.2f}, max {max(times[name]):.2f})")
+
+
+def row(n: int, name: str, timed: Timed, peer: Timed | None) -> dict:
+    """Results of one method."""
+    found: dict = {"n": n, "method": name, "peak_gb": timed.peak / 1e9}
+    for phase, times in timed.milliseconds.items():
+        found[phase] = {"ms": median(times), "least": min(times), "most": max(times), **timed.profile.get(phase, {})}
+        if peer is not None:
+            found[phase]["ratio"] = found[phase]["ms"] / median(peer.milliseconds[phase])
+    return found
+
+
+def tabulate(rows: list[dict], scene: Path) -> Table:
+    """One line for each method."""
+    table = Table(title=f"{_device()}, {scene.name}, {rows[0]['n']} Gaussians")
+    keys = ("ms", "least", "most", "ratio", "busy", "launches", "copies", "waits")
+    for heading in ("method", "phase", *keys, "GB"):
+        table.add_column(heading, justify="left" if heading in ("method", "phase") else "right")
+    for each in rows:
+        for phase in PHASES:
+            cells = (f"{each[phase][key]:.2f}" if key in each[phase] else "" for key in keys)
+            table.add_row(each["method"], phase, *cells, f"{each['peak_gb']:.2f}")
+    return table
+
+
+def _wait() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def _device() -> str:
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(tyro.cli(Benchmark))

@@ -33,6 +33,7 @@ from shellgs_method.losses import PAPER_ITERATIONS
 from shellgs_method.losses.objective import Cues, ExtraLossConfig, GeometryLossConfig, Objective, Trust, ViewLosses
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.losses.transients import Transients
+from shellgs_method.machine.constants import constant
 from shellgs_method.machine.threads import ThreadsByLoad
 from shellgs_method.occlusion.exposure import exposed
 from shellgs_method.render.maps import DepthKind, Geometry, Primitive
@@ -170,6 +171,7 @@ class FacadeModel(SplatfactoModel):
         self.geometry: Geometry | None = None
         self.surface_weights: SurfaceWeights | None = None
         self.register_buffer("surface", None)
+        self._cameras: dict[int, Camera] = {}
         self._threads = ThreadsByLoad()
         self.step, self.log_every = 0, 1
         self.plan(PAPER_ITERATIONS)
@@ -303,7 +305,7 @@ class FacadeModel(SplatfactoModel):
         if not isinstance(camera, Cameras):
             refuse(NO_RAYS)
         self._threads.follow()
-        pinhole, background = pinhole_camera(camera), self._get_background_color()
+        pinhole, background = self._pinhole(camera), self._get_background_color()
         surface_every = max(1, round(SURFACE_EVERY * self.num_iterations / PAPER_ITERATIONS))
         if self.training and self.step % surface_every == 0:
             self.surface = None
@@ -329,9 +331,18 @@ class FacadeModel(SplatfactoModel):
             depth, normal = self.geometry.depth, self.geometry.normal
             if not self.training:
                 depth, normal = self.renderer.view_of_geometry(self.geometry, gaussians, pinhole)
+                outputs["normal"] = normals_to_colours(nn.functional.normalize(normal, dim=-1))
             outputs["depth"] = depth
-            outputs["normal"] = normals_to_colours(nn.functional.normalize(normal, dim=-1))
         return outputs
+
+    def _pinhole(self, camera: Cameras) -> Camera:
+        """A camera as ours; those of training photographs are kept, as the host waits for the size of one on a GPU."""
+        index = (camera.metadata or {}).get("cam_idx") if self.training else None
+        if index is None:
+            return pinhole_camera(camera)
+        if index not in self._cameras:
+            self._cameras[index] = pinhole_camera(camera)
+        return self._cameras[index]
 
     @property
     def _renders_geometry(self) -> bool:
@@ -358,7 +369,11 @@ class FacadeModel(SplatfactoModel):
     def _get_background_color(self) -> Float[Tensor, "3"]:
         """Colour behind the Gaussians: the setting's, or of a cropped image outside training that of the crop."""
         of_crop = renderers.BACKGROUND_COLOR_OVERRIDE  # a context of ns-render and the viewer
-        return super()._get_background_color() if of_crop is None or self.training else of_crop.to(self.device)
+        if of_crop is not None and not self.training:
+            return of_crop.to(self.device)
+        if self.config.background_color == "random":
+            return super()._get_background_color()
+        return constant(*self.background_color.tolist(), like=self.means)
 
     def get_metrics_dict(self, outputs, batch) -> dict[str, Tensor]:
         """Metrics of a training view, in the steps in which they are logged."""
@@ -375,7 +390,7 @@ class FacadeModel(SplatfactoModel):
         view, progress = self._view(batch, outputs["background"]), self.step / self.num_iterations
         transient = self._transient(view, batch["image_idx"], outputs["rgb"]) if self.training else None
         losses = self.objective(view, batch, outputs["rgb"], self.geometry, progress, transient)
-        return losses | self.objective.of_shapes(self.scales, self.info["radii"][0] > 0)
+        return losses | self.objective.of_shapes(self.scales, self.info["radii"][0])
 
     def _transient(self, view: ViewLosses, index: int, rgb: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"] | None:
         if self.transients is None or self.geometry is None or self.step < TRANSIENTS_FROM * self.num_iterations:

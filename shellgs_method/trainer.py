@@ -31,7 +31,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.progress import ITERATION, Lines, tell, track
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
 from shellgs_method.runs.folders import held
-from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers, forget_gradients
+from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers
 from shellgs_method.runs.host import wandb_refusals
 from shellgs_method.runs.limits import check_settings, check_training
 from shellgs_method.runs.run_folder import check_method, guard_nerfstudio, written_config
@@ -43,6 +43,8 @@ PARTIAL = "checkpoint-"
 """Prefix of the folder in which a checkpoint is written."""
 CHECK_EVERY = 100
 """Steps between two checks that all Gaussians are finite."""
+LOOK_EVERY = 10
+"""Steps between two looks at which were skipped, for which the host waits for the device."""
 PRUNED = (
     "densification pruned all: lower the learning rates or --pipeline.model.cull-alpha-thresh, "
     "or raise --pipeline.model.cull-scale-thresh"
@@ -123,6 +125,7 @@ class FacadeTrainer(Trainer):
         after_step = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         self.callbacks.append(TrainingCallback(after_step, self._check_any_left, kwargs={"why": PRUNED}))
         self._skipped = 0
+        self._unread: list[tuple[int, str, dict[str, Tensor]]] = []
         self._lines = Lines(ITERATION, self.config.max_num_iterations)
         self._last_step = self.config.max_num_iterations - 1  # later versions of nerfstudio change the setting
 
@@ -149,6 +152,8 @@ class FacadeTrainer(Trainer):
     def train_iteration(self, step: int):
         """One step, skipped where its gradients are not finite. The last one ends the run.
 
+        That a step was skipped is told at most :data:`LOOK_EVERY` steps later.
+
         Nerfstudio 1.1.5 counts the iterations of a resumed run anew, later versions may not: neither is relied on.
 
         Raises:
@@ -156,9 +161,12 @@ class FacadeTrainer(Trainer):
         """
         loss, losses, metrics = super().train_iteration(step)
         self._lines.at(min(step + 2, self.config.max_num_iterations))
-        if self.optimizers.skipped:
-            self._report_skipped(step, losses)
-        if step % CHECK_EVERY == 0 or self.optimizers.skipped:
+        self.pipeline.model.info["skipped"] = self.optimizers.last_skipped
+        view = self.pipeline.last_trained
+        self._unread.append((step, view, {name: value.detach() for name, value in losses.items()}))
+        if step % LOOK_EVERY == 0 or step >= self._last_step:
+            self._report_skipped()
+        if step % CHECK_EVERY == 0:
             self._remove_broken_gaussians(step)
         if step == self.pipeline.model.strategy.refine_stop_iter and self.pipeline.model.config.init == "shell":
             self._remove_hardly_shown_gaussians()
@@ -166,19 +174,28 @@ class FacadeTrainer(Trainer):
             self.stop_training = True
         return loss, losses, metrics
 
-    def _report_skipped(self, step: int, losses: dict[str, Tensor]) -> None:
-        self._skipped += 1
-        forget_gradients(self.pipeline.model.info)
-        terms = [name for name, value in losses.items() if not bool(value.isfinite())]
-        what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
-        view, count = self.pipeline.last_trained, f"{self._skipped} of at most {MAX_SKIPPED}"
-        CONSOLE.print(f"[yellow]Step {step} is skipped: {what} of {view} is not finite ({count}).")
-        if self._skipped > MAX_SKIPPED:
-            raise SceneError(
-                f"training stopped at step {step} after more than {MAX_SKIPPED} steps whose loss or gradient is not "
-                f"finite, the last one with {view}: look at its photograph and maps, or lower the learning rates; "
-                f"{self._last_good}"
-            )
+    def _report_skipped(self) -> None:
+        """Report the steps that were skipped since the last call.
+
+        Raises:
+            SceneError: too many were skipped.
+        """
+        unread, self._unread = self._unread, []
+        skipped = [each for each, skip in zip(unread, self.optimizers.skipped(), strict=True) if skip]
+        for step, view, losses in skipped:
+            self._skipped += 1
+            terms = [name for name, value in losses.items() if not bool(value.isfinite())]
+            what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
+            count = f"{self._skipped} of at most {MAX_SKIPPED}"
+            CONSOLE.print(f"[yellow]Step {step} is skipped: {what} of {view} is not finite ({count}).")
+            if self._skipped > MAX_SKIPPED:
+                raise SceneError(
+                    f"training stopped at step {step} after more than {MAX_SKIPPED} steps whose loss or gradient is "
+                    f"not finite, the last one with {view}: look at its photograph and maps, or lower the learning "
+                    f"rates; {self._last_good}"
+                )
+        if skipped:
+            self._remove_broken_gaussians(self.step)
 
     @property
     def _last_good(self) -> str:
@@ -260,6 +277,7 @@ class FacadeTrainer(Trainer):
         if self.local_rank != 0:
             return
         with self.train_lock:  # the viewer renders
+            self._report_skipped()
             self._remove_broken_gaussians(step)
             self.pipeline.model.update_surface()
         folder = self.checkpoint_dir

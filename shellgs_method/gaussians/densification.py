@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,8 @@ from torch.optim import Optimizer
 from typing_extensions import Self
 
 from shellgs_method.losses.schedules import PAPER_ITERATIONS
+from shellgs_method.machine.constants import constant
+from shellgs_method.machine.elementwise import Value, elementwise
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 
 WIDE = 0.05
@@ -101,11 +104,14 @@ class GradientStrategy(DefaultStrategy):
                 state[gathered] = centres.new_zeros(len(params["means"]))
         if radii.shape[1] != len(params["means"]):
             return  # broken ones were removed since, and nobody knows which of these are left
-        size = radii.new_tensor([info["width"], info["height"]])
-        gradients = (centres.absgrad if self.absgrad else centres.grad) * size / 2 * len(radii)
-        state["grad2d"] += torch.where(radii > 0, gradients.norm(dim=-1), 0.0).sum(dim=0)
-        state["count"] += (radii > 0).sum(dim=0)
-        state["radii"] = state["radii"].maximum(radii.amax(dim=0) / size.amax())
+        gradients = centres.absgrad if self.absgrad else centres.grad
+        half = (size / 2 * len(radii) for size in (info["width"], info["height"]))
+        scale = constant(*half, 1 / max(info["width"], info["height"]), like=gradients)
+        skipped = info.get("skipped", constant(0.0, like=gradients)[0])[None]
+        for gradient, radius in zip(gradients.unbind(0), radii.to(gradients).unbind(0), strict=True):
+            sums = (state[gathered][:, None] for gathered in ("grad2d", "count", "radii"))
+            added = elementwise(_added, gradient, radius[:, None], scale, skipped, *sums)
+            state["grad2d"], state["count"], state["radii"] = (each[:, 0] for each in added)
 
     @torch.no_grad()
     def _grow_gs(
@@ -117,6 +123,26 @@ class GradientStrategy(DefaultStrategy):
     ) -> tuple[int, int]:
         state["grad2d"][state["radii"] > WIDE] *= self.wide_gradient
         return super()._grow_gs(params, optimizers, state, step)
+
+
+def _added(
+    gradient: Sequence[Value],
+    radius: Sequence[Value],
+    scale: Sequence[Value],
+    skipped: Sequence[Value],
+    grad2d: Sequence[Value],
+    count: Sequence[Value],
+    largest: Sequence[Value],
+) -> list[list[Value]]:
+    """What is gathered of a Gaussian, with one more view; a step that was skipped adds no gradient."""
+    x, y = gradient[0] * scale[0], gradient[1] * scale[1]
+    shown = radius[0] > 0
+    norm = torch.where(skipped[0] > 0, 0.0, torch.sqrt(x * x + y * y))
+    return [
+        [grad2d[0] + torch.where(shown, norm, 0.0)],
+        [count[0] + torch.where(shown, 1.0, 0.0)],
+        [torch.maximum(largest[0], radius[0] * scale[2])],
+    ]
 
 
 @dataclass

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
+
+from shellgs_method.machine.constants import constant
+from shellgs_method.machine.elementwise import Value, elementwise
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Camera:
         """Camera of the photograph resized to ``width`` x ``height`` pixels."""
         if (width, height) == (self.width, self.height):
             return self
-        stretch = self.K.new_tensor([width / self.width, height / self.height, 1.0])
+        stretch = constant(width / self.width, height / self.height, 1.0, like=self.K)
         return Camera(self.viewmat, stretch[:, None] * self.K, width, height)
 
     def thinning(self, max_image_size: int) -> int:
@@ -62,10 +66,8 @@ class Camera:
 
     def rays(self) -> Float[Tensor, "height width 3"]:
         """Ray through each pixel's centre in the camera frame, scaled to z = 1, so that ``depth * ray`` is a point."""
-        u = torch.arange(self.width, dtype=self.K.dtype, device=self.K.device) + 0.5
-        v = torch.arange(self.height, dtype=self.K.dtype, device=self.K.device) + 0.5
-        pixels = torch.stack([*torch.meshgrid(u, v, indexing="xy"), torch.ones_like(u).expand(self.height, -1)], dim=-1)
-        return pixels @ torch.linalg.inv(self.K).T
+        centres = _pixel_centres(self.width, self.height, self.K.dtype, self.K.device)
+        return elementwise(_ray, *centres, self.K.flatten())[0]
 
     def project(self, points: Float[Tensor, "*N 3"]) -> tuple[Float[Tensor, "*N 2"], Float[Tensor, "*N"]]:
         """Pixels and z-depths of points of the world; pixels of points behind the camera mean nothing."""
@@ -77,6 +79,22 @@ class Camera:
         """Whether pixels of projected points are in the image, and the points in front of the camera."""
         size = pixels.new_tensor([self.width, self.height])
         return (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)
+
+
+@functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
+def _pixel_centres(
+    width: int, height: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "width 1"], Float[Tensor, "height 1 1"]]:
+    u, v = (torch.arange(size, dtype=dtype, device=device) + 0.5 for size in (width, height))
+    return u[:, None], v[:, None, None]
+
+
+def _ray(u: Sequence[Value], v: Sequence[Value], K: Sequence[Value]) -> list[list[Value]]:
+    """K⁻¹ (u, v, 1), in closed form: an inverse by LU waits for the device."""
+    fx, skew, cx, _, fy, cy, _, _, one = K
+    y = (v[0] - cy) / fy
+    return [[(u[0] - cx - skew * y) / fx, y, one]]
 
 
 def angle_between(one: Camera, other: Camera) -> float:

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Annotated, Literal, NamedTuple, Optional
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from shellgs_method.bounds import Bounds, Count, Weight
@@ -159,10 +159,10 @@ class Objective:
                 losses |= view.cue(geometry, progress)
         return losses
 
-    def of_shapes(self, log_scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> dict[str, Tensor]:
-        """Weighted terms of the Gaussians' shapes in the rescaled world, over those that a view shows."""
+    def of_shapes(self, log_scales: Float[Tensor, "N 3"], radii: Int[Tensor, "N"]) -> dict[str, Tensor]:
+        """Weighted terms of the Gaussians' shapes in the rescaled world, over those with a radius in a view."""
         weight = self.extra.flattening
-        return {"flattening": weight * flattening_loss(log_scales.exp(), visible)} if weight > 0 else {}
+        return {"flattening": weight * flattening_loss(log_scales.exp(), radii > 0)} if weight > 0 else {}
 
 
 class CueLosses:

@@ -111,7 +111,10 @@ def _project(
 
 
 def disc_maps(
-    alpha: Float[Tensor, "*batch 1"], maps: Float[Tensor, "*batch 3"]
+    alpha: Float[Tensor, "*batch 1"],
+    inverse_depth: Float[Tensor, "*batch 1"],
+    square: Float[Tensor, "*batch 1"],
+    median_depth: Float[Tensor, "*batch 1"],
 ) -> dict[str, Float[Tensor, "*batch 1"]]:
     """Geometry maps of a disc render, from its composited 1/z and 1/z² and its median z.
 
@@ -119,10 +122,14 @@ def disc_maps(
     m = far / (far - near) (1 - near / z). It equals A Σ w m² - (Σ w m)², A = Σ w, in which the constant of the mapping
     cancels; leaving it out avoids rounding errors.
     """
-    inverse_depth, square, median_depth = maps.split(1, dim=-1)
-    mapping = MAPPING_FAR * MAPPING_NEAR / (MAPPING_FAR - MAPPING_NEAR)
-    distortion = mapping**2 * (alpha * square - inverse_depth.square())
+    flat = (each.flatten(0, -3) if each.dim() > 3 else each for each in (alpha, inverse_depth, square))
+    distortion = elementwise(_distortion, *flat)[0].view_as(alpha)
     return {"inverse_depth": inverse_depth, "median_depth": median_depth, "distortion": distortion}
+
+
+def _distortion(alpha: Sequence[Value], inverse_depth: Sequence[Value], square: Sequence[Value]) -> list[list[Value]]:
+    mapping = MAPPING_FAR * MAPPING_NEAR / (MAPPING_FAR - MAPPING_NEAR)
+    return [[mapping**2 * (alpha[0] * square[0] - inverse_depth[0] * inverse_depth[0])]]
 
 
 def _outline(

@@ -9,6 +9,7 @@ and how large the others are; tiles are found, and densification measures, by co
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -22,14 +23,17 @@ from gsplat import (
     rasterize_to_pixels,
     rasterize_to_pixels_2dgs,
 )
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from shellgs_method.errors import notice
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine.constants import constant
+from shellgs_method.machine.elementwise import Function, Value, dot, elementwise
 from shellgs_method.machine.gsplat_kernels import TORCH_COSTS, kernels_fault
 from shellgs_method.render.rasterizer import discs as disc_projection
-from shellgs_method.render.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs, three_sigmas
+from shellgs_method.render.rasterizer.binning import touches
+from shellgs_method.render.rasterizer.projection import LOW_PASS, NEAR_PLANE, cutoffs, three_sigma
 from shellgs_method.render.rasterizer.renders import Renders
 
 Backend = Literal["auto", "torch", "gsplat"]
@@ -77,22 +81,16 @@ def rasterize_3d(
     radii, means2d, depths, conics, _ = fully_fused_projection(
         means, None, quats, scales, viewmats, Ks, width, height, eps2d=LOW_PASS, near_plane=NEAR_PLANE, packed=False
     )
-    covars2d = _covariances(radii, conics)
-    # A splat is binned to all tiles where its alpha counts: farther out than gsplat does, to avoid visible tile
-    # borders; less far if it is faint, to save time.
-    reach = (cutoffs(opacities)[:, None] * covars2d[..., ::2]).sqrt()
-    visible = _kept(radii) & _touches(means2d, reach, width, height)
-    bins = _bin(means2d, _tile_radii(reach, visible, radii), depths, width, height)
+    tile_radii, sizes = _extents(means2d, conics, radii, opacities, width, height)
+    bins = _bin(means2d, tile_radii, depths, width, height)
     probe, groups = _probed(means2d, features, n_densifying)
     renders = [
         rasterize_to_pixels(
-            *(centres, conics, group.expand(len(cameras), -1, -1), opacities.expand(len(cameras), -1)),
-            *(width, height, TILE, *bins),
+            *(centres, conics, _of_each(cameras, group), _of_each(cameras, opacities), width, height, TILE, *bins)
         )
         for centres, group in groups
     ]
-    composited, alpha = torch.cat([render for render, _ in renders], dim=-1), renders[-1][1]
-    return Renders(composited, alpha, composited[..., :0], probe, three_sigmas(covars2d, visible))
+    return Renders(_joined([render for render, _ in renders], dim=-1), renders[-1][1], (), probe, sizes)
 
 
 def rasterize_2d(
@@ -115,56 +113,96 @@ def rasterize_2d(
     """
     discs = _project_discs(means, quats, scales, opacities, cameras)
     probe, groups = _probed(discs.means2d, features, n_densifying)
-    renders = []
-    for means2d, group in groups:
-        moved = replace(discs, means2d=means2d, ray_transforms=_centred(discs.ray_transforms, means2d))
+    views = []
+    for i, camera in enumerate(cameras):
         # One camera at a time: gsplat 1.4 writes all normals of a batch into those of its first (its issue #425).
-        views = [_composite_discs(moved, i, opacities, group, camera) for i, camera in enumerate(cameras)]
-        renders.append([torch.cat(view) for view in zip(*views, strict=True)])
-    composited = torch.cat([render[0] for render in renders], dim=-1)
-    _, alpha, maps = renders[-1]
-    return Renders(composited, alpha, maps, probe, discs.radii)
+        disc = discs.of_view(i)
+        bins = _bin(disc.means2d, disc.tile_radii, disc.depths, camera.width, camera.height)
+        *others, (_, last) = groups
+        composited = [
+            _composite_discs(disc.moved(_of_view(to, i)), bins, opacities, each, camera) for to, each in others
+        ]
+        *rendered, alpha, maps = _composite_with_maps(disc, bins, opacities, last, camera)
+        views.append((_joined([*composited, *rendered], dim=-1), alpha, *maps))
+    composited, alpha, *maps = (_joined(each, dim=0) for each in zip(*views, strict=True))
+    return Renders(composited, alpha, tuple(maps), probe, discs.radii)
 
 
 RASTERIZE = {"3d": rasterize_3d, "2d": rasterize_2d}
 
 
-def _kept(radii: Int[Tensor, "B N ..."]) -> Bool[Tensor, "B N"]:
-    """Which splats gsplat has not culled."""
-    return radii > 0 if radii.dim() == 2 else (radii > 0).all(dim=-1)
+def _of_each(cameras: Sequence[Camera], of_splats: Float[Tensor, "N *k"]) -> Float[Tensor, "B N *k"]:
+    return of_splats[None].expand(len(cameras), *of_splats.shape)
+
+
+def _of_view(of_views: Float[Tensor, "B *k"], i: int) -> Float[Tensor, "1 *k"]:
+    return of_views if len(of_views) == 1 else of_views[i, None]  # the gradient of which would be a copy
+
+
+def _joined(parts: Sequence[Tensor], dim: int) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat([*parts], dim=dim)
 
 
 @torch.no_grad()
-def _covariances(radii: Int[Tensor, "B N ..."], conics: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
-    """Covariances (xx, xy, yy) in px² of Gaussians on the screen, from gsplat's radii and inverse covariances.
+def _extents(
+    means2d: Float[Tensor, "B N 2"],
+    conics: Float[Tensor, "B N 3"],
+    radii: Int[Tensor, "B N ..."],
+    opacities: Float[Tensor, "N"],
+    width: int,
+    height: int,
+) -> tuple[Float[Tensor, "B N ..."], Int[Tensor, "B N"]]:
+    """Radii to bin Gaussians by, as many as gsplat has for each, and sizes, see :class:`Renders`; 0 if not visible.
 
-    The inverse of a conic (a, b, c) is a multiple of (c, -b, a). Its determinant, lost to rounding for a long and thin
-    splat, is not needed: the radii give the size. They are rounded up, and so is the result.
+    A splat is binned to all tiles where its alpha counts: farther out than gsplat does, to avoid visible tile borders;
+    less far if it is faint, to save time.
     """
-    a, b, c = conics.unbind(-1)
-    if radii.dim() == 2:
-        longest = (a + c) / 2 + (((a - c) / 2).square() + b.square()).sqrt()
-        size = (radii / 3).square() / longest
+    size = constant(width, height, like=means2d)
+    tile_radii, sizes = elementwise(_extent, means2d, conics, _floats(radii), opacities[:, None], size)
+    return tile_radii.view_as(radii), sizes[..., 0].int()
+
+
+def _floats(radii: Int[Tensor, "B N ..."]) -> Float[Tensor, "B N r"]:
+    return (radii[..., None] if radii.dim() == 2 else radii).float()
+
+
+def _extent(
+    mean2d: Sequence[Value],
+    conic: Sequence[Value],
+    radii: Sequence[Value],
+    opacity: Sequence[Value],
+    size: Sequence[Value],
+) -> list[Sequence[Value]]:
+    """The inverse of a conic (a, b, c) is a multiple of (c, -b, a). Its determinant, lost to rounding for a long and
+    thin splat, is not needed: gsplat's radii give the size. They are rounded up, and so is the result.
+    """
+    a, b, c = conic
+    if len(radii) == 1:
+        half = (a - c) / 2
+        spread = radii[0] / 3 * (radii[0] / 3) / ((a + c) / 2 + torch.sqrt(half * half + b * b))
     else:
-        size = (radii / 3.33).square().sum(dim=-1) / (a + c)
-    return size[..., None] * torch.stack([c, -b, a], dim=-1)
+        spread = dot(radii, radii) / (3.33**2 * (a + c))
+    covar2d = [spread * c, -spread * b, spread * a]
+    cutoff = cutoffs(opacity[0])
+    reach = [torch.sqrt(cutoff * covar2d[0]), torch.sqrt(cutoff * covar2d[2])]
+    visible = _kept(radii) & _touches(mean2d, reach, size)
+    return [_tile_radii(reach, visible, radii), [three_sigma(covar2d, visible)]]
 
 
-@torch.no_grad()
-def _touches(
-    means2d: Float[Tensor, "B N 2"], reach: Float[Tensor, "B N 2"], width: int, height: int
-) -> Bool[Tensor, "B N"]:
+def _kept(radii: Sequence[Value]) -> Value:
+    """Which splats gsplat has not culled."""
+    return functools.reduce(operator.and_, [each > 0 for each in radii])
+
+
+def _touches(mean2d: Sequence[Value], reach: Sequence[Value], size: Sequence[Value]) -> Value:
     """Whether the box that reaches so far around a splat, if it is not too faint to have one, touches the image."""
-    size = means2d.new_tensor([width, height])
-    return ((reach > 0) & (means2d + reach > 0) & (means2d - reach < size)).all(dim=-1)
+    return (reach[0] > 0) & (reach[1] > 0) & touches([*mean2d, *reach], size)
 
 
-def _tile_radii(
-    reach: Float[Tensor, "B N 2"], visible: Bool[Tensor, "B N"], radii: Int[Tensor, "B N ..."]
-) -> Float[Tensor, "B N ..."]:
-    """Radii to bin splats by, as many as gsplat has for each: 0 for those not visible, whose reach may be undefined."""
-    reach = torch.where(visible[..., None], reach, 0.0)
-    return reach.amax(dim=-1) if radii.dim() == 2 else reach
+def _tile_radii(reach: Sequence[Value], visible: Value, radii: Sequence[Value]) -> list[Value]:
+    """Radii to bin splats by: 0 for those not visible, whose reach may be undefined."""
+    reach = [torch.maximum(*reach)] if len(radii) == 1 else [*reach]
+    return [torch.where(visible, torch.ceil(each), 0.0) for each in reach]
 
 
 def _probed(
@@ -177,15 +215,20 @@ def _probed(
     if n_densifying is None:
         return means2d, [(means2d, features)]
     probe = means2d.detach().requires_grad_()
-    first, rest = features[:, :n_densifying], features[:, n_densifying:]
-    return probe, [(means2d + (probe - probe.detach()), first), (means2d, rest)]
+    first, rest = features.split([n_densifying, features.shape[1] - n_densifying], dim=1)
+    return probe, [(_Tapped.apply(means2d, probe), first), (means2d, rest)]
 
 
-def _centred(ray_transforms: Float[Tensor, "B N 3 3"], means2d: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N 3 3"]:
-    """Ray transforms of discs with the centres, the last column, recomputed from means2d and depths."""
-    depths = ray_transforms[..., 2:, 2]
-    centres = torch.cat([means2d * depths, depths], dim=-1)
-    return torch.cat([ray_transforms[..., :2], centres[..., None]], dim=-1)
+class _Tapped(torch.autograd.Function):
+    """The first of two equal tensors, whose gradient both get."""
+
+    @staticmethod
+    def forward(ctx, x, probe):
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return gradient, gradient
 
 
 @dataclass(frozen=True)
@@ -194,7 +237,7 @@ class _Discs:
 
     Attributes:
         means2d: projected centres in pixels.
-        ray_transforms: K [s_u t_u | s_v t_v | centre] in the camera frame; equation 8 of 2DGS.
+        ray_transforms: K [s_u t_u | s_v t_v | centre] in the camera frame, row by row; equation 8 of 2DGS.
         inverse_planes: q = normal / (normal · centre), so that q · ray = 1/z where a ray meets the plane;
             a steep disc is treated as facing the camera.
         radii: see :class:`Renders`.
@@ -202,10 +245,28 @@ class _Discs:
     """
 
     means2d: Float[Tensor, "B N 2"]
-    ray_transforms: Float[Tensor, "B N 3 3"]
+    ray_transforms: Float[Tensor, "B N 9"]
     inverse_planes: Float[Tensor, "B N 3"]
     radii: Int[Tensor, "B N"]
     tile_radii: Float[Tensor, "B N ..."]
+
+    @property
+    def depths(self) -> Float[Tensor, "B N"]:
+        """Depths of the centres."""
+        return self.ray_transforms[..., 8]
+
+    def of_view(self, i: int) -> _Discs:
+        """Those of one camera, whose number stays a dimension."""
+        return _Discs(*(_of_view(each, i) for each in vars(self).values()))
+
+    def moved(self, means2d: Float[Tensor, "B N 2"]) -> _Discs:
+        """The same with the centres, the last column, recomputed from means2d and depths."""
+        return replace(self, means2d=means2d, ray_transforms=elementwise(_recentred, self.ray_transforms, means2d)[0])
+
+
+def _recentred(transform: Sequence[Value], mean2d: Sequence[Value]) -> list[list[Value]]:
+    t, depth = transform, transform[8]
+    return [[t[0], t[1], mean2d[0] * depth, t[3], t[4], mean2d[1] * depth, t[6], t[7], depth]]
 
 
 def _project_discs(
@@ -218,99 +279,182 @@ def _project_discs(
     viewmats, Ks, width, height = _stack(cameras)
     splats = fully_fused_projection_2dgs(means, quats, scales, viewmats, Ks, width, height, near_plane=NEAR_PLANE)
     radii, _, _, ray_transforms, normals = splats  # pyright: ignore[reportAssignmentType]
-    # gsplat leaves the memory of culled discs uninitialised; none of it may reach a gradient, as 0 times NaN.
-    visible = _kept(radii)
-    normals = torch.where(visible[..., None], normals, normals.new_tensor([0.0, 0.0, -1.0]))
-    ray_transforms = torch.where(visible[..., None, None], ray_transforms, torch.eye(3).to(means))
-
+    sides = _floats(radii)
     # The centres are computed from means2d, so that these get the full gradient of a shift on the screen. gsplat's own
     # are centres of boxes, unlike the torch backend's, and in 1.4 their gradient lacks the mixed terms of tilted discs.
-    depths = ray_transforms[..., 2:, 2]
-    means2d = ray_transforms[..., :2, 2] / depths
-    ray_transforms = _centred(ray_transforms, means2d)
+    means2d, ray_transforms = elementwise(_centres, ray_transforms.flatten(2), sides)
+    size = constant(width, height, like=means)
+    ray_transforms, inverse_planes, tile_radii, sizes = elementwise(
+        _disc, *(means2d, ray_transforms, normals, sides, opacities[:, None], Ks.flatten(1)[:, None], size)
+    )
+    return _Discs(means2d, ray_transforms, inverse_planes, sizes[..., 0].int(), tile_radii.view_as(radii))
 
-    centres = ray_transforms[..., 2] @ torch.linalg.inv(Ks).mT
-    planes = (normals * centres).sum(-1, keepdim=True)
-    shows = planes[..., 0].detach().abs() > disc_projection.EDGE_ON * centres.detach().norm(dim=-1)
+
+def _centres(transform: Sequence[Value], radii: Sequence[Value]) -> list[list[Value]]:
+    """Projected centre, and the ray transform; that of a disc in front of the camera for one that gsplat culled.
+
+    gsplat leaves the memory of culled discs uninitialised; none of it may reach a gradient, as 0 times NaN.
+    """
+    kept = _kept(radii)
+    t = [torch.where(kept, each, 1.0 if i in (0, 4, 8) else 0.0) for i, each in enumerate(transform)]
+    return [[t[2] / t[8], t[5] / t[8]], t]
+
+
+def _disc(
+    mean2d: Sequence[Value],
+    transform: Sequence[Value],
+    normal: Sequence[Value],
+    radii: Sequence[Value],
+    opacity: Sequence[Value],
+    K: Sequence[Value],
+    size: Sequence[Value],
+) -> list[Sequence[Value]]:
+    """Ray transform, inverse plane, tile radii, and size of a disc, see :class:`_Discs`."""
+    kept, cutoff, (fx, _, cx, _, fy, cy, *_) = _kept(radii), cutoffs(opacity[0]), K
+    normal = [torch.where(kept, each, facing) for each, facing in zip(normal, (0.0, 0.0, -1.0), strict=True)]
+    (transform,) = _recentred(transform, mean2d)
+    x, y, z = transform[2::3]
+    centre = [(x - cx * z) / fx, (y - cy * z) / fy, z]
+    plane = dot(normal, centre)
+    shows = torch.abs(plane.detach()) > disc_projection.EDGE_ON * torch.sqrt(dot(centre, centre).detach())
     # The low-pass shows a steep disc even where the ray meets its plane behind the camera. The centre's depth is right
     # there; with one q per disc, it must also serve where a ray meets the plane in front.
-    cutoff = cutoffs(opacities)
-    slopes = (normals[..., :2] / torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], dim=-1)[:, None]).norm(dim=-1)
-    steep = planes[..., 0].abs() <= slopes * (cutoff / 2).sqrt() * depths[..., 0]
-    facing = torch.cat([torch.zeros_like(means2d), 1 / depths], dim=-1)
-    inverse_planes = torch.where(steep[..., None], facing, normals / torch.where(steep[..., None], 1.0, planes))
+    slope = [(normal[0] / fx).detach(), (normal[1] / fy).detach()]
+    steep = torch.abs(plane.detach()) <= torch.sqrt(dot(slope, slope)) * torch.sqrt(cutoff / 2) * z.detach()
+    safe = torch.where(steep, 1.0, plane)
+    facing = [0.0, 0.0, 1 / z]
+    inverse_plane = [torch.where(steep, flat, each / safe) for flat, each in zip(facing, normal, strict=True)]
 
-    reach = _reach_of_discs(means2d, ray_transforms, cutoff, max(width, height))
-    visible = visible & shows & (cutoff > 0) & _touches(means2d, reach, width, height)
-    sizes = three_sigmas(_covariances_of_discs(means2d, ray_transforms), visible)
-    return _Discs(means2d, ray_transforms, inverse_planes, sizes, _tile_radii(reach, visible, radii))
-
-
-@torch.no_grad()
-def _covariances_of_discs(
-    means2d: Float[Tensor, "B N 2"], ray_transforms: Float[Tensor, "B N 3 3"]
-) -> Float[Tensor, "B N 3"]:
-    """Covariances (xx, xy, yy) in px² of discs on the screen as if seen from afar."""
-    w = ray_transforms[..., 2:, :]
-    half_axes = (ray_transforms[..., :2, :2] - means2d[..., None] * w[..., :2]) / w[..., 2:]
-    across, down = half_axes.unbind(dim=-2)
-    xx, xy, yy = ((u * v).sum(dim=-1) for u, v in ((across, across), (across, down), (down, down)))
-    return torch.stack([xx + disc_projection.LOW_PASS, xy, yy + disc_projection.LOW_PASS], dim=-1)
+    mean2d, flat = [each.detach() for each in mean2d], [each.detach() for each in transform]
+    u, v, w = flat[:3], flat[3:6], flat[6:]
+    reach = [_reach(row, centre, w, cutoff, size) for row, centre in zip((u, v), mean2d, strict=True)]
+    visible = kept & shows & (cutoff > 0) & _touches(mean2d, reach, size)
+    # As if seen from afar.
+    across, down = (
+        [(row[i] - centre * w[i]) / w[2] for i in (0, 1)] for row, centre in zip((u, v), mean2d, strict=True)
+    )
+    low_pass = disc_projection.LOW_PASS
+    covar2d = [dot(across, across) + low_pass, dot(across, down), dot(down, down) + low_pass]
+    return [transform, inverse_plane, _tile_radii(reach, visible, radii), [three_sigma(covar2d, visible)]]
 
 
-@torch.no_grad()
-def _reach_of_discs(
-    means2d: Float[Tensor, "B N 2"],
-    ray_transforms: Float[Tensor, "B N 3 3"],
-    cutoff: Float[Tensor, "N"],
-    image_size: int,
-) -> Float[Tensor, "B N 2"]:
-    """Half the sides of boxes around the means2d that contain a disc, and its low-pass, up to a cutoff.
+def _reach(row: Sequence[Value], centre: Value, w: Sequence[Value], cutoff: Value, size: Sequence[Value]) -> Value:
+    """Half a side of the box around a centre that contains a disc, and its low-pass, up to a cutoff.
 
     The points (u, v) of a disc with u² + v² = cutoff project to an ellipse, whose box follows from the dual conic
     T diag(cutoff, cutoff, -1) Tᵀ (2DGS, section 4.2), here in pixels relative to the projected centre.
     """
-    w = ray_transforms[..., 2:, :]
-    rows = ray_transforms[..., :2, :] - means2d[..., None] * w
-    signs = torch.stack([cutoff, cutoff, -torch.ones_like(cutoff)], dim=-1)[:, None]
-    against = (signs * w * w).sum(-1)
-    middle = (signs * rows * w).sum(-1) / against
-    half = (middle.square() - (signs * rows * rows).sum(-1) / against).clamp_min(0).sqrt()
+
+    def product(a: Sequence[Value], b: Sequence[Value]) -> Value:
+        return cutoff * (a[0] * b[0] + a[1] * b[1]) - a[2] * b[2]
+
+    row = [each - centre * other for each, other in zip(row, w, strict=True)]
+    against = product(w, w)
+    middle = product(row, w) / against
+    half = torch.sqrt(torch.relu(middle * middle - product(row, row) / against))
     # A disc that reaches behind the camera has no ellipse and may be anywhere in the image.
-    on_plane = torch.where(against < 0, middle.abs() + half, means2d.abs() + image_size)
-    return torch.maximum(on_plane, (cutoff / 2).sqrt()[:, None])
+    anywhere = torch.abs(centre) + torch.maximum(*size)
+    return torch.maximum(torch.where(against < 0, torch.abs(middle) + half, anywhere), torch.sqrt(cutoff / 2))
 
 
 def _composite_discs(
-    discs: _Discs, i: int, opacities: Float[Tensor, "N"], features: Float[Tensor, "N C"], camera: Camera
-) -> tuple[Float[Tensor, "1 height width C"], Float[Tensor, "1 height width 1"], Float[Tensor, "1 height width 3"]]:
-    """Features, alpha, and the maps of camera ``i``."""
-    one = slice(i, i + 1)
-    means2d, inverse_planes = discs.means2d[one], discs.inverse_planes[one]
-    bins = _bin(means2d, discs.tile_radii[one], discs.ray_transforms[one, :, 2, 2], camera.width, camera.height)
-    rows, columns = torch.triu_indices(3, 3, device=means2d.device)
-    # Pad with zeros to a power of two: gsplat would pad with uninitialised memory. The kernel returns the last feature
-    # of the median disc as its depth: the disc's index here, to look it up.
-    n_features = features.shape[-1]
-    size = 1 << (n_features + len(rows)).bit_length()
-    products = inverse_planes[..., rows] * inverse_planes[..., columns]
-    numbers = torch.arange(len(features), dtype=features.dtype, device=features.device)
-    filling = features.new_zeros(1, len(features), size - n_features - len(rows) - 1)
-    channels = torch.cat([features[None], products, filling, numbers[None, :, None]], dim=-1)
+    discs: _Discs,
+    bins: tuple[Tensor, Tensor],
+    opacities: Float[Tensor, "N"],
+    features: Float[Tensor, "N C"],
+    camera: Camera,
+) -> Float[Tensor, "1 height width C"]:
+    """Features of one camera."""
+    (channels,) = elementwise(_padded(1 << features.shape[1].bit_length()), features)
+    return _run_discs(discs, bins, opacities, channels[None], camera)[0][..., : features.shape[1]]
+
+
+def _composite_with_maps(
+    discs: _Discs,
+    bins: tuple[Tensor, Tensor],
+    opacities: Float[Tensor, "N"],
+    features: Float[Tensor, "N C"],
+    camera: Camera,
+) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    """Features, alpha, and the maps of one camera, see :class:`Renders`."""
+    n_features = features.shape[1]
+    numbers = torch.arange(len(features), dtype=features.dtype, device=features.device)[:, None]
+    # A power of two: gsplat would pad with uninitialised memory. The kernel returns the last feature of the median disc
+    # as its depth: the disc's index here, to look it up.
+    size = 1 << (n_features + 6).bit_length()
+    (channels,) = elementwise(_with_products(size), features, discs.inverse_planes, numbers)
+    composited, alpha, inverse_plane, median = (
+        each.squeeze(0) for each in _run_discs(discs, bins, opacities, channels, camera)
+    )
+    rays = camera.rays()
+    rendered, inverse_depth, square = elementwise(_maps(n_features), composited, inverse_plane, rays)
+    (median_depth,) = elementwise(_median, discs.inverse_planes[0, median[..., 0].long()], rays, alpha)
+    rendered, alpha, *maps = (each[None] for each in (rendered, alpha, inverse_depth, square, median_depth))
+    return rendered, alpha, tuple(maps)
+
+
+def _run_discs(
+    discs: _Discs,
+    bins: tuple[Tensor, Tensor],
+    opacities: Float[Tensor, "N"],
+    channels: Float[Tensor, "1 N c"],
+    camera: Camera,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Composited channels, alpha and inverse planes, and the last channel of the median disc."""
+    transforms = discs.ray_transforms.unflatten(-1, (3, 3))
     renders = rasterize_to_pixels_2dgs(
-        *(means2d, discs.ray_transforms[one], channels, opacities[None], inverse_planes),
-        *(torch.zeros_like(means2d), camera.width, camera.height, TILE, *bins),
+        *(discs.means2d, transforms, channels, opacities[None], discs.inverse_planes),
+        *(torch.zeros_like(discs.means2d), camera.width, camera.height, TILE, *bins),
     )
     composited, alpha, inverse_plane, _, median = renders  # pyright: ignore[reportAssignmentType]
-    composited, products, _ = composited.split([n_features, len(rows), size - n_features - len(rows)], dim=-1)
-    rays = camera.rays()
-    pairs_of_rays = torch.where(rows == columns, 1, 2) * rays[..., rows] * rays[..., columns]
-    inverse_depth = (inverse_plane * rays).sum(-1, keepdim=True)
-    square = (products * pairs_of_rays).sum(-1, keepdim=True)
-    at_median = (inverse_planes[:, median[0, ..., 0].long()] * rays).sum(-1, keepdim=True)
-    halves = alpha >= 0.5
-    median_depth = torch.where(halves, 1 / torch.where(halves, at_median, 1.0), 0.0)
-    return composited, alpha, torch.cat([inverse_depth, square, median_depth], dim=-1)
+    return composited, alpha, inverse_plane, median
+
+
+@functools.cache
+def _padded(size: int) -> Function:
+    """The function that appends zeros to features."""
+
+    def padded(features: Sequence[Value]) -> list[list[Value]]:
+        return [[*features, *[0 * features[0]] * (size - len(features))]]
+
+    return padded
+
+
+@functools.cache
+def _with_products(size: int) -> Function:
+    """The function that appends to features the products of a plane's coordinates, zeros, and the disc's index."""
+
+    def with_products(
+        features: Sequence[Value], inverse_plane: Sequence[Value], index: Sequence[Value]
+    ) -> list[list[Value]]:
+        products = [inverse_plane[i] * inverse_plane[j] for i, j in _PAIRS]
+        filling = [0 * index[0]] * (size - len(features) - len(products) - 1)
+        return [[*features, *products, *filling, index[0]]]
+
+    return with_products
+
+
+@functools.cache
+def _maps(n_features: int) -> Function:
+    """The function that takes composited channels and planes, and the ray: features, and sums of weight over z and
+    over z².
+    """
+
+    def maps(channels: Sequence[Value], inverse_plane: Sequence[Value], ray: Sequence[Value]) -> list[list[Value]]:
+        products = channels[n_features : n_features + len(_PAIRS)]
+        pairs_of_ray = [(1 if i == j else 2) * ray[i] * ray[j] for i, j in _PAIRS]
+        return [[*channels[:n_features]], [dot(inverse_plane, ray)], [dot(products, pairs_of_ray)]]
+
+    return maps
+
+
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def _median(inverse_plane: Sequence[Value], ray: Sequence[Value], alpha: Sequence[Value]) -> list[list[Value]]:
+    """Depth at which a ray meets the plane of the median disc, 0 where there is none."""
+    halves = alpha[0] >= 0.5
+    return [[torch.where(halves, 1 / torch.where(halves, dot(inverse_plane, ray), 1.0), 0.0)]]
 
 
 @torch.no_grad()
@@ -323,11 +467,14 @@ def _bin(
 ) -> tuple[Int[Tensor, "B rows columns"], Int[Tensor, "entries"]]:
     """Bin splats to tiles, front to back: offset of each tile in the list of splats, and the list."""
     columns, rows = -(-width // TILE), -(-height // TILE)
-    _, tiles, splats = isect_tiles(means2d, radii.ceil().int(), depths, TILE, columns, rows)
+    _, tiles, splats = isect_tiles(means2d, radii.int(), depths, TILE, columns, rows)
     return isect_offset_encode(tiles, len(means2d), columns, rows), splats
 
 
 def _stack(cameras: Sequence[Camera]) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 3 3"], int, int]:
     """Viewmats, Ks, and the common width and height."""
-    viewmats = torch.stack([camera.viewmat for camera in cameras])
-    return viewmats, torch.stack([camera.K for camera in cameras]), cameras[0].width, cameras[0].height
+    viewmats, Ks = (
+        _joined([each[None] for each in matrices], dim=0)
+        for matrices in zip(*((camera.viewmat, camera.K) for camera in cameras), strict=True)
+    )
+    return viewmats, Ks, cameras[0].width, cameras[0].height

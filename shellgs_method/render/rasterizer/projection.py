@@ -139,9 +139,15 @@ def _project(
 
 def three_sigmas(covars2d: Float[Tensor, "B N 3"], visible: Bool[Tensor, "B N"]) -> Int[Tensor, "B N"]:
     """Radii of splats, see :class:`~.renders.Renders`, from their covariances (xx, xy, yy) in px²."""
-    xx, xy, yy = covars2d.unbind(-1)
-    variance = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
-    return torch.where(visible, (3 * variance.sqrt()).ceil(), 0).int()
+    return three_sigma(covars2d.unbind(-1), visible).int()
+
+
+def three_sigma(covar2d: Sequence[Value], visible: Value) -> Value:
+    """Radius of a splat, a whole number, see :func:`three_sigmas`."""
+    xx, xy, yy = covar2d
+    half = (xx - yy) / 2
+    variance = (xx + yy) / 2 + torch.sqrt(half * half + xy * xy)
+    return torch.where(visible, torch.ceil(3 * torch.sqrt(variance)), 0.0)
 
 
 def stack_cameras(

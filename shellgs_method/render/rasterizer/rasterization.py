@@ -88,10 +88,10 @@ def rasterize(
         "height": height,
         "n_cameras": len(cameras),
     }
-    one = isinstance(camera, Camera)
-    composited, alpha, maps = (each[0] if one else each for each in (renders.composited, renders.alpha, renders.maps))
+    rendered = renders.composited, renders.alpha, *renders.maps
+    composited, alpha, *maps = (each.squeeze(0) for each in rendered) if isinstance(camera, Camera) else rendered
     if primitive == "2d":
-        info |= {"gradient_2dgs": renders.means2d, **disc_maps(alpha, maps)}
+        info |= {"gradient_2dgs": renders.means2d, **disc_maps(alpha, *maps)}
     return composited, alpha, info
 
 
@@ -109,10 +109,10 @@ def _rasterize(
     """Rasterize in torch the primitive given by ``project`` and ``kernels``."""
     projection = project(means, quats, scales, opacities, cameras, with_probe=n_densifying is not None)
     views = [_render(view, kernels, features, cameras[0], n_densifying or 0) for view in projection.views()]
-    composited, alpha, maps = torch.stack(views).split([features.shape[1], 1, kernels.n_maps], dim=-1)
+    composited, alpha, *maps = torch.stack(views).split([features.shape[1], 1, *[1] * kernels.n_maps], dim=-1)
     radii = three_sigmas(projection.covars2d, projection.visible)
     centres = projection.means2d if projection.probe is None else projection.probe
-    return Renders(composited, alpha, maps, centres, radii)
+    return Renders(composited, alpha, tuple(maps), centres, radii)
 
 
 _RASTERIZE = {

@@ -24,6 +24,6 @@ class Renders:
 
     composited: Float[Tensor, "B height width C"]
     alpha: Float[Tensor, "B height width 1"]
-    maps: Float[Tensor, "B height width maps"]
+    maps: tuple[Float[Tensor, "B height width 1"], ...]
     means2d: Float[Tensor, "B N 2"]
     radii: Int[Tensor, "B N"]
