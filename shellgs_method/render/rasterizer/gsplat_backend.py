@@ -9,6 +9,7 @@ and how large the others are; tiles are found, and densification measures, by co
 
 from __future__ import annotations
 
+import functools
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
