@@ -1,0 +1,39 @@
+"""How many kernels a training step launches on a GPU outside gsplat's, and how often the host waits for it.
+
+A GPU takes some 5 µs to start a kernel: below a million Gaussians their number decides how long a step takes.
+"""
+
+from __future__ import annotations
+
+import pytest
+from launches import Launches, on_twins
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.utils import profiler
+from training_runs import trainer_of
+
+MOST = {"photo_gs": 95, "shellgs": 195, "shellgs_metric": 330, "two_dgs": 205}
+STEPS = range(11_000, 11_010)
+"""Of 30 000: all terms count, and none of them logs, refines or looks for skipped steps but the first."""
+
+
+@pytest.mark.parametrize("method", MOST)
+def test_a_step_launches_few_kernels_and_never_waits(method, pristine_scene, tmp_path, monkeypatch):
+    trainer = trainer_of(pristine_scene, tmp_path, method, iterations=30_000)
+    profiler.setup_profiler(trainer.config.logging, tmp_path)
+    trainer.pipeline.train()
+
+    def run(step: int) -> None:
+        trainer.step = step
+        for when in (TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION):
+            if when == TrainingCallbackLocation.AFTER_TRAIN_ITERATION:
+                trainer.train_iteration(step)
+            for callback in trainer.callbacks:
+                callback.run_callback_at_location(step, when)
+
+    with on_twins(monkeypatch):
+        for step in STEPS[:-1]:  # all 8 views, whose maps are prepared once
+            run(step)
+        with Launches() as counted:
+            run(STEPS[-1])
+    assert not counted.waits, counted.table()
+    assert sum(counted.launches.values()) <= MOST[method], counted.table()
