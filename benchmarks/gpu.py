@@ -31,6 +31,7 @@ from torch import Tensor, nn
 
 import method_configs
 from dataparsers.facade import FacadeDataParserConfig
+from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.gaussians.initial import InitialGaussians
 from shellgs_method.gaussians.seeds import Seeds, view_of_shell
 
@@ -104,7 +105,9 @@ def trainer_of(name: str, scene: Path, folder: Path) -> Trainer:
         leftovers.clear()
     if method == PEER:
         config = copy.deepcopy(nerfstudio_methods.method_configs[PEER])
-        config.pipeline.datamanager.dataparser = FacadeDataParserConfig(data=scene)
+        config.pipeline.datamanager = FacadeDataManagerConfig(
+            dataparser=FacadeDataParserConfig(), cache_images_type="uint8"
+        )
     else:
         config = copy.deepcopy(getattr(method_configs, METHODS[method]).config)
         if backend:
@@ -118,6 +121,8 @@ def trainer_of(name: str, scene: Path, folder: Path) -> Trainer:
     with mock.patch("torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity", NoLpips):
         trainer = config.setup()
         trainer.setup()
+    if method == PEER:
+        trainer.pipeline.datamanager.train_dataset.kinds = ()  # no maps
     trainer.pipeline.train()
     return trainer
 

@@ -90,7 +90,7 @@ def _indexes_by_mask(name: str, args: tuple) -> bool:
 
 def _place() -> str:
     """The line of our sources, or of those that we call, from which an operation comes; also of a backward pass."""
-    node = torch._C._current_autograd_node()
+    node: Any = torch._C._current_autograd_node()
     if node is not None:
         lines = [line for line in node.metadata.get("traceback_", []) if any(f"/{room}/" in line for room in ROOMS)]
         ours = [line for line in lines if "/shellgs_method/" in line] or lines

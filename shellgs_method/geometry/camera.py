@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from shellgs_method.machine.constants import constant
-from shellgs_method.machine.elementwise import Value, elementwise
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,8 @@ class Camera:
 
     def to(self, *args, **kwargs) -> Camera:
         """Move or cast the tensors, as :meth:`torch.Tensor.to`."""
-        return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
+        viewmat, K = self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs)
+        return self if viewmat is self.viewmat and K is self.K else replace(self, viewmat=viewmat, K=K)
 
     @property
     def position(self) -> Float[Tensor, "3"]:
@@ -66,8 +66,11 @@ class Camera:
 
     def rays(self) -> Float[Tensor, "height width 3"]:
         """Ray through each pixel's centre in the camera frame, scaled to z = 1, so that ``depth * ray`` is a point."""
-        centres = _pixel_centres(self.width, self.height, self.K.dtype, self.K.device)
-        return elementwise(_ray, *centres, self.K.flatten())[0]
+        return _pixels(self.width, self.height, self.K.dtype, self.K.device) @ self._inverse_K.T
+
+    @functools.cached_property
+    def _inverse_K(self) -> Float[Tensor, "3 3"]:
+        return torch.linalg.inv(self.K)  # kept: on a GPU, the host waits for it
 
     def project(self, points: Float[Tensor, "*N 3"]) -> tuple[Float[Tensor, "*N 2"], Float[Tensor, "*N"]]:
         """Pixels and z-depths of points of the world; pixels of points behind the camera mean nothing."""
@@ -81,20 +84,12 @@ class Camera:
         return (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=-1)
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=4)
 @torch.inference_mode(False)
-def _pixel_centres(
-    width: int, height: int, dtype: torch.dtype, device: torch.device
-) -> tuple[Float[Tensor, "width 1"], Float[Tensor, "height 1 1"]]:
+def _pixels(width: int, height: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "height width 3"]:
+    """Centre (u, v, 1) of each pixel."""
     u, v = (torch.arange(size, dtype=dtype, device=device) + 0.5 for size in (width, height))
-    return u[:, None], v[:, None, None]
-
-
-def _ray(u: Sequence[Value], v: Sequence[Value], K: Sequence[Value]) -> list[list[Value]]:
-    """K⁻¹ (u, v, 1), in closed form: an inverse by LU waits for the device."""
-    fx, skew, cx, _, fy, cy, _, _, one = K
-    y = (v[0] - cy) / fy
-    return [[(u[0] - cx - skew * y) / fx, y, one]]
+    return torch.stack([*torch.meshgrid(u, v, indexing="xy"), torch.ones_like(u).expand(height, -1)], dim=-1)
 
 
 def angle_between(one: Camera, other: Camera) -> float:

@@ -60,7 +60,7 @@ class GuardedOptimizers(Optimizers):
         self._skipped.append(skipped)
         if gradients and not grad_scaler.is_enabled():
             one = constant(1.0, like=skipped)[0]
-            torch._amp_foreach_non_finite_check_and_unscale_(gradients, skipped, one)
+            torch._amp_foreach_non_finite_check_and_unscale_(gradients, skipped, one)  # pyright: ignore
             for optimizer in self.optimizers.values():
                 optimizer.found_inf = skipped  # pyright: ignore[reportAttributeAccessIssue]
             if not all(each.defaults.get("fused") for each in self.optimizers.values()) and skipped.item():
