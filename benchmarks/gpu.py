@@ -52,13 +52,15 @@ class Benchmark:
         methods: methods against splatfacto; with ``/torch`` behind the name, on the torch backend.
         n: numbers of Gaussians.
         rounds: blocks of steps of each method.
+        scale: size of the photographs, relative to the maps'.
         out: file for the results (JSON).
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
-    methods: tuple[str, ...] = ("photo-gs", "shellgs", "shellgs-metric", "2dgs", "photo-gs/torch")
+    methods: tuple[str, ...] = ("photo-gs", "shellgs", "shellgs-metric", "2dgs")
     n: tuple[int, ...] = (100_000, 1_000_000)
     rounds: int = 8
+    scale: float = 1.0
     out: Path | None = None
 
 
@@ -82,7 +84,7 @@ def main(benchmark: Benchmark) -> None:
     names = ((PEER,) if cuda else ()) + benchmark.methods
     for n in benchmark.n:
         with TemporaryDirectory() as folder:
-            timed = {name: Timed(trainer_of(name, benchmark.scene, Path(folder) / name)) for name in names}
+            timed = {name: Timed(trainer_of(name, benchmark, Path(folder) / name)) for name in names}
             splats = seeds(next(each.trainer for name, each in timed.items() if name != PEER), n)
             for each in timed.values():
                 replace_gaussians(each.trainer, splats)
@@ -93,12 +95,12 @@ def main(benchmark: Benchmark) -> None:
                         each.milliseconds[phase].append(block(each.trainer, phase))
             results += [row(n, name, each, timed.get(PEER)) for name, each in timed.items()]
             del timed
-        Console(width=160).print(tabulate([each for each in results if each["n"] == n], benchmark.scene))
+        Console(width=160).print(tabulate([each for each in results if each["n"] == n], benchmark))
     if benchmark.out is not None:
         benchmark.out.write_text(json.dumps({"device": _device(), "rows": results}, indent=1) + "\n")
 
 
-def trainer_of(name: str, scene: Path, folder: Path) -> Trainer:
+def trainer_of(name: str, benchmark: Benchmark, folder: Path) -> Trainer:
     """A trainer set up as ns-train does it."""
     method, _, backend = name.partition("/")
     for leftovers in (writer.EVENT_WRITERS, writer.EVENT_STORAGE):
@@ -113,7 +115,8 @@ def trainer_of(name: str, scene: Path, folder: Path) -> Trainer:
         if backend:
             config.pipeline.model.backend = backend
     assert isinstance(config, TrainerConfig)
-    config.pipeline.datamanager.data = scene
+    config.pipeline.datamanager.data = benchmark.scene
+    config.pipeline.datamanager.camera_res_scale_factor = benchmark.scale
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
     config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
     config.logging.local_writer.enable = False
@@ -222,9 +225,9 @@ def row(n: int, name: str, timed: Timed, peer: Timed | None) -> dict:
     return found
 
 
-def tabulate(rows: list[dict], scene: Path) -> Table:
+def tabulate(rows: list[dict], benchmark: Benchmark) -> Table:
     """One line for each method."""
-    table = Table(title=f"{_device()}, {scene.name}, {rows[0]['n']} Gaussians")
+    table = Table(title=f"{_device()}, {benchmark.scene.name} x {benchmark.scale:g}, {rows[0]['n']} Gaussians")
     keys = ("ms", "least", "most", "ratio", "busy", "launches", "copies", "waits")
     for heading in ("method", "phase", *keys, "GB"):
         table.add_column(heading, justify="left" if heading in ("method", "phase") else "right")

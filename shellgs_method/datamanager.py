@@ -214,6 +214,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
     config: FacadeDataManagerConfig
     train_pixel_sampler = NoPixelSampler()
+    _room_on_gpu: float | None = None
+    """Bytes of the GPU that photographs and maps may take besides those there already, once known."""
 
     @cached_property
     def eval_dataloader(self) -> FixedIndicesEvalDataloader:
@@ -368,6 +370,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             return batch
         view = {key: _moved(value, self.device) for key, value in self._with_maps(batch).items()}
         size = sum(value.nbytes for value in view.values() if isinstance(value, Tensor))
+        if self._room_on_gpu is None:
+            self._room_on_gpu = self._share_of_gpu()
         if size <= self._room_on_gpu:
             self._room_on_gpu -= size
             self._kept_on_gpu.add(index)
@@ -381,9 +385,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         """Training views that are on the GPU with their maps."""
         return set()
 
-    @cached_property
-    def _room_on_gpu(self) -> float:
-        """Bytes of the GPU that photographs and maps may take besides those there already."""
+    def _share_of_gpu(self) -> float:
+        """Bytes of the GPU that photographs and maps may take, which are told if they matter."""
         free, needed = torch.cuda.mem_get_info(self.device)[0], self.train_dataset.nbytes(self.config.cache_images_type)
         room = MAX_GPU_SHARE * free
         if needed > min(room, MIN_REPORTED_BYTES):
