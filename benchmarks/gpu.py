@@ -21,21 +21,20 @@ from unittest import mock
 
 import torch
 import tyro
-from nerfstudio.configs import method_configs as nerfstudio_methods
+from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
+from torch.profiler import ProfilerActivity, profile
 
-import method_configs
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.gaussians.initial import InitialGaussians
 from shellgs_method.gaussians.seeds import Seeds, view_of_shell
 
-METHODS = {"photo-gs": "photo_gs", "shellgs": "shellgs", "shellgs-metric": "shellgs_metric", "2dgs": "two_dgs"}
 PHASES = {"densifying": 0.3, "after": 0.7}
 """Shares of the run at which steps are timed."""
 PEER = "splatfacto"
@@ -105,16 +104,14 @@ def trainer_of(name: str, benchmark: Benchmark, folder: Path) -> Trainer:
     method, _, backend = name.partition("/")
     for leftovers in (writer.EVENT_WRITERS, writer.EVENT_STORAGE):
         leftovers.clear()
+    config = copy.deepcopy(all_methods[method])
+    assert isinstance(config, TrainerConfig)
     if method == PEER:
-        config = copy.deepcopy(nerfstudio_methods.method_configs[PEER])
         config.pipeline.datamanager = FacadeDataManagerConfig(
             dataparser=FacadeDataParserConfig(), cache_images_type="uint8"
         )
-    else:
-        config = copy.deepcopy(getattr(method_configs, METHODS[method]).config)
-        if backend:
-            config.pipeline.model.backend = backend
-    assert isinstance(config, TrainerConfig)
+    elif backend:
+        config.pipeline.model.backend = backend
     config.pipeline.datamanager.data = benchmark.scene
     config.pipeline.datamanager.camera_res_scale_factor = benchmark.scale
     config.output_dir, config.timestamp, config.vis = folder, "run", "tensorboard"
@@ -132,11 +129,11 @@ def trainer_of(name: str, benchmark: Benchmark, folder: Path) -> Trainer:
 
 def seeds(trainer: Trainer, n: int) -> dict[str, Tensor]:
     """Parameters of n Gaussians of degree 3 at pixels of the training views, on the shell."""
-    data = trainer.pipeline.datamanager
-    before, data.train_dataset.kinds = data.train_dataset.kinds, ("shell",)
-    dataset = data.train_dataset
+    dataset = trainer.pipeline.datamanager.train_dataset
+    before, dataset.kinds = dataset.kinds, ("shell",)
     views = [view_of_shell(dataset.camera(k), dataset.get_data(k, "uint8")) for k in range(len(dataset))]
-    data.train_dataset.kinds = before
+    dataset.kinds = before
+    pixels_on_shell = sum(float(view.shell.mask.sum()) for view in views)
     generator, parts = torch.Generator().manual_seed(0), []
     for view in views:
         pixels = view.shell.mask[..., 0].nonzero()
@@ -144,7 +141,7 @@ def seeds(trainer: Trainer, n: int) -> dict[str, Tensor]:
         v, u = pixels.unbind(-1)
         rotation, depth = view.camera.viewmat[:3, :3], view.shell.depth[v, u]
         points = view.camera.position + (view.camera.rays()[v, u] * depth).to(rotation) @ rotation
-        spacing = depth[:, 0] / view.camera.K[0, 0] * (sum(float(each.shell.mask.sum()) for each in views) / n) ** 0.5
+        spacing = depth[:, 0] / view.camera.K[0, 0] * (pixels_on_shell / n) ** 0.5
         parts.append((points, view.shell.normal[v, u].to(rotation) @ rotation, view.image[v, u], spacing))
     points, normals, colours, spacing = (torch.cat(each)[:n].double().numpy() for each in zip(*parts, strict=True))
     return InitialGaussians("3d", 3, 0.5).at_seeds(Seeds(points, normals, colours, spacing))
@@ -199,14 +196,15 @@ def one_step(trainer: Trainer, step: int) -> None:
 
 
 def profiled(trainer: Trainer, phase: str) -> dict[str, float]:
-    """Launches, waits, bytes copied from the host and busy milliseconds of a step."""
-    from torch.profiler import ProfilerActivity, profile
-
+    """Launches, copies, waits, and busy milliseconds of a step."""
     with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA], acc_events=True) as made:
         block(trainer, phase)
     events = made.events() or []
     on_device = [each for each in events if each.device_type == torch.autograd.DeviceType.CUDA]
-    named = lambda *words: sum(any(word in each.name for word in words) for each in events)  # noqa: E731
+
+    def named(*words: str) -> int:
+        return sum(any(word in each.name for word in words) for each in events)
+
     return {
         "launches": named("cudaLaunchKernel", "cuLaunchKernel") / BLOCK,
         "copies": named("cudaMemcpyAsync") / BLOCK,

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import pytest
 from launches import Launches, on_twins
-from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.utils import profiler
 from training_runs import trainer_of
+
+from benchmarks.gpu import one_step
 
 MOST = {"photo_gs": 95, "shellgs": 195, "shellgs_metric": 330, "two_dgs": 205}
 STEPS = range(11_000, 11_010)
@@ -22,18 +23,10 @@ def test_a_step_launches_few_kernels_and_never_waits(method, pristine_scene, tmp
     profiler.setup_profiler(trainer.config.logging, tmp_path)
     trainer.pipeline.train()
 
-    def run(step: int) -> None:
-        trainer.step = step
-        for when in (TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION):
-            if when == TrainingCallbackLocation.AFTER_TRAIN_ITERATION:
-                trainer.train_iteration(step)
-            for callback in trainer.callbacks:
-                callback.run_callback_at_location(step, when)
-
     with on_twins(monkeypatch):
         for step in STEPS[:-1]:  # all 8 views, whose maps are prepared once
-            run(step)
+            one_step(trainer, step)
         with Launches() as counted:
-            run(STEPS[-1])
+            one_step(trainer, STEPS[-1])
     assert not counted.waits, counted.table()
     assert sum(counted.launches.values()) <= MOST[method], counted.table()

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from layouts import LAYOUTS
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
-from torch import Tensor
 
 from shellgs_method.errors import SceneError
 from shellgs_method.machine import cpp, system
@@ -51,17 +51,6 @@ def test_each_operation_and_its_derivative_are_those_of_torch(compiler, name):
 def mixed(a, b, scale):
     """Two outputs of three inputs."""
     return [[scale[0] * dot(a, b)], [x * y * scale[0] for x, y in zip(a, b, strict=True)]]
-
-
-LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
-    "contiguous": lambda x: x,
-    "transposed": lambda x: x.transpose(0, 1).contiguous().transpose(0, 1),
-    "shifted": lambda x: torch.nn.functional.pad(x, (0, 0, 2, 3, 1, 1))[1:-1, 2:-3],
-    "coordinates apart": lambda x: x.permute(2, 0, 1).contiguous().permute(1, 2, 0),
-    "one for all rows": lambda x: x[:1],
-    "one for all columns": lambda x: x[:, :1],
-    "one for all": lambda x: x[0, 0],
-}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

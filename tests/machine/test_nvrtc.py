@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from layouts import LAYOUTS
 from random_splats import make_camera, make_discs, make_splats
 from torch import Tensor
 
@@ -166,15 +167,6 @@ def mixed(a, b, scale):
         [scale[0] * elementwise.dot(a, b)],
         [torch.sqrt(x * x + 1) * scale[0] * y for x, y in zip(a, b, strict=True)],
     ]
-
-
-LAYOUTS: dict[str, Callable[[Tensor], Tensor]] = {
-    "shifted": lambda x: torch.nn.functional.pad(x, (0, 0, 2, 3, 1, 1))[1:-1, 2:-3],
-    "coordinates apart": lambda x: x.permute(2, 0, 1).contiguous().permute(1, 2, 0),
-    "one for all rows": lambda x: x[:1],
-    "one for all columns": lambda x: x[:, :1],
-    "one for all": lambda x: x[0, 0],
-}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
