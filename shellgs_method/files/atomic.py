@@ -60,6 +60,26 @@ def replace_folder(folder: Path, complete: Path) -> None:
     os.replace(complete, folder)
 
 
+@contextmanager
+def atomic_contents(folder: Path) -> Iterator[Path]:
+    """Make a folder to write to; once it is complete, its contents replace what has the same names in ``folder``.
+
+    What else is there stays.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    complete = unfinished(folder / folder.resolve().name)  # inside: the folder itself may be a mounted one
+    complete.mkdir()
+    try:
+        yield complete
+        for path in complete.iterdir():
+            if path.is_dir():
+                replace_folder(folder / path.name, path)
+            else:
+                os.replace(path, folder / path.name)
+    finally:
+        shutil.rmtree(complete, ignore_errors=True)
+
+
 def remove_leftovers(folder: Path) -> None:
     """Delete what killed processes left :func:`unfinished` in a folder and below."""
     for path in folder.rglob(".*.tmp*"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import write_splats
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import atomic_contents, atomic_write, read_json
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
@@ -53,6 +54,8 @@ def simulate(
 ) -> tuple[dict, list[Chapter]]:
     """Export the buildings of trained runs to one folder that simulators load.
 
+    The folder stays as it was until all is written; buildings of an earlier world in it are removed then.
+
     Args:
         configs: config.yml of each run; the first run's frame is the world's.
         out: output folder.
@@ -74,7 +77,21 @@ def simulate(
             "remove it, or give another folder"
         )
     import_mujoco()  # fail before hours of work
-    out.mkdir(parents=True, exist_ok=True)
+    with atomic_contents(out) as folder:
+        metrics, chapters = _world(configs, folder, settings, log, truths)
+        for name in _buildings(out) - _buildings(folder):
+            shutil.rmtree(out / name, ignore_errors=True)
+    return metrics, chapters
+
+
+def _world(
+    configs: Sequence[Path],
+    out: Path,
+    settings: SimSettings,
+    log: Callable[[str], None],
+    truths: Sequence[Callable[[np.ndarray], Triangles]],
+) -> tuple[dict, list[Chapter]]:
+    """Write the files of :func:`simulate`."""
     names: list[str] = []
     chapters, home = [], None
     for number, config in enumerate(configs):
@@ -100,6 +117,13 @@ def simulate(
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
     return metrics, chapters
+
+
+def _buildings(folder: Path) -> set[str]:
+    """Names of the buildings of the world in a folder, if there is one."""
+    record = folder / "frame.json"
+    names = read_json(record).get("buildings", {}) if record.exists() else {}
+    return {name for name in names if (folder / name / f"{name}.xml").exists()}
 
 
 def _building(

@@ -86,3 +86,19 @@ def test_the_hash_of_a_gltf_is_of_the_files_beside_it_too(tmp_path: Path, suffix
 def test_a_damaged_gltf_has_the_hash_of_its_bytes(tmp_path: Path, data: bytes):
     (tmp_path / "a.gltf").write_bytes(data)
     assert atomic.content_hash(tmp_path / "a.gltf") == hashlib.sha256(data).hexdigest()
+
+
+def test_contents_replace_those_of_the_same_names_once_they_are_complete(tmp_path: Path):
+    folder = tmp_path / "made"
+    for name in ("a/old", "b/other", "page"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("old")
+    with pytest.raises(FileNotFoundError), atomic.atomic_contents(folder) as complete:
+        (complete / "page").rename(complete / "interrupted")
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {"a", "a/old", "b", "b/other", "page"}
+    with atomic.atomic_contents(folder) as complete:
+        (complete / "a").mkdir()
+        (complete / "a/new").write_text("new")
+        (complete / "page").write_text("new")
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {"a", "a/new", "b", "b/other", "page"}
+    assert (folder / "page").read_text() == "new"

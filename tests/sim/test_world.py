@@ -257,6 +257,24 @@ def test_a_folder_of_an_earlier_version_is_refused_and_stays(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [OUTDATED]
 
 
+def test_a_world_replaces_the_buildings_of_an_earlier_one_and_nothing_else(tmp_path, monkeypatch):
+    def write(*names: str) -> None:
+        def world(configs, out, *rest):
+            for name in names:
+                (out / name).mkdir()
+                (out / name / f"{name}.xml").write_text("<mujoco/>")
+            (out / "frame.json").write_text(json.dumps({"buildings": dict.fromkeys(names, "scene")}))
+            return {}, []
+
+        monkeypatch.setattr("shellgs_method.sim.simulate._world", world)
+        simulate([tmp_path / "config.yml"], tmp_path / "sim", SMALL)
+
+    write("church", "school")
+    (tmp_path / "sim" / "robot").mkdir()
+    write("school", "bank")
+    assert {path.name for path in (tmp_path / "sim").iterdir()} == {"bank", "frame.json", "robot", "school"}
+
+
 def test_walls_far_apart_are_reported(collider):
     from shellgs_method.sim.simulate import _report_gaps
 
