@@ -191,6 +191,13 @@ def test_a_hole_is_found_where_it_is(bays, of_bays):
     assert holed.surface.cast(eye[None], away[None]).t > 1
 
 
+@pytest.mark.parametrize(("radius", "leaking"), [(0.99, False), (0.5, True)])
+def test_a_ball_leaks_where_its_collider_is_much_smaller_and_not_where_rays_graze_it(radius, leaking):
+    ball, smaller = (trimesh.creation.icosphere(4, radius) for radius in (1.0, radius))
+    share = leaks(surface_of(smaller), surface_of(ball), np.array([[0, -4.0, 0], [3.0, 2, 1]])).share
+    assert (share > 0.3) if leaking else (share == 0)
+
+
 def test_a_part_contains_the_points_inside_its_hull():
     """Against the Delaunay triangulation of its corners."""
     rng = np.random.default_rng(1)

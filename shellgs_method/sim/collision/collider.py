@@ -39,6 +39,9 @@ SPECK = 0.01
 """Area in square metres below which a separate piece of surface in front of the shell is noise."""
 PASSED = 0.1
 """Metres behind a surface at which a ray has passed the collision geometry."""
+STEEP = 0.2
+"""Least cosine between a camera's ray and the normal of what it reaches that can leak: beside a round thing that is a
+centimetre wider than its collision geometry, others pass both."""
 LEAKY = 0.005
 """Share of leaking camera rays above which the collision geometry has a hole."""
 
@@ -234,13 +237,17 @@ class Leaks:
 
 
 def leaks(collider: Triangles, shell: Triangles, eyes: Float64[np.ndarray, "E 3"], count: int = 40_000) -> Leaks:
-    """Find the camera rays that reach the shell and pass 10 cm behind it without hitting the collision geometry."""
+    """Find the camera rays that reach the shell and pass 10 cm behind it without hitting the collision geometry.
+
+    Rays that graze the shell are left out.
+    """
     points, _ = shell.samples(count)
     eye = np.arange(count) % len(eyes)
     away = points - eyes[eye]
     length = np.linalg.norm(away, axis=1)
     directions = away / length[:, None]
-    visible = shell.cast(eyes[eye], directions).t > length - 0.01
+    hits = shell.cast(eyes[eye], directions)
+    visible = (hits.t > length - 0.01) & (np.abs(np.einsum("nc,nc->n", hits.normal, directions)) > STEEP)
     through = np.flatnonzero(visible & (collider.cast(eyes[eye], directions).t > length + PASSED))
     if not len(through):
         return Leaks(0.0)
