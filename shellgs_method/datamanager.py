@@ -262,11 +262,16 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         dataset = self.train_dataset
         dataset.kinds = kinds
         for kind, missing in dataset.missing().items():
-            command = dataset.cues[kind].command
+            maps = dataset.cues[kind]
+            command = maps.command
+            if not maps.names:
+                raise SceneError(
+                    f"{maps.folder} has a manifest and no maps: if it is a copy, copy all of it; else run `{command}`"
+                )
             if missing == len(dataset):
                 raise SceneError(
                     f"none of the {missing} training views has a {kind} map that supports a pixel, though "
-                    f"{dataset.cues[kind].folder} has a manifest: run `{command}` to make them again"
+                    f"{maps.folder} has a manifest: run `{command}` to make them again"
                 )
             if missing:
                 logger.warning(
