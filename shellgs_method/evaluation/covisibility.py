@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.nearest import point_tree
 
 MAX_SIZE = 320
@@ -65,10 +67,24 @@ class Covisibility:
         rays, thinned = camera.rays()[::step, ::step], depth[::step, ::step]
         thinned = torch.where(thinned > 0, thinned, self._depth_of_points(camera, rays))
         world = (thinned * rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-        count = sum(_sees(*each, world).int() for each in zip(self.cameras, self.depths, strict=True))
-        seen = torch.as_tensor(count, device=depth.device) >= MIN_VIEWS
-        seen = seen.expand(thinned.shape[:2]).repeat_interleave(step, 0).repeat_interleave(step, 1)
+        seen = self._seen(camera, world.reshape(-1, 3)).view(world.shape[:2])
+        seen = seen.repeat_interleave(step, 0).repeat_interleave(step, 1)
         return seen[: camera.height, : camera.width, None]
+
+    def _seen(self, camera: Camera, world: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
+        """Points of a view that training views see: the nearest first, each only what too few have seen before it."""
+        left, count = torch.arange(len(world), device=world.device), world.new_zeros(len(world), dtype=torch.int32)
+        away = np.linalg.norm(self._centres - positions([camera]), axis=1)
+        for k in np.argsort(away, kind="stable"):
+            count[left] += _sees(self.cameras[k], self.depths[k], world[left])
+            left = left[count[left] < MIN_VIEWS]
+            if not len(left):
+                break
+        return count >= MIN_VIEWS
+
+    @cached_property
+    def _centres(self) -> Float64[np.ndarray, "V 3"]:
+        return positions(self.cameras)
 
     def _depth_of_points(self, camera: Camera, rays: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 1"]:
         """Depth of the SfM point nearest in the image; that of the sky, 1e6, if the image has none."""
@@ -81,7 +97,7 @@ class Covisibility:
         return z[inside][torch.as_tensor(nearest, device=z.device)].view(*rays.shape[:2], 1)
 
 
-def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "*shape 3"]) -> Bool[Tensor, "*shape"]:
+def _sees(camera: Camera, depth: Float[Tensor, "h w"], world: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
     pixels, z = camera.project(world)
     inside = camera.contains(pixels, z)
     size = pixels.new_tensor([camera.width, camera.height])

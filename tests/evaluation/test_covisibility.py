@@ -65,3 +65,16 @@ def test_visibility_of_large_images_is_computed_on_a_thinned_grid():
     assert seen.shape == (751, 1001, 1)
     assert not seen[:, :246].any()
     assert seen[:, 254:].all()
+
+
+def test_the_order_of_many_views_does_not_matter():
+    """Against the count of all of them."""
+    generator = torch.Generator().manual_seed(0)
+    places = (20 * torch.rand(40, generator=generator) - 10).tolist()
+    depths = [torch.where(torch.rand(6, 8, generator=generator) < 0.5, 4.0, 10.0) for _ in places]
+    own = wall(10.0)[..., None]
+    one_by_one = [
+        Covisibility([camera(x)] * 2, [depth] * 2, NO_POINTS) for x, depth in zip(places, depths, strict=True)
+    ]
+    expected = sum(each.mask(camera(0), own).int() for each in one_by_one) >= 2
+    assert torch.equal(Covisibility([*map(camera, places)], depths, NO_POINTS).mask(camera(0), own), expected)
