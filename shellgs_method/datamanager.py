@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar
@@ -33,6 +34,7 @@ from shellgs_method.gaussians.skybox import SkyView
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory
 from shellgs_method.machine.progress import track
+from shellgs_method.machine.threads import MAX_WORKERS, ahead
 from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sightings_of_points, sightings_on_surface
 from shellgs_method.runs.host import NoPixelSampler
 
@@ -316,8 +318,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             that show it, in the mean.
         """
         dataset, exposures = self.train_dataset, []
-        for index, batch in enumerate(self.cached_train):
-            camera, batch = dataset.camera(index), self._with_maps(batch)
+        for index, batch in enumerate(ahead(self._with_maps, self.cached_train)):
+            camera = dataset.camera(index)
             seen = view_of_surface(camera, batch) if "shell_depth" in batch else None
             surface = None if seen is None else seen.shell.depth.where(seen.shell.mask, 0.0)[..., 0]
             exposures.append(Exposed.of(camera, photograph_of(batch), surface))
@@ -343,17 +345,17 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         dataset = self.train_dataset
         maps = dataset.cues[kind] if kind else None
         chosen = [k for k, view in enumerate(dataset.views) if maps is None or maps.record(view.name)]
-        cameras, cached = [dataset.camera(k) for k in chosen], self.cached_train
+        cached = self.cached_train
 
-        def made(index: int, camera: Camera) -> ViewT:
-            view = view_of(camera, self._with_maps(cached[index]))
+        def made(index: int) -> ViewT:
+            view = view_of(dataset.camera(index), self._with_maps(cached[index]))
             if log_gains is None:
                 return view
             gain = torch.from_numpy(log_gains[index]).float()
             return view._replace(image=exposed(view.image, -gain).clamp(0, 1))
 
-        shown = track(zip(chosen, cameras, strict=True), "Placing the first Gaussians", len(chosen))
-        views = (made(k, camera) for k, camera in shown)
+        views = track(ahead(made, chosen), "Placing the first Gaussians", len(chosen))
+        cameras = (dataset.views[k].camera for k in chosen)
         return views, sum(camera.width * camera.height for camera in cameras)
 
     @property
@@ -364,9 +366,25 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """The next training view, with its maps; on a GPU both are there, as far as its memory allows."""
         camera, batch = super().next_train(step)
-        if torch.device(self.device).type != "cuda":
-            return camera, self._with_maps(batch)
-        return camera, self._on_gpu(batch)
+        batch = self._on_gpu(batch) if torch.device(self.device).type == "cuda" else self._with_maps(batch)
+        if not self.train_dataset.held:
+            self._read_ahead()
+        return camera, batch
+
+    def _read_ahead(self) -> None:
+        """Let other threads read the maps of the next training views."""
+        for index in self.train_unseen_cameras[:MAX_WORKERS]:
+            if index not in self._ahead and index not in self._kept_on_gpu:
+                self._ahead[index] = self._readers.submit(self.train_dataset.get_metadata, {"image_idx": index})
+
+    @cached_property
+    def _readers(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(MAX_WORKERS)
+
+    @cached_property
+    def _ahead(self) -> dict[int, Future[dict]]:
+        """Maps that are read before their turn."""
+        return {}
 
     def _on_gpu(self, batch: dict) -> dict:
         """A training view on the GPU, where it is kept from its first step on while there is room."""
@@ -403,7 +421,10 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         return room
 
     def _with_maps(self, batch: dict) -> dict:
-        return batch if self.train_dataset.held else batch | self.train_dataset.get_metadata(batch)
+        if self.train_dataset.held:
+            return batch
+        begun = self._ahead.pop(batch["image_idx"], None)
+        return batch | (begun.result() if begun else self.train_dataset.get_metadata(batch))
 
     def _hold_maps_if_they_fit(self) -> None:
         dataset, free = self.train_dataset, available_memory()

@@ -159,8 +159,10 @@ def test_a_resampled_map_equals_one_cast_at_that_size(scene, size):
     assert resized.depth[resized.mask].all()
 
 
-@pytest.mark.parametrize("empty", [False, True])
-def test_missing_maps_of_all_views_are_refused_before_training(scene, tmp_path, empty):
+@pytest.mark.parametrize(
+    ("empty", "said"), [(False, "has a manifest and no maps"), (True, "none of the 8 training views has a shell map")]
+)
+def test_missing_maps_of_all_views_are_refused_before_training(scene, tmp_path, empty, said):
     for path in (scene / "cues" / "shell").rglob("*.npz"):
         path.unlink()
     if empty:
@@ -169,7 +171,7 @@ def test_missing_maps_of_all_views_are_refused_before_training(scene, tmp_path, 
             shape = (view.camera.height, view.camera.width)
             nothing = CueMap(np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float16), np.zeros(shape, bool))
             spoilt.write(view.name, nothing, view.camera)
-    with pytest.raises(SystemExit, match=r"none of the 8 training views has a shell map.*run `shellgs cast"):
+    with pytest.raises(SystemExit, match=rf"{said}.*run `shellgs cast"):
         trainer_of(scene, tmp_path)
 
 
@@ -191,9 +193,11 @@ def test_memory_is_reported_and_maps_that_do_not_fit_are_read_in_every_step(scen
     assert "10 photographs and their shell maps take 0.0 GB of memory" in printed
     assert "read from disk in every step" in printed
     assert "shell_depth" not in data_of(read).cached_train[0]
-    (_, one), (_, other) = data_of(held).next_train(0), data_of(read).next_train(0)
-    assert one["image_idx"] == other["image_idx"]
-    torch.testing.assert_close(one["shell_depth"], other["shell_depth"])
+    for step in range(20):  # more than twice around the views
+        (_, one), (_, other) = data_of(held).next_train(step), data_of(read).next_train(step)
+        assert one["image_idx"] == other["image_idx"]
+        torch.testing.assert_close(one["shell_depth"], other["shell_depth"])
+        assert [*data_of(read)._ahead] == data_of(read).train_unseen_cameras[: len(data_of(read)._ahead)]
     assert len(model_of(held).gauss_params["means"]) == len(model_of(read).gauss_params["means"])
 
 

@@ -11,13 +11,17 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 import psutil
 import torch
+
+T, R = TypeVar("T"), TypeVar("R")
 
 LOOK_EVERY = 2.0
 """Seconds between two measurements of the load."""
@@ -71,6 +75,18 @@ class ThreadsByLoad:
         self._load = load
         ThreadsByLoad._set = min(max(cores, 1), ThreadsByLoad._most)
         torch.set_num_threads(ThreadsByLoad._set)
+
+
+def ahead(make: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """What is made of items, in their order: threads make the next few while one is used."""
+    with ThreadPoolExecutor(MAX_WORKERS) as pool:
+        pending: deque[Future[R]] = deque()
+        for item in items:
+            pending.append(pool.submit(make, item))
+            if len(pending) > MAX_WORKERS:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 @contextmanager

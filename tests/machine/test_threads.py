@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from shellgs_method.machine import threads
-from shellgs_method.machine.threads import Load, ThreadsByLoad, workers
+from shellgs_method.machine.threads import MAX_WORKERS, Load, ThreadsByLoad, ahead, workers
 
 
 @pytest.fixture
@@ -105,3 +105,23 @@ def test_the_load_of_this_machine_can_be_read():
         sum(range(10_000))
     assert later.passed > start.passed
     assert later.cores_since(start) > 0
+
+
+def test_a_few_items_are_made_ahead_in_their_order():
+    begun: list[int] = []
+
+    def square(number: int) -> int:
+        begun.append(number)
+        return number**2
+
+    for used, result in enumerate(ahead(square, range(20))):
+        assert result == used**2
+        assert len(begun) <= used + MAX_WORKERS + 1
+    assert sorted(begun) == [*range(20)]
+
+
+def test_an_item_that_cannot_be_made_ends_what_uses_it_in_its_turn():
+    made = ahead(lambda number: 1 / number, [2, 1, 0, 4])
+    assert [next(made), next(made)] == [0.5, 1.0]
+    with pytest.raises(ZeroDivisionError):
+        next(made)
