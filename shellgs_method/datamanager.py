@@ -32,9 +32,9 @@ from shellgs_method.files.photographs import View, exif_log_gains, has_alpha, lo
 from shellgs_method.gaussians.seeds import SeededView, photograph_of, view_of_surface
 from shellgs_method.gaussians.skybox import SkyView
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.machine.memory import available_memory
+from shellgs_method.machine.memory import available_memory, free_memory
 from shellgs_method.machine.progress import track
-from shellgs_method.machine.threads import MAX_WORKERS, ahead
+from shellgs_method.machine.threads import ahead
 from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sightings_of_points, sightings_on_surface
 from shellgs_method.runs.host import NoPixelSampler
 
@@ -49,6 +49,8 @@ MIN_REPORTED_BYTES = 1e9
 """Bytes in memory from which their sum is reported."""
 MAX_MEMORY_SHARE = 0.6
 """Share of the free memory that photographs and maps may take."""
+READERS = 8
+"""Threads that read maps before their turn: of 2 megapixels that takes as long as several steps on a GPU."""
 MAX_GPU_SHARE = 1 / 3
 """Share of the GPU's free memory that training views may take: Gaussians, and what a step needs, take the rest."""
 
@@ -373,13 +375,13 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
     def _read_ahead(self) -> None:
         """Let other threads read the maps of the next training views."""
-        for index in self.train_unseen_cameras[:MAX_WORKERS]:
+        for index in self.train_unseen_cameras[:READERS]:
             if index not in self._ahead and index not in self._kept_on_gpu:
                 self._ahead[index] = self._readers.submit(self.train_dataset.get_metadata, {"image_idx": index})
 
     @cached_property
     def _readers(self) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(MAX_WORKERS)
+        return ThreadPoolExecutor(READERS)
 
     @cached_property
     def _ahead(self) -> dict[int, Future[dict]]:
@@ -410,7 +412,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
     def _share_of_gpu(self) -> float:
         """Bytes of the GPU that photographs and maps may take, which are told if they matter."""
-        free, needed = torch.cuda.mem_get_info(self.device)[0], self.train_dataset.nbytes(self.config.cache_images_type)
+        free, needed = free_memory(torch.device(self.device)), self.train_dataset.nbytes(self.config.cache_images_type)
         room = MAX_GPU_SHARE * free
         if needed > min(room, MIN_REPORTED_BYTES):
             share = min(1.0, room / needed)

@@ -22,6 +22,7 @@ from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.losses.objective import KEPT_BYTES, MAX_KEPT_SHARE
 from shellgs_method.machine import cpp, progress
 from shellgs_method.machine.progress import Stage
 from shellgs_method.render.maps import geometry_channels
@@ -144,8 +145,15 @@ def test_losses_of_a_training_view_are_cached_while_there_is_room(trained, monke
     monkeypatch.setattr(model, "training", True)
     kept = model._view(batch, outputs["background"])
     assert model._view(batch, outputs["background"]) is kept
-    full = batch | {"image_idx": 7}
-    monkeypatch.setattr("shellgs_method.losses.objective.MAX_KEPT_PIXELS", 48 * 32)
+    pixels = batch["image"][..., 0].numel()
+    monkeypatch.setattr(model.objective, "_room", None)
+    monkeypatch.setattr(
+        "shellgs_method.losses.objective.free_memory", lambda device: 2.5 * pixels * KEPT_BYTES / MAX_KEPT_SHARE
+    )
+    for index in (20, 21):
+        new = batch | {"image_idx": index}
+        assert model._view(new, outputs["background"]) is model._view(new, outputs["background"])
+    full = batch | {"image_idx": 22}
     assert model._view(full, outputs["background"]) is not model._view(full, outputs["background"])
 
 

@@ -28,13 +28,16 @@ from shellgs_method.losses import (
     vid2sim_ncc_loss,
 )
 from shellgs_method.losses.reduction import weighted_mean
+from shellgs_method.machine.memory import free_memory
 from shellgs_method.render.maps import Geometry
 
 Cues = Literal["none", "mono", "shell"]
 Trust = Literal["shell", "photographs"]
 
-MAX_KEPT_PIXELS = 3_000_000
-"""Most pixels of training views whose losses are cached, at some 80 bytes each."""
+MAX_KEPT_SHARE = 0.1
+"""Share of the device's free memory that losses of training views may take, which are made in their first step."""
+KEPT_BYTES = 110
+"""Bytes that the losses of a pixel take, of all terms: 105 of `shellgs-metric`."""
 SOLID = 0.5
 """Opacity that the shell must have where what is behind it may be seen through it."""
 DISTORTION_FROM = 3000
@@ -116,6 +119,7 @@ class Objective:
         self.cues, self.trust, self.paper, self.extra = cues, trust, paper, extra
         self.metres_per_unit, self.shell_error = metres_per_unit, shell_error
         self._views: dict[int, ViewLosses] = {}
+        self._room: float | None = None
 
     @property
     def needs_geometry(self) -> bool:
@@ -135,9 +139,19 @@ class Objective:
             maps = reference_maps(batch, self.cues, target.device, everywhere=self.trust == "shell")
             cue = CueLosses(maps, self.paper, self.extra, self.metres_per_unit, self.shell_error)
         view = ViewLosses(PhotometricLoss(target, kept), cue, with_cue)
-        if keep and len(self._views) < MAX_KEPT_PIXELS // target[..., 0].numel():
+        if keep and self._has_room(target):
             self._views[index] = view
         return view
+
+    def _has_room(self, image: Float[Tensor, "H W 3"]) -> bool:
+        """Whether the losses of one more view may be kept; if so, they count."""
+        if self._room is None:
+            self._room = MAX_KEPT_SHARE * free_memory(image.device)
+        needed = KEPT_BYTES * image[..., 0].numel()
+        if needed > self._room:
+            return False
+        self._room -= needed
+        return True
 
     def __call__(
         self,

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import psutil
+import torch
 
 
 class _Version(NamedTuple):
@@ -23,6 +24,11 @@ class _Version(NamedTuple):
 
 _V1 = _Version("sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 _V2 = _Version("sys/fs/cgroup", "memory.max", "memory.current", "inactive_file")
+
+
+def free_memory(device: torch.device) -> int:
+    """Bytes that this process can still take on a device: :func:`available_memory` on the CPU."""
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else available_memory()
 
 
 def available_memory(root: Path = Path("/")) -> int:

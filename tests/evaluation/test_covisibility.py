@@ -76,5 +76,5 @@ def test_the_order_of_many_views_does_not_matter():
     one_by_one = [
         Covisibility([camera(x)] * 2, [depth] * 2, NO_POINTS) for x, depth in zip(places, depths, strict=True)
     ]
-    expected = sum(each.mask(camera(0), own).int() for each in one_by_one) >= 2
+    expected = torch.stack([each.mask(camera(0), own) for each in one_by_one]).sum(dim=0) >= 2
     assert torch.equal(Covisibility([*map(camera, places)], depths, NO_POINTS).mask(camera(0), own), expected)
