@@ -136,7 +136,8 @@ class FacadeModel(SplatfactoModel):
     """Splatfacto with geometry channels, on any device.
 
     Outputs: ``rgb``, ``depth`` (forward z in nerfstudio's rescaled units), ``normal`` (camera frame, as colours
-    of :func:`normals_to_colours`), ``accumulation``, ``background``; all [H, W, C].
+    of :func:`normals_to_colours`), ``accumulation``, ``background``, and where exposures are learned ``unclipped``, the
+    colours before those above 1 are clipped; all [H, W, C].
 
     Splatfacto itself calls CUDA and downloads LPIPS' network when it is built
     (https://github.com/nerfstudio-project/nerfstudio/issues/3290), and its resume leaves the optimizers with the old
@@ -327,6 +328,8 @@ class FacadeModel(SplatfactoModel):
         outputs = {"rgb": rgb.clamp(0, 1), "accumulation": alpha, "background": background}
         if not self.training:
             outputs["background"] = background.expand(pinhole.height, pinhole.width, 3)
+            if self.exposures is not None:  # at another exposure, what is white now may be grey
+                outputs["unclipped"] = rgb
         if self.geometry is not None:
             depth, normal = self.geometry.depth, self.geometry.normal
             if not self.training:
@@ -419,7 +422,8 @@ class FacadeModel(SplatfactoModel):
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
         normal = colours_to_normals(outputs["normal"])
-        rendering = Rendering(outputs["rgb"], outputs["depth"], outputs["accumulation"], normal)
+        rgb = outputs.get("unclipped", outputs["rgb"])
+        rendering = Rendering(rgb, outputs["depth"], outputs["accumulation"], normal)
         metrics = masked_image_errors(rendering.rgb, target, batch, self.metres_per_unit)
         metrics |= reference_errors(rendering, camera, batch, self.metres_per_unit)
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}

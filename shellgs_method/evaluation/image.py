@@ -38,10 +38,11 @@ def image_errors(
 ) -> dict[str, float]:
     """PSNR in dB (at most 100, so that an exact image can be averaged), SSIM, and LPIPS if available.
 
-    Colours are in [0, 1]. SSIM is as in the loss, with a Gaussian window of 11 pixels and sigma 1.5; LPIPS uses the
-    AlexNet backbone. PSNR and SSIM of each region that is not empty are ``psnr_…`` and ``ssim_…`` with its name. The
-    same metrics of the :func:`colour_corrected` render are ``cc_psnr`` and so on; it is corrected over the region
-    ``seen`` if there is one: what training views do not show says nothing of a photograph's exposure.
+    Colours are in [0, 1]; a render's may be larger, and are clipped once they are corrected. SSIM is as in the loss,
+    with a Gaussian window of 11 pixels and sigma 1.5; LPIPS uses the AlexNet backbone. PSNR and SSIM of each region
+    that is not empty are ``psnr_…`` and ``ssim_…`` with its name. The same metrics of the :func:`colour_corrected`
+    render are ``cc_psnr`` and so on; it is corrected over the region ``seen`` if there is one: what training views do
+    not show says nothing of a photograph's exposure.
 
     Pixels outside ``kept`` are ignored: they are set to the target, so that no window differs there, and excluded from
     all means. LPIPS, whose mean is over all pixels, is divided by the share of kept pixels.
@@ -49,9 +50,9 @@ def image_errors(
     kept = torch.ones_like(target[..., :1], dtype=torch.bool) if kept is None else kept
     if not kept.any():
         return {}
-    rgb, regions = rgb.detach().clamp(0, 1), regions or {}
+    rgb, regions = rgb.detach(), regions or {}
     corrected = colour_corrected(rgb, target, kept & regions.get("seen", kept))
-    metrics = _errors(rgb, target, regions, kept)
+    metrics = _errors(rgb.clamp(0, 1), target, regions, kept)
     return metrics | {f"cc_{name}": value for name, value in _errors(corrected, target, regions, kept).items()}
 
 
@@ -65,7 +66,7 @@ def colour_corrected(
     a row, which takes out more; gsplat has both.
 
     Args:
-        rgb: render, in [0, 1].
+        rgb: render, in [0, 1] or not clipped.
         target: photograph, in [0, 1].
         where: pixels to fit; those that are clipped in either do not count. If too few are left, the map stays close to
             the identity.

@@ -55,3 +55,13 @@ def test_every_region_has_corrected_metrics_and_what_is_not_seen_does_not_count_
     assert {f"cc_{name}" for name in metrics if not name.startswith("cc_")} <= metrics.keys()
     assert metrics["cc_psnr_seen"] > 60
     assert metrics["cc_psnr_off_shell"] < 30
+
+
+def test_what_is_white_at_one_exposure_is_corrected_to_grey_at_a_darker_one_if_the_render_was_not_clipped():
+    bright = RENDER.clone()
+    bright[:10] = 1.4
+    darker = (0.6 * bright).clamp(0, 1)
+    whole, clipped = (image_errors(render, darker) for render in (bright, bright.clamp(0, 1)))
+    assert whole["psnr"] == clipped["psnr"]
+    assert whole["cc_psnr"] > 60
+    assert clipped["cc_psnr"] < 20
