@@ -11,16 +11,20 @@ import zlib  # noqa: F401  isort: skip
 import json
 import os
 import shutil
+import sqlite3
 import sys
 import threading
 from collections.abc import Collection, Iterator
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from loops import DRIFT, View, agree, astray, bridges, loops, shared  # pyright: ignore[reportMissingImports]  isort: skip
+from loops import CONFIRMED, DRIFT, View, agree, astray, bridges, loops, shared, weakest_cut  # pyright: ignore[reportMissingImports]  isort: skip
 
 SEED = 0
 _RIGID_DEGREES, _RIGID_STEPS = 3.0, 0.5  # most that cameras which are mounted together move against each other
@@ -29,6 +33,7 @@ _BRIDGES = 16  # views of a model that are matched with those of another, if the
 _MIN_JOINING = 30  # matches of points that join two models
 _RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
 _PLANAR = 8.0  # pixels, within which a step's matches are of one plane
+_NEAR = 10  # photographs, within which they are neighbours along a walk
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 
 
@@ -223,7 +228,9 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
     """Write all models, largest first, into numbered folders, and the largest into ``output``; return what they are.
 
     Global mapping (GLOMAP, Pan et al. 2024) bends a long walk less than incremental mapping. The latter is tried if
-    photographs are missing, without parallax, where it finds no cameras and the former invents them, and for rigs.
+    photographs are missing or a part is torn from the rest, without parallax, where it finds no cameras and the former
+    invents them, and for rigs. Global mapping takes the focal length as given until its last step, so that it begins
+    with one that pairs agree on.
     """
     with pycolmap.Database.open(database) as opened:
         count, is_global = opened.num_images(), has_parallax and not _has_rigs(opened)
@@ -233,14 +240,14 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
         models = []
         if is_global:
             options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
-            models = pycolmap.global_mapping(database, photographs, folder, options).values()
-        if _registered_at_most(models) < count:
+            models = pycolmap.global_mapping(_calibrated(database, folder), photographs, folder, options).values()
+        if _fitting(database, models) < (count, CONFIRMED):
             options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
             options.constant_cameras, options.constant_rigs = known, rigs
             others = pycolmap.incremental_mapping(
                 database, photographs, folder, options, next_image_callback=lambda: print(flush=True)
             ).values()
-            models = max(models, others, key=_registered_at_most)
+            models = max(models, others, key=partial(_fitting, database))
     ranked = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     for k, model in enumerate(ranked):
         (Path(output) / str(k)).mkdir()
@@ -253,9 +260,42 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
             "points": model.num_points3D(),
             "reprojection_error": model.compute_mean_reprojection_error(),
             "track_length": model.compute_mean_track_length(),
+            "torn": weakest.between if (weakest := _weakest(database, model)).confirmed < CONFIRMED else None,
         }
         for model in ranked
     ]
+
+
+def _fitting(database: str, models: Collection[pycolmap.Reconstruction]) -> tuple[int, float]:
+    """Number of photographs of the largest model, and the share of matches that it confirms where it does least."""
+    if not models:
+        return 0, 0.0
+    largest = max(models, key=pycolmap.Reconstruction.num_reg_images)
+    return largest.num_reg_images(), _weakest(database, largest).confirmed
+
+
+class _Weakest(NamedTuple):
+    confirmed: float
+    between: list[str]
+
+
+def _weakest(database: str, model: pycolmap.Reconstruction) -> _Weakest:
+    """Share of the matches of neighbours that a model confirms where it does least, and the names around that place."""
+    images = sorted(_registered(model), key=lambda image: image.name)
+    at = {image.image_id: k for k, image in enumerate(images)}
+    points = {
+        image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
+        for image in images
+    }
+    rows = []
+    with pycolmap.Database.open(database) as opened:
+        for a, b, matches in _verified(opened):
+            if a in at and b in at and abs(at[a] - at[b]) <= _NEAR and len(matches):
+                of_a, of_b = points[a][matches[:, 0]], points[b][matches[:, 1]]
+                rows.append([*sorted((at[a], at[b])), ((of_a == of_b) & (of_a >= 0)).sum(), len(matches)])
+    table = np.array(rows, int).reshape(-1, 4)
+    share, k = weakest_cut(table[:, :2], table[:, 2], table[:, 3])
+    return _Weakest(share, [image.name for image in images[k : k + 2]])
 
 
 def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> dict:
@@ -293,8 +333,17 @@ def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> d
     return {"models": reconstruct(database, photographs, model, has_parallax=True)}
 
 
-def _registered_at_most(models: Collection[pycolmap.Reconstruction]) -> int:
-    return max((model.num_reg_images() for model in models), default=0)
+def _calibrated(database: str, folder: str) -> str:
+    """A copy of a database, in a folder, whose cameras have the focal lengths that their pairs agree on.
+
+    COLMAP's guess without EXIF is 1.2 widths, and of a phone it is 0.75 (view graph calibration: Sweeney et al. 2015).
+    Where pairs do not determine it, the guess stays.
+    """
+    copy = f"{folder}/calibrated.db"
+    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
+        source.backup(target)
+    pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=SEED))
+    return copy
 
 
 def _read(models: str) -> list[pycolmap.Reconstruction]:

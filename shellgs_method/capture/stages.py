@@ -390,6 +390,13 @@ class _Capture:
                 f"points, each in {largest['track_length']:.1f} of {registered} photographs. Give larger and sharper "
                 f"photographs of the building, which show at least {LEAST_SEEN} points each"
             )
+        if torn := largest.pop("torn", None):
+            slower = "more --frames, or a slower walk, help" if self.is_video else "more photographs there help"
+            notice(
+                f"The cameras found for {self.source} contradict nearly all that {' and '.join(torn)} and their "
+                f"neighbours have in common: what is on one side of them may be metres off. Look at the cameras' path; "
+                f"{slower}."
+            )
         for model in models[1:]:
             if len(model["names"]) >= LEAST_REGISTERED:
                 self._tell_of_a_pass_apart(sorted(set(model["names"]) - set(largest["names"])), found.get("apart", []))

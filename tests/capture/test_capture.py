@@ -653,6 +653,23 @@ def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch,
     assert "b/5.jpg to b/7.jpg, did not join the others, nobody knows why" in caplog.text
 
 
+def test_a_model_that_is_torn_from_what_its_photographs_share_is_told(tmp_path, monkeypatch, caplog):
+    (tmp_path / "photographs").mkdir()
+    for k in range(8):
+        photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
+    model = {"names": [f"{k}.jpg" for k in range(8)], "points": 900, "reprojection_error": 0.5, "track_length": 3.0}
+
+    def run_step(step: str, arguments: dict, **_):
+        if step == "undistort":
+            for name in ("images", "sparse"):
+                (Path(arguments["output"]) / name).mkdir()
+        return [model | {"torn": ["4.jpg", "5.jpg"]}] if step == "reconstruct" else []
+
+    monkeypatch.setattr(stages, "run_step", run_step)
+    capture(tmp_path / "photographs", tmp_path / "scene")
+    assert "contradict nearly all that 4.jpg and 5.jpg and their neighbours have in common" in caplog.text
+
+
 @pytest.mark.parametrize(("points", "message"), [(49, "only 49 points, each in 3.0 of 5 photographs"), (50, "")])
 def test_a_model_of_a_few_points_is_no_scene(tmp_path, monkeypatch, points, message):
     (tmp_path / "photographs").mkdir()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.capture.loops import DRIFT, View, agree, astray, bridges, loops, shared
+from shellgs_method.capture.loops import CONFIRMED, DRIFT, View, agree, astray, bridges, loops, shared, weakest_cut
 
 BAY = 3.0
 EXTENT = np.array([0.65, 0.4])
@@ -70,6 +70,36 @@ def test_matches_that_are_a_bay_off_are_contradicted_and_drift_is_not(distance):
     assert agree(first, second, points, matches(first, second))
     confused = facing(1, distance, points, shifted=BAY)
     assert not agree(first, confused, points, matches(first, second))
+
+
+@pytest.mark.parametrize(("share", "is_believed"), [(0.1, True), (0.4, False)])
+def test_a_pair_whose_matches_are_of_two_windows_is_not_believed(share: float, is_believed: bool):
+    points = wall()
+    first, second = facing(0, 8, points), facing(1, 8, points)
+    mixed = matches(first, second)
+    index = {tuple(point): k for k, point in enumerate(points)}
+    for k in range(int(share * len(mixed))):
+        mixed[k, 1] = index[tuple(points[mixed[k, 0]] + [BAY, 0, 0])]
+    assert agree(first, second, points, mixed) == is_believed
+
+
+def test_a_walk_is_weakest_where_its_model_takes_the_same_for_different_points():
+    """Pairs of up to three steps share 50 matches a pair; the model confirms 30, across a tear 2."""
+    pairs = np.array([(i, j) for i in range(12) for j in range(i + 1, min(i + 4, 12))])
+    matched, torn = np.full(len(pairs), 50), (pairs[:, 0] <= 6) & (pairs[:, 1] > 6)
+    share, _ = weakest_cut(pairs, np.full(len(pairs), 30), matched)
+    assert share == pytest.approx(0.6)
+    share, k = weakest_cut(pairs, np.where(torn, 2, 30), matched)
+    assert (share, k) == (pytest.approx(0.04), 6)
+    assert share < CONFIRMED
+
+
+def test_where_a_walk_has_hardly_any_matches_nothing_is_said_of_its_model():
+    """A video that is cut, or two passes in two folders."""
+    pairs, confirmed, matched = np.array([[0, 1], [1, 2], [2, 3]]), np.array([90, 0, 90]), np.array([200, 20, 200])
+    assert weakest_cut(pairs, confirmed, matched)[0] == pytest.approx(0.45)
+    none = np.zeros((0, 2), int), np.zeros(0, int), np.zeros(0, int)
+    assert weakest_cut(*none)[0] == 1
 
 
 def test_matches_without_points_are_not_believed():
