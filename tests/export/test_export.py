@@ -19,7 +19,8 @@ from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import lpips_network
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.export.splats import Splats, harmonics_rotation, write_splats
+from shellgs_method.export.splats import harmonics_rotation, moved
+from shellgs_method.files.splats import Splats, write_splats
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.doctor import examine
 from shellgs_method.render.maps import Primitive
@@ -126,10 +127,10 @@ def test_gaussians_move_with_the_similarity():
         axes = axes * splats.scales.exp().numpy()[:, None]
         return axes @ axes.transpose(0, 2, 1)
 
-    moved, A = splats.transformed(similarity), similarity[:3, :3]
-    np.testing.assert_allclose(covariances(moved), A @ covariances(splats) @ A.T, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(moved.means, splats.means.numpy() @ A.T + [1, 2, 3])
-    np.testing.assert_array_equal(moved.opacities, splats.opacities)
+    there, A = moved(splats, similarity), similarity[:3, :3]
+    np.testing.assert_allclose(covariances(there), A @ covariances(splats) @ A.T, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(there.means, splats.means.numpy() @ A.T + [1, 2, 3])
+    np.testing.assert_array_equal(there.opacities, splats.opacities)
 
 
 def rotations(count: int) -> list[Tensor]:
