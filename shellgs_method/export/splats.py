@@ -30,7 +30,7 @@ def moved(splats: Splats, similarity: Float64[np.ndarray, "4 4"]) -> Splats:
         splats.scales.double() + math.log(scale),
         splats.opacities,
         torch.einsum("kj,njc->nkc", bands, splats.harmonics.double()),
-        splats.discs,
+        discs=splats.discs,
     )
 
 

@@ -7,7 +7,7 @@ import json
 import math
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +46,7 @@ class Splats:
     scales: Float[Tensor, "N 3"]
     opacities: Float[Tensor, "N 1"]
     harmonics: Float[Tensor, "N K 3"]
-    discs: bool = False
+    discs: bool = field(default=False, kw_only=True)
 
     def __len__(self) -> int:
         """Number of Gaussians."""
@@ -55,7 +55,7 @@ class Splats:
     def __getitem__(self, chosen: Tensor) -> Splats:
         """Select Gaussians by an index or a mask."""
         fields = (self.means, self.quats, self.scales, self.opacities, self.harmonics)
-        return Splats(*(each[chosen] for each in fields), self.discs)
+        return Splats(*(each[chosen] for each in fields), discs=self.discs)
 
     @property
     def degree(self) -> int:

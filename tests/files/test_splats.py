@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import os
-import struct
 import subprocess
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from splat_files import glb_attributes, unpacked
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.splats import moved
@@ -35,25 +34,7 @@ def some(count: int = 400, degree: int = 3, *, discs: bool = False) -> Splats:
     harmonics = torch.randn(count, (degree + 1) ** 2, 3, generator=generator) * 0.1
     harmonics[:, 0] *= 8
     quats, opacities = (torch.randn(count, n, generator=generator) for n in (4, 1))
-    return Splats(means, quats, scales, opacities, harmonics, discs)
-
-
-def glb_attributes(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
-    """The document of a binary glTF, and the attributes of its primitive."""
-    content = path.read_bytes()
-    magic, version, length = struct.unpack("<4sII", content[:12])
-    assert (magic, version, length) == (b"glTF", 2, len(content))
-    size, kind = struct.unpack("<I4s", content[12:20])
-    assert (kind, size % 4) == (b"JSON", 0)
-    document, data = json.loads(content[20 : 20 + size]), content[28 + size :]
-    attributes = {}
-    for name, number in document["meshes"][0]["primitives"][0]["attributes"].items():
-        accessor = document["accessors"][number]
-        view = document["bufferViews"][accessor["bufferView"]]
-        kind = {5121: "u1", 5126: "<f4"}[accessor["componentType"]]
-        values = np.frombuffer(data[view.get("byteOffset", 0) :][: view["byteLength"]], kind)
-        attributes[name] = values.reshape(accessor["count"], -1)
-    return document, attributes
+    return Splats(means, quats, scales, opacities, harmonics, discs=discs)
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
@@ -75,35 +56,6 @@ def test_gltf_has_linear_scales_and_opacities_and_each_coefficient_by_itself(tmp
     assert [name for name in own if name.startswith("SH")] == names
     np.testing.assert_array_equal(np.stack([own[name] for name in names], axis=1), splats.harmonics)
     np.testing.assert_allclose(attributes["COLOR_0"][:, 3] / 255, own["OPACITY"][:, 0], atol=0.003)
-
-
-def unpacked(path: Path) -> Splats:
-    """Gaussians of an spz of version 3, as its documentation has it."""
-    content = gzip.decompress(path.read_bytes())
-    magic, version, count, degree, fraction, flags, reserved = struct.unpack("<IIIBBBB", content[:16])
-    assert (magic, version, flags, reserved) == (0x5053474E, 3, 0, 0)
-    sizes = 9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)
-    assert len(content) == 16 + count * sum(sizes)
-    parts = np.split(np.frombuffer(content[16:], np.uint8), count * np.cumsum(sizes)[:-1])
-    positions, opacities, colours, scales, packed, rest = (
-        part.reshape(count, size) for part, size in zip(parts, sizes, strict=True)
-    )
-    fixed = positions.reshape(count, 3, 3).astype(np.int32) @ np.array([1, 1 << 8, 1 << 16])
-    fixed = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed)
-    quats = np.zeros((count, 4))
-    for row, word in zip(quats, packed.copy().view("<u4")[:, 0].tolist(), strict=True):
-        largest = word >> 30
-        others = [k for k in range(4) if k != largest]
-        for k, shift in zip(others, (20, 10, 0), strict=True):
-            bits = word >> shift & 1023
-            row[k] = (-1 if bits & 512 else 1) * (bits & 511) / 511 / np.sqrt(2)
-        row[largest] = np.sqrt(1 - (row**2).sum())
-    alpha = torch.from_numpy(opacities / 255).clamp(1e-4, 1 - 1e-4)
-    harmonics = np.concatenate(
-        [((colours / 255 - 0.5) / 0.15)[:, None], (rest.reshape(count, -1, 3).astype(float) - 128) / 128], axis=1
-    )
-    fields = fixed / 2**fraction, quats[:, [3, 0, 1, 2]], scales / 16 - 10, torch.logit(alpha), harmonics
-    return Splats(*(torch.as_tensor(np.asarray(each)).float() for each in fields))
 
 
 def psnr(one: Splats, other: Splats) -> float:
@@ -200,7 +152,7 @@ def test_programs_of_others_read_the_files(tmp_path):
     fields = [["x", "y", "z"], [f"rot_{k}" for k in range(4)], [f"scale_{k}" for k in range(3)], ["opacity"]]
     tensors = [torch.from_numpy(np.stack([read[name] for name in names], axis=-1).copy()) for names in fields]
     coefficients = np.stack([np.stack([read[name] for name in names], axis=-1) for names in harmonics], axis=1)
-    assert psnr(Splats(*tensors, torch.from_numpy(coefficients)), splats) > 38
+    assert psnr(Splats(*tensors, *[torch.from_numpy(coefficients)]), splats) > 38
     script = "require('gltf-validator').validateBytes(new Uint8Array(require('fs').readFileSync(process.argv[1])))"
     script += ".then(report => console.log(JSON.stringify(report.issues)))"
     found = subprocess.run(
