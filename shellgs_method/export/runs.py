@@ -226,8 +226,14 @@ class TrainedRun:
         """The Gaussians in the frame."""
         trained = {name: parameter.detach().cpu() for name, parameter in self.model.gauss_params.items()}
         harmonics = torch.cat([trained["features_dc"][:, None], trained["features_rest"]], dim=1)
-        gaussians = (*(trained[name] for name in ("means", "quats", "scales", "opacities")), harmonics)
-        splats = Splats(*gaussians, discs=self.model.config.primitive == "2d")
+        splats = Splats(
+            trained["means"],
+            trained["quats"],
+            trained["scales"],
+            trained["opacities"],
+            harmonics,
+            discs=self.model.config.primitive == "2d",
+        )
         return moved(splats, np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
 
 
