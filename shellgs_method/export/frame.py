@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float64
 
 from shellgs_method.files.atomic import atomic_write
-from shellgs_method.geometry.axes import name_of
+from shellgs_method.geometry.axes import name_of, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import scale_of
 from shellgs_method.shell import Alignment, ShellMesh
 
-Z = np.array([0.0, 0.0, 1.0])
+Y, Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 FAR = 1000.0
 """Distance from the origin above which coordinates are shifted: there float32 has steps of 0.06 mm."""
 
@@ -53,18 +53,29 @@ class Frame:
         viewmat = torch.from_numpy(rescaled @ camera.viewmat.double().cpu().numpy() @ self.to_scene)
         return Camera(viewmat, camera.K, camera.width, camera.height)
 
-    def describe(self, path: Path, facts: dict) -> None:
-        """Write a .json beside ``path`` that describes the coordinates in that file, with ``facts`` added."""
-        description = {
+    @property
+    def properties(self) -> dict[str, str | list[float]]:
+        """What coordinates in this frame mean."""
+        properties = {
             "frame": self.name,
             "unit": "metre" if self.metric else "unknown",
             "up": name_of(self.up),
             "offset": self.offset.tolist(),
-            **({"crs": self.crs} if self.crs else {}),
-            "to_scene": self.to_scene.tolist(),
         }
+        return properties | ({"crs": self.crs} if self.crs else {})
+
+    def turned(self, up: Float64[np.ndarray, " 3"]) -> tuple[Frame, Float64[np.ndarray, "4 4"]]:
+        """This frame with its up axis turned to another direction, and the motion from this one to it."""
+        motion = np.eye(4)
+        motion[:3, :3] = turn(self.up, up)
+        to_scene = self.to_scene @ motion.T
+        return replace(self, to_scene=to_scene, offset=motion[:3, :3] @ self.offset, up=up), motion
+
+    def describe(self, path: Path, facts: dict) -> None:
+        """Write a .json beside ``path`` that describes the coordinates in that file, with ``facts`` added."""
+        description = self.properties | {"to_scene": self.to_scene.tolist()} | facts
         with atomic_write(path.with_suffix(".json")) as file:
-            file.write((json.dumps(description | facts, indent=1) + "\n").encode())
+            file.write((json.dumps(description, indent=1) + "\n").encode())
 
 
 def shell_frame(alignment: Alignment, shell: ShellMesh, up: Float64[np.ndarray, " 3"] = Z) -> Frame:

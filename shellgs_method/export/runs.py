@@ -18,8 +18,9 @@ from shellgs_method.evaluation import Rendering, mean_over_views
 from shellgs_method.evaluation.regions import reference_errors
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.export.frame import Frame, scene_frame, shell_frame
-from shellgs_method.export.splats import Splats
+from shellgs_method.export.splats import moved
 from shellgs_method.files.photographs import load_mask
+from shellgs_method.files.splats import Splats
 from shellgs_method.files.surfaces import usual_up
 from shellgs_method.geometry.axes import likely_up
 from shellgs_method.geometry.box import Box
@@ -225,8 +226,15 @@ class TrainedRun:
         """The Gaussians in the frame."""
         trained = {name: parameter.detach().cpu() for name, parameter in self.model.gauss_params.items()}
         harmonics = torch.cat([trained["features_dc"][:, None], trained["features_rest"]], dim=1)
-        splats = Splats(trained["means"], trained["quats"], trained["scales"], trained["opacities"], harmonics)
-        return splats.transformed(np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
+        splats = Splats(
+            trained["means"],
+            trained["quats"],
+            trained["scales"],
+            trained["opacities"],
+            harmonics,
+            discs=self.model.config.primitive == "2d",
+        )
+        return moved(splats, np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
 
 
 def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.splats import DEGREE_0
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.render.maps import DISC_LOG_THICKNESS, Primitive
@@ -29,8 +30,6 @@ MAX_SEEDS = 200_000
 """Most seeds; the spacing is increased where it would give more."""
 SKYBOX_SEEDS = 2500
 """Seeds of the skybox, without which the sky is painted in front of what is beside the building."""
-_DEGREE_0 = 0.28209479177387814
-"""The spherical harmonic of degree 0."""
 
 
 def sfm_points(
@@ -94,7 +93,7 @@ class InitialGaussians:
 
 def harmonics(colours: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """Coefficients of degree 0 of colours in [0, 1]."""
-    return (colours - 0.5) / _DEGREE_0
+    return (colours - 0.5) / DEGREE_0
 
 
 def _random_quats(count: int) -> Float[Tensor, "N 4"]:

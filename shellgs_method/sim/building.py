@@ -16,9 +16,10 @@ from scipy.ndimage import binary_dilation
 from shellgs_method.errors import SceneError
 from shellgs_method.export.frame import Z
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.export.splats import Splats
+from shellgs_method.export.splats import moved
 from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.photographs import View, load_mask, load_photograph
+from shellgs_method.files.splats import Splats
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.depth_normals import normals_from_depth
 from shellgs_method.geometry.similarity import transformed
@@ -118,7 +119,7 @@ class Reconstruction:
             run.shell[1].classes if run.shell else NO_CLASSES,
             run.shell[1].source if run.shell else NO_SOURCES,
             run.shell[0].shells if run.shell else (),
-            run.splats().transformed(motion),
+            moved(run.splats(), motion),
             views,
             hidden,
             {view.name for view in run.datasets[1].views},

@@ -13,8 +13,8 @@ import numpy as np
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.export.splats import write_splats
 from shellgs_method.files.atomic import atomic_contents, atomic_write, read_json
+from shellgs_method.files.splats import write_splats
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from nerfstudio.scripts.exporter import ExportGaussianSplat
 from scipy.spatial.transform import Rotation
+from splat_files import of_glb, unpacked
 from torch import Tensor
 from training_runs import Method, data_of, held_out, model_of, render, trainer_of
 
@@ -19,7 +21,8 @@ from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import lpips_network
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.export.splats import Splats, harmonics_rotation, write_splats
+from shellgs_method.export.splats import harmonics_rotation, moved
+from shellgs_method.files.splats import Splats, write_splats
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.doctor import examine
 from shellgs_method.render.maps import Primitive
@@ -109,6 +112,28 @@ def test_splats_in_the_shells_frame_look_the_same_from_the_same_place(trainer, t
     assert difference.quantile(0.999) < 0.02
 
 
+@pytest.mark.parametrize(("suffix", "read", "least"), [("glb", of_glb, 45), ("spz", unpacked, 38)])
+def test_y_points_up_in_gltf_and_spz_and_what_they_show_is_the_same(trainer, tmp_path, suffix, read, least):
+    path, primitive = tmp_path / f"splats.{suffix}", model_of(trainer).config.primitive
+    if (suffix, primitive) == ("spz", "2d"):
+        with pytest.raises(SceneError, match="spz has no discs"):
+            cli.splats(trainer.base_dir / "config.yml", path)
+        return
+    cli.splats(trainer.base_dir / "config.yml", path)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert record["up"] == "y"
+    frame, motion = TrainedRun(model_of(trainer), data_of(trainer)).frame.turned(np.array([0.0, 1.0, 0.0]))
+    np.testing.assert_allclose(record["turned"], motion[:3, :3])
+    np.testing.assert_allclose(record["to_scene"], frame.to_scene)
+    splats = read(path)
+    camera = frame.camera(data_of(trainer).eval_dataset.views[0].camera).to(dtype=torch.float32)
+    colours = spherical_harmonics(splats.degree, splats.means - camera.position, splats.harmonics) + 0.5
+    opacities = splats.opacities.sigmoid().squeeze(-1)
+    gaussians = (splats.means, splats.quats, splats.scales.exp(), opacities, colours.clamp_min(0))
+    image = rasterize(*gaussians, camera, primitive)[0].clamp(0, 1)
+    assert -10 * (image - render(trainer)["rgb"]).square().mean().log10() > least
+
+
 def test_gaussians_move_with_the_similarity():
     """Against covariances: S = R diag(s²) Rᵀ becomes A S Aᵀ."""
     generator = torch.Generator().manual_seed(1)
@@ -126,10 +151,10 @@ def test_gaussians_move_with_the_similarity():
         axes = axes * splats.scales.exp().numpy()[:, None]
         return axes @ axes.transpose(0, 2, 1)
 
-    moved, A = splats.transformed(similarity), similarity[:3, :3]
-    np.testing.assert_allclose(covariances(moved), A @ covariances(splats) @ A.T, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(moved.means, splats.means.numpy() @ A.T + [1, 2, 3])
-    np.testing.assert_array_equal(moved.opacities, splats.opacities)
+    there, A = moved(splats, similarity), similarity[:3, :3]
+    np.testing.assert_allclose(covariances(there), A @ covariances(splats) @ A.T, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(there.means, splats.means.numpy() @ A.T + [1, 2, 3])
+    np.testing.assert_array_equal(there.opacities, splats.opacities)
 
 
 def rotations(count: int) -> list[Tensor]:
@@ -184,7 +209,7 @@ def test_the_doctor_reports_where_it_looks_for_lpips_weights(tmp_path, monkeypat
     assert next(finding for finding in examine() if finding.subject == "LPIPS weights").works
 
 
-@pytest.mark.parametrize("name", ["scene.glb", "scene.spz", "scene.splat", "scene"])
+@pytest.mark.parametrize("name", ["scene.splat", "scene"])
 def test_splats_are_not_written_as_a_ply_under_another_name(tmp_path, name):
-    with pytest.raises(SceneError, match=f"{name}: splats are written as ply: name a file that ends in .ply"):
+    with pytest.raises(SceneError, match=f"{name}: splats are written as ply, glb or spz: name a file"):
         cli.splats(tmp_path / "config.yml", tmp_path / name)

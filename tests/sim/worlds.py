@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from shellgs_method.export.frame import Z
-from shellgs_method.export.splats import Splats
+from shellgs_method.files.splats import Splats
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import Collider

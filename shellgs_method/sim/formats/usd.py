@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from shellgs_method.export.splats import Splats
+from shellgs_method.files.splats import Splats
 from shellgs_method.files.usd import add_mesh, import_pxr, make_collider, new_stage
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
@@ -196,10 +196,9 @@ def _colliders(pxr: SimpleNamespace, stage, parts: Sequence[Part]) -> None:
 
 def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
     """Add the Gaussians without NaN or infinity; a particle's coefficients are contiguous, by degree, as in Splats."""
-    columns = (splats.means, splats.quats, splats.scales, splats.opacities, splats.harmonics)
-    kept = torch.stack([column.flatten(1).isfinite().all(dim=1) for column in columns]).all(dim=0)
-    means, quats, scales, opacities, harmonics = (column[kept].float() for column in columns)
-    quats = torch.nn.functional.normalize(quats, dim=-1)
+    splats = splats.finite
+    means, scales, harmonics = splats.means, splats.scales, splats.harmonics
+    quats = torch.nn.functional.normalize(splats.quats, dim=-1)
     field = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, "/splats")
 
     def array(kind, values: torch.Tensor):
@@ -209,8 +208,8 @@ def _particles(pxr: SimpleNamespace, stage, splats: Splats) -> None:
     field.CreatePositionsAttr(array(pxr.Vt.Vec3fArray, means))
     field.CreateOrientationsAttr(array(pxr.Vt.QuatfArray, quats[:, [1, 2, 3, 0]]))  # real part last in memory
     field.CreateScalesAttr(array(pxr.Vt.Vec3fArray, sizes))
-    field.CreateOpacitiesAttr(array(pxr.Vt.FloatArray, opacities.sigmoid().flatten()))
-    field.CreateRadianceSphericalHarmonicsDegreeAttr(int(np.sqrt(harmonics.shape[1])) - 1)
+    field.CreateOpacitiesAttr(array(pxr.Vt.FloatArray, splats.opacities.sigmoid().flatten()))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.degree)
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(array(pxr.Vt.Vec3fArray, harmonics.flatten(0, 1)))
     reach = 3 * sizes.amax(dim=1, keepdim=True)
     if len(means):
