@@ -52,8 +52,8 @@ class Splats:
         """Number of Gaussians."""
         return len(self.means)
 
-    def __getitem__(self, chosen: Tensor) -> Splats:
-        """Select Gaussians by an index or a mask."""
+    def __getitem__(self, chosen: Tensor | slice) -> Splats:
+        """Select Gaussians by indices, a mask or a slice."""
         fields = (self.means, self.quats, self.scales, self.opacities, self.harmonics)
         return Splats(*(each[chosen] for each in fields), discs=self.discs)
 
@@ -96,11 +96,37 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = ()) -> in
     """
     check_splats_format(path, splats.discs)
     splats = splats.finite
-    content = _WRITERS[path.suffix.lower()](splats, comments)
+    _write(path, _WRITERS[path.suffix.lower()](splats, comments))
+    return len(splats)
+
+
+def write_best_splats(path: Path, splats: Splats, megabytes: float, comments: Sequence[str] = ()) -> int:
+    """Write as many of the first Gaussians as a size allows; otherwise as :func:`write_splats`.
+
+    Args:
+        path: as in :func:`write_splats`.
+        splats: Gaussians, the best first.
+        megabytes: largest size of the file.
+        comments: as in :func:`write_splats`.
+
+    Raises:
+        SceneError: as in :func:`write_splats`, or not one Gaussian is that small.
+    """
+    check_splats_format(path, splats.discs)
+    splats, most = splats.finite, 1e6 * megabytes
+    encode, count = _WRITERS[path.suffix.lower()], len(splats)
+    while len(content := encode(splats[:count], comments)) > most:
+        count = min(count - 1, int(count * most / len(content)))
+        if count < 1:
+            raise SceneError(f"{path}: no Gaussian fits into {megabytes:g} MB: give --megabytes more")
+    _write(path, content)
+    return count
+
+
+def _write(path: Path, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         file.write(content)
-    return len(splats)
 
 
 def _unit_quats(splats: Splats) -> Tensor:

@@ -28,19 +28,25 @@ def broken(gaussians: nn.ParameterDict) -> Bool[Tensor, "N"]:
     return ~torch.stack(finite).all(dim=0)
 
 
-def hardly_shown(
+def contributions(
     cameras: Iterable[Camera], coverage: Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]]
-) -> Bool[Tensor, "N"]:
-    """Gaussians that contribute less than :data:`HARDLY` to every training view, by the sum of compositing weights.
+) -> Float[Tensor, "N"]:
+    """Largest area in pixels that each Gaussian covers of a training view, by the sum of compositing weights.
 
-    The largest contribution to a view decides, as in RadSplat (Niemeyer et al. 2024), which takes that to a pixel.
+    As in RadSplat (Niemeyer et al. 2024), which takes the largest contribution to a pixel.
 
     Args:
         cameras: cameras of the training views, at least one.
         coverage: area in pixels that each Gaussian covers of a view, and whether it reaches into the view.
     """
-    areas = (coverage(camera)[0] for camera in cameras)
-    return reduce(torch.maximum, areas) < HARDLY
+    return reduce(torch.maximum, (coverage(camera)[0] for camera in cameras))
+
+
+def hardly_shown(
+    cameras: Iterable[Camera], coverage: Callable[[Camera], tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]]
+) -> Bool[Tensor, "N"]:
+    """Gaussians that contribute less than :data:`HARDLY` to every training view, see :func:`contributions`."""
+    return contributions(cameras, coverage) < HARDLY
 
 
 def unshaped(

@@ -134,6 +134,29 @@ def test_y_points_up_in_gltf_and_spz_and_what_they_show_is_the_same(trainer, tmp
     assert -10 * (image - render(trainer)["rgb"]).square().mean().log10() > least
 
 
+def test_levels_have_half_as_many_gaussians_each_those_that_views_show_most(trainer, tmp_path):
+    cli.splats(trainer.base_dir / "config.yml", tmp_path / "splats.ply", levels=3)
+    run = TrainedRun(model_of(trainer), data_of(trainer))
+    views, count = run.datasets[0], run.model.num_points
+    shown = torch.stack([run.model.coverage(views.camera(k))[0] for k in range(len(views))]).amax(dim=0)
+    best, means = shown.argsort(descending=True), run.splats().means.float()
+    for level, name in enumerate(("splats", "splats-1", "splats-2")):
+        written = columns_of(tmp_path / f"{name}.ply")["positions"]
+        assert len(written) == count >> level
+        torch.testing.assert_close(written, means[best[: len(written)]])
+    losses = [json.loads((tmp_path / f"{name}.json").read_text())["psnr_loss"] for name in ("splats", "splats-2")]
+    assert losses[0] == 0
+    assert losses[1] > 0.1
+
+
+def test_a_size_is_kept_to_the_byte(trainer, tmp_path):
+    path = tmp_path / "splats.ply"
+    cli.splats(trainer.base_dir / "config.yml", path)
+    whole = path.stat().st_size
+    cli.splats(trainer.base_dir / "config.yml", path, megabytes=0.6e-6 * whole)
+    assert 0.55 * whole < path.stat().st_size <= 0.6 * whole
+
+
 def test_gaussians_move_with_the_similarity():
     """Against covariances: S = R diag(s²) Rᵀ becomes A S Aᵀ."""
     generator = torch.Generator().manual_seed(1)

@@ -15,7 +15,7 @@ from splat_files import glb_attributes, unpacked
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.splats import moved
-from shellgs_method.files.splats import DISCS, Splats, check_splats_format, write_splats
+from shellgs_method.files.splats import DISCS, Splats, check_splats_format, write_best_splats, write_splats
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 from shellgs_method.render.view import ViewRenderer
@@ -108,6 +108,19 @@ def test_a_ply_of_discs_says_so_and_what_its_coordinates_are(tmp_path):
         "comment unit: metre",
         "element vertex 400",
     ]
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "spz"])
+def test_as_many_gaussians_are_written_as_the_size_allows(tmp_path, suffix):
+    splats, path = some(), tmp_path / f"a.{suffix}"
+    write_splats(path, splats)
+    whole = path.stat().st_size / 1e6
+    assert write_best_splats(path, splats, whole) == 400
+    count = write_best_splats(path, splats, whole / 2)
+    assert 150 < count < 210
+    assert path.stat().st_size / 1e6 <= whole / 2
+    with pytest.raises(SceneError, match="no Gaussian fits into 1e-05 MB"):
+        write_best_splats(path, splats, 1e-5)
 
 
 @pytest.mark.parametrize(
