@@ -1,6 +1,6 @@
 """Learn to reach goals behind an obstacle from a lidar, by PPO of stable-baselines3, and count success and SPL.
 
-    python -m benchmarks.nav facade-sim/ --steps 15000
+    python -m benchmarks.nav facade-sim/ --steps 30000
 
 trains one policy a seed, and compares it with random actions over the same episodes. ``--measure-speed``
 measures the environment instead: steps a second without images, and images a second of the splat camera.

@@ -90,7 +90,8 @@ class FreeSpace:
             SceneError: there are none.
         """
         clear = distance_transform_edt(np.pad(~self.occupied, 1, constant_values=True))[1:-1, 1:-1] * CELL > radius  # pyright: ignore
-        groups, _ = label(clear)
+        groups = np.empty(clear.shape, np.int32)
+        label(clear, output=groups)
         of = groups[tuple(self._cells(places).T)]
         if not of.any():
             raise SceneError(f"no free ground for a robot of {radius:.2f} m radius below the cameras")

@@ -175,7 +175,7 @@ def test_a_pedestrian_before_the_camera_hides_the_splats_and_noise_is_the_seeds(
     np.testing.assert_array_equal(one, same)
     camera = camera_of(env.model, env.data, env._camera, 32, 18)
     env._put(env._walkers[0], np.array([4.0, -4.8]), 0.85)
-    mujoco.mj_forward(env.model, env.data)
+    mujoco.mj_forward(env.model, env.data)  # pyright: ignore[reportAttributeAccessIssue]
     image = env._images.image(env.model, env.data, camera)
     assert image[12:, 15:17, 2].mean() > image[12:, 15:17, 0].mean() + 0.2  # blue
 
@@ -233,3 +233,13 @@ def test_ppo_learns_some_updates_without_fault(folder):
     env = Flat(gymnasium.make(NAME, world=folder, depth=False, obstacle=True))
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0, device="cpu").learn(128)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+def test_the_example_of_the_documentation_runs(folder, tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs/sim.md").read_text()
+    example = page.partition("```python\n")[2].partition("```")[0]
+    (tmp_path / "facade-sim").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(example, names)
+    assert names["env"].observation_space.contains(names["observation"])
