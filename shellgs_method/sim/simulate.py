@@ -15,6 +15,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.atomic import atomic_contents, atomic_write, read_json
 from shellgs_method.files.splats import write_splats
+from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
@@ -28,12 +29,14 @@ from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.usd import write_usd_asset
 from shellgs_method.sim.formats.world import write_asset, write_world
+from shellgs_method.sim.free_space import FreeSpace
 from shellgs_method.sim.ground import STEP, Ground
 from shellgs_method.sim.look.texture import bake
 from shellgs_method.sim.look.visual import write_visual
 from shellgs_method.sim.report import Chapter, write_report
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.trials.engine import import_mujoco
+from shellgs_method.sim.workspace import Workspace
 
 AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
@@ -110,7 +113,11 @@ def _world(
     for chapter in chapters:
         _report_steps(chapter.made, ground, log)
     write_world(out, assets, home, ground)
-    home.write(out, {"buildings": {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}})
+    trusted = _trusted([chapter.made for chapter in chapters])
+    buildings = {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}
+    home.write(out, {"buildings": buildings, "trusted": trusted.facts})
+    parts = [part.vertices for chapter in chapters for part in chapter.collider.parts]
+    FreeSpace.of(parts, ground, trusted.eyes[:, :2]).write(out)
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
     metrics = write_report(out, chapters, ground, settings.test, log)
     write_readme(out, assets, home, metrics)
@@ -210,6 +217,15 @@ def _common_ground(buildings: Sequence[Reconstruction]) -> Ground:
         return buildings[0].ground
     points, eyes = ([getattr(made, name) for made in buildings] for name in ("ground_points", "eyes"))
     return Ground.of(np.concatenate(points), np.concatenate(eyes))
+
+
+def _trusted(buildings: Sequence[Reconstruction]) -> Workspace:
+    """The workspace where the splats of all buildings are to be believed."""
+    cameras = [camera for made in buildings for camera in made.cameras]
+    eyes, directions = positions(cameras), np.array([camera.viewmat[2, :3].double().numpy() for camera in cameras])
+    surfaces = [Triangles(np.asarray(made.fused.vertices), np.asarray(made.fused.faces)) for made in buildings]
+    distances = [np.linalg.norm(surface.closest(eyes).point - eyes, axis=1) for surface in surfaces]
+    return Workspace.around(eyes, directions, np.min(distances, axis=0))
 
 
 def _report_steps(made: Reconstruction, ground: Ground, log: Callable[[str], None]) -> None:

@@ -15,7 +15,7 @@ from splat_files import glb_attributes, unpacked
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.splats import moved
-from shellgs_method.files.splats import DISCS, Splats, check_splats_format, write_best_splats, write_splats
+from shellgs_method.files.splats import DISCS, Splats, check_splats_format, read_splats, write_best_splats, write_splats
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
 from shellgs_method.render.view import ViewRenderer
@@ -108,6 +108,33 @@ def test_a_ply_of_discs_says_so_and_what_its_coordinates_are(tmp_path):
         "comment unit: metre",
         "element vertex 400",
     ]
+
+
+@pytest.mark.parametrize(("degree", "discs"), [(0, False), (2, False), (3, True)])
+def test_a_ply_is_read_as_it_was_written(tmp_path, degree, discs):
+    splats = some(degree=degree, discs=discs)
+    write_splats(tmp_path / "a.ply", splats, ["unit: metre"])
+    read = read_splats(tmp_path / "a.ply")
+    assert read.discs == discs
+    for name in ("means", "scales", "opacities", "harmonics"):
+        assert torch.equal(getattr(read, name), getattr(splats, name))
+    torch.testing.assert_close(read.quats, torch.nn.functional.normalize(splats.quats, dim=-1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content[:-1], "is damaged"),
+        (lambda content: b"solid", "is damaged"),
+        (lambda content: content.replace(b"property float opacity", b"property float density"), "it has no opacity"),
+        (lambda content: content.replace(b"property float x", b"property double x"), "is damaged, or no ply"),
+    ],
+)
+def test_a_file_that_is_no_ply_of_gaussians_is_refused(tmp_path, change, message):
+    write_splats(tmp_path / "a.ply", some())
+    (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
+    with pytest.raises(SceneError, match=message):
+        read_splats(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb", "spz"])

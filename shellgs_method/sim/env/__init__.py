@@ -1,0 +1,20 @@
+"""A world of ``shellgs sim`` as a gymnasium environment; importing this registers ``shellgs/FacadeNav-v0``."""
+
+from __future__ import annotations
+
+from shellgs_method.machine.extras import import_extra
+
+NAME = "shellgs/FacadeNav-v0"
+TIME = 300
+"""Steps after which an episode is truncated: a minute."""
+
+
+def register() -> None:
+    """Register the environment; gymnasium calls this by its entry point."""
+    gymnasium = import_extra("gymnasium", "gymnasium", "rl", "the environment")
+    if NAME not in gymnasium.registry:
+        entry = "shellgs_method.sim.env.facade_nav:FacadeNav"
+        gymnasium.register(NAME, entry_point=entry, max_episode_steps=TIME)
+
+
+register()

@@ -1,0 +1,299 @@
+"""Point-goal navigation before a facade, as a gymnasium environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.sim.env.sensors import SplatCamera, as_bytes, camera_of, cast, depth_image, splats_of
+from shellgs_method.sim.env.world import (
+    BOX,
+    COLLISION,
+    HALF_HEIGHT,
+    MOVING,
+    PERSON,
+    PREFIX,
+    TIMESTEP,
+    World,
+    mujoco,
+    robot_geoms,
+    root_of,
+)
+from shellgs_method.sim.free_space import FreeSpace
+
+STEP = 0.2
+"""Seconds between actions."""
+RANGE = 20.0
+"""Range of lidar and depth in metres."""
+BEAMS = 36
+"""Beams of the lidar, all around, the first ahead, then to the left."""
+NEAR = 0.5
+"""Distance in metres at which a goal is reached."""
+SUCCESS, COLLISION_COST = 10.0, 0.5
+"""Reward of a reached goal, and cost of a step with a collision; a metre of progress is 1."""
+WALK = 1.0
+"""Speed of pedestrians in metres a second."""
+TRIES = 200
+"""Spawns and goals that are tried for an episode."""
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Settings of the robot's camera.
+
+    Attributes:
+        width: of the image in pixels.
+        height: of the image in pixels.
+        noise: standard deviation of a pixel's noise, of colours from 0 to 1.
+        exposure: largest exposure of an episode in stops, above or below that of the photographs; drawn uniformly.
+    """
+
+    width: int = 160
+    height: int = 90
+    noise: float = 0.0
+    exposure: float = 0.0
+
+
+class FacadeNav(gymnasium.Env):
+    """Drive a robot to a goal before a facade.
+
+    Action: each of the robot's actuators, from -1 to 1, scaled to its ``ctrlrange``; of the default robot these are the
+    velocities ahead, to the left (1.5 m/s each) and around (1.5 rad/s to the left).
+
+    Observation, a dictionary: ``goal``, its distance in metres and its bearing in radians, positive to the left;
+    ``lidar`` [36], distances in metres, the first ahead, then to the left; ``depth`` [H, W], forward depth of the
+    robot's camera in metres; ``rgb`` [H, W, 3], the camera's image by the splats. Distances end at 20 m.
+
+    Reward: metres of progress along the shortest way, plus 10 at the goal, minus 0.5 for a step with a collision.
+
+    An episode terminates within half a metre of the goal, and is truncated after 300 steps of 0.2 seconds. ``info`` has
+    ``success``, ``spl`` (Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents": 0 without success, else
+    the length of the shortest way over that driven, at most 1), ``collisions`` (steps with one), ``trusted`` (whether
+    the camera is where its images are to be believed), ``shortest`` and ``driven`` in metres; the
+    shortest way ends where the goal is reached.
+
+    Args:
+        world: folder that ``shellgs sim`` wrote.
+        robot: MJCF file of another robot: its first body has a free joint, its actuators a ctrlrange; the camera is the
+            one named ``camera``, and the lidar the site ``lidar``.
+        depth: whether there is a depth image, of 32 x 18 pixels.
+        rgb: the camera's settings; no image if None.
+        pedestrians: number of people who walk about.
+        obstacle: whether a box stands between spawn and goal.
+        distance: smallest and largest distance of the goal by the shortest way, in metres.
+        everywhere: whether spawns and goals may be outside the trusted workspace.
+        render_mode: ``rgb_array``, or None.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / STEP)}  # noqa: RUF012
+
+    def __init__(
+        self,
+        world: str | Path,
+        robot: str | Path | None = None,
+        depth: bool = True,
+        rgb: CameraSettings | None = None,
+        pedestrians: int = 0,
+        obstacle: bool = False,
+        distance: tuple[float, float] = (5.0, 15.0),
+        everywhere: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        self.world = World.load(Path(world), Path(robot) if robot else None, pedestrians, obstacle)
+        self.model = self.world.model
+        self.data = mujoco.MjData(self.model)
+        self.render_mode, self._distance, self._rgb, self._depth = render_mode, distance, rgb, depth
+        self._obstacle, self._walkers = obstacle, [self._mocap(f"pedestrian_{k}") for k in range(pedestrians)]
+        self._root = root_of(self.model)
+        joint = self.model.body_jntadr[self._root]
+        self._qpos = self.model.jnt_qposadr[joint]
+        self._lidar, self._camera = self._sensor("site", "lidar"), self._sensor("camera", "camera")
+        self._robot = np.isin(np.arange(self.model.ngeom), robot_geoms(self.model))
+        self._space = self.world.space.reachable(self.world.radius, self.world.workspace.eyes)
+        allowed = ~self._space.occupied
+        if not everywhere:
+            allowed &= self.world.workspace.has(self._space.centres)
+        self._allowed = self._space.centres[allowed]
+        if len(self._allowed) == 0:
+            raise SceneError(f"{world}: no free ground in the trusted workspace: give everywhere=True")
+        buildings = [self.world.folder / name / "splats.ply" for name in self.world.buildings]
+        self._images = SplatCamera(splats_of(buildings)) if rgb or render_mode else None
+        self.action_space = spaces.Box(-1, 1, (self.model.nu,), np.float32)
+        self.observation_space = spaces.Dict(self._spaces())
+
+    def _spaces(self) -> dict[str, spaces.Space]:
+        bounds = np.array([1000, np.pi], np.float32)
+        found: dict[str, spaces.Space] = {
+            "goal": spaces.Box(np.array([0, -np.pi], np.float32), bounds),
+            "lidar": spaces.Box(0, RANGE, (BEAMS,), np.float32),
+        }
+        if self._depth:
+            found["depth"] = spaces.Box(0, RANGE, (18, 32), np.float32)
+        if self._rgb:
+            found["rgb"] = spaces.Box(0, 255, (self._rgb.height, self._rgb.width, 3), np.uint8)
+        return found
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Begin an episode; ``options`` may have ``start`` and ``goal`` (x, y in metres) and ``heading`` (radians)."""
+        super().reset(seed=seed)
+        options = options or {}
+        mujoco.mj_resetData(self.model, self.data)
+        start, self.goal = self._drawn(options)
+        heading = float(options.get("heading", self.np_random.uniform(-np.pi, np.pi)))
+        height = float(self.world.ground.at(start[None])[0]) + self.model.qpos0[self._qpos + 2] + 0.01
+        self.data.qpos[self._qpos : self._qpos + 7] = *start, height, np.cos(heading / 2), 0, 0, np.sin(heading / 2)
+        stops = self._rgb.exposure if self._rgb else 0.0
+        self._gain = 2 ** (stops * self.np_random.uniform(-1, 1))
+        self._ways = [self._way() for _ in self._walkers]
+        for walker in self._walkers:
+            self._put(walker, self._allowed[self.np_random.integers(len(self._allowed))], HALF_HEIGHT + PERSON)
+        mujoco.mj_forward(self.model, self.data)
+        self._left = float(self._episode.at(self._field, start))
+        self._shortest = max(0.0, self._left - NEAR)
+        self._driven, self._collisions, self._was = 0.0, 0, start
+        return self._observed(), self._info()
+
+    def step(self, action: Float64[np.ndarray, " A"]):
+        """Drive for a fifth of a second."""
+        low, high = self.model.actuator_ctrlrange.T
+        self.data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
+        self._walk()
+        mujoco.mj_step(self.model, self.data, round(STEP / TIMESTEP))
+        now = self._place
+        self._driven += float(np.linalg.norm(now - self._was))
+        self._was = now
+        collides = self._collides()
+        self._collisions += collides
+        left = float(self._episode.at(self._field, now))
+        progress = self._left - left if np.isfinite(left) else 0.0
+        self._left = left if np.isfinite(left) else self._left
+        success = bool(np.linalg.norm(self.goal - now) < NEAR)
+        reward = progress + SUCCESS * success - COLLISION_COST * collides
+        return self._observed(), reward, success, False, self._info(success)
+
+    def render(self):
+        """The robot's camera image by the splats."""
+        if self._images is None:
+            return None
+        rgb = self._rgb or CameraSettings()
+        camera = camera_of(self.model, self.data, self._camera, rgb.width, rgb.height)
+        return as_bytes(self._images.image(self.model, self.data, camera, self._gain))
+
+    @property
+    def _place(self) -> Float64[np.ndarray, " 2"]:
+        return self.data.xpos[self._root, :2].copy()
+
+    def _drawn(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Start and goal; keeps the episode's free space and the lengths of the ways to the goal."""
+        for _ in range(TRIES):
+            goal = np.asarray(options.get("goal", self._allowed[self.np_random.integers(len(self._allowed))]), float)
+            start = options.get("start")
+            if start is None:
+                off = np.linalg.norm(self._allowed - goal, axis=1)
+                far = self._allowed[(off > self._distance[0]) & (off < self._distance[1])]
+                if len(far) == 0:
+                    continue
+                start = far[self.np_random.integers(len(far))]
+            start = np.asarray(start, float)
+            self._episode = self._space
+            if self._obstacle:
+                self._episode = self._blocked(start, goal)
+            self._field = self._episode.distances(goal)
+            length = float(self._episode.at(self._field, start))
+            given = "goal" in options and "start" in options
+            if np.isfinite(length) and (given or self._distance[0] <= length <= self._distance[1]):
+                return start, goal
+        low, high = self._distance
+        raise SceneError(f"{self.world.folder}: found no start and goal with a free way of {low:g} to {high:g} m")
+
+    def _blocked(self, start: np.ndarray, goal: np.ndarray) -> FreeSpace:
+        """Put the obstacle half way between, and return the free space beside it."""
+        middle = start + (goal - start) * self.np_random.uniform(0.4, 0.6)
+        ahead = goal - start
+        self._put(self._mocap("obstacle"), middle, 1.0, float(np.arctan2(ahead[1], ahead[0])))
+        return self._space.without(middle, np.sqrt(2) * BOX + self.world.radius)
+
+    def _way(self) -> np.ndarray:
+        """Lengths of the ways to a place where a pedestrian goes."""
+        return self._space.distances(self._allowed[self.np_random.integers(len(self._allowed))])
+
+    def _walk(self) -> None:
+        """Move the pedestrians along the grid's shortest ways."""
+        for k, walker in enumerate(self._walkers):
+            here = self.data.mocap_pos[walker, :2].copy()
+            ahead = self._space.downhill(self._ways[k], here) - here
+            length = float(np.linalg.norm(ahead))
+            if length < 1e-6 or self._space.at(self._ways[k], here) == 0:
+                self._ways[k] = self._way()
+                continue
+            self._put(walker, here + ahead * min(1, WALK * STEP / length), HALF_HEIGHT + PERSON)
+
+    def _put(self, mocap: int, place: np.ndarray, height: float, heading: float = 0.0) -> None:
+        self.data.mocap_pos[mocap] = *place, self.world.ground.at(place[None])[0] + height
+        self.data.mocap_quat[mocap] = np.cos(heading / 2), 0, 0, np.sin(heading / 2)
+
+    def _mocap(self, name: str) -> int:
+        return int(self.model.body_mocapid[self.model.body(name).id])
+
+    def _sensor(self, kind: str, name: str) -> int:
+        """Number of a sensor of the robot.
+
+        Raises:
+            SceneError: it has none of this name.
+        """
+        try:
+            return int(getattr(self.model, kind)(PREFIX + name).id)
+        except KeyError as error:
+            raise SceneError(f"the robot has no {kind} named {name}: add it to its MJCF file") from error
+
+    def _collides(self) -> bool:
+        """Whether the robot touches anything but itself and the ground."""
+        pairs = self.data.contact.geom
+        if len(pairs) == 0:
+            return False
+        groups = self.model.geom_group[pairs]
+        foreign = ~self._robot[pairs] & np.isin(groups, (COLLISION, MOVING))
+        return bool((self._robot[pairs].any(axis=1) & foreign.any(axis=1)).any())
+
+    def _observed(self) -> dict[str, np.ndarray]:
+        turn = self.data.xmat[self._root].reshape(3, 3)
+        yaw = np.arctan2(turn[1, 0], turn[0, 0])
+        off = self.goal - self._place
+        bearing = (np.arctan2(off[1], off[0]) - yaw + np.pi) % (2 * np.pi) - np.pi
+        found = {"goal": np.array([min(np.linalg.norm(off), 1000), bearing]), "lidar": self._scan(yaw)}
+        if self._depth:
+            camera = camera_of(self.model, self.data, self._camera, 32, 18)
+            found["depth"] = depth_image(self.world, self.data, camera).clip(0, RANGE)
+        found = {name: value.astype(np.float32) for name, value in found.items()}
+        if self._rgb and self._images:
+            camera = camera_of(self.model, self.data, self._camera, self._rgb.width, self._rgb.height)
+            image = self._images.image(self.model, self.data, camera, self._gain)
+            image += self._rgb.noise * self.np_random.standard_normal(image.shape) if self._rgb.noise else 0
+            found["rgb"] = as_bytes(image)
+        return found
+
+    def _scan(self, yaw: float) -> Float64[np.ndarray, " 36"]:
+        """Distances around the lidar, level."""
+        angles = yaw + np.linspace(0, 2 * np.pi, BEAMS, endpoint=False)
+        rays = np.stack([np.cos(angles), np.sin(angles), np.zeros(BEAMS)], axis=1)
+        origin = self.data.site_xpos[self._lidar]
+        return cast(self.world, self.data, origin, rays).clip(0, RANGE)
+
+    def _info(self, success: bool = False) -> dict[str, Any]:
+        pose = self.data.cam_xmat[self._camera].reshape(3, 3)
+        spl = self._shortest / max(self._shortest, self._driven, 1e-9) if success else 0.0
+        return {
+            "success": success,
+            "spl": spl,
+            "collisions": self._collisions,
+            "trusted": self.world.workspace.trusts(self.data.cam_xpos[self._camera], -pose[:, 2]),
+            "shortest": self._shortest,
+            "driven": self._driven,
+        }

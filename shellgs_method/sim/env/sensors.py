@@ -1,0 +1,131 @@
+"""What a robot measures: rays in MuJoCo, and images by splats, composited by depth with what moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, UInt8
+from torch import Tensor
+
+from shellgs_method.files.splats import Splats, read_splats
+from shellgs_method.geometry.camera import Camera, world_rays
+from shellgs_method.render.view import ViewRenderer
+from shellgs_method.sim.env.world import MOVING, World, mujoco
+
+SKY = 0.7, 0.8, 0.9
+"""Colour behind the splats."""
+SUN = np.array([0.3, -0.4, 0.87])
+"""Unit vector to the light on what moves."""
+AMBIENT = 0.5
+"""Share of the light on what moves that is from everywhere."""
+
+
+def cast_at_moving(
+    model, data, origin: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"]
+) -> tuple[Float64[np.ndarray, " R"], np.ndarray, Float64[np.ndarray, "R 3"]]:
+    """Cast rays of any length from a point at what moves beside the robot.
+
+    Returns:
+        For each ray the distance in lengths of the ray, infinite where nothing is hit, the number of the geom, and the
+        normal.
+    """
+    distances, geoms, normals = np.full(len(rays), -1.0), np.zeros(len(rays), np.int32), np.zeros((len(rays), 3))
+    if model.nmocap == 0:
+        return np.full(len(rays), np.inf), geoms, normals
+    mask = np.zeros(6, np.uint8)
+    mask[MOVING] = 1
+    lengths = np.linalg.norm(rays, axis=1)
+    directions = rays / lengths[:, None]
+    mujoco.mj_multiRay(
+        model, data, origin[:, None], directions.reshape(-1, 1), mask, 1, -1, geoms, distances,
+        normals.reshape(-1, 1), len(rays), 1e3,
+    )  # fmt: skip
+    return np.where(distances < 0, np.inf, distances / lengths), geoms, normals
+
+
+def cast(
+    world: World, data, origin: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"]
+) -> Float64[np.ndarray, " R"]:
+    """Distances in lengths of the rays to the nearest of all but the robot; infinite where nothing is hit.
+
+    What stands is cast at by Embree: MuJoCo tries each of its hundreds of meshes for each ray.
+    """
+    return np.minimum(world.solid.cast(origin, rays).t, cast_at_moving(world.model, data, origin, rays)[0])
+
+
+def camera_of(model, data, number: int, width: int, height: int) -> Camera:
+    """A camera of MuJoCo's, of square pixels and with the middle of the image as principal point."""
+    pose = np.eye(4)
+    pose[:3, :3] = data.cam_xmat[number].reshape(3, 3) * [1, -1, -1]  # from OpenGL's axes
+    pose[:3, 3] = data.cam_xpos[number]
+    focal = height / 2 / np.tan(np.radians(model.cam_fovy[number]) / 2)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
+    return Camera(torch.from_numpy(np.linalg.inv(pose)).float(), K, width, height)
+
+
+class SplatCamera:
+    """Renders images of splats with MuJoCo's moving bodies among them."""
+
+    def __init__(self, splats: Splats) -> None:
+        self._renderer = ViewRenderer("2d" if splats.discs else "3d", "expected")
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        tensors = {
+            "means": splats.means, "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacities,
+            "features_dc": splats.harmonics[:, 0], "features_rest": splats.harmonics[:, 1:].contiguous(),
+        }  # fmt: skip
+        self._gaussians = {name: tensor.float().to(device) for name, tensor in tensors.items()}
+        self._degree = splats.degree
+        self._sky = torch.tensor(SKY, device=device)
+
+    @torch.no_grad()
+    def splats(self, camera: Camera) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+        """Colours from 0 to 1 and forward depth in metres; infinite where less than half is opaque."""
+        camera = camera.to(self._sky.device)
+        rendered = self._renderer(self._gaussians, camera, self._sky, self._degree)
+        assert rendered.geometry is not None
+        depth = rendered.geometry.depth.where(rendered.alpha > 0.5, torch.inf)[..., 0]
+        return rendered.rgb.clamp(0, 1).cpu(), depth.cpu()
+
+    def image(self, model, data, camera: Camera, gain: float = 1.0) -> Float64[np.ndarray, "H W 3"]:
+        """Colours from 0 to 1; a gain multiplies them."""
+        colours, depth = self.splats(camera)
+        image, far = colours.double().numpy(), depth.double().numpy()
+        eye, rays = world_rays(camera)
+        distances, geoms, normals = cast_at_moving(model, data, eye, rays.reshape(-1, 3))
+        nearer = distances < far.ravel()
+        light = AMBIENT + (1 - AMBIENT) * np.abs(normals[nearer] @ SUN)
+        image.reshape(-1, 3)[nearer] = model.geom_rgba[geoms[nearer], :3] * light[:, None]
+        return (image * gain).clip(0, 1)
+
+
+def as_bytes(image: Float64[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours as bytes."""
+    return (image.clip(0, 1) * 255).round().astype(np.uint8)
+
+
+def depth_image(world: World, data, camera: Camera) -> Float64[np.ndarray, "H W"]:
+    """Forward depth in metres of collision geometry, ground and what moves; infinite where nothing is."""
+    eye, rays = world_rays(camera)
+    return cast(world, data, eye, rays.reshape(-1, 3)).reshape(camera.height, camera.width)
+
+
+def splats_of(buildings: Sequence[Path]) -> Splats:
+    """The Gaussians of some buildings' files, in the simulation frame, with the harmonics that all of them have.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        SceneError: a file is damaged.
+    """
+    parts = [read_splats(path) for path in buildings]
+    least = min(part.harmonics.shape[1] for part in parts)
+    return Splats(
+        torch.cat([part.means for part in parts]),
+        torch.cat([part.quats for part in parts]),
+        torch.cat([part.scales for part in parts]),
+        torch.cat([part.opacities for part in parts]),
+        torch.cat([part.harmonics[:, :least] for part in parts]),
+        discs=all(part.discs for part in parts),
+    )

@@ -1,0 +1,153 @@
+"""Free space of a world as a grid: what a robot can reach, how far it is, and the map of ROS' nav2."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from PIL import Image
+from scipy.ndimage import distance_transform_edt, label
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import ConvexHull
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.sim.ground import Ground
+
+CELL = 0.2
+"""Side of a cell in metres."""
+MARGIN = 10.0
+"""Width of the grid around the places it is made for, in metres."""
+HEIGHTS = np.arange(0.15, 1.5, 0.15)
+"""Heights above the ground, in metres, at which something is in a robot's way."""
+CLIMB = 0.08
+"""Step of the ground in metres, from a cell to the next, that a robot does not climb."""
+STEPS = {
+    (0, 1): (),
+    (1, 0): (),
+    **{(1, side): ((1, 0), (0, side)) for side in (1, -1)},
+    **{(1, 2 * side): ((0, side), (1, side)) for side in (1, -1)},
+    **{(2, side): ((1, 0), (1, side)) for side in (1, -1)},
+}
+"""Steps of a way, in rows and columns, and the cells that each passes: in 16 directions, at most 2.8 % too long."""
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """A grid of cells that are occupied or free.
+
+    Attributes:
+        occupied: cells with an obstacle; rows along y, columns along x.
+        origin: x and y in metres of the first cell's centre.
+    """
+
+    occupied: Bool[np.ndarray, "R C"]
+    origin: Float64[np.ndarray, " 2"]
+
+    @classmethod
+    def of(
+        cls, parts: Sequence[Float64[np.ndarray, "V 3"]], ground: Ground, places: Float64[np.ndarray, "P 2"]
+    ) -> FreeSpace:
+        """The grid around places, given the corners of the collision geometry's convex parts.
+
+        A cell is occupied if a point above its centre is in a part, or within half a cell of its planes.
+        """
+        origin = np.floor((places.min(axis=0) - MARGIN) / CELL) * CELL
+        columns, rows = np.ceil((places.max(axis=0) + MARGIN - origin) / CELL).astype(int)
+        made = cls(np.zeros((rows, columns), bool), origin)
+        centres = made.centres
+        floor = ground.at(centres)
+        for part in parts:
+            low, high = (made._cell(corner[:2], sign) for corner, sign in ((part.min(0), -1), (part.max(0), 1)))
+            near = slice(low[0], high[0] + 1), slice(low[1], high[1] + 1)
+            if made.occupied[near].size == 0:
+                continue
+            planes = ConvexHull(part).equations
+            levels = floor[near][..., None] + HEIGHTS
+            flat = np.broadcast_to(centres[near][..., None, :], (*levels.shape, 2))
+            points = np.concatenate([flat, levels[..., None]], axis=-1)
+            inside = (points @ planes[:, :3].T + planes[:, 3] <= CELL / 2).all(axis=-1)
+            made.occupied[near] |= inside.any(axis=-1)
+        for axis in (0, 1):
+            steep = np.abs(np.diff(floor, axis=axis)) > CLIMB
+            made.occupied[(slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))] |= steep
+        return made
+
+    @property
+    def centres(self) -> Float64[np.ndarray, "R C 2"]:
+        """X and y of each cell's centre."""
+        rows, columns = np.indices(self.occupied.shape)
+        return self.origin + CELL * np.stack([columns, rows], axis=-1)
+
+    def reachable(self, radius: float, places: Float64[np.ndarray, "P 2"]) -> FreeSpace:
+        """The cells where a robot of a radius in metres can be: those joined that hold most of the places.
+
+        Raises:
+            SceneError: there are none.
+        """
+        clear = distance_transform_edt(np.pad(~self.occupied, 1, constant_values=True))[1:-1, 1:-1] * CELL > radius  # pyright: ignore
+        groups = np.empty(clear.shape, np.int32)
+        label(clear, output=groups)
+        of = groups[tuple(self._cells(places).T)]
+        if not of.any():
+            raise SceneError(f"no free ground for a robot of {radius:.2f} m radius below the cameras")
+        return FreeSpace(groups != np.bincount(of[of > 0]).argmax(), self.origin)
+
+    def without(self, middle: Float64[np.ndarray, " 2"], radius: float) -> FreeSpace:
+        """The same space without a disc."""
+        return FreeSpace(self.occupied | (np.linalg.norm(self.centres - middle, axis=-1) < radius), self.origin)
+
+    def distances(self, goal: Float64[np.ndarray, " 2"]) -> Float64[np.ndarray, "R C"]:
+        """Length of the shortest way on the grid to a goal, in metres; infinite where there is none."""
+        number = np.arange(self.occupied.size).reshape(self.occupied.shape)
+        free, pairs, lengths = ~self.occupied, [], []
+        for step, between in STEPS.items():
+            cells = np.array([(0, 0), step, *between])
+            cells -= cells.min(axis=0)
+            rows, columns = number.shape - cells.max(axis=0)
+            windows = [(slice(down, down + rows), slice(right, right + columns)) for down, right in cells]
+            passable = np.logical_and.reduce([free[window] for window in windows])
+            pairs.append(np.stack([number[window][passable] for window in windows[:2]]))
+            lengths.append(np.full(pairs[-1].shape[1], CELL * np.hypot(*step)))
+        ends = np.concatenate(pairs, axis=1)
+        graph = coo_matrix((np.concatenate(lengths), tuple(ends)), shape=(number.size, number.size))
+        start = number[tuple(self._cells(goal[None])[0])]
+        return dijkstra(graph.tocsr(), directed=False, indices=start).reshape(number.shape)
+
+    def at(self, values: np.ndarray, places: Float64[np.ndarray, "*P C"]) -> np.ndarray:
+        """Values of the cells below places; beyond the edge, those of the edge."""
+        cells = self._cells(places)
+        return values[cells[..., 0], cells[..., 1]]
+
+    def downhill(self, distances: Float64[np.ndarray, "R C"], place: Float64[np.ndarray, " 2"]) -> np.ndarray:
+        """Centre of the neighbouring cell that is nearest to the goal by the grid."""
+        row, column = self._cells(place[None])[0]
+        top, left = max(0, row - 1), max(0, column - 1)
+        around = distances[top : row + 2, left : column + 2]
+        down, right = np.unravel_index(around.argmin(), around.shape)
+        return self.origin + CELL * np.array([left + right, top + down])
+
+    def write(self, folder: Path) -> None:
+        """Write ``map.pgm`` and ``map.yaml``, the map of ROS' nav2: the first row is that of the largest y."""
+        with atomic_write(folder / "map.pgm") as file:
+            Image.fromarray(np.where(self.occupied[::-1], 0, 254).astype(np.uint8)).save(file, format="PPM")
+        x, y = self.origin - CELL / 2
+        lines = (
+            "image: map.pgm", "mode: trinary", f"resolution: {CELL}", f"origin: [{x:.3f}, {y:.3f}, 0.0]", "negate: 0",
+            "occupied_thresh: 0.65", "free_thresh: 0.196", "",
+        )  # fmt: skip
+        with atomic_write(folder / "map.yaml") as file:
+            file.write("\n".join(lines).encode())
+
+    def _cells(self, places: Float64[np.ndarray, "*P C"]) -> np.ndarray:
+        """Row and column of the cells below places, those of the edge beyond it."""
+        index = np.round((places[..., :2] - self.origin) / CELL).astype(int)[..., ::-1]
+        return np.clip(index, 0, np.array(self.occupied.shape) - 1)
+
+    def _cell(self, place: np.ndarray, beside: int) -> np.ndarray:
+        """Row and column below a place, and one beside; beyond the grid's edge, but never before its first."""
+        return np.maximum(0, np.round((place - self.origin) / CELL).astype(int)[::-1] + beside)

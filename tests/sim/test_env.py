@@ -1,0 +1,245 @@
+"""The gymnasium environment: its interface, what it measures, its free space, and that it learns without fault."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from PIL import Image
+from worlds import frame_at, some_splats, uneven, write_folder
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.splats import write_splats
+from shellgs_method.sim.env import NAME
+from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings
+from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
+from shellgs_method.sim.free_space import CELL, FreeSpace
+from shellgs_method.sim.ground import LEVEL
+from shellgs_method.sim.workspace import Workspace
+
+ROBOT = """
+<mujoco model="sphere">
+  <worldbody>
+    <body name="ball" pos="0 0 0.3">
+      <freejoint/>
+      <geom type="sphere" size="0.3" mass="5"/>
+      <site name="lidar" pos="0 0 0.4"/>
+      <camera name="camera" pos="0 0 0.4" xyaxes="0 -1 0 0 0 1"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="free" gear="1 0 0 0 0 0" ctrlrange="-9 9"/></actuator>
+</mujoco>
+""".replace("<freejoint/>", '<freejoint name="free"/>')
+
+
+@pytest.fixture(scope="module")
+def folder(collider, eyes, tmp_path_factory) -> Path:
+    out = write_folder(tmp_path_factory.mktemp("nav") / "sim", collider)
+    write_splats(out / "facade" / "splats.ply", some_splats(20))
+    along = np.array([[x, -6.0, 1.6] for x in np.linspace(0, 14, 15)])
+    workspace = Workspace.around(along, np.tile([0.0, 1.0, 0.0], (15, 1)), np.full(15, 8.0))
+    frame_at().write(out, {"buildings": {"facade": "x"}, "trusted": workspace.facts})
+    return out
+
+
+def make(folder, **settings) -> Any:
+    return gymnasium.make(NAME, world=folder, **settings).unwrapped
+
+
+def episode(env, seed: int) -> list[np.ndarray]:
+    env.reset(seed=seed)
+    actions = np.random.default_rng(0).uniform(-1, 1, (8, *env.action_space.shape))
+    return [np.concatenate([np.ravel(v) for v in env.step(action)[0].values()]) for action in actions]
+
+
+def test_the_checker_of_gymnasium_has_nothing_to_say(folder, recwarn):
+    check_env(make(folder, pedestrians=1, obstacle=True), skip_render_check=True)
+    assert not [str(each.message) for each in recwarn if "gymnasium" in str(each.filename)]
+
+
+def test_a_seed_determines_an_episode(folder):
+    env = make(folder, pedestrians=2, obstacle=True)
+    first, again, other = (np.stack(episode(env, seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_straight_to_the_goal_is_a_success_of_spl_one_and_progress_adds_up_to_the_way(folder):
+    env = make(folder, depth=False)
+    env.reset(seed=0, options={"start": (2, -6), "goal": (8, -6), "heading": 0.0})
+    rewards = []
+    for _ in range(60):
+        _, reward, terminated, _, info = env.step(np.array([1, 0, 0]))
+        rewards.append(reward)
+        if terminated:
+            break
+    assert info["success"]
+    assert info["spl"] > 0.97
+    assert info["collisions"] == 0
+    assert sum(rewards) == pytest.approx(10 + 6 - NEAR, abs=0.3)
+
+
+def test_driving_into_the_wall_is_a_collision_each_step_and_the_wall_stands(folder, collider):
+    env = make(folder, depth=False)
+    front = collider.surface.vertices[:, 1].min()
+    env.reset(seed=0, options={"start": (3, front - 1.5), "goal": (9, -6), "heading": np.pi / 2})
+    for _ in range(20):
+        _, reward, _, _, info = env.step(np.array([1, 0, 0]))
+    assert info["collisions"] > 5
+    assert reward < -0.3
+    assert env._place[1] < collider.surface.vertices[:, 1].max()
+
+
+def test_lidar_and_depth_agree_with_the_collision_geometry(folder, collider):
+    env = make(folder)
+    observation, _ = env.reset(seed=0, options={"start": (4, -6), "goal": (9, -6), "heading": np.pi / 2})
+    eye = env.data.site_xpos[env._lidar]
+    expected = collider.surface.cast(eye, np.array([[0.0, 1.0, 0.0]])).t[0]
+    assert observation["lidar"][0] == pytest.approx(expected, abs=0.01)
+    camera = camera_of(env.model, env.data, env._camera, 32, 18)
+    assert camera.viewmat[2, :3].numpy() == pytest.approx([0, 1, 0], abs=1e-3)
+    depth = depth_image(env.world, env.data, camera)
+    middle = collider.surface.cast(camera.position.numpy(), np.array([[0.0, 1.0, 0.0]])).t[0]
+    assert depth[8:10, 15:17] == pytest.approx(middle, abs=0.5)
+
+
+def test_the_bearing_is_positive_to_the_left(folder):
+    env = make(folder, depth=False)
+    observation, _ = env.reset(seed=0, options={"start": (2, -6), "goal": (2, -3), "heading": 0.0})
+    assert observation["goal"] == pytest.approx([3, np.pi / 2], abs=0.01)
+
+
+def test_the_obstacle_is_between_start_and_goal_and_the_shortest_way_goes_around(folder):
+    env = make(folder, depth=False, obstacle=True)
+    for seed in range(5):
+        _, info = env.reset(seed=seed)
+        box = env.data.mocap_pos[env._mocap("obstacle"), :2]
+        away, ahead = box - env._place, env.goal - env._place
+        assert abs(np.cross(away, ahead)) / np.linalg.norm(ahead) < 0.05
+        assert info["shortest"] >= np.linalg.norm(ahead) - NEAR - CELL
+
+
+def test_the_length_on_the_grid_is_that_of_the_way_around_a_wall():
+    occupied = np.zeros((21, 21), bool)
+    occupied[:20, 10] = True
+    space = FreeSpace(occupied, np.zeros(2))
+    length = space.distances(np.array([0.0, 0.0]))[0, 20]
+    way = 2 * np.hypot(9, 20) + 2  # up to the wall's end, past it, and down again
+    assert way - 1e-6 <= length / CELL <= 1.028 * way
+    sealed = FreeSpace(occupied | (np.arange(21) == 10), np.zeros(2))
+    assert np.isinf(sealed.distances(np.array([0.0, 0.0]))[0, 20])
+
+
+def test_a_part_is_occupied_on_the_map_of_nav2_where_it_stands(tmp_path):
+    corners = np.array([[x, y, z] for x in (1.0, 2.0) for y in (3.0, 3.4) for z in (0.0, 2.0)])
+    FreeSpace.of([corners], LEVEL, np.array([[0.0, 0.0]])).write(tmp_path)
+    facts = dict(line.split(": ") for line in (tmp_path / "map.yaml").read_text().splitlines())
+    image, origin = np.asarray(Image.open(tmp_path / facts["image"])), json.loads(facts["origin"])
+    rows, columns = np.nonzero(image == 0)
+    x = origin[0] + (columns + 0.5) * float(facts["resolution"])
+    y = origin[1] + (len(image) - rows - 0.5) * float(facts["resolution"])
+    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((1, 2, 3, 3.4), abs=CELL)
+
+
+def test_spawns_are_inside_the_trusted_workspace_and_views_away_from_the_facade_are_not_trusted(folder):
+    env = make(folder, depth=False)
+    for seed in range(5):
+        env.reset(seed=seed)
+        assert env.world.workspace.has(env._place)
+    facing = env.reset(options={"start": (4, -6), "goal": (9, -6), "heading": np.pi / 2})[1]
+    away = env.reset(options={"start": (4, -6), "goal": (9, -6), "heading": -np.pi / 2})[1]
+    assert (facing["trusted"], away["trusted"]) == (True, False)
+
+
+def test_splats_are_read_back_exactly(tmp_path):
+    splats = some_splats(7)
+    write_splats(tmp_path / "s.ply", splats)
+    read = splats_of([tmp_path / "s.ply", tmp_path / "s.ply"])
+    torch.testing.assert_close(read.harmonics[:7], splats.harmonics, rtol=0, atol=0)
+    torch.testing.assert_close(read.means[7:], splats.means, rtol=0, atol=0)
+    torch.testing.assert_close(read.quats[:7], torch.nn.functional.normalize(splats.quats, dim=1))
+
+
+def test_a_pedestrian_before_the_camera_hides_the_splats_and_noise_is_the_seeds(folder):
+    env = make(folder, pedestrians=1, rgb=CameraSettings(32, 18, noise=0.05, exposure=1.0))
+    options = {"start": (4, -6), "goal": (9, -6), "heading": np.pi / 2}
+    one, same = (env.reset(seed=3, options=options)[0]["rgb"] for _ in range(2))
+    np.testing.assert_array_equal(one, same)
+    camera = camera_of(env.model, env.data, env._camera, 32, 18)
+    env._put(env._walkers[0], np.array([4.0, -4.8]), 0.85)
+    mujoco.mj_forward(env.model, env.data)  # pyright: ignore[reportAttributeAccessIssue]
+    image = env._images.image(env.model, env.data, camera)
+    assert image[12:, 15:17, 2].mean() > image[12:, 15:17, 0].mean() + 0.2  # blue
+
+
+def test_another_robot_is_attached_and_its_actuators_are_the_actions(folder, tmp_path):
+    (tmp_path / "ball.xml").write_text(ROBOT)
+    env = make(folder, robot=tmp_path / "ball.xml", depth=False)
+    assert env.action_space.shape == (1,)
+    assert env.world.radius == pytest.approx(0.3)
+    env.reset(seed=0, options={"start": (2, -6), "goal": (9, -6), "heading": 0.0})
+    for _ in range(10):
+        env.step(np.array([1.0]))
+    assert env._place[0] > 2.5
+
+
+def test_the_robot_follows_uneven_ground(collider, folder, tmp_path):
+    out = write_folder(tmp_path / "sim", collider, ground=uneven())
+    shutil.copy(folder / "frame.json", out)
+    env = make(out, depth=False)
+    env.reset(seed=0, options={"start": (2, -6), "goal": (9, -6), "heading": 0.0})
+    for _ in range(10):
+        env.step(np.array([1, 0, 0]))
+        height = env.data.qpos[env._qpos + 2] - env.world.ground.at(env._place[None])[0]
+        assert abs(height) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda out: (out / "frame.json").unlink(), "frame.json"),
+        (lambda out: (out / "frame.json").write_text("{}"), "trusted workspace"),
+        (lambda out: (out / "frame.json").write_text("{"), "damaged"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_gets_one_sentence(folder, tmp_path, spoil, says):
+    out = shutil.copytree(folder, tmp_path / "sim")
+    spoil(out)
+    with pytest.raises(SceneError, match=says):
+        make(out)
+
+
+def test_the_vectorised_form_steps_all(folder):
+    envs = gymnasium.make_vec(NAME, num_envs=2, world=folder, depth=False)
+    observations, _ = envs.reset(seed=0)
+    assert observations["lidar"].shape == (2, 36)
+    assert envs.step(envs.action_space.sample())[1].shape == (2,)
+    envs.close()
+
+
+def test_ppo_learns_some_updates_without_fault(folder):
+    from stable_baselines3 import PPO
+
+    from benchmarks.nav import Flat
+
+    env = Flat(gymnasium.make(NAME, world=folder, depth=False, obstacle=True))
+    model = PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0, device="cpu").learn(128)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+
+
+def test_the_example_of_the_documentation_runs(folder, tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs/sim.md").read_text()
+    example = page.partition("```python\n")[2].partition("```")[0]
+    (tmp_path / "facade-sim").symlink_to(folder)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(example, names)
+    assert names["env"].observation_space.contains(names["observation"])
