@@ -33,6 +33,7 @@ _BRIDGES = 16  # views of a model that are matched with those of another, if the
 _MIN_JOINING = 30  # matches of points that join two models
 _RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
 _PLANAR = 8.0  # pixels, within which a step's matches are of one plane
+_FOCAL = 0.8  # widths, as of phones: calibration finds less from COLMAP's 1.2
 _NEAR = 10  # photographs, within which they are neighbours along a walk
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 
@@ -66,6 +67,7 @@ def extract(
         reader = pycolmap.ImageReaderOptions(
             camera_model=camera_model if len(lens["names"]) >= _MIN_CALIBRATED else "SIMPLE_RADIAL",
             mask_path=masks or "",
+            default_focal_length_factor=_FOCAL,
         )
         if lens["focal"]:
             width, height = lens["size"]
@@ -336,8 +338,7 @@ def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> d
 def _calibrated(database: str, folder: str) -> str:
     """A copy of a database, in a folder, whose cameras have the focal lengths that their pairs agree on.
 
-    COLMAP's guess without EXIF is 1.2 widths, and of a phone it is 0.75 (view graph calibration: Sweeney et al. 2015).
-    Where pairs do not determine it, the guess stays.
+    View graph calibration (Sweeney et al. 2015); where pairs do not determine it, the guess stays.
     """
     copy = f"{folder}/calibrated.db"
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import errno
+import json
 import shutil
 import sqlite3
+import subprocess
+import sys
 from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture import CaptureConfig, capture, stages
 from shellgs_method.capture.frames import extract_frames, sharpest, shift, stretches, travelled
+from shellgs_method.capture.loops import CONFIRMED
 from shellgs_method.capture.pairs import choose_matching, image_pairs
 from shellgs_method.capture.photographs import (
     add_mask,
@@ -841,6 +845,42 @@ def test_cameras_of_the_synthetic_facade_are_found(truth, captured):
     assert np.median(np.linalg.norm(errors, axis=1)) < 0.02 * np.ptp(positions, axis=0).max()
     focal = next(iter(true.values())).camera.K[0, 0].item()
     assert next(iter(found.values())).camera.K[0, 0].item() == pytest.approx(focal, rel=0.03)
+
+
+_MAPPING = """
+import json, sys, tempfile
+sys.path.insert(0, sys.argv[1])
+import sfm  # first: it imports what must come before pycolmap
+import pycolmap
+
+database, model = sys.argv[2], pycolmap.Reconstruction(sys.argv[3])
+with tempfile.TemporaryDirectory() as folder, pycolmap.Database.open(sfm._calibrated(database, folder)) as opened:
+    focal = opened.read_all_cameras()[0].focal_length_x
+whole = sfm._weakest(database, model).confirmed
+ids = sorted(model.reg_image_ids(), key=lambda i: model.image(i).name)
+before = set(ids[: len(ids) // 2])
+for number, point in list(model.points3D.items()):
+    if len({element.image_id in before for element in point.track.elements}) == 2:
+        model.delete_point3D(number)
+torn = sfm._weakest(database, model)
+names = [model.image(i).name for i in ids[len(before) - 1 : len(before) + 1]]
+print(json.dumps([focal, whole, torn.confirmed, torn.between == names]))
+"""
+
+
+@pytest.mark.slow
+def test_mapping_begins_with_the_focal_length_and_notices_a_tear(truth, captured):
+    """Of the torn model no point is seen from both sides of its middle."""
+    work = captured / "capture"
+    script = Path(stages.__file__).parent
+    command = [sys.executable, "-c", _MAPPING, script, work / "features/database.db", work / "model"]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    focal, whole, torn, is_in_the_middle = json.loads(printed.splitlines()[-1])
+    true = read_views(FacadeDataParserConfig(data=truth))[0].camera.K[0, 0].item()
+    assert focal == pytest.approx(true, rel=0.15)
+    assert whole > 2 * CONFIRMED
+    assert torn == 0
+    assert is_in_the_middle
 
 
 @pytest.mark.slow
