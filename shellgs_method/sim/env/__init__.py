@@ -9,12 +9,6 @@ TIME = 300
 """Steps after which an episode is truncated: a minute."""
 
 
-def register() -> None:
-    """Register the environment; gymnasium calls this by its entry point."""
-    gymnasium = import_extra("gymnasium", "gymnasium", "rl", "the environment")
-    if NAME not in gymnasium.registry:
-        entry = "shellgs_method.sim.env.facade_nav:FacadeNav"
-        gymnasium.register(NAME, entry_point=entry, max_episode_steps=TIME)
-
-
-register()
+gymnasium = import_extra("gymnasium", "gymnasium", "rl", "the environment")
+if NAME not in gymnasium.registry:
+    gymnasium.register(NAME, entry_point="shellgs_method.sim.env.facade_nav:FacadeNav", max_episode_steps=TIME)
