@@ -250,6 +250,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             read += [maps for name, maps in sets.items() if name == "checked"]
         try:
             for maps in read:
+                if not maps.names:
+                    raise SceneError(f"{maps.folder} has a manifest and no maps, run `{maps.command}`")
                 for view in views:
                     maps.check(view.name, view.camera, any_size=True)
         except SceneError as error:

@@ -136,8 +136,7 @@ class FacadeModel(SplatfactoModel):
     """Splatfacto with geometry channels, on any device.
 
     Outputs: ``rgb``, ``depth`` (forward z in nerfstudio's rescaled units), ``normal`` (camera frame, as colours
-    of :func:`normals_to_colours`), ``accumulation``, ``background``, and where exposures are learned ``unclipped``, the
-    colours before those above 1 are clipped; all [H, W, C].
+    of :func:`normals_to_colours`), ``accumulation``, ``background``; all [H, W, C].
 
     Splatfacto itself calls CUDA and downloads LPIPS' network when it is built
     (https://github.com/nerfstudio-project/nerfstudio/issues/3290), and its resume leaves the optimizers with the old
@@ -173,6 +172,7 @@ class FacadeModel(SplatfactoModel):
         self.surface_weights: SurfaceWeights | None = None
         self.register_buffer("surface", None)
         self._cameras: dict[int, Camera] = {}
+        self._unclipped: Tensor | None = None
         self._threads = ThreadsByLoad()
         self.step, self.log_every = 0, 1
         self.plan(PAPER_ITERATIONS)
@@ -325,11 +325,10 @@ class FacadeModel(SplatfactoModel):
         photograph = (camera.metadata or {}).get("cam_idx") if self.training else None
         if self.exposures is not None and photograph is not None:
             rgb = exposed(rgb, self.exposures.log_gains[photograph])
+        self._unclipped = None if self.training else rgb.detach()
         outputs = {"rgb": rgb.clamp(0, 1), "accumulation": alpha, "background": background}
         if not self.training:
             outputs["background"] = background.expand(pinhole.height, pinhole.width, 3)
-            if self.exposures is not None:  # at another exposure, what is white now may be grey
-                outputs["unclipped"] = rgb
         if self.geometry is not None:
             depth, normal = self.geometry.depth, self.geometry.normal
             if not self.training:
@@ -412,6 +411,12 @@ class FacadeModel(SplatfactoModel):
     def _photograph(self, batch: dict, background: Tensor) -> Float[Tensor, "H W 3"]:
         return self.composite_with_background(self.get_gt_img(batch["image"]), background)
 
+    def _unclipped_of(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        """An image before it was clipped, if it is the last; at another exposure, what is white may be grey."""
+        last = self._unclipped
+        is_last = last is not None and last.shape == rgb.shape and torch.equal(last.clamp(0, 1), rgb)
+        return last if is_last and last is not None else rgb
+
     @torch.no_grad()
     def get_image_metrics_and_images(self, outputs, batch) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of a held-out view, against the shell and, as ``truth_…``, the true geometry; and its images.
@@ -422,8 +427,7 @@ class FacadeModel(SplatfactoModel):
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
         normal = colours_to_normals(outputs["normal"])
-        rgb = outputs.get("unclipped", outputs["rgb"])
-        rendering = Rendering(rgb, outputs["depth"], outputs["accumulation"], normal)
+        rendering = Rendering(self._unclipped_of(outputs["rgb"]), outputs["depth"], outputs["accumulation"], normal)
         metrics = masked_image_errors(rendering.rgb, target, batch, self.metres_per_unit)
         metrics |= reference_errors(rendering, camera, batch, self.metres_per_unit)
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1)}

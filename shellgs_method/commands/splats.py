@@ -44,7 +44,7 @@ def splats(
     comments = [f"{name}: {value}" for name, value in frame.properties.items()]
     if levels == 1 and megabytes is None:
         count = write_splats(output, gaussians, comments)
-        frame.describe(output, {"splats": count, **facts})
+        frame.describe(Path(f"{output}.json"), {"splats": count, **facts})
         console.print(f"{output}: {count} Gaussians. {place(frame)}")
         return
     from shellgs_method.export.levels import psnr_of, ranked
@@ -60,7 +60,7 @@ def splats(
             count = write_splats(path, best_first[: max(1, count // 2 if level else count)], comments)
         whole = psnr_of(run, order) if whole is None else whole
         loss = whole - psnr_of(run, order[:count])
-        frame.describe(path, {"splats": count, "psnr_loss": round(loss, 3), **facts})
+        frame.describe(Path(f"{path}.json"), {"splats": count, "psnr_loss": round(loss, 3), **facts})
         size = path.stat().st_size / 1e6
         console.print(f"{path}: {count} Gaussians, {size:.1f} MB, {loss:.2f} dB of PSNR lost.", highlight=False)
     console.print(place(frame))

@@ -62,22 +62,34 @@ def replace_folder(folder: Path, complete: Path) -> None:
 
 @contextmanager
 def atomic_contents(folder: Path) -> Iterator[Path]:
-    """Make a folder to write to; once it is complete, its contents replace what has the same names in ``folder``.
+    """Make a folder to write to; once it is complete, its files replace those of the same paths in ``folder``.
 
     What else is there stays.
+
+    Raises:
+        SceneError: a file and a folder have the same path; none is replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
     complete = unfinished(folder / folder.resolve().name)  # inside: the folder itself may be a mounted one
     complete.mkdir()
     try:
         yield complete
-        for path in complete.iterdir():
-            if path.is_dir():
-                replace_folder(folder / path.name, path)
-            else:
-                os.replace(path, folder / path.name)
+        paths = files_in(complete)
+        for path in paths:
+            blocked = [each for each in path.parents if (folder / each).exists() and not (folder / each).is_dir()]
+            blocked += [path] if (folder / path).is_dir() else []
+            if blocked:
+                raise SceneError(f"{folder / blocked[0]} is in the way of {folder / path}: move it away")
+        for path in paths:
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(complete / path, folder / path)
     finally:
         shutil.rmtree(complete, ignore_errors=True)
+
+
+def files_in(folder: Path) -> list[Path]:
+    """Paths of the files in a folder and below, relative to it."""
+    return sorted(path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir())
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -325,7 +325,7 @@ class CueMaps:
         try:
             return reader(path)
         except UNREADABLE as error:
-            raise self._refusal(name, f"the file is damaged ({error})") from error
+            raise self._refusal(name, f"the file is damaged ({error})" if path.exists() else "it is gone") from error
 
     def _refusal(self, name: str, problem: str, max_image_size: int | None = None) -> SceneError:
         """Refusal of a map, with the command that makes it again, at another size where that is the problem."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.files.atomic import atomic_contents, atomic_write, read_json
+from shellgs_method.files.atomic import atomic_contents, atomic_write, files_in, read_json
 from shellgs_method.files.splats import write_splats
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -42,6 +42,8 @@ AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
 RESERVED = ("world", "site", "ground", "physics", "light", "sun", "friction")
 """Names of parts of a world, in one format or another."""
+FRAME = "frame.json"
+"""Record of a world: its frame and its files."""
 OUTDATED = "facade.xml"
 """A file that version 0.2.0 wrote, which knew no folder for each building."""
 MAX_GAP = 2.0
@@ -57,7 +59,7 @@ def simulate(
 ) -> tuple[dict, list[Chapter]]:
     """Export the buildings of trained runs to one folder that simulators load.
 
-    The folder stays as it was until all is written; buildings of an earlier world in it are removed then.
+    The folder stays as it was until all is written; files of an earlier world are removed then, and no others.
 
     Args:
         configs: config.yml of each run; the first run's frame is the world's.
@@ -70,7 +72,7 @@ def simulate(
         The metrics of ``metrics.json``, and the chapters that they were computed from.
 
     Raises:
-        SceneError: a run cannot be used, or the runs have no common frame.
+        SceneError: a run cannot be used, the runs have no common frame, or the folder has other files.
     """
     if not configs or out.suffix in (".yml", ".yaml") or out.is_file():
         raise SceneError(f"give the config.yml of at least one run, then an output folder (last was {out})")
@@ -79,12 +81,33 @@ def simulate(
             f"{out} is of an earlier version, whose files ({OUTDATED} and others) would stay beside the new ones: "
             "remove it, or give another folder"
         )
+    earlier = _earlier_files(out)
     import_mujoco()  # fail before hours of work
     with atomic_contents(out) as folder:
         metrics, chapters = _world(configs, folder, settings, log, truths)
-        for name in _buildings(out) - _buildings(folder):
-            shutil.rmtree(out / name, ignore_errors=True)
+        record, files = read_json(folder / FRAME), [path.as_posix() for path in files_in(folder)]
+        (folder / FRAME).write_text(json.dumps({**record, "files": files}, indent=1) + "\n")
+    for path in (out / name for name in set(earlier) - set(files)):
+        path.unlink(missing_ok=True)
+        for parent in path.relative_to(out).parents[:-1]:
+            with suppress(OSError):  # the user has something there
+                (out / parent).rmdir()
     return metrics, chapters
+
+
+def _earlier_files(out: Path) -> list[str]:
+    """Paths of the files of an earlier world in a folder, as far as they are known.
+
+    Raises:
+        SceneError: the folder has files, and is not one of a world.
+    """
+    if not out.is_dir() or not any(not path.name.startswith(".") for path in out.iterdir()):
+        return []
+    if not (out / FRAME).is_file():
+        raise SceneError(f"{out} has other files: give a new folder, or one that `shellgs sim` wrote")
+    files = read_json(out / FRAME).get("files", [])
+    plain = [name for name in files if isinstance(name, str) and not Path(name).is_absolute() and ".." not in name]
+    return plain if len(plain) == len(files) else []
 
 
 def _world(
@@ -124,13 +147,6 @@ def _world(
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
     return metrics, chapters
-
-
-def _buildings(folder: Path) -> set[str]:
-    """Names of the buildings of the world in a folder, if there is one."""
-    record = folder / "frame.json"
-    names = read_json(record).get("buildings", {}) if record.exists() else {}
-    return {name for name in names if (folder / name / f"{name}.xml").exists()}
 
 
 def _building(

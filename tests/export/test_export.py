@@ -120,7 +120,7 @@ def test_y_points_up_in_gltf_and_spz_and_what_they_show_is_the_same(trainer, tmp
             cli.splats(trainer.base_dir / "config.yml", path)
         return
     cli.splats(trainer.base_dir / "config.yml", path)
-    record = json.loads(path.with_suffix(".json").read_text())
+    record = json.loads(Path(f"{path}.json").read_text())
     assert record["up"] == "y"
     frame, motion = TrainedRun(model_of(trainer), data_of(trainer)).frame.turned(np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(record["turned"], motion[:3, :3])
@@ -144,7 +144,7 @@ def test_levels_have_half_as_many_gaussians_each_those_that_views_show_most(trai
         written = columns_of(tmp_path / f"{name}.ply")["positions"]
         assert len(written) == count >> level
         torch.testing.assert_close(written, means[best[: len(written)]])
-    losses = [json.loads((tmp_path / f"{name}.json").read_text())["psnr_loss"] for name in ("splats", "splats-2")]
+    losses = [json.loads((tmp_path / f"{name}.ply.json").read_text())["psnr_loss"] for name in ("splats", "splats-2")]
     assert losses[0] == 0
     assert losses[1] > 0.1
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from shellgs_method.errors import SceneError
 from shellgs_method.files import atomic
 
 
@@ -100,5 +101,21 @@ def test_contents_replace_those_of_the_same_names_once_they_are_complete(tmp_pat
         (complete / "a").mkdir()
         (complete / "a/new").write_text("new")
         (complete / "page").write_text("new")
-    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == {"a", "a/new", "b", "b/other", "page"}
+    everything = {"a", "a/new", "a/old", "b", "b/other", "page"}
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*")} == everything
     assert (folder / "page").read_text() == "new"
+
+
+def fill(folder: Path, names: tuple[str, ...], content: str) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content)
+
+
+@pytest.mark.parametrize(("there", "made"), [("a", "a/b"), ("a/b", "a")])
+def test_a_file_in_the_place_of_a_folder_is_refused_before_anything_is_replaced(tmp_path: Path, there: str, made: str):
+    folder = tmp_path / "made"
+    fill(folder, (there, "first"), "old")
+    with pytest.raises(SceneError, match=r"made/a is in the way"), atomic.atomic_contents(folder) as complete:
+        fill(complete, (made, "first"), "new")
+    assert (folder / "first").read_text() == "old"

@@ -257,7 +257,7 @@ def test_a_folder_of_an_earlier_version_is_refused_and_stays(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [OUTDATED]
 
 
-def test_a_world_replaces_the_buildings_of_an_earlier_one_and_nothing_else(tmp_path, monkeypatch):
+def test_a_world_replaces_the_files_of_an_earlier_one_and_no_others(tmp_path, monkeypatch):
     def write(*names: str) -> None:
         def world(configs, out, *rest):
             for name in names:
@@ -269,10 +269,23 @@ def test_a_world_replaces_the_buildings_of_an_earlier_one_and_nothing_else(tmp_p
         monkeypatch.setattr("shellgs_method.sim.simulate._world", world)
         simulate([tmp_path / "config.yml"], tmp_path / "sim", SMALL)
 
-    write("church", "school")
-    (tmp_path / "sim" / "robot").mkdir()
+    write("church", "school", "shop")
+    mine = ["shop/robot.xml", "robot/robot.xml", "bank/photo.jpg"]
+    for name in mine:
+        (tmp_path / "sim" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "sim" / name).write_text("mine")
     write("school", "bank")
-    assert {path.name for path in (tmp_path / "sim").iterdir()} == {"bank", "frame.json", "robot", "school"}
+    expected = {"bank/bank.xml", "frame.json", "school/school.xml", *mine}
+    found = {path.relative_to(tmp_path / "sim").as_posix() for path in (tmp_path / "sim").rglob("*") if path.is_file()}
+    assert found == expected
+    assert not (tmp_path / "sim" / "church").exists()
+
+
+def test_a_folder_of_something_else_is_refused_and_stays(tmp_path):
+    (tmp_path / "facade" / "images").mkdir(parents=True)
+    with pytest.raises(SceneError, match="has other files: give a new folder"):
+        simulate([tmp_path / "config.yml"], tmp_path, SMALL)
+    assert (tmp_path / "facade" / "images").is_dir()
 
 
 def test_walls_far_apart_are_reported(collider):
