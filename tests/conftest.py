@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,6 +44,22 @@ def pristine_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(pristine_scene: Path, tmp_path: Path) -> Path:
     """A copy of the scene that a test may change."""
     return Path(shutil.copytree(pristine_scene, tmp_path / "scene"))
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    """Headless Chromium, whose WebGL needs no GPU."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with sync_api.sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+        names = ("chromium", "chromium-browser", "google-chrome")
+        found = own if Path(own).is_file() else next(filter(None, map(shutil.which, names)), None)
+        if found is None:
+            pytest.skip("there is no Chromium")
+        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=found, args=software)
+        yield browser
+        browser.close()
 
 
 @pytest.fixture

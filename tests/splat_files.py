@@ -1,4 +1,4 @@
-"""glTF and spz files of Gaussians, decoded as their specifications have it."""
+"""Gaussians before a camera; glTF and spz files of Gaussians, decoded as their specifications have it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,20 @@ import numpy as np
 import torch
 
 from shellgs_method.files.splats import Splats
+from shellgs_method.render.maps import DISC_LOG_THICKNESS
+
+
+def some(count: int = 400, degree: int = 3, *, discs: bool = False) -> Splats:
+    """Gaussians before the camera."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([6.0, 4, 4]) + torch.tensor([-3.0, -2, 4])
+    scales = torch.randn(count, 3, generator=generator) * 0.5 - 2
+    if discs:
+        scales[:, 2] = DISC_LOG_THICKNESS
+    harmonics = torch.randn(count, (degree + 1) ** 2, 3, generator=generator) * 0.1
+    harmonics[:, 0] *= 8
+    quats, opacities = (torch.randn(count, n, generator=generator) for n in (4, 1))
+    return Splats(means, quats, scales, opacities, harmonics, discs=discs)
 
 
 def glb_attributes(path: Path) -> tuple[dict, dict[str, np.ndarray]]:

@@ -78,7 +78,7 @@ def check_splats_format(path: Path, discs: bool = False) -> None:
     check_output(path)
     suffix = path.suffix.lower()
     if suffix not in _WRITERS:
-        raise SceneError(f"{path}: splats are written as ply, glb or spz: name a file that ends in one of these")
+        raise SceneError(f"{path}: splats are written as ply, glb, spz or html: name a file that ends in one of these")
     if discs and suffix == ".spz":
         raise SceneError(f"{path}: spz has no discs, which have no thickness: name a .ply or .glb")
 

@@ -234,5 +234,5 @@ def test_the_doctor_reports_where_it_looks_for_lpips_weights(tmp_path, monkeypat
 
 @pytest.mark.parametrize("name", ["scene.splat", "scene"])
 def test_splats_are_not_written_as_a_ply_under_another_name(tmp_path, name):
-    with pytest.raises(SceneError, match=f"{name}: splats are written as ply, glb or spz: name a file"):
+    with pytest.raises(SceneError, match=f"{name}: splats are written as ply, glb, spz or html: name a file"):
         cli.splats(tmp_path / "config.yml", tmp_path / name)

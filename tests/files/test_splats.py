@@ -11,30 +11,16 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from splat_files import glb_attributes, unpacked
+from splat_files import glb_attributes, some, unpacked
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.splats import moved
 from shellgs_method.files.splats import DISCS, Splats, check_splats_format, read_splats, write_best_splats, write_splats
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.render.maps import DISC_LOG_THICKNESS
 from shellgs_method.render.view import ViewRenderer
 
 NODE = Path(os.environ["SHELLGS_NODE"]) / "node_modules" if "SHELLGS_NODE" in os.environ else None
 CAMERA = Camera(torch.eye(4), torch.tensor([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]), 160, 120)
-
-
-def some(count: int = 400, degree: int = 3, *, discs: bool = False) -> Splats:
-    """Gaussians before the camera."""
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(count, 3, generator=generator) * torch.tensor([6.0, 4, 4]) + torch.tensor([-3.0, -2, 4])
-    scales = torch.randn(count, 3, generator=generator) * 0.5 - 2
-    if discs:
-        scales[:, 2] = DISC_LOG_THICKNESS
-    harmonics = torch.randn(count, (degree + 1) ** 2, 3, generator=generator) * 0.1
-    harmonics[:, 0] *= 8
-    quats, opacities = (torch.randn(count, n, generator=generator) for n in (4, 1))
-    return Splats(means, quats, scales, opacities, harmonics, discs=discs)
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
@@ -151,7 +137,7 @@ def test_as_many_gaussians_are_written_as_the_size_allows(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    ("name", "discs", "message"), [("a.splat", False, "ply, glb or spz"), ("a.spz", True, "spz has no discs")]
+    ("name", "discs", "message"), [("a.splat", False, "ply, glb, spz or html"), ("a.spz", True, "spz has no discs")]
 )
 def test_formats_that_cannot_be_written_are_refused(tmp_path, name, discs, message):
     with pytest.raises(SceneError, match=message):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -29,21 +27,6 @@ from shellgs_method.synthetic.frames import SHELL_FROM_BUILDING
 CORNERS = [(0, 0, 2), (0, 2, 0), (3, 2, 3), (5, 2, 3), (5, 0, 1), (2, 1, 0)]
 """Bay and storey of windows, and which of their corners: lower left, lower right, upper left, upper right."""
 PAGE = {"width": 1400, "height": 850}
-
-
-@pytest.fixture
-def browser() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with sync_api.sync_playwright() as playwright:
-        own = playwright.chromium.executable_path
-        names = ("chromium", "chromium-browser", "google-chrome")
-        found = own if Path(own).is_file() else next(filter(None, map(shutil.which, names)), None)
-        if found is None:
-            pytest.skip("there is no Chromium")
-        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = playwright.chromium.launch(executable_path=found, args=software)
-        yield browser
-        browser.close()
 
 
 class Hand:
