@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -23,7 +22,10 @@ from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
 from shellgs_method.sim.free_space import CELL, FreeSpace
 from shellgs_method.sim.ground import LEVEL
+from shellgs_method.sim.trials.engine import import_mujoco
 from shellgs_method.sim.workspace import Workspace
+
+mujoco = import_mujoco()  # before others, which would choose another OpenGL
 
 ROBOT = """
 <mujoco model="sphere">
