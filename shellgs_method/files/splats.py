@@ -54,8 +54,11 @@ class Splats:
 
     def __getitem__(self, chosen: Tensor | slice) -> Splats:
         """Select Gaussians by indices, a mask or a slice."""
-        fields = (self.means, self.quats, self.scales, self.opacities, self.harmonics)
-        return Splats(*(each[chosen] for each in fields), discs=self.discs)
+        return Splats(*(each[chosen] for each in self._tensors), discs=self.discs)
+
+    @property
+    def _tensors(self) -> tuple[Tensor, ...]:
+        return self.means, self.quats, self.scales, self.opacities, self.harmonics
 
     @property
     def degree(self) -> int:
@@ -65,8 +68,7 @@ class Splats:
     @property
     def finite(self) -> Splats:
         """Without Gaussians that have a NaN or infinite value, which break viewers."""
-        fields = (self.means, self.quats, self.scales, self.opacities, self.harmonics.flatten(1))
-        return self[torch.cat([each.double() for each in fields], dim=1).isfinite().all(dim=1)]
+        return self[torch.cat([each.flatten(1).double() for each in self._tensors], dim=1).isfinite().all(dim=1)]
 
 
 def check_splats_format(path: Path, discs: bool = False) -> None:

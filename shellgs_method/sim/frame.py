@@ -15,6 +15,8 @@ from shellgs_method.geometry.axes import turn
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.similarity import transformed
 
+FRAME = "frame.json"
+"""Record of a world: its frame, buildings, trusted workspace and files."""
 MAX_STEP = 20.0
 """Largest distance in metres of a given ground from the lower edge of the surface: a hill, no mistake."""
 LOWEST = 0.002
@@ -33,8 +35,8 @@ class SimFrame(Frame):
     to_national: Float64[np.ndarray, "4 4"]
 
     def write(self, folder: Path, facts: dict) -> None:
-        """Write ``frame.json``: unit, axes, the offset of georeferenced coordinates, both matrices, and ``facts``."""
-        self.describe(folder / "frame.json", {"to_national": self.to_national.tolist(), **facts})
+        """Write :data:`FRAME`: unit, axes, the offset of georeferenced coordinates, both matrices, and ``facts``."""
+        self.describe(folder / FRAME, {"to_national": self.to_national.tolist(), **facts})
 
 
 def sim_frame(

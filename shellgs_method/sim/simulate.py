@@ -29,6 +29,7 @@ from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
 from shellgs_method.sim.formats.usd import write_usd_asset
 from shellgs_method.sim.formats.world import write_asset, write_world
+from shellgs_method.sim.frame import FRAME
 from shellgs_method.sim.free_space import FreeSpace
 from shellgs_method.sim.ground import STEP, Ground
 from shellgs_method.sim.look.texture import bake
@@ -42,8 +43,6 @@ AHEAD = 0.05
 """Distance in metres from which the fused surface is in front of the shell, or two voxels if that is more."""
 RESERVED = ("world", "site", "ground", "physics", "light", "sun", "friction")
 """Names of parts of a world, in one format or another."""
-FRAME = "frame.json"
-"""Record of a world: its frame and its files."""
 OUTDATED = "facade.xml"
 """A file that version 0.2.0 wrote, which knew no folder for each building."""
 MAX_GAP = 2.0

@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.env.robot import DEFAULT_ROBOT
+from shellgs_method.sim.frame import FRAME
 from shellgs_method.sim.free_space import FreeSpace
 from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
@@ -72,13 +73,13 @@ class World:
         Raises:
             SceneError: the folder or the robot cannot be used.
         """
-        if not (folder / "world.xml").is_file() or not (folder / "frame.json").is_file():
+        if not (folder / "world.xml").is_file() or not (folder / FRAME).is_file():
             raise SceneError(f"{folder} has no world.xml and frame.json: give a folder that shellgs sim wrote")
         try:
-            facts = json.loads((folder / "frame.json").read_text())
+            facts = json.loads((folder / FRAME).read_text())
         except ValueError as error:
-            raise SceneError(f"{folder / 'frame.json'} is damaged ({error}): write the folder again") from error
-        workspace = Workspace.read(facts, folder / "frame.json")
+            raise SceneError(f"{folder / FRAME} is damaged ({error}): write the folder again") from error
+        workspace = Workspace.read(facts, folder / FRAME)
         spec = read_spec(folder / "world.xml")
         spec.option.timestep = TIMESTEP
         given = mujoco.MjSpec.from_string(DEFAULT_ROBOT) if robot is None else read_spec(robot)
