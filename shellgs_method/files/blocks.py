@@ -1,0 +1,183 @@
+"""The blocks that a large scene is trained in: cells of a tree of vertical cuts, and the photographs of each.
+
+In ``blocks.json`` the tree is as it is cut, in the scene's own frame and units, so that a person can move a cut::
+
+    {"overlap": 5.0,
+     "tree": {"cut": {"normal": [1, 0, 0], "offset": 30.2},
+              "below": {"name": "block-1", "photographs": ["images/frame_00001.png", ...]},
+              "above": {"name": "block-2", "photographs": [...]}}}
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_write, read_json
+
+BLOCKS = "blocks.json"
+_NAME = re.compile(r"[\w.+-]*\w[\w.+-]*")
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A plane that divides space: ``above`` it lies what has a signed distance of 0 or more."""
+
+    normal: tuple[float, float, float]
+    """Unit normal."""
+    offset: float
+    """Distance of the plane from the origin along its normal."""
+
+    def distances(self, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N"]:
+        """Signed distances of points."""
+        return np.asarray(points, dtype=np.float64) @ np.array(self.normal) - self.offset
+
+
+@dataclass(frozen=True)
+class Block:
+    """A leaf of the tree."""
+
+    name: str
+    photographs: tuple[str, ...]
+    """Paths of its photographs in the scene."""
+
+
+@dataclass(frozen=True)
+class Fork:
+    """An inner node of the tree."""
+
+    cut: Cut
+    below: Fork | Block
+    above: Fork | Block
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The region of a block: an intersection of half-spaces, so that the cores of all blocks tile space.
+
+    Attributes:
+        block: the block.
+        sides: cuts that bound it, and whether it lies above each.
+        overlap: how far the extended region reaches beyond the core, in scene units.
+    """
+
+    block: Block
+    sides: tuple[tuple[Cut, bool], ...]
+    overlap: float
+
+    def core(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
+        """Which points lie in the core, which each point does in one block."""
+        inside = np.ones(len(points), bool)
+        for cut, above in self.sides:
+            inside &= (cut.distances(points) >= 0) == above
+        return inside
+
+    def extended(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
+        """Which points lie in the core or within the overlap of it."""
+        inside = np.ones(len(points), bool)
+        for cut, above in self.sides:
+            inside &= cut.distances(points) * (1 if above else -1) >= -self.overlap
+        return inside
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """All blocks of a scene."""
+
+    tree: Fork | Block
+    overlap: float
+    """How far extended regions reach beyond cores, in scene units."""
+
+    def __post_init__(self) -> None:
+        """Refuse extended regions that are smaller than their cores."""
+        if self.overlap < 0:
+            raise ValueError(f"the overlap is negative: {self.overlap}")
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """The region of each block, in the order of the tree."""
+        return tuple(Cell(block, sides, self.overlap) for block, sides in _leaves(self.tree))
+
+    def cell(self, name: str) -> Cell:
+        """The region of a block.
+
+        Raises:
+            SceneError: there is no block of this name.
+        """
+        for cell in self.cells:
+            if cell.block.name == name:
+                return cell
+        raise SceneError(f"there is no block {name!r}: use {', '.join(cell.block.name for cell in self.cells)}")
+
+    def write(self, path: Path) -> None:
+        """Write the file, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as file:
+            file.write((json.dumps({"overlap": self.overlap, "tree": _written(self.tree)}, indent=1) + "\n").encode())
+
+    @classmethod
+    def read(cls, path: Path) -> Blocks:
+        """Read a file, which a person may have edited.
+
+        Raises:
+            SceneError: it is not there, damaged, or names two blocks alike.
+        """
+        if not path.is_file():
+            raise SceneError(f"{path} is not there: run `shellgs blocks {path.parent}` first")
+        contents = read_json(path)
+        try:
+            blocks = cls(_node(contents["tree"]), _number(contents["overlap"]))
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise SceneError(f"{path} is damaged ({error!r}): mend it, or remove it and cut anew") from error
+        names = [cell.block.name for cell in blocks.cells]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise SceneError(f"{path} has two blocks named {min(twice)}: give each its own name")
+        return blocks
+
+
+def _leaves(
+    node: Fork | Block, sides: tuple[tuple[Cut, bool], ...] = ()
+) -> Iterator[tuple[Block, tuple[tuple[Cut, bool], ...]]]:
+    if isinstance(node, Block):
+        yield node, sides
+    else:
+        yield from _leaves(node.below, (*sides, (node.cut, False)))
+        yield from _leaves(node.above, (*sides, (node.cut, True)))
+
+
+def _written(node: Fork | Block) -> dict[str, Any]:
+    if isinstance(node, Block):
+        return {"name": node.name, "photographs": [*node.photographs]}
+    cut = {"normal": [*node.cut.normal], "offset": node.cut.offset}
+    return {"cut": cut, "below": _written(node.below), "above": _written(node.above)}
+
+
+def _node(record: dict[str, Any]) -> Fork | Block:
+    if "cut" not in record:
+        name, photographs = record["name"], record["photographs"]
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise ValueError(f"{name!r} cannot name a folder")
+        if not isinstance(photographs, list) or not all(isinstance(path, str) for path in photographs):
+            raise ValueError(f"the photographs of {name} are no list of paths")
+        return Block(name, tuple(photographs))
+    x, y, z = map(_number, record["cut"]["normal"])
+    length = float(np.linalg.norm((x, y, z)))
+    if length == 0:
+        raise ValueError("the normal of a cut is 0")
+    cut = Cut((x / length, y / length, z / length), _number(record["cut"]["offset"]) / length)
+    return Fork(cut, _node(record["below"]), _node(record["above"]))
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise ValueError(f"{value!r} is no number")
+    return float(value)
