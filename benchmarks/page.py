@@ -26,6 +26,7 @@ COLUMNS = {
         Column("psnr_on_shell", "on the shell", max, ".2f"),
         Column("psnr_off_shell", "off it", max, ".2f"),
         Column("psnr_before_shell", "before it", max, ".2f"),
+        Column("cc_psnr_seen", "Corrected, seen", max, ".2f"),
     ),
     "surface": (
         Column("normal_deg", "Normal (°)", min, ".1f"),

@@ -53,8 +53,9 @@ _FINEST = 0.005
 """Metres: smallest noise of a shell. No scan of a building is better, and no building is its model."""
 _PATCH = 1.0
 """Metres: how far the errors of a shell are alike, so that all points in a patch of this size count as one."""
-_PICKED = 0.02
-"""Metres: standard deviation of a pick, on the shell and in photographs."""
+_PICKED = 0.005
+"""Metres: standard deviation of a pick on the shell. Picks are worse than that, and yet tell more: what points on the
+shell say together has a bias, since many are of frames and sills a centimetre or two off it."""
 _RANGE = 0.05
 """Largest change of focal lengths, relative, and of distortion coefficients."""
 _OUTLYING = 4.0
@@ -227,10 +228,12 @@ def _drawn_to(
     objective = Objective(seen, _noise_of_pixels(bundle, seen), positions=positions, planes=marks.planes)
     gates = [*np.full(_ROBUST, np.inf), *np.geomspace(REACH, GATE, _GATES)]
     gates += [GATE] * (_ROUNDS - len(gates))
-    damping = 1e-4
-    for gate in track(gates, "Adjusting the cameras", len(gates)):
+    damping, bent = 1e-4, bundle.points
+    for turn, gate in enumerate(track(gates, "Adjusting the cameras", len(gates))):
         # Points are triangulated again: those drawn to the shell say nothing of its noise, nor where they belong.
         free = intersected(objective, bundle, steps=5)
+        if turn == _ROBUST:
+            free = _carried(free, _back(surface, objective.observations, free.points, bent))
         pixel = _noise_of_pixels(free, seen)
         observations = _trusted(free, seen, pixel).joined(marks.seen)
         objective = replace(objective, observations=observations, pixel=pixel)
@@ -241,6 +244,20 @@ def _drawn_to(
         if gate == GATE and np.linalg.norm(bundle.centres - before, axis=1).max() < _STILL:
             break
     return bundle, objective
+
+
+def _back(
+    surface: ShellSurface, seen: Observations, points: Float64[np.ndarray, "N 3"], before: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "4 4"]:
+    """The similarity that brings points near the shell back to where they were.
+
+    The shell was placed by them. Cameras, which keep their places while nothing else is known, may unbend to another
+    scale: a wall before them would then be farther off than any gate.
+    """
+    on = np.intersect1d(seen.points[seen.weights > 0], np.flatnonzero(surface.distance(before) < REACH))
+    jump = np.linalg.norm(points[on] - before[on], axis=1)
+    on = on[jump <= 3 * np.median(jump)] if len(on) else on
+    return fit_similarity(points[on], before[on]) if len(on) >= FEW else np.eye(4)
 
 
 def _trusted(bundle: Bundle, seen: Observations, pixel: float) -> Observations:
