@@ -36,8 +36,6 @@ IMPORTED = """
 import runpy, sys
 from importlib.metadata import packages_distributions, version
 import pytest
-from shellgs_method.machine.doctor import examine
-*_, = examine()
 runpy.run_module("benchmarks.gpu", run_name="__main__", alter_sys=True)
 named = packages_distributions()
 names = {name for module in sys.modules for name in named.get(module.partition(".")[0], ())}
@@ -55,7 +53,6 @@ export PYTHONPATH="$PWD/site:$PWD/code"
 {
     $python -c 'import sys, torch; print(sys.version, torch.__version__, torch.version.cuda)'
     $python -c 'import torch; print(torch.cuda.is_available() and torch.cuda.get_device_name())'
-    $python -c 'from shellgs_method.cli import main; main()' doctor
     cd code
     $python -m pytest -q -rs -p no:cacheprovider $(grep -lr cuda.is_available --include 'test_*.py' tests)
     $python -m benchmarks.gpu ../scene --out ../results.json "$@"

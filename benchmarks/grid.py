@@ -85,7 +85,7 @@ GRID = (
         "default", 320, 1500, SCENES, ("photo-gs", "photo-gs-exposure", "2dgs", "shellgs", "shellgs-metric"), (0, 1, 2)
     ),
     Setting("halves", 320, 1500, (SYNTHETIC, COURT, *SHELLS), TRIO, (0, 1, 2), every=2),
-    Setting("thirds", 320, 1500, (SYNTHETIC, COURT, *SHELLS), TRIO, (0, 1, 2), every=3),
+    Setting("thirds", 320, 1500, (SYNTHETIC, COURT, *SHELLS), PAIR, (0, 1, 2), every=3),
     Setting("larger", 480, 3000, SCENES, PAIR),
 )
 
