@@ -19,6 +19,7 @@ from torch import Tensor
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
+from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.gaussians.initial import BEHIND_SPACING, MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.seeds import shell_seeds, view_behind_shell, view_of_shell, view_of_surface
 from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
@@ -100,7 +101,8 @@ class FacadePipeline(VanillaPipeline):
         both = (data.train_dataset, data.eval_dataset)
         cameras = [dataset.camera(index) for dataset in both for index in range(len(dataset))]
         self.model.start_in(coarse, track(cameras, "Looking at the coarse run from view", len(cameras)))
-        cell = parsed.metadata["cell"]
+        parser: Any = data.config.dataparser
+        cell = Blocks.read(parser.data / BLOCKS).cell(parser.block)
         self._block = {"name": cell.block.name, "region": cell.fingerprint, "coarse": coarse.hash}
 
     def _add_seeds(self, seed_views: Callable[..., tuple[Iterator, int]]) -> None:

@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from training_runs import Method, trainer_of
 
@@ -16,14 +17,14 @@ from shellgs_method.trainer import FacadeTrainer
 HALVES = ("west", "east")
 
 
-def cut_in_two(scene: Path, overlap: float = 1.0) -> Blocks:
-    """Cut a scene of ten photographs in the middle of its walk; both blocks have a held-out photograph."""
+def cut_in_two(scene: Path, overlap: float = 0.5) -> Blocks:
+    """Cut a scene of ten photographs, of a walk out and back, in the middle of its length."""
     views = read_views(FacadeDataParserConfig(data=scene))
-    names = [view.name for view in views]
-    first, last = (views[k].camera.position.numpy() for k in (0, -1))
-    along = (last - first) / sum((last - first) ** 2) ** 0.5
-    cut = Cut((float(along[0]), float(along[1]), float(along[2])), float(along @ (first + last) / 2))
-    blocks = Blocks(Fork(cut, Block("west", (*names[:6],)), Block("east", (*names[4:],))), overlap)
+    first, farthest = (views[k].camera.position.numpy() for k in (0, 4))
+    along = (farthest - first) / np.linalg.norm(farthest - first)
+    cut = Cut((float(along[0]), float(along[1]), float(along[2])), float(along @ (first + farthest) / 2))
+    west, east = ([views[k].name for k in chosen] for chosen in ((0, 1, 2, 3, 7, 8, 9), (2, 3, 4, 5, 6, 7, 8)))
+    blocks = Blocks(Fork(cut, Block("west", tuple(west)), Block("east", tuple(east))), overlap)
     blocks.write(scene / BLOCKS)
     return blocks
 
