@@ -89,10 +89,11 @@ class FacadePipeline(VanillaPipeline):
             )
         if self.model.config.coarse is not None:
             self._start_in_block(self.model.config.coarse)
-        if self.model.exposures is not None:
-            if self.model.surroundings is None:
-                self.model.start_exposures(*data.log_gains())
+        if self.model.exposures is not None and self.model.surroundings is not None:
             gains = self.model.exposures.log_gains.detach().double().cpu().numpy()
+        elif self.model.exposures is not None:
+            gains, of_points = data.log_gains()
+            self.model.start_exposures(gains, of_points)
         self._add_seeds(partial(data.seed_views, log_gains=gains))
 
     def _start_in_block(self, path: Path) -> None:
