@@ -18,6 +18,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from dataparsers.cameras import pinhole_cameras
 from dataparsers.orientation import oriented
 from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.frames import Frame, Recording
 from shellgs_method.files.photographs import View
@@ -46,6 +47,9 @@ class FacadeDataParserConfig(SceneLayout, DataParserConfig):
     """How to orient the scene for the viewer."""
     center_method: Literal["poses", "focus", "none"] = "poses"
     """How to centre the scene for the viewer. Coordinates too large for float32 are always centred."""
+    block: Optional[str] = None
+    """Block of the scene's blocks.json (`shellgs blocks`) whose photographs are used. The frame stays that of the whole
+    scene. If not set: all photographs."""
 
     @property
     def downscale_factor(self) -> None:
@@ -70,7 +74,9 @@ class FacadeDataParser(DataParser):
     :class:`~shellgs_method.files.photographs.View`) and ``observed`` (indices of the SfM points that each observes, all
     where that is unknown), and for the whole scene ``cues`` (the :class:`CueMaps` found, by kind), ``metres_per_unit``
     (of nerfstudio's rescaled world) and ``shell_error`` (possible offset of the whole shell in metres), both None
-    without a shell alignment.
+    without a shell alignment. So that blocks know their scene: ``split``, the number of photographs of the whole scene
+    in the split, and the indices among them of those used; ``cell``, the block's region in the rescaled world, None in
+    a whole scene; and ``centre``, that of the whole scene's training cameras.
     """
 
     config: FacadeDataParserConfig
@@ -84,13 +90,16 @@ class FacadeDataParser(DataParser):
         shell = cues["shell"].manifest if "shell" in cues else None
         sized = shell or (cues["mono"].manifest if "mono" in cues else None)
         max_image_size = _image_size(config, sized.max_image_size if sized else None)
-        chosen = _of_split(recording, split, config)
+        whole = _of_split(recording, split, config)
+        chosen, cell = _of_block(recording, whole, split, config)
         views = [replace(views[k], camera=views[k].camera.shrunk(max_image_size)) for k in chosen]
         points = find_sparse_points(config)
         if split == "train":
             check_points(points, views)
         placed = scale * (points.positions @ transform[:3, :3].T + transform[:3, 3])
         metres_per_unit = shell.metres_per_unit if shell else None
+        to_world = np.eye(4)
+        to_world[:3] = scale * transform[:3]
         masks = [view.mask for view in views if view.mask is not None]
         return DataparserOutputs(
             image_filenames=[view.image for view in views],
@@ -107,6 +116,9 @@ class FacadeDataParser(DataParser):
                 "cues": cues,
                 "metres_per_unit": metres_per_unit / scale if metres_per_unit else None,
                 "shell_error": shell.error if shell else None,
+                "split": (len(whole), [whole.index(k) for k in chosen]),
+                "cell": cell and cell.moved(to_world),
+                "centre": poses[_of_split(recording, "train", config), :3, 3].double().mean(dim=0).numpy(),
             },
         )
 
@@ -186,6 +198,23 @@ def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) 
     if len(names) < 2:
         raise SceneError(f"{config.data} has one photograph: one is held out, and training needs at least one more")
     return [k for k in range(len(names)) if (k % interval == 0) != (split == "train")]
+
+
+def _of_block(
+    recording: Recording, of_split: list[int], split: str, config: FacadeDataParserConfig
+) -> tuple[list[int], Cell | None]:
+    """Those photographs of a split that belong to the block, and its region in the scene; all if there is no block."""
+    if config.block is None:
+        return of_split, None
+    path = config.data / BLOCKS
+    cell = Blocks.read(path).cell(config.block)
+    listed = set(cell.block.photographs)
+    if unknown := sorted(listed - {frame.name for frame in recording.frames}):
+        raise SceneError(f"{path}: {config.block} has {unknown[0]}, which is no photograph of the scene: take it out")
+    if not (chosen := [k for k in of_split if recording.frames[k].name in listed]):
+        what = "to train on" if split == "train" else "that is held out"
+        raise SceneError(f"{path}: {config.block} has no photograph {what}: add one to it, or join it with a neighbour")
+    return chosen, cell
 
 
 def _refuse_missing_images(frames: Sequence[Frame], scene: Path) -> None:

@@ -14,15 +14,34 @@ from shellgs_method.commands.demo import demo
 from shellgs_method.commands.doctor import doctor
 from shellgs_method.commands.elevation import elevation
 from shellgs_method.commands.evaluate import evaluate
+from shellgs_method.commands.merge import merge
 from shellgs_method.commands.mesh import mesh
 from shellgs_method.commands.mono import mono
 from shellgs_method.commands.pick import pick
 from shellgs_method.commands.run import run
 from shellgs_method.commands.sim import sim
 from shellgs_method.commands.splats import splats
+from shellgs_method.commands.street import street
 from shellgs_method.errors import refusals_end_the_program
 
-COMMANDS = (demo, run, capture, pick, align, cast, mono, compare, evaluate, mesh, splats, elevation, sim, doctor)
+COMMANDS = (
+    demo,
+    run,
+    capture,
+    pick,
+    align,
+    cast,
+    mono,
+    compare,
+    street,
+    merge,
+    evaluate,
+    mesh,
+    splats,
+    elevation,
+    sim,
+    doctor,
+)
 
 
 def main() -> None:

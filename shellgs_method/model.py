@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import reduce
+from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Optional
 
 import numpy as np
@@ -28,6 +31,7 @@ from shellgs_method.gaussians.exposures import Exposures
 from shellgs_method.gaussians.initial import OPACITY, Init, InitialGaussians, harmonics, sfm_points
 from shellgs_method.gaussians.seeds import Seeds
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
+from shellgs_method.gaussians.surroundings import Region, Surroundings
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses import PAPER_ITERATIONS
 from shellgs_method.losses.objective import Cues, ExtraLossConfig, GeometryLossConfig, Objective, Trust, ViewLosses
@@ -40,6 +44,7 @@ from shellgs_method.render.maps import DepthKind, Geometry, Primitive
 from shellgs_method.render.panorama import is_pinhole, render_around
 from shellgs_method.render.rasterizer.gsplat_backend import Backend
 from shellgs_method.render.view import ViewRenderer
+from shellgs_method.runs.coarse import CoarseRun
 from shellgs_method.runs.host import NO_FIELD, NO_RAYS, NO_RGBA, refuse
 
 SURFACE_EVERY = 500
@@ -83,6 +88,10 @@ class FacadeModelConfig(SplatfactoModelConfig):
     # A value, not a factory: an older config.yml without this setting finds it on the class.
     extra: ExtraLossConfig = ExtraLossConfig()  # noqa: RUF009
     """Terms beyond the paper."""
+
+    coarse: Optional[Path] = None
+    """Of a block (facade-data --block): the trained run of the whole scene, by its folder or config.yml, that it starts
+    from. Its Gaussians in the block are trained on; those around it, and the exposures, stay as they are."""
 
     backend: Backend = "auto"
     """Rasterizer: gsplat's CUDA kernels, torch, or auto, which is gsplat where its kernels load. With gsplat, training
@@ -156,7 +165,7 @@ class FacadeModel(SplatfactoModel):
         self.background_color = get_color("black" if config.background_color == "random" else config.background_color)
         self.crop_box = None
         self.metres_per_unit: float | None = metadata.get("metres_per_unit")
-        self.exposures = Exposures(self.num_train_data) if config.exposure == "learned" else None
+        self.exposures = Exposures(*metadata["split"]) if config.exposure == "learned" else None
         self.transients = Transients(self.num_train_data) if config.transients == "ignored" else None
         self.objective = Objective(
             config.cues, config.trust, config.geometry, config.extra, self.metres_per_unit, metadata.get("shell_error")
@@ -171,6 +180,8 @@ class FacadeModel(SplatfactoModel):
         self.geometry: Geometry | None = None
         self.surface_weights: SurfaceWeights | None = None
         self.register_buffer("surface", None)
+        self.surroundings: Surroundings | None = None
+        self.region: Region | None = None
         self._cameras: dict[int, Camera] = {}
         self._unclipped: Tensor | None = None
         self._threads = ThreadsByLoad()
@@ -192,6 +203,8 @@ class FacadeModel(SplatfactoModel):
             raise SceneError(
                 "empty_space needs the depths of the centres: set pipeline.model.depth to expected or mode"
             )
+        if config.coarse is not None and self.kwargs["metadata"]["cell"] is None:
+            raise SceneError(f"a block starts from the coarse run {config.coarse}: name it, by facade-data --block")
         for kind in sorted(self.training_cues - set(self.kwargs["metadata"]["cues"])):
             command = {"shell": "cast", "mono": "mono"}[kind]
             raise SceneError(
@@ -211,15 +224,48 @@ class FacadeModel(SplatfactoModel):
         colours = exposed(sfm_points(self.seed_points)[1], -torch.from_numpy(of_points).float())
         self.gauss_params["features_dc"].data = harmonics(colours.clamp(0, 1)).to(self.device)
 
+    def start_in(self, coarse: CoarseRun, cameras: Iterable[Camera]) -> None:
+        """Start a block from the coarse run of its scene, and keep of its other Gaussians those that cameras see.
+
+        Raises:
+            SceneError: the coarse run has no Gaussian in the block.
+        """
+        metadata = self.kwargs["metadata"]
+        self.region = Region.of(metadata["cell"], metadata["centre"], sfm_points(self.seed_points)[0].cpu().numpy())
+        gaussians = {name: values.to(self.device) for name, values in coarse.gaussians.items()}
+        inside = self.region.extended(gaussians["means"])
+        if not inside.any():
+            name = self.region.cell.block.name
+            raise SceneError(f"the coarse run {self.config.coarse} has no Gaussian in {name}: join it with a neighbour")
+        views = (self.renderer.coverage(gaussians, camera, self._renders_geometry)[1] for camera in cameras)
+        seen = reduce(torch.logical_or, views)
+        self.surroundings = Surroundings({name: values[~inside & seen] for name, values in gaussians.items()})
+        for name in self.gauss_params:
+            self.gauss_params[name] = nn.Parameter(gaussians[name][inside])
+        if self.exposures is not None and coarse.exposures is not None:
+            self.exposures.parameter.data = coarse.exposures.to(self.device)
+
+    def outside(self) -> Bool[Tensor, "N"]:
+        """Gaussians that have left their block: merged, it would lack what they show of it in its photographs."""
+        return (
+            self.means.new_zeros(self.num_points).bool() if self.region is None else ~self.region.extended(self.means)
+        )
+
     def add_seeds(self, seeds: Seeds) -> None:
-        """Add flat initial Gaussians at seeds."""
+        """Add flat initial Gaussians at seeds, in a block where the coarse run's are farther apart."""
+        if self.region is not None:
+            seeds = self.region.lacking(seeds, self.means)
         for name, new in self._initial.at_seeds(seeds).items():
             old = self.gauss_params[name].data
             self.gauss_params[name] = nn.Parameter(torch.cat([old, new.to(old)]))
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters of each optimizer: the Gaussians', and where they are learned the photographs' exposures."""
-        exposures = {} if self.exposures is None else {"exposures": [*self.exposures.parameters()]}
+        """Parameters of each optimizer: the Gaussians', and where they are learned the photographs' exposures.
+
+        Those of a block stay: its few photographs would drift from their neighbours' in light.
+        """
+        stay = self.exposures is None or self.config.coarse is not None
+        exposures = {} if stay else {"exposures": [*self.exposures.parameters()]}
         return super().get_param_groups() | exposures
 
     def plan(self, num_iterations: int) -> None:
@@ -254,6 +300,8 @@ class FacadeModel(SplatfactoModel):
         if self.exposures is not None:
             self.exposures.parameter.data = torch.zeros_like(dict["exposures.parameter"], device=self.device)
         self.surface = torch.empty_like(dict["surface"], device=self.device) if "surface" in dict else None
+        around = Surroundings.shaped(dict, "surroundings.")
+        self.surroundings = around and around.to(self.device)
         self.step = self.num_iterations
         return nn.Module.load_state_dict(self, dict, **kwargs)
 
@@ -268,14 +316,17 @@ class FacadeModel(SplatfactoModel):
         """The Gaussians to render: all, or in the viewer those inside its crop box."""
         self.update_surface()
         gaussians = dict(self.gauss_params) | ({} if self.surface is None else {"surface": self.surface})
+        if self.surroundings is not None:
+            gaussians = self.surroundings.around(gaussians)
         if self.crop_box is None or self.training:
             return gaussians
-        inside = self.crop_box.within(self.means).squeeze(-1)
+        inside = self.crop_box.within(gaussians["means"]).squeeze(-1)
         return {name: values[inside] for name, values in gaussians.items()}
 
     def coverage(self, camera: Camera) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
-        """:meth:`ViewRenderer.coverage` of a training view."""
-        return self.renderer.coverage(self._gaussians, camera, self._renders_geometry)
+        """:meth:`ViewRenderer.coverage` of a training view by the Gaussians that are trained."""
+        area, in_view = self.renderer.coverage(self._gaussians, camera, self._renders_geometry)
+        return area[: self.num_points], in_view[: self.num_points]
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: Optional[OrientedBox] = None) -> dict[str, Tensor]:
         """Render one camera outside training, within a crop box if given.
@@ -314,10 +365,13 @@ class FacadeModel(SplatfactoModel):
         if len(gaussians["means"]) == 0:
             return _nothing(pinhole, background)
         degree = min(int(self.step / (DEGREE_EVERY * self.num_iterations / PAPER_ITERATIONS)), self.config.sh_degree)
+        if self.surroundings is not None:  # a block starts from colours of all degrees
+            degree = self.config.sh_degree
         densifies = self.training and self.step < self.strategy.refine_stop_iter
         rgb, alpha, self.geometry, self.info = self.renderer(
             gaussians, pinhole, background, degree, self._renders_geometry, densifies
         )
+        self.info["frozen"] = 0 if self.surroundings is None else len(self.surroundings)
         if self.training:
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
@@ -392,7 +446,7 @@ class FacadeModel(SplatfactoModel):
         view, progress = self._view(batch, outputs["background"]), self.step / self.num_iterations
         transient = self._transient(view, batch["image_idx"], outputs["rgb"]) if self.training else None
         losses = self.objective(view, batch, outputs["rgb"], self.geometry, progress, transient)
-        return losses | self.objective.of_shapes(self.scales, self.info["radii"][0])
+        return losses | self.objective.of_shapes(self.scales, self.info["radii"][0, : self.num_points])
 
     def _transient(self, view: ViewLosses, index: int, rgb: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"] | None:
         if self.transients is None or self.geometry is None or self.step < TRANSIENTS_FROM * self.num_iterations:

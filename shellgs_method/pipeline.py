@@ -19,6 +19,7 @@ from torch import Tensor
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
+from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.gaussians.initial import BEHIND_SPACING, MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.seeds import shell_seeds, view_behind_shell, view_of_shell, view_of_surface
 from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
@@ -26,6 +27,7 @@ from shellgs_method.gaussians.surface_weights import SurfaceWeights
 from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
+from shellgs_method.runs.coarse import CoarseRun
 from shellgs_method.runs.host import mend_commands
 from shellgs_method.viewer import ContradictedShell
 
@@ -50,6 +52,8 @@ class FacadePipeline(VanillaPipeline):
     last_trained = ""
     """Name of the view that the last step was trained on."""
     _training_state: Mapping[str, Any] = MappingProxyType({})
+    _block: Mapping[str, Any] = MappingProxyType({})
+    """What a block's run is of, which its checkpoints say."""
 
     @property
     def model(self) -> FacadeModel:
@@ -83,10 +87,24 @@ class FacadePipeline(VanillaPipeline):
                 names[0],
                 data.train_dataset.cues["shell"].command,
             )
-        if self.model.exposures is not None:
+        if self.model.config.coarse is not None:
+            self._start_in_block(self.model.config.coarse)
+        if self.model.exposures is not None and self.model.surroundings is not None:
+            gains = self.model.exposures.log_gains.detach().double().cpu().numpy()
+        elif self.model.exposures is not None:
             gains, of_points = data.log_gains()
             self.model.start_exposures(gains, of_points)
         self._add_seeds(partial(data.seed_views, log_gains=gains))
+
+    def _start_in_block(self, path: Path) -> None:
+        data, parsed = self.datamanager, self.datamanager.train_dataparser_outputs
+        coarse = CoarseRun.load(path, self.model.config, parsed)
+        both = (data.train_dataset, data.eval_dataset)
+        cameras = [dataset.camera(index) for dataset in both for index in range(len(dataset))]
+        self.model.start_in(coarse, track(cameras, "Looking at the coarse run from view", len(cameras)))
+        parser: Any = data.config.dataparser
+        cell = Blocks.read(parser.data / BLOCKS).cell(parser.block)
+        self._block = {"name": cell.block.name, "region": cell.fingerprint, "coarse": coarse.hash}
 
     def _add_seeds(self, seed_views: Callable[..., tuple[Iterator, int]]) -> None:
         model, data = self.model, self.datamanager
@@ -99,7 +117,7 @@ class FacadePipeline(VanillaPipeline):
             model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
             behind = seed_views(view_behind_shell, "shell")
             model.add_seeds(shell_seeds(*behind, BEHIND_SPACING, MAX_SEEDS))
-        if config.init == "shell":
+        if config.init == "shell" and model.surroundings is None:
             points = data.sfm_points.double().numpy()
             model.add_seeds(skybox_seeds(*seed_views(view_of_sky), points, SKYBOX_SEEDS))
 
@@ -132,10 +150,10 @@ class FacadePipeline(VanillaPipeline):
                 f"the checkpoint has {has} exposures of its photographs: load it with "
                 f"--pipeline.model.exposure {setting}"
             )
-        if stored is not None and self.test_mode == "val" and len(stored) != self.model.num_train_data:
+        if stored is not None and ours is not None and self.test_mode == "val" and len(stored) != len(ours.parameter):
             raise SceneError(
                 f"the checkpoint has exposures of {len(stored)} photographs, and the scene has "
-                f"{self.model.num_train_data} to train on: train on the same photographs, or anew"
+                f"{len(ours.parameter)} to train on: train on the same photographs, or anew"
             )
 
     def get_train_loss_dict(self, step: int):
@@ -151,6 +169,7 @@ class FacadePipeline(VanillaPipeline):
         data, sums = self.datamanager, self.model.strategy_state
         order = getattr(data, "random_generator", None)
         return {
+            "block": dict(self._block),
             "densification": {name: value for name, value in sums.items() if isinstance(value, Tensor)},
             "views": list(data.train_unseen_cameras),
             "order": order and list(map(_listed, order.getstate())),
@@ -171,6 +190,11 @@ class FacadePipeline(VanillaPipeline):
         state, self._training_state = self._training_state, {}
         if not state:
             return
+        if (block := state.get("block", {})) != dict(self._block):
+            raise SceneError(
+                f"the checkpoint is of {block.get('name', 'no block')}, as it was cut, and of the coarse run then; "
+                "one of them has changed: train anew"
+            )
         data, model = self.datamanager, self.model
         try:
             sums = {name: value.to(model.device) for name, value in state["densification"].items()}

@@ -205,9 +205,10 @@ class FacadeTrainer(Trainer):
         return "no checkpoint was saved before"
 
     def _remove_broken_gaussians(self, step: int) -> None:
-        gone = broken(self.pipeline.model.gauss_params)
-        if count := self._remove(gone):
+        model = self.pipeline.model
+        if count := self._remove(broken(model.gauss_params)):
             CONSOLE.print(f"[yellow]Step {step}: {count} Gaussians were not finite, and are removed.")
+        self._remove(model.outside())
         self._check_any_left(step, "none was finite: lower the learning rates")
 
     def _remove_hardly_shown_gaussians(self) -> None:

@@ -25,7 +25,7 @@ from shellgs_method.files.transforms import find_cloud
 _IRRELEVANT = re.compile(
     r"(output_dir|experiment_name|timestamp|project_name|vis|relative_model_dir|start_paused|max_num_iterations"
     r"|(load|steps_per|save_only)_\w+|(viewer|logging|machine)\..*|(pipeline\.datamanager\.(dataparser\.)?)?data"
-    r"|pipeline\.datamanager\.train_cameras_sampling_seed)"
+    r"|pipeline\.(datamanager\.train_cameras_sampling_seed|model\.coarse))"
 )
 """Settings of a run's place, viewer, logs and checkpoints, and those that :class:`~.runs.Run` records by itself."""
 

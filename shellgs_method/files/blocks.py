@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, read_json
+from shellgs_method.files.atomic import atomic_write, fingerprint, read_json
+from shellgs_method.geometry.similarity import scale_of
 
 BLOCKS = "blocks.json"
 _NAME = re.compile(r"[\w.+-]*\w[\w.+-]*")
@@ -40,6 +41,12 @@ class Cut:
     def distances(self, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N"]:
         """Signed distances of points."""
         return np.asarray(points, dtype=np.float64) @ np.array(self.normal) - self.offset
+
+    def moved(self, similarity: Float64[np.ndarray, "4 4"]) -> Cut:
+        """The cut in another frame, given the similarity to it."""
+        scale = scale_of(similarity)
+        x, y, z = map(float, similarity[:3, :3] @ np.array(self.normal) / scale)
+        return Cut((x, y, z), scale * self.offset + float(np.dot((x, y, z), similarity[:3, 3])))
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,17 @@ class Cell:
     block: Block
     sides: tuple[tuple[Cut, bool], ...]
     overlap: float
+
+    def moved(self, similarity: Float64[np.ndarray, "4 4"]) -> Cell:
+        """The region in another frame, given the similarity to it."""
+        sides = tuple((cut.moved(similarity), above) for cut, above in self.sides)
+        return replace(self, sides=sides, overlap=scale_of(similarity) * self.overlap)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of what makes the region, and of its photographs."""
+        sides = [(*cut.normal, cut.offset, above) for cut, above in self.sides]
+        return fingerprint(self.block.name, sorted(self.block.photographs), self.overlap, sides)
 
     def core(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
         """Which points lie in the core, which each point does in one block."""

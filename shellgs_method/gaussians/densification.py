@@ -102,9 +102,11 @@ class GradientStrategy(DefaultStrategy):
         for gathered in ("grad2d", "count", "radii"):
             if state[gathered] is None:
                 state[gathered] = centres.new_zeros(len(params["means"]))
-        if radii.shape[1] != len(params["means"]):
+        trained = radii.shape[1] - info.get("frozen", 0)
+        if trained != len(params["means"]):
             return  # broken ones were removed since, and nobody knows which of these are left
-        gradients = centres.absgrad if self.absgrad else centres.grad
+        gradients = (centres.absgrad if self.absgrad else centres.grad)[:, :trained]
+        radii = radii[:, :trained]
         half = (size / 2 * len(radii) for size in (info["width"], info["height"]))
         scale = constant(*half, 1 / max(info["width"], info["height"]), like=gradients)
         skipped = info.get("skipped", constant(0.0, like=gradients)[0])[None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -13,18 +14,26 @@ from torch import Tensor, nn
 class Exposures(nn.Module):
     """A gain per channel in linear light for each of V photographs.
 
-    Their logarithms have a mean of 0 over the photographs whatever the parameter is, so that the Gaussians, and all
-    that is exported from them, have the mean exposure: no tint can be learned that cancels.
+    Their logarithms have a mean of 0 over the photographs of the whole scene whatever the parameter is, so that the
+    Gaussians, and all that is exported from them, have the mean exposure: no tint can be learned that cancels.
+
+    Args:
+        num_views: number of photographs of the whole scene.
+        used: indices of those that are trained on here; all if not given.
     """
 
-    def __init__(self, num_views: int):
+    _used: Tensor
+
+    def __init__(self, num_views: int, used: Sequence[int] | None = None):
         super().__init__()
         self.parameter = nn.Parameter(torch.zeros(num_views, 3))
+        used = range(num_views) if used is None else used
+        self.register_buffer("_used", torch.tensor([*used]), persistent=False)
 
     @property
     def log_gains(self) -> Float[Tensor, "V 3"]:
-        """Logarithms of the gains."""
-        return self.parameter - self.parameter.mean(dim=0)
+        """Logarithms of the gains of the photographs used."""
+        return (self.parameter - self.parameter.mean(dim=0))[self._used]
 
     def start(self, log_gains: Float[np.ndarray, "V 3"]) -> None:
         """Start from gains that are known."""

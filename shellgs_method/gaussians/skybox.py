@@ -79,11 +79,16 @@ def skybox_seeds(views: Iterable[SkyView], num_pixels: int, sfm_points: Float[nd
     if not len(directions):
         return NO_SEEDS
     centre, towards = positions(cameras).mean(axis=0), _fibonacci_sphere(count)
-    radius = RADIUS * np.percentile(np.linalg.norm(sfm_points - centre, axis=1), 99)
+    radius = skybox_radius(centre, sfm_points)
     k = min(PIXELS_PER_COLOUR, len(directions))
     _, nearest = point_tree(directions).query(towards, k, workers=-1)
     spacing = np.full(count, OVERLAP * radius * np.sqrt(4 * np.pi / count))
     return Seeds(centre + radius * towards, -towards, np.median(colours[nearest.reshape(count, k)], axis=1), spacing)
+
+
+def skybox_radius(centre: Float[ndarray, " 3"], sfm_points: Float[ndarray, "P 3"]) -> float:
+    """Radius of the skybox around the cameras' centre."""
+    return RADIUS * float(np.percentile(np.linalg.norm(sfm_points - centre, axis=1), 99))
 
 
 def _fibonacci_sphere(count: int) -> Float[ndarray, "N 3"]:

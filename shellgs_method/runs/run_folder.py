@@ -103,8 +103,19 @@ def check_scene(config: TrainerConfig, pipeline: Pipeline) -> None:
     Raises:
         SceneError: the run's world is not that of the scene.
     """
-    path, parsed = config.get_base_dir() / "dataparser_transforms.json", _parsed(pipeline)
-    if parsed is None or not path.is_file():
+    folder, parsed = config.get_base_dir(), _parsed(pipeline)
+    if parsed is not None:
+        check_world(folder, parsed, f"`data` in {folder / 'config.yml'}, or train again")
+
+
+def check_world(folder: Path, parsed: DataparserOutputs, what: str) -> None:
+    """Refuse the run of a folder whose world is not that of the parsed scene; ``what`` is what to correct.
+
+    Raises:
+        SceneError: the run's world is not that of the scene.
+    """
+    path = folder / "dataparser_transforms.json"
+    if not path.is_file():
         return
     try:
         stored = json.loads(path.read_text("utf8"))
@@ -115,10 +126,10 @@ def check_scene(config: TrainerConfig, pipeline: Pipeline) -> None:
     cameras = parsed.cameras.camera_to_worlds[..., 3].double().numpy()
     moved = np.abs(cameras @ (between[:3, :3] - np.eye(3)).T + between[:3, 3]).max()
     if not moved < SAME_WORLD:
-        scene = config.pipeline.datamanager.data
+        image = parsed.image_filenames[0]
         raise SceneError(
-            f"{scene} is not the scene that the run {path.parent} was trained on, or its cameras have changed since: "
-            f"correct `data` in {path.with_name('config.yml')}, or train again"
+            f"the scene of {image} is not the scene that the run {folder} was trained on, or its cameras have "
+            f"changed since: correct {what}"
         )
 
 

@@ -30,6 +30,16 @@ def test_an_extended_region_ends_where_the_core_does_moved_by_the_overlap(points
     np.testing.assert_array_equal(a.extended(points), (points[:, 0] <= 12) & (points @ [0.6, 0.8, 0] <= 6))
 
 
+def test_a_region_moves_with_its_frame(points):
+    similarity = np.eye(4)
+    similarity[:3, :3] = 0.3 * np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    similarity[:3, 3] = [5, -7, 1]
+    for cell in PLAN.cells:
+        moved, there = cell.moved(similarity), points @ similarity[:3, :3].T + similarity[:3, 3]
+        np.testing.assert_array_equal(moved.core(there), cell.core(points))
+        np.testing.assert_array_equal(moved.extended(there), cell.extended(points))
+
+
 def test_a_file_is_read_as_it_was_written(tmp_path: Path):
     PLAN.write(tmp_path / BLOCKS)
     assert Blocks.read(tmp_path / BLOCKS) == PLAN

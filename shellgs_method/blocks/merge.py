@@ -1,0 +1,181 @@
+"""The runs of all blocks of a scene as one: an ordinary run, without training."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+from torch import Tensor
+
+from dataparsers.facade import FacadeDataParserConfig
+from shellgs_method.compare.settings import config_settings
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_contents
+from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.gaussians.surroundings import Region
+from shellgs_method.machine.progress import track
+from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.runs.coarse import CoarseRun
+from shellgs_method.runs.run_folder import open_run, written_config
+
+_PARAMETERS = "_model.gauss_params."
+
+
+@dataclass(frozen=True)
+class BlockRun:
+    """A finished run of a block, whose checkpoint is not loaded yet."""
+
+    config: TrainerConfig
+    checkpoint: Path
+
+    @classmethod
+    def open(cls, path: Path) -> BlockRun:
+        """Open the run of a config.yml.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            SceneError: it is no run of a block, or unfinished.
+        """
+        config = open_run(path)
+        run = cls(config, find_checkpoint(config.get_checkpoint_dir()))
+        if run.dataparser.block is None or getattr(config.pipeline.model, "coarse", None) is None:
+            raise SceneError(f"{path} is no run of a block from a coarse run: name those of the blocks alone")
+        done = 1 + int(run.checkpoint.stem.removeprefix("step-"))
+        if done < config.max_num_iterations:
+            raise SceneError(
+                f"the run of {run.name}, {path.parent}, has {done} of its {config.max_num_iterations} iterations: "
+                f"train it to its end with `ns-train {config.method_name} --load-config {path} "
+                f"--load-dir {run.checkpoint.parent}`"
+            )
+        return run
+
+    @property
+    def dataparser(self) -> FacadeDataParserConfig:
+        """How it reads its scene."""
+        manager: Any = self.config.pipeline.datamanager
+        return replace(manager.dataparser, data=manager.data)
+
+    @property
+    def name(self) -> str:
+        """Name of its block."""
+        return self.dataparser.block or ""
+
+    @property
+    def folder(self) -> Path:
+        """Its folder."""
+        return self.config.get_base_dir()
+
+    @property
+    def coarse(self) -> Path:
+        """The coarse run that it started from."""
+        return self.config.pipeline.model.coarse  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def merge(paths: Sequence[Path], output: Path) -> Path:
+    """Merge runs of all blocks of a scene: the Gaussians of each block's core, and the coarse run's where it is far.
+
+    Exposures are those of the coarse run, which the blocks did not train.
+
+    Args:
+        paths: config.yml of a run of each block.
+        output: folder of the merged run.
+
+    Returns:
+        Its config.yml.
+
+    Raises:
+        FileNotFoundError: there is no such run.
+        SceneError: a block has no run or two, or an unfinished one, or one that was cut otherwise, started from another
+            coarse run, or has other settings.
+    """
+    runs = [BlockRun.open(path) for path in paths]
+    if not runs:
+        raise SceneError("there is nothing to merge: name the config.yml of the run of each block")
+    first = runs[0]
+    if output.resolve() in {run.folder.resolve() for run in runs}:
+        raise SceneError(f"{output} is the folder of a run that is merged: name another one")
+    scene = first.dataparser.data
+    blocks = Blocks.read(scene / BLOCKS)
+    by_name = {run.name: run for run in runs}
+    names = [cell.block.name for cell in blocks.cells]
+    if (lacking := [name for name in names if name not in by_name]) or len(runs) != len(names):
+        what = f"no run of {', '.join(lacking)}" if lacking else f"{len(runs)} runs of {len(names)} blocks"
+        raise SceneError(f"there is {what} of {scene / BLOCKS} among those to merge: name one run of each block")
+    for run in runs[1:]:
+        _check_settings(first, run)
+    parsed = replace(first.dataparser, block=None).setup().get_dataparser_outputs("train")
+    coarse = CoarseRun.load(first.coarse, first.config.pipeline.model, parsed)
+    points, to_world = parsed.metadata["points3D_xyz"].double().numpy(), np.eye(4)
+    to_world[:3] = parsed.dataparser_scale * parsed.dataparser_transform.double().numpy()
+    parts, state = [], {}
+    for cell in track(blocks.cells, "Merging block", len(blocks.cells)):
+        run = by_name[cell.block.name]
+        state = load_checkpoint(run.checkpoint)["pipeline"]
+        trained_as = state.pop("_extra_state", {}).get("block", {})
+        if trained_as.get("region") != cell.fingerprint:
+            raise SceneError(f"{run.name} was cut anew since its run {run.folder} was trained: train it again")
+        if trained_as.get("coarse") != coarse.hash:
+            raise SceneError(
+                f"{run.folder} started from another coarse run than {first.coarse}, or from this one before it was "
+                "trained again: train it again"
+            )
+        region = Region.of(cell.moved(to_world), parsed.metadata["centre"], points)
+        gaussians = _gaussians(state)
+        parts.append({name: values[region.core(gaussians["means"])] for name, values in gaussians.items()})
+    far = ~region.near(coarse.gaussians["means"])
+    parts.append({name: coarse.gaussians[name][far] for name in parts[0]})
+    state = {name: each for name, each in state.items() if not name.startswith(("_model.surroundings.", _PARAMETERS))}
+    for name in parts[0]:
+        key = "_model.surface" if name == "surface" else f"{_PARAMETERS}{name}"
+        state[key] = torch.cat([part[name] for part in parts])
+    _write(first, state, output)
+    return output / "config.yml"
+
+
+def _check_settings(first: BlockRun, run: BlockRun) -> None:
+    if run.dataparser.data.resolve() != first.dataparser.data.resolve():
+        raise SceneError(f"{run.folder} is of the scene {run.dataparser.data}, and {first.folder} of another one")
+    ours, theirs = (
+        {
+            **config_settings(each.config),
+            "method": each.config.method_name,
+            "pipeline.datamanager.dataparser.block": None,
+            "iterations": each.config.max_num_iterations,
+        }
+        for each in (first, run)
+    )
+    if different := [name for name in ours if ours[name] != theirs.get(name)]:
+        name = different[0]
+        raise SceneError(
+            f"{run.folder} has other settings than {first.folder} ({name}: {theirs.get(name)}, and {ours[name]} "
+            "there): train all blocks with the same"
+        )
+
+
+def _gaussians(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    found = {key.removeprefix(_PARAMETERS): each for key, each in state.items() if key.startswith(_PARAMETERS)}
+    return found | ({"surface": state["_model.surface"]} if "_model.surface" in state else {})
+
+
+def _write(first: BlockRun, state: Mapping[str, Tensor], output: Path) -> None:
+    config = copy.deepcopy(first.config)
+    data: Any = config.pipeline.datamanager
+    model: Any = config.pipeline.model
+    data.dataparser.block = model.coarse = config.load_dir = config.load_checkpoint = None
+    data.data = data.data.resolve()
+    config.experiment_name, config.timestamp = output.resolve().parent.name, output.resolve().name
+    step = config.max_num_iterations - 1
+    with atomic_contents(output) as folder:
+        checkpoints = folder / config.relative_model_dir
+        checkpoints.mkdir()
+        whole = {"step": step, "pipeline": dict(state), "optimizers": {}, "scalers": {}}
+        torch.save(whole, checkpoints / f"step-{step:09d}.ckpt")
+        world = "dataparser_transforms.json"
+        (folder / world).write_bytes((first.folder / world).read_bytes())
+        (folder / "config.yml").write_text(written_config(config), "utf8")

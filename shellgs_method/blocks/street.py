@@ -1,0 +1,170 @@
+"""The runs that a scene in blocks takes: a coarse one of everything, then one of each block."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from shellgs_method.compare.runs import Run, Variant
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import atomic_contents, content_hash
+from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.files.scene import ScenePaths
+from shellgs_method.runs.checkpoints import find_checkpoint
+
+COARSE = "coarse"
+"""Name of the coarse run, and of its copy in the folder of a block's run."""
+_PARSER = "facade-data"
+
+
+@dataclass(frozen=True)
+class BlockJob(Run):
+    """The run of a block, whose folder holds the coarse run that it starts from: nothing else need be shipped."""
+
+    coarse: Path = Path()
+    """Folder of the coarse run."""
+
+    def _train(self) -> list[str]:
+        script, method, *flags = super()._train()
+        return [script, method, "--pipeline.model.coarse", str(self.folder / COARSE), *flags]
+
+    @cached_property
+    def settings(self) -> dict:
+        """All settings that the run's result depends on.
+
+        Raises:
+            SceneError: the flags set what the street sets, or there is no coarse run.
+        """
+        cell = Blocks.read(self.scene / BLOCKS).cell(self.variant.name)
+        coarse = content_hash(find_checkpoint(self.coarse / "nerfstudio_models"))
+        return {**super().settings, "block": cell.fingerprint, "coarse": coarse}
+
+    def settle(self) -> None:
+        """Write the settings into the run's folder, and the coarse run's last checkpoint.
+
+        Raises:
+            SceneError: the folder holds another run.
+        """
+        super().settle()
+        checkpoint = find_checkpoint(self.coarse / "nerfstudio_models")
+        with atomic_contents(self.folder / COARSE) as folder:
+            for name in ("config.yml", "dataparser_transforms.json"):
+                shutil.copyfile(self.coarse / name, folder / name)
+            (folder / "nerfstudio_models").mkdir()
+            _link(checkpoint, folder / "nerfstudio_models" / checkpoint.name)
+
+
+@dataclass(frozen=True)
+class Street:
+    """The runs of a scene in blocks, each in a folder below one.
+
+    Attributes:
+        coarse: the run of the whole scene.
+        blocks: the runs of its blocks, in their order.
+    """
+
+    coarse: Run
+    blocks: Sequence[BlockJob]
+
+    @classmethod
+    def plan(
+        cls,
+        scene: Path,
+        method: str,
+        iterations: int,
+        coarse_iterations: int,
+        coarse_scale: float,
+        seed: int,
+        output: Path,
+        paths: ScenePaths,
+    ) -> Street:
+        """The runs of a scene with a blocks.json.
+
+        Args:
+            scene: the scene's folder.
+            method: one of ShellGS's, an ablation, or NAME='METHOD FLAGS'.
+            iterations: training iterations of each block.
+            coarse_iterations: those of the coarse run.
+            coarse_scale: size of its photographs, as a share of the blocks'.
+            seed: seed of all runs.
+            output: folder of all runs.
+            paths: paths of the scene's files.
+
+        Raises:
+            SceneError: the scene has no blocks, or the method is none of ShellGS.
+        """
+        variant = Variant.parse(method)
+        if not variant.ours:
+            raise SceneError(f"{variant.method} trains no blocks: use a method of ShellGS")
+        scene, output = scene.resolve(), output.resolve()
+        scale = ("--pipeline.datamanager.camera-res-scale-factor", f"{coarse_scale:g}")
+        of_whole = replace(variant, name=COARSE, flags=(*scale, *variant.flags))
+        coarse = Run(scene, of_whole, seed, coarse_iterations, output / COARSE, paths=paths)
+        parser = () if _PARSER in variant.flags else (_PARSER,)
+        blocks = [
+            BlockJob(
+                scene,
+                replace(variant, name=name, flags=(*variant.flags, *parser, "--block", name)),
+                seed,
+                iterations,
+                output / "blocks",
+                paths=paths,
+                coarse=coarse.folder,
+            )
+            for name in (cell.block.name for cell in Blocks.read(scene / BLOCKS).cells)
+        ]
+        return cls(coarse, blocks)
+
+
+Launch = Callable[[Sequence[Run]], Mapping[Run, str]]
+"""Finish runs; return those that failed, with the reason."""
+
+
+def train(street: Street, launch: Launch) -> None:
+    """Finish the coarse run, and then those of the blocks; what is finished stays.
+
+    Raises:
+        SceneError: a folder holds another run, or one failed.
+    """
+    for runs in ([street.coarse], street.blocks):
+        unfinished = [run for run in settled(runs) if not run.finished]
+        if unfinished and (failures := launch(unfinished)):
+            run, why = next(iter(failures.items()))
+            raise SceneError(
+                f"{len(failures)} of {len(unfinished)} runs failed, the first is {run.label}; all of its output is in "
+                f"{run.folder / 'log.txt'}, and the same command goes on where it stopped:\n{why}"
+            )
+
+
+def settled(runs: Sequence[Run]) -> Sequence[Run]:
+    """The runs, with their settings in their folders.
+
+    Raises:
+        SceneError: a folder holds a run with other settings.
+    """
+    for run in runs:
+        run.settle()
+    return runs
+
+
+def script(street: Street) -> list[str]:
+    """Commands of the runs that can be started now, one line a run: the coarse run, or once it is finished the blocks.
+
+    Raises:
+        SceneError: a folder holds another run.
+    """
+    runs = [street.coarse] if not street.coarse.finished else street.blocks
+    return [" && ".join(map(shlex.join, run.commands())) for run in settled(runs) if not run.finished]
+
+
+def _link(file: Path, to: Path) -> None:
+    """A hard link where the file system has them, else a copy."""
+    try:
+        os.link(file, to)
+    except OSError:
+        shutil.copyfile(file, to)

@@ -1,0 +1,73 @@
+"""The coarse run of a whole scene, from which its blocks start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import content_hash
+from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.runs.run_folder import check_world, open_run
+
+if TYPE_CHECKING:
+    from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+    from nerfstudio.models.base_model import ModelConfig
+
+
+@dataclass(frozen=True)
+class CoarseRun:
+    """What blocks take from a trained run of their whole scene."""
+
+    gaussians: dict[str, Tensor]
+    """Parameters, and their weights ``surface`` where the run has them."""
+    exposures: Tensor | None
+    """Parameter of the exposures of all training photographs, where they are learned."""
+    hash: str
+    """Hash of the checkpoint."""
+
+    @classmethod
+    def load(cls, path: Path, model: ModelConfig, parsed: DataparserOutputs) -> CoarseRun:
+        """Read a run that was trained to its end.
+
+        Args:
+            path: its config.yml, or its folder.
+            model: settings of the block's run.
+            parsed: the block's views, in its world.
+
+        Raises:
+            FileNotFoundError: there is no such run.
+            SceneError: it is unfinished, or of another scene or other settings.
+        """
+        path = path / "config.yml" if path.is_dir() else path
+        config = open_run(path, find_scene=False)
+        theirs = config.pipeline.model
+        for name in ("primitive", "sh_degree", "exposure", "trust"):
+            if (other := getattr(theirs, name, None)) != (ours := getattr(model, name)):
+                raise SceneError(
+                    f"the coarse run {path.parent} has {name} {other}, and this run {ours}: train both with the same"
+                )
+        if (block := config.pipeline.datamanager.dataparser.block) is not None:  # pyright: ignore
+            raise SceneError(f"{path.parent} is a run of {block}: the coarse run is one of the whole scene")
+        check_world(path.parent, parsed, f"coarse run, or train {path.parent} again")
+        checkpoint = find_checkpoint(config.get_checkpoint_dir())
+        state = load_checkpoint(checkpoint)
+        if (done := state["step"] + 1) < config.max_num_iterations:
+            raise SceneError(
+                f"the coarse run {path.parent} has {done} of its {config.max_num_iterations} iterations: train it to "
+                f"its end with `ns-train {config.method_name} --load-config {path} --load-dir {checkpoint.parent}`"
+            )
+        stored = {name.removeprefix("_model."): values for name, values in state["pipeline"].items()}
+        gaussians = {name.rpartition(".")[2]: each for name, each in stored.items() if name.startswith("gauss_params.")}
+        if "surface" in stored:
+            gaussians["surface"] = stored["surface"]
+        exposures, count = stored.get("exposures.parameter"), parsed.metadata["split"][0]
+        if exposures is not None and len(exposures) != count:
+            raise SceneError(
+                f"the coarse run {path.parent} has exposures of {len(exposures)} photographs, and the scene has "
+                f"{count} to train on: train it again"
+            )
+        return cls(gaussians, exposures, content_hash(checkpoint))

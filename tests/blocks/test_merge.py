@@ -1,0 +1,171 @@
+"""Runs of blocks as one: which Gaussians it has, that other commands take it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from training_runs import model_of
+from two_blocks import HALVES, block_run, coarse_run, cut_in_two
+
+from shellgs_method.blocks.merge import merge
+from shellgs_method.blocks.seams import from_cuts, on_another
+from shellgs_method.errors import SceneError
+from shellgs_method.export.runs import TrainedRun
+from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
+from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.trainer import FacadeTrainer
+
+
+@pytest.fixture(scope="module")
+def street(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scene = Path(shutil.copytree(pristine_scene, tmp_path_factory.mktemp("street") / "scene"))
+    cut_in_two(scene)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def coarse(street: Path, tmp_path_factory: pytest.TempPathFactory) -> FacadeTrainer:
+    return coarse_run(street, tmp_path_factory.mktemp("coarse"), iterations=6)
+
+
+@pytest.fixture(scope="module")
+def configs(coarse: FacadeTrainer, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Runs of both blocks of six iterations."""
+    return [trained_block(coarse, name, tmp_path_factory.mktemp("blocks")) for name in HALVES]
+
+
+def trained_block(coarse: FacadeTrainer, name: str, folder: Path, **kwargs: Any) -> Path:
+    trainer = block_run(coarse, name, folder, **{"iterations": 6, **kwargs})
+    return finished(trainer, train=True)
+
+
+def finished(trainer: FacadeTrainer, train: bool) -> Path:
+    """The config of a run that was trained to its end, or that is said to be."""
+    trainer.config.save_config()
+    trainer.pipeline.datamanager.train_dataparser_outputs.save_dataparser_transform(
+        trainer.base_dir / "dataparser_transforms.json"
+    )
+    if train:
+        trainer.train()
+    else:
+        trainer.save_checkpoint(trainer.config.max_num_iterations - 1)
+    return trainer.base_dir / "config.yml"
+
+
+def gaussians(config: Path) -> dict[str, torch.Tensor]:
+    state = load_checkpoint(find_checkpoint(config.parent / "nerfstudio_models"))["pipeline"]
+    return {name.rpartition(".")[2]: each for name, each in state.items() if ".gauss_params." in name}
+
+
+def in_order(parameters: dict[str, torch.Tensor]) -> torch.Tensor:
+    """A row for each Gaussian, sorted."""
+    rows = torch.cat([each.flatten(1) for _, each in sorted(parameters.items())], dim=1)
+    return rows[np.lexsort(rows.numpy().T[::-1])]
+
+
+def test_blocks_that_were_not_trained_merge_into_the_coarse_run(street, tmp_path):
+    coarse = coarse_run(street, tmp_path / "coarse", "photo_gs", 4)
+    blocks = [finished(block_run(coarse, name, tmp_path / name, 4), train=False) for name in HALVES]
+    merged = merge(blocks, tmp_path / "merged")
+    assert torch.equal(in_order(gaussians(merged)), in_order(gaussians(coarse.base_dir / "config.yml")))
+
+
+def test_a_merged_run_has_of_each_block_its_core_and_of_the_coarse_run_what_is_far(configs, coarse, street, tmp_path):
+    merged = TrainedRun.load(merge(configs, tmp_path / "merged"))
+    cells = [cell.moved(merged.datamanager.scene_to_world) for cell in Blocks.read(street / BLOCKS).cells]
+    means = merged.model.means.detach().double().numpy()
+    metadata = merged.datamanager.train_dataparser_outputs.metadata
+    region = block_run(coarse, "west", tmp_path).pipeline.model.region
+    near = region.near(merged.model.means).numpy()
+    assert 0 < near.sum() < len(near)
+    for cell, config in zip(cells, configs, strict=True):
+        trained = gaussians(config)["means"].double().numpy()
+        distances = np.linalg.norm(trained - metadata["centre"], axis=1)
+        expected = trained[cell.core(trained) & (distances < region.far)]
+        np.testing.assert_array_equal(means[near & cell.core(means)], expected)
+    everything = model_of(coarse).means.detach()
+    assert torch.equal(merged.model.means[~near], everything[~region.near(everything)])
+    exposures, theirs = merged.model.exposures, model_of(coarse).exposures
+    assert exposures is not None
+    assert theirs is not None
+    torch.testing.assert_close(exposures.log_gains, theirs.log_gains)
+    torch.testing.assert_close(exposures.log_gains.mean(dim=0), torch.zeros(3), atol=1e-6, rtol=0)
+    assert merged.model.surroundings is None
+
+
+def test_other_commands_take_a_merged_run(configs, tmp_path, shellgs, in_process):
+    config = merge(configs, tmp_path / "merged")
+    in_process("ns-eval", "--load-config", config, "--output-path", tmp_path / "eval.json")
+    assert np.isfinite(json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"])
+    assert "Gaussians" in shellgs("splats", config)
+    assert (tmp_path / "merged" / "splats.ply").is_file()
+
+
+def test_the_seams_are_reported_beside_the_run(configs, tmp_path, shellgs):
+    printed = shellgs("merge", *configs, "--output", tmp_path / "merged")
+    assert "Within 1 m of a cut: PSNR" in printed
+    report = json.loads((tmp_path / "merged" / "seams.json").read_text())
+    for part in ("near", "elsewhere"):
+        assert {"psnr", "normal_deg", "chamfer_m", "holes"} <= report[part].keys()
+    assert report["doubles"]["count"] >= 0
+
+
+def test_the_nearest_cut_is_one_that_bounds_the_core_of_a_point():
+    east, north = Cut((1.0, 0.0, 0.0), 0.0), Cut((0.0, 1.0, 0.0), 0.0)
+    blocks = Blocks(Fork(east, Block("west", ()), Fork(north, Block("south", ()), Block("north", ()))), 1.0)
+    points = np.array([[-3.0, 0.1, 0], [3, 0.1, 0], [0.2, -7, 0]])
+    np.testing.assert_allclose(from_cuts(points, blocks.cells), [3, 0.1, 0.2])
+
+
+def test_gaussians_of_two_blocks_in_one_place_are_doubles_and_those_of_one_block_are_not():
+    points = np.array([[0.0, 0, 0], [0.01, 0, 0], [1, 0, 0], [1.01, 0, 0], [2, 0, 0]])
+    blocks = np.array([0, 1, 0, 0, 1])
+    np.testing.assert_array_equal(on_another(points, np.full(5, 0.2), blocks), [True, True, False, False, False])
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        ("missing", "no run of east"),
+        ("twice", "3 runs of 2 blocks"),
+        ("of the whole scene", "no run of a block"),
+        ("unfinished", "6 of its 99 iterations"),
+        ("cut anew", "was cut anew"),
+        ("another coarse run", "another coarse run"),
+        ("other settings", "has other settings than .*sh_degree"),
+        ("itself", "name another one"),
+    ],
+)
+def test_what_cannot_be_merged_is_refused_in_a_sentence(configs, coarse, street, tmp_path, broken, said):
+    given, output = list(configs), tmp_path / "merged"
+    if broken == "missing":
+        given = given[:1]
+    elif broken == "twice":
+        given.append(given[0])
+    elif broken == "of the whole scene":
+        given.append(coarse.base_dir / "config.yml")
+    elif broken == "itself":
+        output = given[0].parent
+    else:
+        folder = Path(shutil.copytree(given[1].parent, tmp_path / "east"))
+        given[1] = folder / "config.yml"
+        text = given[1].read_text()
+        if broken == "unfinished":
+            given[1].write_text(text.replace("max_num_iterations: 6", "max_num_iterations: 99"))
+        elif broken == "other settings":
+            given[1].write_text(text.replace("sh_degree: 3", "sh_degree: 2"))
+        else:
+            (path,) = (folder / "nerfstudio_models").glob("*.ckpt")
+            state = torch.load(path, weights_only=True)
+            record = state["pipeline"]["_extra_state"]["block"]
+            record["region" if broken == "cut anew" else "coarse"] = "another"
+            torch.save(state, path)
+    with pytest.raises(SceneError, match=said):
+        merge(given, output)
+    assert not (tmp_path / "merged").exists()

@@ -1,0 +1,98 @@
+"""The runs of a street: in which order, from what, and what they need on another machine."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from two_blocks import HALVES, coarse_run, cut_in_two
+
+from shellgs_method.blocks.street import Street, script, train
+from shellgs_method.compare.settings import parsed
+from shellgs_method.errors import SceneError
+from shellgs_method.files.scene import ScenePaths
+from shellgs_method.runs.checkpoints import find_checkpoint
+
+
+@pytest.fixture
+def cut(scene: Path) -> Path:
+    cut_in_two(scene)
+    return scene
+
+
+def planned(scene: Path, output: Path, method: str = "shellgs-metric") -> Street:
+    return Street.plan(scene, method, 6, 4, 0.5, 0, output, ScenePaths())
+
+
+def finish_coarse(street: Street, folder: Path) -> None:
+    """Put a finished coarse run where the street has it."""
+    trained = coarse_run(street.coarse.scene, folder, iterations=4).base_dir
+    shutil.copytree(trained, street.coarse.folder, dirs_exist_ok=True)
+    street.coarse.metrics().write_text("{}")
+
+
+def test_blocks_can_be_started_once_the_coarse_run_is_finished_each_with_a_copy_of_it(cut, tmp_path):
+    street = planned(cut, tmp_path / "street")
+    (line,) = script(street)
+    words = tuple(shlex.split(line.partition(" && ")[0])[1:])
+    assert parsed(words).pipeline.datamanager.camera_res_scale_factor == 0.5  # pyright: ignore
+    finish_coarse(street, tmp_path / "coarse")
+    lines = script(street)
+    assert len(lines) == 2
+    for name, line, run in zip(HALVES, lines, street.blocks, strict=True):
+        config = parsed(tuple(shlex.split(line.partition(" && ")[0])[1:]))
+        assert config.pipeline.datamanager.dataparser.block == name  # pyright: ignore
+        copy = config.pipeline.model.coarse  # pyright: ignore
+        assert copy == run.folder / "coarse"
+        ours, theirs = (find_checkpoint(each / "nerfstudio_models") for each in (copy, street.coarse.folder))
+        assert ours.read_bytes() == theirs.read_bytes()
+        moved = run.moved(Path("/node/scene"), Path("/node/runs"))
+        assert f"--pipeline.model.coarse /node/runs/runs/scene/{name}" in shlex.join(moved.commands()[0])
+
+
+def test_the_coarse_run_comes_first_and_a_failure_ends_the_street_in_a_sentence(cut, tmp_path):
+    street, launched = planned(cut, tmp_path / "street"), []
+
+    def launch(runs):
+        launched.append([run.variant.name for run in runs])
+        if len(launched) == 1:
+            finish_coarse(street, tmp_path / "coarse")
+            return {}
+        return {runs[1]: "out of memory"}
+
+    with pytest.raises(SceneError, match=r"1 of 2 runs failed, the first is scene/east.*log.txt.*\nout of memory"):
+        train(street, launch)
+    assert launched == [["coarse"], list(HALVES)]
+
+
+def test_a_block_that_was_cut_anew_is_not_gone_on_with(cut, tmp_path):
+    street = planned(cut, tmp_path / "street")
+    finish_coarse(street, tmp_path / "coarse")
+    script(street)
+    for run in street.blocks:
+        shutil.copytree(run.folder / "coarse" / "nerfstudio_models", run.checkpoints)
+    assert len(script(planned(cut, tmp_path / "street"))) == 2
+    cut_in_two(cut, overlap=0.7)
+    with pytest.raises(SceneError, match=r"a run with other settings \(block"):
+        script(planned(cut, tmp_path / "street"))
+
+
+def test_a_method_of_nerfstudio_trains_no_blocks(cut, tmp_path):
+    with pytest.raises(SceneError, match="splatfacto trains no blocks"):
+        planned(cut, tmp_path, "splatfacto")
+
+
+@pytest.mark.slow
+def test_a_street_is_trained_and_merged_by_one_command(cut, tmp_path, shellgs):
+    words = (cut, "--iterations", 6, "--coarse-iterations", 4, "--output", tmp_path / "street")
+    assert "Elsewhere on the shell: PSNR" in shellgs("street", *words)
+    report = json.loads((tmp_path / "street" / "merged" / "seams.json").read_text())
+    assert report["elsewhere"]["psnr"] > 5
+    logs = {
+        run.folder / "log.txt": (run.folder / "log.txt").read_text() for run in planned(cut, tmp_path / "street").blocks
+    }
+    assert "Elsewhere on the shell: PSNR" in shellgs("street", *words)  # merges again, and trains nothing
+    assert all(path.read_text() == text for path, text in logs.items())
