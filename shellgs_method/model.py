@@ -264,9 +264,10 @@ class FacadeModel(SplatfactoModel):
 
         Those of a block stay: its few photographs would drift from their neighbours' in light.
         """
-        stay = self.exposures is None or self.config.coarse is not None
-        exposures = {} if stay else {"exposures": [*self.exposures.parameters()]}
-        return super().get_param_groups() | exposures
+        groups = super().get_param_groups()
+        if self.exposures is None or self.config.coarse is not None:
+            return groups
+        return groups | {"exposures": [*self.exposures.parameters()]}
 
     def plan(self, num_iterations: int) -> None:
         """Scale every schedule to a run of ``num_iterations``."""

@@ -48,9 +48,8 @@ def block_run(
     """A run of a block, set up as ns-train does."""
 
     def of_block(config: Any) -> None:
-        model = copy.deepcopy(coarse.config.pipeline.model)
-        config.pipeline.model = model
-        config.pipeline.model.coarse = coarse.base_dir
+        config.pipeline.model = copy.deepcopy(coarse.config.pipeline.model)
+        vars(config.pipeline.model)["coarse"] = coarse.base_dir
         config.pipeline.datamanager.dataparser.block = name
         config.experiment_name = name
         if change is not None:

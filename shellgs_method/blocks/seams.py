@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, colours_to_normals, mean_over_views
 from shellgs_method.evaluation.pixels import kept_pixels
 from shellgs_method.evaluation.regions import references
@@ -40,10 +39,7 @@ def seams(config: Path) -> dict[str, dict[str, float]]:
     * ``holes``: share of the shell's pixels that are less than half opaque.
 
     ``doubles`` has ``count``, the number of Gaussians that lie on one of another block (:data:`DOUBLE`), and ``share``
-    of those near a cut.
-
-    Raises:
-        SceneError: the scene has no shell maps.
+    of those near a cut. Of a scene without shell maps, or where no held-out view shows a part, the others are empty.
     """
     run = TrainedRun.load(config)
     model, held_out = run.model, run.datasets[1]
@@ -64,8 +60,6 @@ def seams(config: Path) -> dict[str, dict[str, float]]:
             if mask.any():
                 of_part = geometry_errors(rendering, camera, shell._replace(mask=mask), model.metres_per_unit)
                 views[name].append(of_part | _more(rendering, target, shell.depth, mask, 1000 * metres))
-    if not views["elsewhere"] and not views["near"]:
-        raise SceneError(f"no held-out view of the run {config.parent} has a shell map: run `shellgs cast` first")
     count, of = _doubles(model.means.cpu(), model.scales.exp().cpu(), run, cells, NEAR / metres)
     found = {name: mean_over_views(each) for name, each in views.items()}
     return found | {"doubles": {"count": float(count), "share": count / max(of, 1)}}

@@ -82,6 +82,7 @@ def test_a_merged_run_has_of_each_block_its_core_and_of_the_coarse_run_what_is_f
     means = merged.model.means.detach().double().numpy()
     metadata = merged.datamanager.train_dataparser_outputs.metadata
     region = block_run(coarse, "west", tmp_path).pipeline.model.region
+    assert region is not None
     near = region.near(merged.model.means).numpy()
     assert 0 < near.sum() < len(near)
     for cell, config in zip(cells, configs, strict=True):
