@@ -7,6 +7,7 @@ import warnings
 import tyro
 
 from shellgs_method.commands.align import align
+from shellgs_method.commands.blocks import blocks
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
 from shellgs_method.commands.compare import compare
@@ -33,6 +34,7 @@ COMMANDS = (
     cast,
     mono,
     compare,
+    blocks,
     street,
     merge,
     evaluate,

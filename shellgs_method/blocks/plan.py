@@ -1,0 +1,53 @@
+"""The plan of a scene's blocks as an image: the shell from above, cameras, cuts and counts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from shellgs_method.blocks.cut import Sights
+from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.blocks import Blocks
+from shellgs_method.geometry.similarity import transformed
+
+
+def draw(path: Path, blocks: Blocks, seen: Sights, cameras: Float64[np.ndarray, "V 3"]) -> None:
+    """Write the plan as a png: what each block's core shows in a colour of its own, and where its photographs are from.
+
+    Args:
+        path: the file.
+        blocks: the blocks.
+        seen: what the photographs show.
+        cameras: centres of all cameras, in the scene's frame.
+    """
+    from matplotlib.figure import Figure
+
+    upright = np.linalg.inv(seen.to_scene)
+    points, centres = transformed(seen.points, seen.to_scene), transformed(cameras, upright)
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    axes = figure.add_subplot(aspect="equal", xlabel="m", ylabel="m")
+    axes.plot(centres[:, 0], centres[:, 1], ".", color="black", markersize=3)
+    for number, cell in enumerate(blocks.cells):
+        x, y, _ = seen.points[cell.core(points)].T
+        colour = f"C{number % 10}"
+        axes.plot(x, y, ",", color=colour)
+        label = f"{cell.block.name}: {len(cell.block.photographs)}"
+        axes.plot([], [], "s", color=colour, label=label)
+        if len(x):
+            axes.annotate(label, (np.median(x), np.median(y)), ha="center", bbox={"facecolor": "white", "alpha": 0.8})
+    edges = axes.get_xlim(), axes.get_ylim()
+    for cell in blocks.cells:
+        for cut, _ in cell.sides:
+            normal, offset = np.array((moved := cut.moved(upright)).normal), moved.offset
+            axes.axline(
+                tuple(normal[:2] * offset),
+                slope=None,
+                xy2=tuple(normal[:2] * offset + [-normal[1], normal[0]]),
+                color="gray",
+                lw=0.8,
+            )
+    axes.set(xlim=edges[0], ylim=edges[1], title=f"{len(blocks.cells)} blocks, and their photographs; dots are cameras")
+    with atomic_write(path) as file:
+        figure.savefig(file, format="png", dpi=120)

@@ -1,0 +1,81 @@
+"""`shellgs blocks`: cut a large scene into blocks."""
+
+from __future__ import annotations
+
+from typing import Optional
+
+from shellgs_method.commands.common import PATHS, Paths, Scene, console
+from shellgs_method.errors import SceneError
+
+
+def blocks(
+    scene: Scene,
+    length: float = 30.0,
+    photographs: Optional[int] = None,
+    overlap: float = 5.0,
+    again: bool = False,
+    paths: Paths = PATHS,
+) -> None:
+    """Cut a large scene into blocks that are trained one by one, with `shellgs street`.
+
+    Cuts are vertical, across the street, where buildings end. They are written to scene/blocks.json and drawn from
+    above in scene/blocks.png. A cut may be moved by hand: the same command keeps the cuts of a blocks.json that is
+    there, and finds which photographs show each block.
+
+    Args:
+        scene: Scene folder with the shell's maps (`shellgs cast`), or else with SfM points that have tracks.
+        length: Length of a block in metres.
+        photographs: Number of photographs of a block, in place of its length.
+        overlap: How far a block reaches beyond its cuts, in metres.
+        again: Cut anew.
+        paths: Paths of the scene's files.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from dataparsers.facade import read_views
+    from shellgs_method.blocks.cut import WEAK, Sights, assigned, cut, sights
+    from shellgs_method.blocks.plan import draw
+    from shellgs_method.files.blocks import BLOCKS, Blocks
+    from shellgs_method.files.cue_maps import CueMaps, find_cues
+    from shellgs_method.files.sparse_points import find_sparse_points
+    from shellgs_method.geometry.axes import likely_up
+    from shellgs_method.machine.progress import track
+
+    if not (length > 0 and overlap >= 0 and (photographs is None or photographs >= WEAK)):
+        raise SceneError(f"--length must be above 0, --overlap at least 0, and --photographs at least {WEAK}")
+    layout = paths.of(scene)
+    views, metres = read_views(layout), None
+    if "shell" in find_cues(scene):
+        maps = CueMaps.open(scene, "shell")
+        metres, size = maps.manifest.metres_per_unit, maps.manifest.max_image_size
+        shrunk = [replace(view, camera=view.camera.shrunk(size)) for view in views]
+        read = sights(
+            track(shrunk, "Reading the shell's maps", len(views)), lambda view: maps.read(view.name, view.camera)
+        )
+        shown = dict(read)
+    else:
+        points = find_sparse_points(layout)
+        if points.observed is None:
+            raise SceneError(
+                f"{scene} has neither maps of a shell nor tracks of its SfM points, which tell what each photograph "
+                f"shows: run `shellgs cast {scene}` first"
+            )
+        shown = {name: points.positions[of].astype(np.float64) for name, of in points.observed.items() if len(of)}
+    if not shown:
+        raise SceneError(f"no photograph of {scene} shows the shell: look at it with `shellgs align`")
+    if metres is None:
+        console.print("The scene's unit is not known, without maps of an aligned shell: lengths are in scene units.")
+    seen = Sights.of(shown, likely_up(view.camera for view in views), metres or 1.0)
+    file = scene / BLOCKS
+    found = (
+        assigned(Blocks.read(file), seen) if file.exists() and not again else cut(seen, length, overlap, photographs)
+    )
+    found.write(file)
+    draw(file.with_suffix(".png"), found, seen, np.stack([view.camera.position.double().numpy() for view in views]))
+    for cell in found.cells:
+        console.print(f"{cell.block.name}: {len(cell.block.photographs)} photographs", highlight=False)
+    if len(found.cells) == 1:
+        console.print("The scene is one block: train it as it is, with ns-train.")
+    console.print(f"Written: {file}, {file.with_suffix('.png')}.", highlight=False)

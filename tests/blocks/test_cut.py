@@ -1,0 +1,175 @@
+"""Cuts are where buildings end, and each block has the photographs that show it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, cut
+from shellgs_method.commands.blocks import blocks as command
+from shellgs_method.errors import SceneError
+from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
+from shellgs_method.geometry.similarity import transformed
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def row(ends: Sequence[float], faces: Sequence[float], heights: Sequence[float]) -> np.ndarray:
+    """Points of the fronts of houses along x, between their ends, at their depths and up to their heights."""
+    fronts = []
+    for (start, end), y, height in zip(pairwise(ends), faces, heights, strict=True):
+        x, z = np.meshgrid(np.arange(start, end, 0.1), np.arange(0.05, height, 0.1))
+        fronts.append(np.stack([x.ravel(), np.full(x.size, y), z.ravel()], axis=1))
+    return np.concatenate(fronts)
+
+
+def walk(points: np.ndarray, spacing: float = 1.0, reach: float = 9.0) -> dict[str, np.ndarray]:
+    """Points that photographs show along a walk in x."""
+    shown = {}
+    for number, x in enumerate(np.arange(points[:, 0].min(), points[:, 0].max(), spacing)):
+        near = np.abs(points[:, 0] - x) < reach
+        shown[f"images/{number:03d}.png"] = points[near][:: max(near.sum() // 2000, 1)]
+    return shown
+
+
+@pytest.fixture
+def street() -> np.ndarray:
+    """Four houses in a row, and three across the street whose party walls are elsewhere but for one."""
+    near = row((0, 18, 34, 55, 70), (0, 0.6, -0.5, 0.3), (9, 11, 8, 12))
+    across = row((0, 25, 34, 70), (-14, -13.2, -14.5), (10, 8, 11))
+    return np.concatenate([near, across])
+
+
+def offsets(blocks: Blocks, axis: np.ndarray) -> list[float]:
+    """Where the blocks' cuts lie along an axis."""
+    cuts = {cut for cell in blocks.cells for cut, _ in cell.sides}
+    assert all(abs(abs(np.dot(each.normal, axis)) - 1) < 0.01 for each in cuts)
+    return sorted(float(np.dot(each.normal, axis)) * each.offset for each in cuts)
+
+
+def test_a_street_is_cut_at_a_party_wall_of_both_its_sides(street: np.ndarray):
+    blocks = cut(Sights.of(walk(street), UP, 1.0), length=35.0, overlap=5.0)
+    assert offsets(blocks, np.eye(3)[0]) == pytest.approx([34.0], abs=0.3)
+    assert [cell.block.name for cell in blocks.cells] == ["block-1", "block-2"]
+    assert blocks.overlap == pytest.approx(5.0)
+
+
+def test_more_cuts_are_at_the_ends_of_houses_too():
+    ends = (0, 19, 41, 58, 82)
+    points = row(ends, (0, 0.6, -0.5, 0.3), (9, 11, 8, 12))
+    blocks = cut(Sights.of(walk(points), UP, 1.0), length=20.0, overlap=5.0)
+    assert offsets(blocks, np.eye(3)[0]) == pytest.approx(ends[1:-1], abs=0.4)
+
+
+def test_another_frame_and_unit_give_the_same_blocks(street: np.ndarray):
+    """The scene is turned, in feet, and its y axis points up."""
+    turn = Rotation.from_euler("zx", [0.3, 0.5 * np.pi]).as_matrix()
+    moved = {name: points @ turn.T / 0.3048 + [1000, 5, -20] for name, points in walk(street).items()}
+    blocks = cut(Sights.of(moved, turn @ UP, 0.3048), length=35.0, overlap=5.0)
+    usual = cut(Sights.of(walk(street), UP, 1.0), length=35.0, overlap=5.0)
+    assert blocks.overlap == pytest.approx(5.0 / 0.3048)
+    (found,), (known,) = ({cut for cell in each.cells for cut, _ in cell.sides} for each in (blocks, usual))
+    probe = np.array([[34.0, 0, 0], [34.0, -14, 5], [0.0, 0, 0]])
+    in_feet = probe @ turn.T / 0.3048 + [1000, 5, -20]
+    np.testing.assert_allclose(np.abs(found.distances(in_feet)) * 0.3048, np.abs(known.distances(probe)), atol=0.6)
+
+
+def test_a_street_that_bends_is_cut_across_each_arm():
+    one = row((0, 20, 45), (0, 0.7), (9, 11))
+    other = row((0, 22, 45), (0, 0.7), (9, 11))[:, [1, 0, 2]] * [1, -1, 1] + [45, 0, 0]
+    points = np.concatenate([one, other])
+    shown = walk(one) | {f"b{name}": place for name, place in _along_y(other).items()}
+    blocks = cut(Sights.of(shown, UP, 1.0), length=25.0, overlap=3.0)
+    assert (np.sum([cell.core(points) for cell in blocks.cells], axis=0) == 1).all()
+    sizes = [np.ptp(points[cell.core(points)], axis=0)[:2].max() for cell in blocks.cells]
+    assert max(sizes) < 40
+    assert len(sizes) >= 3
+
+
+def _along_y(points: np.ndarray) -> dict[str, np.ndarray]:
+    turned = points[:, [1, 0, 2]] * [-1, 1, 1]
+    return {name: place[:, [1, 0, 2]] * [1, -1, 1] for name, place in walk(turned).items()}
+
+
+def test_one_building_is_one_block():
+    blocks = cut(Sights.of(walk(row((0, 15), (0,), (10,))), UP, 1.0), length=30.0, overlap=5.0)
+    assert blocks.tree == Block("block-1", tuple(walk(row((0, 15), (0,), (10,)))))
+
+
+def test_blocks_may_be_as_large_as_their_number_of_photographs(street: np.ndarray):
+    blocks = cut(Sights.of(walk(street, spacing=0.5), UP, 1.0), length=1000.0, overlap=0.0, photographs=40)
+    assert len(blocks.cells) in (3, 4)
+
+
+def test_a_block_has_the_photographs_of_which_it_holds_a_share(street: np.ndarray):
+    shown = walk(street)
+    seen = Sights.of(shown, UP, 1.0)
+    blocks = cut(seen, length=35.0, overlap=2.0)
+    for cell in blocks.cells:
+        expected = [name for name, points in shown.items() if cell.extended(points).mean() >= SHARE]
+        assert list(cell.block.photographs) == expected
+        assert 0 < len(expected) < len(shown)
+
+
+def test_a_cut_that_was_moved_by_hand_stays_and_its_photographs_are_found_anew(street: np.ndarray):
+    seen = Sights.of(walk(street), UP, 1.0)
+    blocks = cut(seen, length=35.0, overlap=2.0)
+    assert isinstance(blocks.tree, Fork)
+    moved = replace(blocks, tree=replace(blocks.tree, cut=Cut((1.0, 0.0, 0.0), 20.0)))
+    found = assigned(moved, seen)
+    assert offsets(found, np.eye(3)[0]) == [20.0]
+    assert len(found.cells[0].block.photographs) < len(blocks.cells[0].block.photographs)
+
+
+def test_a_block_with_few_photographs_is_joined_with_its_neighbour(street: np.ndarray):
+    shown = walk(street)
+    rare = {name: points for k, (name, points) in enumerate(shown.items()) if k < 45 or k % 10 == 0}
+    east = Fork(Cut((1.0, 0, 0), 60.0), Block("b", ()), Block("c", ()))
+    blocks = Blocks(Fork(Cut((1.0, 0, 0), 34.0), Block("a", ()), east), 0.0)
+    found = assigned(blocks, Sights.of(rare, UP, 1.0))
+    assert [cell.block.name for cell in found.cells] == ["a", "b"]
+    assert all(len(cell.block.photographs) >= WEAK for cell in found.cells)
+    assert found.cells[1].core(np.array([[65.0, 0, 0]])).all()
+
+
+def test_points_are_upright_and_in_metres():
+    seen = Sights.of({"a": np.array([[0.0, 2.0, 0.0]])}, np.array([0.0, 1.0, 0.0]), 0.5)
+    assert seen.points[0, 2] == pytest.approx(1.0)
+    np.testing.assert_allclose(transformed(seen.points, seen.to_scene), [[0, 2, 0]], atol=1e-12)
+
+
+def test_the_command_draws_the_plan_and_keeps_a_cut_that_was_moved(scene: Path, capsys: pytest.CaptureFixture):
+    command(scene, length=6.0, overlap=1.0)
+    found = Blocks.read(scene / BLOCKS)
+    assert isinstance(found.tree, Fork)
+    assert (scene / "blocks.png").read_bytes().startswith(b"\x89PNG")
+    assert f"block-1: {len(found.cells[0].block.photographs)} photographs" in capsys.readouterr().out
+    names = {path.relative_to(scene).as_posix() for path in (scene / "images").iterdir()}
+    assert {name for cell in found.cells for name in cell.block.photographs} == names
+    moved = replace(found, tree=replace(found.tree, cut=replace(found.tree.cut, offset=found.tree.cut.offset + 0.1)))
+    moved.write(scene / BLOCKS)
+    command(scene, length=6.0, overlap=1.0)
+    kept = Blocks.read(scene / BLOCKS)
+    assert isinstance(kept.tree, Fork)
+    assert kept.tree.cut.offset == pytest.approx(found.tree.cut.offset + 0.1)
+    command(scene, length=6.0, overlap=1.0, again=True)
+    assert Blocks.read(scene / BLOCKS) == found
+
+
+def test_without_maps_and_tracks_nothing_tells_what_photographs_show(scene: Path):
+    shutil.rmtree(scene / "cues")
+    with pytest.raises(SceneError, match="run `shellgs cast"):
+        command(scene)
+
+
+@pytest.mark.parametrize("flags", [{"length": 0.0}, {"overlap": -1.0}, {"photographs": 3}])
+def test_settings_that_no_scene_can_be_cut_by_are_refused(scene: Path, flags: dict):
+    with pytest.raises(SceneError, match="--length must be above 0"):
+        command(scene, **flags)
