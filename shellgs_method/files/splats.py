@@ -1,4 +1,4 @@
-"""Gaussians in files for splat viewers: ply, glTF (KHR_gaussian_splatting) and spz."""
+"""Gaussians in files for splat viewers: ply, glTF (KHR_gaussian_splatting), spz, and a page for browsers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,13 @@ from torch import Tensor
 
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.splats_page import splats_page
+from shellgs_method.geometry.camera import Camera
 
 DEGREE_0 = 0.5 / math.sqrt(math.pi)
 """The spherical harmonic of degree 0."""
-Y_UP = (".glb", ".spz")
+FORMATS: tuple[str, ...] = (".ply", ".glb", ".spz", ".html")
+Y_UP = (".glb", ".spz", ".html")
 """Formats whose y axis points up, whatever the scene's does."""
 DISCS = "SplatRenderMode: 2dgs"
 """Comment in the ply of discs, by which viewers render them as such."""
@@ -79,30 +83,33 @@ def check_splats_format(path: Path, discs: bool = False) -> None:
     """
     check_output(path)
     suffix = path.suffix.lower()
-    if suffix not in _WRITERS:
+    if suffix not in FORMATS:
         raise SceneError(f"{path}: splats are written as ply, glb, spz or html: name a file that ends in one of these")
     if discs and suffix == ".spz":
-        raise SceneError(f"{path}: spz has no discs, which have no thickness: name a .ply or .glb")
+        raise SceneError(f"{path}: spz has no discs, which have no thickness: name a .ply, .glb or .html")
 
 
-def write_splats(path: Path, splats: Splats, comments: Sequence[str] = ()) -> int:
+def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views: Sequence[Camera] = ()) -> int:
     """Write the finite ones of some Gaussians in the format that the path's suffix names; return their number.
 
     Args:
-        path: ply (Kerbl et al. 2023), glb with KHR_gaussian_splatting, or spz.
+        path: ply (Kerbl et al. 2023), glb with KHR_gaussian_splatting, spz, or html.
         splats: Gaussians; of :data:`Y_UP` formats in a frame whose y axis points up.
         comments: lines that say what the coordinates are, where the format has a place for them.
+        views: cameras from which a page shows them.
 
     Raises:
         SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format.
     """
     check_splats_format(path, splats.discs)
     splats = splats.finite
-    _write(path, _WRITERS[path.suffix.lower()](splats, comments))
+    _write(path, _encoder(path, comments, views)(splats))
     return len(splats)
 
 
-def write_best_splats(path: Path, splats: Splats, megabytes: float, comments: Sequence[str] = ()) -> int:
+def write_best_splats(
+    path: Path, splats: Splats, megabytes: float, comments: Sequence[str] = (), views: Sequence[Camera] = ()
+) -> int:
     """Write as many of the first Gaussians as a size allows; otherwise as :func:`write_splats`.
 
     Args:
@@ -110,15 +117,17 @@ def write_best_splats(path: Path, splats: Splats, megabytes: float, comments: Se
         splats: Gaussians, the best first.
         megabytes: largest size of the file.
         comments: as in :func:`write_splats`.
+        views: as in :func:`write_splats`.
 
     Raises:
         SceneError: as in :func:`write_splats`, or not one Gaussian is that small.
     """
     check_splats_format(path, splats.discs)
     splats, most = splats.finite, 1e6 * megabytes
-    encode, count = _WRITERS[path.suffix.lower()], len(splats)
-    while len(content := encode(splats[:count], comments)) > most:
-        count = min(count - 1, int(count * most / len(content)))
+    encode, count = _encoder(path, comments, views), len(splats)
+    fixed = len(encode(splats[:0]))
+    while len(content := encode(splats[:count])) > most:
+        count = min(count - 1, int(count * (most - fixed) / (len(content) - fixed)))
         if count < 1:
             raise SceneError(f"{path}: no Gaussian fits into {megabytes:g} MB: give --megabytes more")
     _write(path, content)
@@ -254,9 +263,8 @@ encoder for degrees 1 to 3 save up to a quarter, but trained coefficients are as
 from what was written, and is 46 with 6."""
 
 
-def _spz(splats: Splats, comments: Sequence[str]) -> bytes:
+def _spz(splats: Splats) -> bytes:
     """Niantic's spz, version 3: fixed-point positions of 24 bits, all else in bytes, rotations in 32 bits, gzipped."""
-    del comments  # it has no place for them
     most = float(splats.means.abs().max()) if len(splats) else 0.0
     fraction = int(np.clip(22 - math.ceil(math.log2(max(most, 1e-6))), 0, 20))  # bits after the point
     if most * 2**fraction >= 2**23:
@@ -300,4 +308,11 @@ def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> np.ndarray:
     return packed.astype("<u4")
 
 
-_WRITERS: dict[str, Callable[[Splats, Sequence[str]], bytes]] = {".ply": _ply, ".glb": _glb, ".spz": _spz}
+def _encoder(path: Path, comments: Sequence[str], views: Sequence[Camera]) -> Callable[[Splats], bytes]:
+    """What makes the content of the file that a path names."""
+
+    def page(splats: Splats) -> bytes:
+        return splats_page(_spz(splats), splats.discs, comments, views)
+
+    encoders = partial(_ply, comments=comments), partial(_glb, comments=comments), _spz, page
+    return dict(zip(FORMATS, encoders, strict=True))[path.suffix.lower()]
