@@ -25,43 +25,44 @@ def splats(
         output: Output file: .ply, .glb (glTF with KHR_gaussian_splatting), .spz or .html. If not set: splats.ply
             beside the config.
         levels: Number of levels of detail: each, NAME-1, NAME-2 and so on, has half as many Gaussians as the one
-            before, those that contribute most to a training view.
-        megabytes: Largest size of the file, or of the first level; Gaussians that contribute least are left out.
+            before: near ones are merged.
+        megabytes: Largest size of the file, or of the first level; near Gaussians are merged until it fits.
     """
     from shellgs_method.export.frame import Y
+    from shellgs_method.export.levels import Level, psnr_of
     from shellgs_method.export.runs import TrainedRun
     from shellgs_method.export.splats import moved
-    from shellgs_method.files.splats import Y_UP, check_splats_format, write_best_splats, write_splats
+    from shellgs_method.files.splats import Y_UP, Splats, check_splats_format, encoded, write_splats
 
     output = output or config.with_name("splats.ply")
     check_splats_format(output)
     run = TrainedRun.load(config)
     gaussians, frame, facts = run.splats(), run.frame, {}
-    check_splats_format(output, gaussians.discs)
     if output.suffix.lower() in Y_UP:
         frame, motion = frame.turned(Y)
         gaussians, facts = moved(gaussians, motion), {"turned": motion[:3, :3].tolist()}
     comments = [f"{name}: {value}" for name, value in frame.properties.items()]
     views = [frame.camera(view.camera) for dataset in run.datasets for view in dataset.views]
-    if levels == 1 and megabytes is None:
+
+    def size(some: Splats) -> int:
+        return len(encoded(output, some, comments, views))
+
+    if levels == 1 and (megabytes is None or size(gaussians.finite) <= 1e6 * megabytes):
         count = write_splats(output, gaussians, comments, views)
         frame.describe(Path(f"{output}.json"), {"splats": count, **facts})
         console.print(f"{output}: {count} Gaussians. {place(frame)}")
         return
-    from shellgs_method.export.levels import psnr_of, ranked
-
-    order, whole = ranked(run), None
-    best_first = gaussians[order.cpu()]
-    count = len(best_first)
-    for level in range(levels):
-        path = output if level == 0 else output.with_stem(f"{output.stem}-{level}")
-        if level == 0 and megabytes is not None:
-            count = write_best_splats(path, best_first, megabytes, comments, views)
-        else:
-            count = write_splats(path, best_first[: max(1, count // 2 if level else count)], comments, views)
-        whole = psnr_of(run, order) if whole is None else whole
-        loss = whole - psnr_of(run, order[:count])
+    level = Level.whole(run, gaussians)
+    all_of_them, whole = len(level.splats), psnr_of(run, level.splats, frame)
+    for number in range(levels):
+        path = output if number == 0 else output.with_stem(f"{output.stem}-{number}")
+        if number:
+            level = level.reduced(max(1, len(level.splats) // 2))
+        elif megabytes is not None:
+            level = level.within(megabytes, size)
+        count = write_splats(path, level.splats, comments, views)
+        loss = whole - psnr_of(run, level.splats, frame) if count < all_of_them else 0.0
         frame.describe(Path(f"{path}.json"), {"splats": count, "psnr_loss": round(loss, 3), **facts})
-        size = path.stat().st_size / 1e6
-        console.print(f"{path}: {count} Gaussians, {size:.1f} MB, {loss:.2f} dB of PSNR lost.", highlight=False)
+        taken = path.stat().st_size / 1e6
+        console.print(f"{path}: {count} Gaussians, {taken:.1f} MB, {loss:.2f} dB of PSNR lost.", highlight=False)
     console.print(place(frame))

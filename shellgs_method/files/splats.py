@@ -6,14 +6,13 @@ import gzip
 import json
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from shellgs_method.errors import SceneError, check_output
@@ -70,9 +69,14 @@ class Splats:
         return math.isqrt(self.harmonics.shape[1]) - 1
 
     @property
+    def is_finite(self) -> Bool[Tensor, " N"]:
+        """Which Gaussians have no NaN or infinite value: these break viewers."""
+        return torch.stack([each.flatten(1).isfinite().all(dim=1) for each in self._tensors]).all(dim=0)
+
+    @property
     def finite(self) -> Splats:
-        """Without Gaussians that have a NaN or infinite value, which break viewers."""
-        return self[torch.cat([each.flatten(1).double() for each in self._tensors], dim=1).isfinite().all(dim=1)]
+        """Those that are."""
+        return self[self.is_finite]
 
 
 def check_splats_format(path: Path, discs: bool = False) -> None:
@@ -101,43 +105,24 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views
     Raises:
         SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format.
     """
-    check_splats_format(path, splats.discs)
     splats = splats.finite
-    _write(path, _encoder(path, comments, views)(splats))
-    return len(splats)
-
-
-def write_best_splats(
-    path: Path, splats: Splats, megabytes: float, comments: Sequence[str] = (), views: Sequence[Camera] = ()
-) -> int:
-    """Write as many of the first Gaussians as a size allows; otherwise as :func:`write_splats`.
-
-    Args:
-        path: as in :func:`write_splats`.
-        splats: Gaussians, the best first.
-        megabytes: largest size of the file.
-        comments: as in :func:`write_splats`.
-        views: as in :func:`write_splats`.
-
-    Raises:
-        SceneError: as in :func:`write_splats`, or not one Gaussian is that small.
-    """
-    check_splats_format(path, splats.discs)
-    splats, most = splats.finite, 1e6 * megabytes
-    encode, count = _encoder(path, comments, views), len(splats)
-    fixed = len(encode(splats[:0]))
-    while len(content := encode(splats[:count])) > most:
-        count = min(count - 1, int(count * (most - fixed) / (len(content) - fixed)))
-        if count < 1:
-            raise SceneError(f"{path}: no Gaussian fits into {megabytes:g} MB: give --megabytes more")
-    _write(path, content)
-    return count
-
-
-def _write(path: Path, content: bytes) -> None:
+    content = encoded(path, splats, comments, views)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         file.write(content)
+    return len(splats)
+
+
+def encoded(path: Path, splats: Splats, comments: Sequence[str] = (), views: Sequence[Camera] = ()) -> bytes:
+    """Content of the file that :func:`write_splats` writes of finite Gaussians."""
+    check_splats_format(path, splats.discs)
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return _ply(splats, comments)
+    if suffix == ".glb":
+        return _glb(splats, comments)
+    spz = _spz(splats)
+    return spz if suffix == ".spz" else splats_page(spz, splats.discs, comments, views)
 
 
 def read_splats(path: Path) -> Splats:
@@ -306,13 +291,3 @@ def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> np.ndarray:
     for k in range(3):
         packed = packed << np.uint32(10) | negative[:, k].astype(np.uint32) << np.uint32(9) | sizes[:, k]
     return packed.astype("<u4")
-
-
-def _encoder(path: Path, comments: Sequence[str], views: Sequence[Camera]) -> Callable[[Splats], bytes]:
-    """What makes the content of the file that a path names."""
-
-    def page(splats: Splats) -> bytes:
-        return splats_page(_spz(splats), splats.discs, comments, views)
-
-    encoders = partial(_ply, comments=comments), partial(_glb, comments=comments), _spz, page
-    return dict(zip(FORMATS, encoders, strict=True))[path.suffix.lower()]

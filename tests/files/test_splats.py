@@ -15,7 +15,7 @@ from splat_files import glb_attributes, psnr, some, unpacked
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.splats import moved
-from shellgs_method.files.splats import DISCS, Splats, check_splats_format, read_splats, write_best_splats, write_splats
+from shellgs_method.files.splats import DISCS, Splats, check_splats_format, read_splats, write_splats
 
 NODE = Path(os.environ["SHELLGS_NODE"]) / "node_modules" if "SHELLGS_NODE" in os.environ else None
 
@@ -100,21 +100,6 @@ def test_a_file_that_is_no_ply_of_gaussians_is_refused(tmp_path, change, message
     (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
     with pytest.raises(SceneError, match=message):
         read_splats(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize("suffix", ["ply", "glb", "spz", "html"])
-def test_as_many_gaussians_are_written_as_the_size_allows(tmp_path, suffix):
-    splats, path, sizes = some(), tmp_path / f"a.{suffix}", []
-    for some_of_them in (splats[:0], splats):
-        write_splats(path, some_of_them)
-        sizes.append(path.stat().st_size / 1e6)
-    empty, whole = sizes
-    assert write_best_splats(path, splats, whole) == 400
-    count = write_best_splats(path, splats, (empty + whole) / 2)
-    assert 150 < count < 210
-    assert path.stat().st_size / 1e6 <= (empty + whole) / 2
-    with pytest.raises(SceneError, match="no Gaussian fits into 1e-05 MB"):
-        write_best_splats(path, splats, 1e-5)
 
 
 @pytest.mark.parametrize(
