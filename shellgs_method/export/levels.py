@@ -157,8 +157,9 @@ def _costs(a: _Mixture, b: _Mixture) -> Float64[np.ndarray, " M"]:
 def _pairs(mixture: _Mixture, most: int) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
     """At least one and at most so many pairs of neighbours, each the cheapest of both."""
     count = len(mixture.means)
-    near = KDTree(mixture.means).query(mixture.means, k=min(NEIGHBOURS + 1, count))[1]
-    pairs = np.stack([np.repeat(np.arange(count), near.shape[1]), near.ravel()])
+    k = min(NEIGHBOURS + 1, count)
+    _, near = KDTree(mixture.means).query(mixture.means, k=k)
+    pairs = np.stack([np.repeat(np.arange(count), k), np.ravel(near)])
     pairs = np.sort(pairs[:, pairs[0] != pairs[1]], axis=0)
     first, second = np.divmod(np.unique(pairs[0] * count + pairs[1]), count)
     blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]

@@ -27,6 +27,8 @@ Y_UP = (".glb", ".spz", ".html")
 """Formats whose y axis points up, whatever the scene's does."""
 DISCS = "SplatRenderMode: 2dgs"
 """Comment in the ply of discs, by which viewers render them as such."""
+LARGEST_PAGE = 300
+"""Megabytes: a string has at most 512 in Chromium, and 9 million Gaussians take 1.2 GB of a graphics card."""
 _EXTENSION = "KHR_gaussian_splatting"
 _ELLIPSE = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 
@@ -103,10 +105,15 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views
         views: cameras from which a page shows them.
 
     Raises:
-        SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format.
+        SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format, or a
+            page would be too large.
     """
     splats = splats.finite
     content = encoded(path, splats, comments, views)
+    if path.suffix.lower() == ".html" and len(content) > 1e6 * LARGEST_PAGE:
+        raise SceneError(
+            f"{path} would have {len(content) / 1e6:.0f} MB, more than browsers read: give --megabytes {LARGEST_PAGE}"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         file.write(content)

@@ -15,10 +15,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from splat_files import CAMERA, image, some
 
+from shellgs_method.errors import SceneError
 from shellgs_method.files.splats import Splats, write_splats
 from shellgs_method.geometry.camera import Camera
 
-Show = Callable[[Splats, Sequence[Camera]], Any]
+Show = Callable[..., Any]
 
 
 def turned(degrees: float) -> Camera:
@@ -34,15 +35,16 @@ def show(tmp_path: Path, browser: Any) -> Iterator[Show]:
     context = browser.new_context(viewport={"width": CAMERA.width, "height": CAMERA.height}, offline=True)
     wrong: list[str] = []
 
-    def opened(splats: Splats, views: Sequence[Camera]) -> Any:
+    def opened(splats: Splats, views: Sequence[Camera], first: str = "") -> Any:
         write_splats(tmp_path / "a page.html", splats, ["unit: metre </script>"], views)
         page = context.new_page()
+        page.add_init_script(first)
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("request", lambda request: wrong.extend([request.url] if request.url.startswith("http") else []))
         page.goto((tmp_path / "a page.html").as_uri())
         page.wait_for_function("settled() || said.textContent != 'Unpacking'")
         assert page.evaluate("said.textContent") == ""
-        page.evaluate("document.getElementById('hint').hidden = true")
+        page.evaluate("for (const each of ['#hint', 'nav']) document.querySelector(each).style.display = 'none'")
         return page
 
     yield opened
@@ -71,6 +73,37 @@ def test_what_is_brighter_than_white_shines_through_what_is_before_it(show: Show
     colours = torch.tensor([3.0, 0])[:, None, None].expand(2, 1, 3)  # 1.35, behind grey of half the opacity
     splats = Splats(means, torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4), torch.zeros(2, 3), opacities, colours)
     assert -10 * (shown(show(splats, [CAMERA])) - image(splats)).square().mean().log10() > 45
+
+
+def test_a_browser_that_blends_no_half_floats_shows_what_is_no_brighter_than_white(show: Show):
+    splats = some(degree=0)
+    splats.harmonics[:, 0] = splats.harmonics[:, 0].clamp(-1.7, 1.7)
+    page = show(splats, [CAMERA], "WebGL2RenderingContext.prototype.getExtension = () => null")
+    assert page.evaluate("light") is None
+    assert -10 * (shown(page) - image(splats)).square().mean().log10() > 35
+
+
+def test_what_was_seen_comes_back_after_the_graphics_card_was_reset(show: Show):
+    page = show(some(), [CAMERA])
+    before = shown(page)
+    page.evaluate("lose = gl.getExtension('WEBGL_lose_context'); lose.loseContext()")
+    page.wait_for_function("said.textContent.startsWith('The graphics card was reset')")
+    page.evaluate("lose.restoreContext()")
+    page.wait_for_function("said.textContent == '' && settled()")
+    torch.testing.assert_close(shown(page), before)
+
+
+def test_a_click_goes_to_the_next_photograph(show: Show):
+    page = show(some(), [turned(-20), CAMERA, turned(15)])
+    page.evaluate("document.querySelectorAll('button')[1].click()")
+    assert page.evaluate("number") == 2
+
+
+def test_a_page_that_no_browser_reads_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("shellgs_method.files.splats.LARGEST_PAGE", 0.01)
+    with pytest.raises(SceneError, match="more than browsers read: give --megabytes"):
+        write_splats(tmp_path / "a.html", some())
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_mouse_turns_around_what_is_ahead_and_keys_walk(show: Show):
