@@ -40,17 +40,31 @@ def explained(error: OSError) -> str:
     return f"{name} cannot be used: {(error.strerror or str(error)).lower()}"
 
 
+LONGEST = 230
+"""Bytes of an output's name: of 255, as those of temporary files and of descriptions beside it are longer."""
+
+
 def check_output(path: Path) -> None:
     """Refuse an output path that cannot be written, before the work starts.
 
     Raises:
-        SceneError: it is a folder, or lies below a file.
+        SceneError: it is a folder, a link to nothing, or too long, or it lies below a file or in a folder that is not
+            writable.
     """
+    if len(os.fsencode(path.name)) > LONGEST:
+        raise SceneError(f"{path.name} is too long for a file's name: give one of at most {LONGEST} bytes")
     if path.is_dir():
         raise SceneError(f"{path} is a folder: name a file to write")
+    for each in (path, *path.absolute().parents):
+        if each.is_symlink() and not each.exists():
+            raise SceneError(
+                f"{each} is a link to {os.readlink(each)}, which does not exist: remove it, or name another"
+            )
     above = next(parent for parent in path.absolute().parents if parent.exists())
     if not above.is_dir():
         raise SceneError(f"{path} cannot be written: {above} is a file, not a folder")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise SceneError(f"{path} cannot be written: you may not write to {above}; name a file elsewhere")
 
 
 def _stdout_is_closed() -> bool:

@@ -1,4 +1,4 @@
-"""Shared fixtures: a tiny synthetic facade, and the rasterizer with and without a compiler."""
+"""Shared fixtures: a tiny synthetic facade, a browser, and the rasterizer with and without a compiler."""
 
 from __future__ import annotations
 
@@ -47,22 +47,6 @@ def scene(pristine_scene: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def browser() -> Iterator[Any]:
-    """Headless Chromium, whose WebGL needs no GPU."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with sync_api.sync_playwright() as playwright:
-        own = playwright.chromium.executable_path
-        names = ("chromium", "chromium-browser", "google-chrome")
-        found = own if Path(own).is_file() else next(filter(None, map(shutil.which, names)), None)
-        if found is None:
-            pytest.skip("there is no Chromium")
-        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = playwright.chromium.launch(executable_path=found, args=software)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture
 def in_process(capsys, monkeypatch) -> Callable[..., str]:
     """Run a command in this process; returns its output on one line, or ``refused: `` and its message."""
 
@@ -102,3 +86,19 @@ def offline_wandb(monkeypatch) -> Iterator[None]:
 
     yield
     wandb.teardown()
+
+
+@pytest.fixture
+def browser() -> Iterator[Any]:
+    """Headless Chromium, with WebGL in software."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with sync_api.sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+        names = ("chromium", "chromium-browser", "google-chrome")
+        found = own if Path(own).is_file() else next(filter(None, map(shutil.which, names)), None)
+        if found is None:
+            pytest.skip("there is no Chromium")
+        software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=found, args=software)
+        yield browser
+        browser.close()

@@ -1,4 +1,4 @@
-"""Gaussians before a camera; glTF and spz files of Gaussians, decoded as their specifications have it."""
+"""Gaussians before a camera, and what it sees; glTF and spz files of Gaussians, decoded as specified."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ import numpy as np
 import torch
 
 from shellgs_method.files.splats import Splats
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
+from shellgs_method.render.view import ViewRenderer
+
+CAMERA = Camera(torch.eye(4), torch.tensor([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]), 160, 120)
 
 
 def some(count: int = 400, degree: int = 3, *, discs: bool = False) -> Splats:
@@ -25,6 +29,25 @@ def some(count: int = 400, degree: int = 3, *, discs: bool = False) -> Splats:
     harmonics[:, 0] *= 8
     quats, opacities = (torch.randn(count, n, generator=generator) for n in (4, 1))
     return Splats(means, quats, scales, opacities, harmonics, discs=discs)
+
+
+def image(splats: Splats, camera: Camera = CAMERA) -> torch.Tensor:
+    """What a camera sees of Gaussians."""
+    gaussians = {
+        "means": splats.means.float(),
+        "quats": splats.quats.float(),
+        "scales": splats.scales.float(),
+        "opacities": splats.opacities.float(),
+        "features_dc": splats.harmonics[:, 0].float(),
+        "features_rest": splats.harmonics[:, 1:].float(),
+    }
+    renderer = ViewRenderer("2d" if splats.discs else "3d", "expected")
+    return renderer(gaussians, camera, torch.zeros(3), splats.degree, False, False)[0].clamp(0, 1)
+
+
+def psnr(one: Splats, other: Splats) -> float:
+    """Of what the camera sees of the one and of the other."""
+    return float(-10 * (image(one) - image(other)).square().mean().log10())
 
 
 def glb_attributes(path: Path) -> tuple[dict, dict[str, np.ndarray]]:

@@ -22,6 +22,7 @@ from shellgs_method.commands.common import console, open_page
 from shellgs_method.commands.mesh import mesh
 from shellgs_method.commands.sim import check_packages
 from shellgs_method.commands.sim import sim as simulate
+from shellgs_method.commands.splats import splats
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, content_hash, fingerprint, read_json
 from shellgs_method.files.scene import ALIGNMENT
@@ -181,7 +182,8 @@ def run(
             trained = _take(steps, recipe, scene, results, accept)
             steps.done("all", *_state(recipe, scene, results))
     console.print(f"Done: {results / 'mesh.ply'}, {results / 'report.html'}.", highlight=False, soft_wrap=True)
-    console.print(f"Walk around: ns-viewer --load-config {trained}", highlight=False, soft_wrap=True)
+    page = trained.with_name("splats.html")
+    console.print(f"Walk around: {page}, or ns-viewer --load-config {trained}", highlight=False, soft_wrap=True)
 
 
 def _state(recipe: Recipe, scene: Path, results: Path) -> list[object]:
@@ -216,6 +218,12 @@ def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: boo
     if steps.changed("mesh", *checkpoint) or not (results / "mesh.ply").exists():
         mesh(trained.config, results / "mesh.ply")
         steps.done("mesh", *checkpoint)
+    if steps.changed("page", *checkpoint) or not trained.page.exists():
+        from shellgs_method.compare.results import write_results
+
+        splats(trained.config, trained.page)
+        write_results([trained], results, {})  # whose report now has a link to it
+        steps.done("page", *checkpoint)
     if recipe.sim:
         steps.begin("folder for simulators")
         if steps.changed("sim", *checkpoint) or not (results / "sim").exists():

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from html import escape
+from os.path import relpath
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import UInt8
@@ -55,8 +57,21 @@ def write_report(
     parts = [f"<p>Failed: {escape(run)}</p><pre>{escape(why)}</pre>" for run, why in failures.items()]
     parts += [f'<div class="numbers">{table.html}</div>' for table in tables]
     parts += [captioned(img(file.read_bytes(), ""), escape(caption)) for caption, file in figures.items()]
+    parts += [_links(scene, pages, path.parent) for scene, runs in views.items() if (pages := _pages(runs))]
     parts += [_slider(scene, runs, names) for scene, runs in views.items() if (names := common_views(runs))]
     write_page(path, "Comparison", [*parts, _SCRIPT], "input[type=range] { width: 100% }")
+
+
+def _pages(runs: Sequence[Run]) -> dict[str, Path]:
+    """Pages that show the Gaussians of runs, by method."""
+    return {run.variant.name: run.page for run in runs if run.page.is_file()}
+
+
+def _links(scene: str, pages: Mapping[str, Path], folder: Path) -> str:
+    links = (
+        f'<a href="{quote(Path(relpath(page, folder)).as_posix())}">{escape(name)}</a>' for name, page in pages.items()
+    )
+    return f"<p>{escape(scene)}: walk around {', '.join(links)}</p>"
 
 
 def _slider(scene: str, runs: Sequence[Run], names: Sequence[str]) -> str:

@@ -154,6 +154,11 @@ class Run:
         return self.folder / "views"
 
     @property
+    def page(self) -> Path:
+        """Page that shows its Gaussians, where `shellgs splats` wrote one."""
+        return self.folder / "splats.html"
+
+    @property
     def checkpoints(self) -> Path:
         """Folder of its checkpoints."""
         return self.folder / "nerfstudio_models"

@@ -1,4 +1,4 @@
-"""Gaussians in files for splat viewers: ply, glTF (KHR_gaussian_splatting) and spz."""
+"""Gaussians in files for splat viewers: ply, glTF (KHR_gaussian_splatting), spz, and a page for browsers."""
 
 from __future__ import annotations
 
@@ -6,24 +6,29 @@ import gzip
 import json
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.splats_page import splats_page
+from shellgs_method.geometry.camera import Camera
 
 DEGREE_0 = 0.5 / math.sqrt(math.pi)
 """The spherical harmonic of degree 0."""
-Y_UP = (".glb", ".spz")
+FORMATS: tuple[str, ...] = (".ply", ".glb", ".spz", ".html")
+Y_UP = (".glb", ".spz", ".html")
 """Formats whose y axis points up, whatever the scene's does."""
 DISCS = "SplatRenderMode: 2dgs"
 """Comment in the ply of discs, by which viewers render them as such."""
+LARGEST_PAGE = 300
+"""Megabytes: a string has at most 512 in Chromium, and 9 million Gaussians take 1.2 GB of a graphics card."""
 _EXTENSION = "KHR_gaussian_splatting"
 _ELLIPSE = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 
@@ -66,9 +71,14 @@ class Splats:
         return math.isqrt(self.harmonics.shape[1]) - 1
 
     @property
+    def is_finite(self) -> Bool[Tensor, " N"]:
+        """Which Gaussians have no NaN or infinite value: these break viewers."""
+        return torch.stack([each.flatten(1).isfinite().all(dim=1) for each in self._tensors]).all(dim=0)
+
+    @property
     def finite(self) -> Splats:
-        """Without Gaussians that have a NaN or infinite value, which break viewers."""
-        return self[torch.cat([each.flatten(1).double() for each in self._tensors], dim=1).isfinite().all(dim=1)]
+        """Those that are."""
+        return self[self.is_finite]
 
 
 def check_splats_format(path: Path, discs: bool = False) -> None:
@@ -79,56 +89,47 @@ def check_splats_format(path: Path, discs: bool = False) -> None:
     """
     check_output(path)
     suffix = path.suffix.lower()
-    if suffix not in _WRITERS:
+    if suffix not in FORMATS:
         raise SceneError(f"{path}: splats are written as ply, glb, spz or html: name a file that ends in one of these")
     if discs and suffix == ".spz":
-        raise SceneError(f"{path}: spz has no discs, which have no thickness: name a .ply or .glb")
+        raise SceneError(f"{path}: spz has no discs, which have no thickness: name a .ply, .glb or .html")
 
 
-def write_splats(path: Path, splats: Splats, comments: Sequence[str] = ()) -> int:
+def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views: Sequence[Camera] = ()) -> int:
     """Write the finite ones of some Gaussians in the format that the path's suffix names; return their number.
 
     Args:
-        path: ply (Kerbl et al. 2023), glb with KHR_gaussian_splatting, or spz.
+        path: ply (Kerbl et al. 2023), glb with KHR_gaussian_splatting, spz, or html.
         splats: Gaussians; of :data:`Y_UP` formats in a frame whose y axis points up.
         comments: lines that say what the coordinates are, where the format has a place for them.
+        views: cameras from which a page shows them.
 
     Raises:
-        SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format.
+        SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format, or a
+            page would be too large.
     """
-    check_splats_format(path, splats.discs)
     splats = splats.finite
-    _write(path, _WRITERS[path.suffix.lower()](splats, comments))
-    return len(splats)
-
-
-def write_best_splats(path: Path, splats: Splats, megabytes: float, comments: Sequence[str] = ()) -> int:
-    """Write as many of the first Gaussians as a size allows; otherwise as :func:`write_splats`.
-
-    Args:
-        path: as in :func:`write_splats`.
-        splats: Gaussians, the best first.
-        megabytes: largest size of the file.
-        comments: as in :func:`write_splats`.
-
-    Raises:
-        SceneError: as in :func:`write_splats`, or not one Gaussian is that small.
-    """
-    check_splats_format(path, splats.discs)
-    splats, most = splats.finite, 1e6 * megabytes
-    encode, count = _WRITERS[path.suffix.lower()], len(splats)
-    while len(content := encode(splats[:count], comments)) > most:
-        count = min(count - 1, int(count * most / len(content)))
-        if count < 1:
-            raise SceneError(f"{path}: no Gaussian fits into {megabytes:g} MB: give --megabytes more")
-    _write(path, content)
-    return count
-
-
-def _write(path: Path, content: bytes) -> None:
+    content = encoded(path, splats, comments, views)
+    if path.suffix.lower() == ".html" and len(content) > 1e6 * LARGEST_PAGE:
+        raise SceneError(
+            f"{path} would have {len(content) / 1e6:.0f} MB, more than browsers read: give --megabytes {LARGEST_PAGE}"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:
         file.write(content)
+    return len(splats)
+
+
+def encoded(path: Path, splats: Splats, comments: Sequence[str] = (), views: Sequence[Camera] = ()) -> bytes:
+    """Content of the file that :func:`write_splats` writes of finite Gaussians."""
+    check_splats_format(path, splats.discs)
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return _ply(splats, comments)
+    if suffix == ".glb":
+        return _glb(splats, comments)
+    spz = _spz(splats)
+    return spz if suffix == ".spz" else splats_page(spz, splats.discs, comments, views)
 
 
 def read_splats(path: Path) -> Splats:
@@ -254,9 +255,8 @@ encoder for degrees 1 to 3 save up to a quarter, but trained coefficients are as
 from what was written, and is 46 with 6."""
 
 
-def _spz(splats: Splats, comments: Sequence[str]) -> bytes:
+def _spz(splats: Splats) -> bytes:
     """Niantic's spz, version 3: fixed-point positions of 24 bits, all else in bytes, rotations in 32 bits, gzipped."""
-    del comments  # it has no place for them
     most = float(splats.means.abs().max()) if len(splats) else 0.0
     fraction = int(np.clip(22 - math.ceil(math.log2(max(most, 1e-6))), 0, 20))  # bits after the point
     if most * 2**fraction >= 2**23:
@@ -298,6 +298,3 @@ def _smallest_three(quats: Float[np.ndarray, "N 4"]) -> np.ndarray:
     for k in range(3):
         packed = packed << np.uint32(10) | negative[:, k].astype(np.uint32) << np.uint32(9) | sizes[:, k]
     return packed.astype("<u4")
-
-
-_WRITERS: dict[str, Callable[[Splats, Sequence[str]], bytes]] = {".ply": _ply, ".glb": _glb, ".spz": _spz}

@@ -46,7 +46,9 @@ def test_one_command_ends_with_a_mesh_and_does_nothing_twice(inputs, shellgs):
     assert "5 of 5: mesh" in told
     mesh = Path("scene-results/mesh.ply")
     written = mesh.stat().st_mtime_ns
-    assert Path("scene-results/report.html").is_file()
+    (page,) = Path("scene-results").rglob("splats.html")
+    report = Path("scene-results/report.html").read_text()
+    assert f'href="{page.relative_to("scene-results")}">photo-gs</a>' in report
     again = shellgs("run")
     assert again.startswith("Nothing is left to do. Done: scene-results/mesh.ply, scene-results/report.html.")
     assert "config.yml" in again

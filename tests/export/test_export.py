@@ -20,9 +20,10 @@ from dataparsers.cameras import pinhole_camera
 from shellgs_method import cli
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import lpips_network
+from shellgs_method.export.levels import Level, psnr_of
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.export.splats import harmonics_rotation, moved
-from shellgs_method.files.splats import Splats, write_splats
+from shellgs_method.files.splats import Splats, read_splats, write_splats
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.doctor import examine
 from shellgs_method.render.maps import Primitive
@@ -134,19 +135,19 @@ def test_y_points_up_in_gltf_and_spz_and_what_they_show_is_the_same(trainer, tmp
     assert -10 * (image - render(trainer)["rgb"]).square().mean().log10() > least
 
 
-def test_levels_have_half_as_many_gaussians_each_those_that_views_show_most(trainer, tmp_path):
+def test_levels_have_half_as_many_gaussians_each_and_lose_less_than_if_the_rest_were_left_out(trainer, tmp_path):
     cli.splats(trainer.base_dir / "config.yml", tmp_path / "splats.ply", levels=3)
     run = TrainedRun(model_of(trainer), data_of(trainer))
-    views, count = run.datasets[0], run.model.num_points
-    shown = torch.stack([run.model.coverage(views.camera(k))[0] for k in range(len(views))]).amax(dim=0)
-    best, means = shown.argsort(descending=True), run.splats().means.float()
-    for level, name in enumerate(("splats", "splats-1", "splats-2")):
-        written = columns_of(tmp_path / f"{name}.ply")["positions"]
-        assert len(written) == count >> level
-        torch.testing.assert_close(written, means[best[: len(written)]])
-    losses = [json.loads((tmp_path / f"{name}.ply.json").read_text())["psnr_loss"] for name in ("splats", "splats-2")]
+    count, whole = run.model.num_points, Level.whole(run, run.splats())
+    names = "splats", "splats-1", "splats-2"
+    written = [read_splats(tmp_path / f"{name}.ply") for name in names]
+    assert [len(each) for each in written] == [count, count >> 1, count >> 2]
+    assert all(each.discs == whole.splats.discs for each in written)
+    losses = [json.loads((tmp_path / f"{name}.ply.json").read_text())["psnr_loss"] for name in names]
+    best = whole.splats[whole.shown.argsort(descending=True)[: count >> 2]]
+    pruned = psnr_of(run, whole.splats, run.frame) - psnr_of(run, best, run.frame)
     assert losses[0] == 0
-    assert losses[1] > 0.1
+    assert losses[2] < pruned
 
 
 def test_a_size_is_kept_to_the_byte(trainer, tmp_path):

@@ -11,16 +11,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from splat_files import glb_attributes, some, unpacked
+from splat_files import glb_attributes, psnr, some, unpacked
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.splats import moved
-from shellgs_method.files.splats import DISCS, Splats, check_splats_format, read_splats, write_best_splats, write_splats
-from shellgs_method.geometry.camera import Camera
-from shellgs_method.render.view import ViewRenderer
+from shellgs_method.files.splats import DISCS, Splats, check_splats_format, read_splats, write_splats
 
 NODE = Path(os.environ["SHELLGS_NODE"]) / "node_modules" if "SHELLGS_NODE" in os.environ else None
-CAMERA = Camera(torch.eye(4), torch.tensor([[90.0, 0, 80], [0, 90, 60], [0, 0, 1]]), 160, 120)
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
@@ -42,24 +39,6 @@ def test_gltf_has_linear_scales_and_opacities_and_each_coefficient_by_itself(tmp
     assert [name for name in own if name.startswith("SH")] == names
     np.testing.assert_array_equal(np.stack([own[name] for name in names], axis=1), splats.harmonics)
     np.testing.assert_allclose(attributes["COLOR_0"][:, 3] / 255, own["OPACITY"][:, 0], atol=0.003)
-
-
-def psnr(one: Splats, other: Splats) -> float:
-    """Of what a camera sees of the one and of the other."""
-
-    def image(splats: Splats) -> torch.Tensor:
-        gaussians = {
-            "means": splats.means.float(),
-            "quats": splats.quats.float(),
-            "scales": splats.scales.float(),
-            "opacities": splats.opacities.float(),
-            "features_dc": splats.harmonics[:, 0].float(),
-            "features_rest": splats.harmonics[:, 1:].float(),
-        }
-        renderer = ViewRenderer("2d" if splats.discs else "3d", "expected")
-        return renderer(gaussians, CAMERA, torch.zeros(3), splats.degree, False, False)[0].clamp(0, 1)
-
-    return float(-10 * (image(one) - image(other)).square().mean().log10())
 
 
 def test_spz_renders_as_what_was_written(tmp_path):
@@ -121,19 +100,6 @@ def test_a_file_that_is_no_ply_of_gaussians_is_refused(tmp_path, change, message
     (tmp_path / "a.ply").write_bytes(change((tmp_path / "a.ply").read_bytes()))
     with pytest.raises(SceneError, match=message):
         read_splats(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize("suffix", ["ply", "glb", "spz"])
-def test_as_many_gaussians_are_written_as_the_size_allows(tmp_path, suffix):
-    splats, path = some(), tmp_path / f"a.{suffix}"
-    write_splats(path, splats)
-    whole = path.stat().st_size / 1e6
-    assert write_best_splats(path, splats, whole) == 400
-    count = write_best_splats(path, splats, whole / 2)
-    assert 150 < count < 210
-    assert path.stat().st_size / 1e6 <= whole / 2
-    with pytest.raises(SceneError, match="no Gaussian fits into 1e-05 MB"):
-        write_best_splats(path, splats, 1e-5)
 
 
 @pytest.mark.parametrize(

@@ -339,6 +339,9 @@ def test_a_missing_config_is_named(tmp_path, monkeypatch):
         (["splats", "--output", "folder"], "folder is a folder"),
         (["mesh", "--output", "folder.ply"], "folder.ply is a folder"),
         (["mesh", "--output", "file/mesh.ply"], "is a file, not a folder"),
+        (["splats", "--output", "dangling/a.ply"], "dangling is a link to gone, which does not exist"),
+        (["splats", "--output", "dangling.ply"], "dangling.ply is a link to gone, which does not exist"),
+        (["splats", "--output", f"{'a' * 240}.ply"], "is too long for a file's name"),
         (["mesh", "--faces", "0"], "--faces must be at least 4"),
         (["mesh", "--voxel", "nan"], "--voxel above 0"),
         (["mesh", "--margin", "-1"], "--margin at least 0"),
@@ -349,9 +352,17 @@ def test_an_invalid_output_or_number_is_refused_before_the_work(run, monkeypatch
     Path("file").touch()
     for name in ("folder", "folder.ply"):
         Path(name).mkdir()
+    for name in ("dangling", "dangling.ply"):
+        Path(name).symlink_to("gone")
     before = files(run)
     assert why in refusal(monkeypatch, words[0], "config.yml", *words[1:])
     assert files(run) == before
+
+
+def test_a_folder_of_another_user_is_refused_before_the_run_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *_: False)
+    said = refusal(monkeypatch, "splats", tmp_path / "config.yml", "--output", tmp_path / "a.ply")
+    assert f"you may not write to {tmp_path}" in said
 
 
 @pytest.mark.parametrize("command", ["evaluate", "splats", "mesh"])
