@@ -32,6 +32,8 @@ from shellgs_method.files.scene import ScenePaths
 
 ROOT = Path(__file__).parents[1]
 TORCH = ("torch", "numpy", "scipy")
+UNUSED = ("shellgs", "transformers")
+"""Packages to leave out: this one is built anew, and the other is imported only where it is, with all it asks for."""
 IMPORTED = """
 import runpy, sys
 from importlib.metadata import packages_distributions, version
@@ -82,7 +84,7 @@ def main(
         raise SceneError(f"{kit} is not empty: give another folder, or remove it first")
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        packages = without(imported(scene), installed(there) | {"shellgs"})
+        packages = without(imported(scene), installed(there) | {*UNUSED})
         download(packages, python, folder / "wheels")
         build_own(folder / "wheels")
         copy_code(folder / "code")
