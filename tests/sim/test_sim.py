@@ -21,8 +21,8 @@ from walls import ARCH, GATE, eyes_before, wall_with_bays
 
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.colours import GREY
-from shellgs_method.export.frame import Frame
-from shellgs_method.geometry.axes import likely_up
+from shellgs_method.export.frame import Frame, Z
+from shellgs_method.geometry.axes import likely_up, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -285,7 +285,7 @@ def test_a_setting_that_nothing_can_be_made_with_is_refused_at_once(name, value)
 
 
 def test_a_ground_that_is_no_height_is_refused():
-    with pytest.raises(SceneError, match="is no height"):
+    with pytest.raises(SceneError, match="--ground nan cannot be: give a number"):
         SimSettings(ground=math.nan)
 
 
@@ -367,6 +367,13 @@ def test_national_coordinates_are_recovered():
     np.testing.assert_allclose(transformed(transformed(points, motion), made.to_national), national, atol=1e-6)
     np.testing.assert_array_equal(made.to_national[:3, :3], np.eye(3))  # the offset alone is enough
     assert not np.mod(made.offset[:2], 1).any()
+
+
+def test_coordinates_and_offset_add_up_to_those_of_the_exported_mesh_with_z_up():
+    frame, points = metric_frame("y")
+    made, motion = sim_frame(frame, points, cameras_of_scene())
+    expected = (points + frame.offset) @ turn(frame.up, Z).T
+    np.testing.assert_allclose(transformed(points, motion) + made.offset, expected, atol=1e-6)
 
 
 def test_a_scene_without_a_shell_is_turned_upright():
