@@ -227,13 +227,15 @@ def test_the_vectorised_form_steps_all(folder):
     envs.close()
 
 
-def test_ppo_learns_some_updates_without_fault(folder):
+@pytest.mark.parametrize("sensor", ["depth", "lidar"])
+def test_ppo_learns_some_updates_without_fault(folder, sensor):
     from stable_baselines3 import PPO
 
-    from benchmarks.nav import Flat
+    from benchmarks.nav import make as flat
 
-    env = Flat(gymnasium.make(NAME, world=folder, depth=False, obstacle=True))
-    model = PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0, device="cpu").learn(128)
+    model = PPO("MlpPolicy", flat(folder, sensor), n_steps=64, batch_size=32, n_epochs=2, seed=0, device="cpu").learn(
+        128
+    )
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 
