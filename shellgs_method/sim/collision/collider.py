@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.geometry.decimation import decimated
 from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.machine.open3d import import_open3d
 from shellgs_method.sim.collision.clusters import ROUND, clusters, connected, flattest
 from shellgs_method.sim.collision.parts import Part, joined
 from shellgs_method.sim.ground import LEVEL, Ground
@@ -113,18 +113,6 @@ def make_collider(
 def _together(one: Triangles, other: Triangles) -> Triangles:
     vertices = np.concatenate([one.vertices, other.vertices])
     return Triangles(vertices, np.concatenate([one.faces, other.faces + len(one.vertices)]))
-
-
-def decimated(surface: Triangles, faces: int) -> Triangles:
-    """About ``faces`` triangles by quadric error (Garland and Heckbert 1997); the surface itself if it has no more."""
-    if len(surface.faces) <= faces:
-        return surface
-    o3d = import_open3d()
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(surface.vertices), o3d.utility.Vector3iVector(surface.faces.astype(np.int32))
-    )
-    mesh = mesh.remove_duplicated_vertices().simplify_quadric_decimation(faces)
-    return Triangles(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
 
 
 def _thickened(solid: Triangles, surface: Triangles, faces: Int64[np.ndarray, " _"]) -> Part | None:

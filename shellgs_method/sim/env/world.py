@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from jaxtyping import Float64
 from scipy.spatial import ConvexHull
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import read_json
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.env.robot import DEFAULT_ROBOT
 from shellgs_method.sim.frame import FRAME
@@ -75,10 +75,7 @@ class World:
         """
         if not (folder / "world.xml").is_file() or not (folder / FRAME).is_file():
             raise SceneError(f"{folder} has no world.xml and frame.json: give a folder that shellgs sim wrote")
-        try:
-            facts = json.loads((folder / FRAME).read_text())
-        except ValueError as error:
-            raise SceneError(f"{folder / FRAME} is damaged ({error}): write the folder again") from error
+        facts = read_json(folder / FRAME)
         workspace = Workspace.read(facts, folder / FRAME)
         spec = read_spec(folder / "world.xml")
         spec.option.timestep = TIMESTEP
