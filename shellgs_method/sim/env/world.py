@@ -99,6 +99,15 @@ class World:
         buildings = list(facts.get("buildings") or ["facade"])
         return cls(model, solid, ground, workspace, grid, _radius(model), buildings, folder)
 
+    def mocap(self, name: str) -> int:
+        """Number of a body that is moved from outside: the obstacle, or a pedestrian."""
+        return int(self.model.body_mocapid[self.model.body(name).id])
+
+    def put(self, data, name: str, place: Float64[np.ndarray, " 2"], height: float, heading: float = 0.0) -> None:
+        """Put such a body somewhere, its middle a height in metres above the ground, turned by a heading in radians."""
+        data.mocap_pos[self.mocap(name)] = *place, self.ground.at(place[None])[0] + height
+        data.mocap_quat[self.mocap(name)] = np.cos(heading / 2), 0, 0, np.sin(heading / 2)
+
 
 def root_of(model) -> int:
     """Number of the robot's first body."""
