@@ -306,6 +306,20 @@ def test_a_surface_that_a_file_has_twice_keeps_its_door(nothing):
     assert not np.any(through)
 
 
+@pytest.mark.parametrize("eyes", [[[0.0, -4, 1.6], [4.4, -4, 1.6]], [[0.0, -4, 1.6], [4.4, -4, 1.6], [2, 4, 1.6]]])
+def test_the_gaps_of_a_fence_are_open(eyes):
+    """Twenty pickets with gaps of 12 cm, and two rails: their backs are not seen, or from one place alone."""
+    pickets = [box([0.22 * k, 0, 0], [0.22 * k + 0.1, 0.04, 1.2]) for k in range(20)]
+    rails = [box([0, 0.04, z], [4.28, 0.07, z + 0.08]) for z in (0.3, 0.9)]
+    vertices = np.concatenate([each.vertices for each in (*pickets, *rails)])
+    faces = np.concatenate([each.faces + 8 * k for k, each in enumerate((*pickets, *rails))])
+    fence, seen = outward(Triangles(vertices, faces), np.array(eyes))
+    made = make_collider(None, fence, seen, density=2000)
+    gaps = np.stack([0.16 + 0.22 * np.arange(19), np.full(19, -3), np.full(19, 0.6)], axis=1)
+    assert not made.surface.blocked(gaps, np.array([0, 1.0, 0])).any()
+    assert made.surface.blocked(gaps + np.array([0.11, 0, 0]), np.array([0, 1.0, 0])).all()
+
+
 def test_a_cellar_is_no_ground():
     floors = [box([0, 0, height], [8, 6, height + 0.01]) for height in (-3.0, 0.3)]
     vertices = np.concatenate([floor.vertices for floor in floors])
