@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
+from benchmarks.walls import eyes_before, wall_with_bays
 from shellgs_method.files.colmap import ColmapImage, read_model
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
@@ -26,7 +27,6 @@ from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.scene import FacadeConfig
-from tests.walls import eyes_before, wall_with_bays
 
 CELLS = 0.1, 0.038, 0.027, 0.0191
 """Cells of the wall in metres: 18, 125, 250 and 500 thousand triangles."""

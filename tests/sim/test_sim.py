@@ -17,8 +17,8 @@ import torch
 import trimesh
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
-from walls import ARCH, GATE, eyes_before, wall_with_bays
 
+from benchmarks.walls import ARCH, GATE, eyes_before, wall_with_bays
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.colours import GREY
 from shellgs_method.export.frame import Frame, Z

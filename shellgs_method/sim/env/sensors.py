@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from shellgs_method.files.splats import Splats, read_splats
@@ -47,17 +47,31 @@ def cast_at_moving(
         For each ray the distance in lengths of the ray, infinite where nothing is hit, the number of the geom, and the
         normal.
     """
-    distances, geoms, normals = np.full(len(rays), -1.0), np.zeros(len(rays), np.int32), np.zeros((len(rays), 3))
-    if model.nmocap == 0 and groups == (MOVING,):
-        return np.full(len(rays), np.inf), geoms, normals
-    mask = np.isin(np.arange(6), groups).astype(np.uint8)
     lengths = np.linalg.norm(rays, axis=1)
     directions = rays / lengths[:, None]
-    mujoco.mj_multiRay(
-        model, data, origin[:, None], directions.reshape(-1, 1), mask, STATIC, -1, geoms, distances,
-        normals.reshape(-1, 1), len(rays), 1e3,
-    )  # fmt: skip
-    return np.where(distances < 0, np.inf, distances / lengths), geoms, normals
+    near = np.flatnonzero(_aimed(model, data, origin, directions, groups))
+    found, hit, normal = np.empty(len(near)), np.zeros(len(near), np.int32), np.zeros((len(near), 3))
+    if len(near):
+        mask = np.isin(np.arange(6), groups).astype(np.uint8)
+        mujoco.mj_multiRay(
+            model, data, origin[:, None], directions[near].reshape(-1, 1), mask, STATIC, -1, hit, found,
+            normal.reshape(-1, 1), len(near), 1e3,
+        )  # fmt: skip
+    distances, geoms, normals = np.full(len(rays), np.inf), np.zeros(len(rays), np.int32), np.zeros((len(rays), 3))
+    distances[near] = np.where(found < 0, np.inf, found / lengths[near])
+    geoms[near], normals[near] = hit, normal
+    return distances, geoms, normals
+
+
+def _aimed(
+    model, data, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "R 3"], groups: Sequence[int]
+) -> Bool[np.ndarray, " R"]:
+    """Which rays pass the sphere around a geom that moves: MuJoCo takes its time with each of the others too."""
+    moving = np.isin(model.geom_group, groups) & (model.body_weldid[model.geom_bodyid] != 0)
+    away, radius = data.geom_xpos[moving] - origin, model.geom_rbound[moving]
+    distance = np.linalg.norm(away, axis=1)
+    beside = np.sqrt(np.maximum(distance**2 - radius**2, 0))  # along a ray that touches the sphere
+    return (directions @ away.T >= beside - 1e-9).any(axis=1) | bool((distance <= radius).any())
 
 
 def cast(
