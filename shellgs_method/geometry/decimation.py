@@ -14,11 +14,20 @@ if TYPE_CHECKING:
     import trimesh
 
 
+MOST = 250_000
+"""Triangles above which vertices are merged in voxels first: collapsing a plane of 500 000 took Open3D minutes."""
+
+
 def decimated(surface: Triangles, faces: int) -> Triangles:
     """About ``faces`` triangles of a surface; the surface itself if it has no more."""
     if len(surface.faces) <= faces:
         return surface
-    mesh = _open3d_mesh(surface.vertices, surface.faces).remove_duplicated_vertices().simplify_quadric_decimation(faces)
+    mesh = _open3d_mesh(surface.vertices, surface.faces).remove_duplicated_vertices()
+    if len(surface.faces) > max(MOST, faces):
+        o3d = import_open3d()
+        voxel = float(np.sqrt(4 * surface.areas.sum() / max(MOST, 4 * faces)))
+        mesh = mesh.simplify_vertex_clustering(voxel, o3d.geometry.SimplificationContraction.Quadric)
+    mesh = mesh.simplify_quadric_decimation(faces)
     return Triangles(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
 
 
