@@ -1,6 +1,7 @@
-"""Learn to reach goals behind an obstacle from a lidar, by PPO of stable-baselines3, and count success and SPL.
+"""Learn to reach goals behind an obstacle from depth or a lidar, by PPO of stable-baselines3; count success and SPL.
 
-    python -m benchmarks.nav facade-sim/ --steps 30000
+    python -m benchmarks.nav facade-sim/ depth --steps 30000
+    python -m benchmarks.nav facade-sim/ lidar --steps 30000
 
 trains one policy a seed, and compares it with random actions over the same episodes. ``--measure-speed``
 measures the environment instead: steps a second without images, and images a second of the splat camera.
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Literal
 
 import gymnasium
 import numpy as np
@@ -21,27 +23,32 @@ from shellgs_method.sim.env import NAME
 from shellgs_method.sim.env.facade_nav import RANGE, CameraSettings
 from shellgs_method.sim.env.sensors import camera_of
 
+Sensor = Literal["depth", "lidar"]
+
 FIRST_EPISODE = 10_000
 """Seed of the first episode of the comparison: none is trained on."""
 
 
 class Flat(gymnasium.ObservationWrapper):
-    """Goal and lidar as one vector of numbers of about 1."""
+    """Goal and nearness, by lidar or depth, as one vector of numbers of about 1."""
 
-    def __init__(self, env: gymnasium.Env) -> None:
+    def __init__(self, env: gymnasium.Env, sensor: Sensor) -> None:
         super().__init__(env)
-        size = 3 + env.observation_space["lidar"].shape[0]  # pyright: ignore
+        self._sensor = sensor
+        size = len(self.observation(env.observation_space.sample()))
         self.observation_space = gymnasium.spaces.Box(-2, 2, (size,), np.float32)
 
     def observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         distance, bearing = observation["goal"]
         goal = [min(distance / 10, 2), np.cos(bearing), np.sin(bearing)]
-        near = np.exp(-observation["lidar"] / (RANGE / 10))
-        return np.concatenate([goal, near]).astype(np.float32)
+        measured = observation[self._sensor]
+        if self._sensor == "depth":
+            measured = measured.reshape(3, 6, 16, 2).min(axis=(1, 3)).ravel()
+        return np.concatenate([goal, np.exp(-measured / (RANGE / 10))]).astype(np.float32)
 
 
-def make(world: Path) -> gymnasium.Env:
-    return Flat(gymnasium.make(NAME, world=world, depth=False, obstacle=True))
+def make(world: Path, sensor: Sensor) -> gymnasium.Env:
+    return Flat(gymnasium.make(NAME, world=world, depth=sensor == "depth", obstacle=True), sensor)
 
 
 def evaluated(env: gymnasium.Env, policy, episodes: int) -> tuple[float, float, float]:
@@ -58,10 +65,10 @@ def evaluated(env: gymnasium.Env, policy, episodes: int) -> tuple[float, float, 
     return float(success), float(spl), float(collisions)
 
 
-def learn(world: Path, steps: int, seeds: int, episodes: int) -> None:
+def learn(world: Path, sensor: Sensor, steps: int, seeds: int, episodes: int) -> None:
     from stable_baselines3 import PPO
 
-    env = make(world)
+    env = make(world, sensor)
     for seed in range(seeds):
         env.action_space.seed(seed)
         random = evaluated(env, lambda _: env.action_space.sample(), episodes)
@@ -99,6 +106,7 @@ def speed(world: Path, steps: int) -> None:
 
 def main(
     world: tyro.conf.Positional[Path],
+    sensor: tyro.conf.Positional[Sensor] = "depth",
     steps: int = 30_000,
     seeds: int = 3,
     episodes: int = 50,
@@ -107,7 +115,7 @@ def main(
     if measure_speed:
         speed(world, 1000)
     else:
-        learn(world, steps, seeds, episodes)
+        learn(world, sensor, steps, seeds, episodes)
 
 
 if __name__ == "__main__":

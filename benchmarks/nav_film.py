@@ -30,7 +30,7 @@ def main(world: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> 
     import mujoco
 
     env = gymnasium.make(NAME, world=world, depth=False, rgb=CameraSettings(*SIZE), pedestrians=4).unwrapped
-    places, ahead = env._allowed, np.median(env.world.workspace.directions, axis=0)  # pyright: ignore
+    places, ahead = env.course.places, np.median(env.world.workspace.directions, axis=0)  # pyright: ignore
     along = places @ np.array([ahead[1], -ahead[0]])
     heading = float(np.arctan2(ahead[1], ahead[0]))
     options = {"start": places[along.argmin()], "goal": places[along.argmax()], "heading": heading}

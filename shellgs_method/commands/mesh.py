@@ -33,14 +33,14 @@ def mesh(
     from shellgs_method.evaluation.tables import SURFACE_COLUMNS, against_truth, rich_table
     from shellgs_method.export.meshes import METRE_FORMATS, check_mesh_format, write_mesh
     from shellgs_method.export.runs import TrainedRun, mesh_errors
-    from shellgs_method.geometry.tsdf import decimate
+    from shellgs_method.geometry.decimation import decimated_mesh
 
     output = output or config.with_name("mesh.ply")
     check_mesh_format(output)
     if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
         raise SceneError("--faces must be at least 4, --voxel above 0 and --margin at least 0")
     run = TrainedRun.load(config)
-    surface = decimate(run.surface(margin, voxel), faces)
+    surface = decimated_mesh(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, surface)
     write_mesh(output, surface, run.frame, metrics)
     rows = {name: row for name, row in (("shell", metrics), ("truth", against_truth(metrics))) if "rendered" in row}

@@ -67,8 +67,10 @@ def atomic_contents(folder: Path) -> Iterator[Path]:
     What else is there stays.
 
     Raises:
-        SceneError: a file and a folder have the same path; none is replaced.
+        SceneError: a file and a folder have the same path, and none is replaced; or the folder is a link to nothing.
     """
+    if folder.is_symlink() and not folder.exists():
+        raise SceneError(f"{folder} is a link to {folder.readlink()}, which does not exist: make that folder")
     folder.mkdir(parents=True, exist_ok=True)
     complete = unfinished(folder / folder.resolve().name)  # inside: the folder itself may be a mounted one
     complete.mkdir()

@@ -104,34 +104,6 @@ def least_voxel(box: Box) -> float:
     return float(np.sort(box.high - box.low)[1]) / FINEST
 
 
-def decimate(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """Decimate a mesh to about ``faces`` triangles by quadric error (Garland and Heckbert 1997), with its colours.
-
-    Raises:
-        SceneError: no triangle is left.
-    """
-    import trimesh
-
-    if len(mesh.faces) <= faces:
-        return mesh
-    o3d = import_open3d()
-    dense = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
-    )
-    dense.vertex_colors = o3d.utility.Vector3dVector(mesh.visual.vertex_colors[:, :3] / 255)  # pyright: ignore
-    sparse = dense.simplify_quadric_decimation(max(faces, 0))
-    if len(sparse.triangles) == 0:
-        raise SceneError(f"nothing is left of a mesh of {len(mesh.faces)} triangles decimated to {faces}")
-    colours = np.round(255 * np.asarray(sparse.vertex_colors)).clip(0, 255).astype(np.uint8)
-    return trimesh.Trimesh(
-        np.asarray(sparse.vertices),
-        np.asarray(sparse.triangles),
-        vertex_colors=colours,
-        process=False,
-        metadata=mesh.metadata,
-    )
-
-
 def _inside(views: Iterable[DepthView], box: Box) -> Iterator[DepthView]:
     """The views that show something in the box, with depth there alone."""
     for view in views:

@@ -21,11 +21,12 @@ from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.photographs import View, load_mask, load_photograph
 from shellgs_method.files.splats import Splats
 from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.decimation import decimated_mesh
 from shellgs_method.geometry.depth_normals import normals_from_depth
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import NO_CLASSES, SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.geometry.tsdf import DepthView, decimate
+from shellgs_method.geometry.tsdf import DepthView
 from shellgs_method.machine.progress import tell
 from shellgs_method.occlusion import shell_verdicts
 from shellgs_method.occlusion.exposure import exposed
@@ -104,7 +105,7 @@ class Reconstruction:
         if ground is None and run.shell is not None:
             below.append(_level_points(run))
         tell("Simplifying the surface")
-        fused = decimate(surface, faces)
+        fused = decimated_mesh(surface, faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
         frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground)
         folder = Path(run.datamanager.config.dataparser.data)

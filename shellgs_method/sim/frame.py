@@ -81,7 +81,7 @@ def sim_frame(
     sim = SimFrame(
         frame.name,
         frame.to_scene @ back,
-        to_national[:3, 3],
+        origin,
         frame.metric,
         Z,
         to_national if frame.metric else np.eye(4),

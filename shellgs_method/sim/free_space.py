@@ -131,10 +131,17 @@ class FreeSpace:
         down, right = np.unravel_index(around.argmin(), around.shape)
         return self.origin + CELL * np.array([left + right, top + down])
 
-    def write(self, folder: Path) -> None:
-        """Write ``map.pgm`` and ``map.yaml``, the map of ROS' nav2: the first row is that of the largest y."""
+    def write(self, folder: Path, places: Float64[np.ndarray, "P 2"]) -> None:
+        """Write ``map.pgm`` and ``map.yaml``, the map of ROS' nav2: the first row is that of the largest y.
+
+        Cells that are not joined to any of the places, those in buildings say, are unknown.
+        """
+        groups = np.empty(self.occupied.shape, np.int32)
+        label(~self.occupied, output=groups)
+        outside = np.isin(groups, groups[tuple(self._cells(places).T)])
+        cells = np.where(self.occupied, 0, np.where(outside, 254, 205))
         with atomic_write(folder / "map.pgm") as file:
-            Image.fromarray(np.where(self.occupied[::-1], 0, 254).astype(np.uint8)).save(file, format="PPM")
+            Image.fromarray(cells[::-1].astype(np.uint8)).save(file, format="PPM")
         x, y = self.origin - CELL / 2
         lines = (
             "image: map.pgm", "mode: trinary", f"resolution: {CELL}", f"origin: [{x:.3f}, {y:.3f}, 0.0]", "negate: 0",

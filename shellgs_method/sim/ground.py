@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import distance_transform_edt, median_filter
 from scipy.optimize import least_squares
@@ -24,7 +26,7 @@ REACH = 15.0
 BEYOND = 20.0
 """Width of the ground around the cameras and what is known of it, in metres."""
 BAND = 1.0
-"""Distance from a plane, in metres, within which the ground is."""
+"""Height in metres by which the ground may leave a plane, or what is already found of it beside it, as on stairs."""
 STEP = 0.25
 """Largest step between neighbouring cells, in metres: stairs have 20 cm, and the tops of walls and cars are higher."""
 GAP = 0.3
@@ -42,6 +44,14 @@ STEADY = 100.0
 along an axis: that of 10 square metres over 10 metres."""
 LEAST = 5.0
 """Area in square metres, measured, below which the ground is taken for level at height 0."""
+STREETS = 3
+"""Number of level surfaces that are looked at: a street, one above it, a roof."""
+STANDING = 3.0
+"""Height in metres up to which a camera is carried by somebody who stands on the ground below it."""
+ASIDE = 5.0
+"""Horizontal distance in metres from a camera up to which the ground that it stands on is measured."""
+STOOD_ON = 0.1
+"""Share of the cameras that must stand on a street: fewer are held over a parapet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,38 +77,26 @@ class Ground:
 
     @classmethod
     def of(cls, points: Float64[np.ndarray, "N 3"], eyes: Float64[np.ndarray, "E 3"]) -> Ground:
-        """The ground that points show: those below the cameras, on cells joined by small steps.
+        """The ground that points show: what cameras stand on, of cells joined by small steps.
 
-        Level, at height 0, if hardly any points are there.
+        If they stand on nothing, as those of a drone, it is the lowest of the large level surfaces: not a roof. Level,
+        at height 0, if hardly any points are there.
 
         Args:
             points: points of the ground and of other things, in the simulation frame.
             eyes: camera positions.
         """
-        away, nearest = point_tree(eyes[:, :2]).query(points[:, :2]) if len(points) else (np.empty(0), np.empty(0, int))
-        points = points[(away < REACH) & (points[:, 2] < eyes[nearest, 2])]
-        if len(points) < 3:
+        if len(points) == 0:
             return cls.level()
-        plane = _plane(points)
-        points = points[np.abs(points @ [*-plane[:2], 1.0] - plane[2]) < BAND]
-        low, high = (
-            end(np.concatenate([points[:, :2], eyes[:, :2]]), axis=0) + sign * BEYOND
-            for end, sign in ((np.min, -1), (np.max, 1))
-        )
-        cell = max(CELL, float(np.sqrt(np.prod(high - low) / CELLS)))
-        shape = tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 1)
-        rows, columns = np.indices(shape)
-        flat = low[0] + cell * columns, low[1] + cell * rows
-        level = plane[0] * flat[0] + plane[1] * flat[1] + plane[2]
-        measured = _lowest(points, low, cell, shape) - level
-        known = _joined(measured, max(round(GAP / cell), 1))
-        if known.sum() * cell**2 < LEAST:
+        away, nearest = (np.asarray(each) for each in point_tree(eyes[:, :2]).query(points[:, :2]))
+        points, highest = points[away < REACH], eyes[nearest[away < REACH], 2]
+        grid = _Grid.around(np.concatenate([points[:, :2], eyes[:, :2]]))
+        streets = _stood_on(list(_streets(points, points[:, 2] < highest, grid)), eyes, grid)
+        if not streets:
             return cls.level()
-        gap, (row, column) = distance_transform_edt(~known, return_indices=True)  # pyright: ignore
-        smooth = median_filter(measured[row, column], size=3)
-        away = gap * cell
-        heights = level + smooth[row, column] * np.exp(-np.maximum(away - GAP, 0) / FADE)
-        return cls(heights, cell, low, away <= GAP)
+        gaps = np.stack([street.gap for street in streets])
+        heights = np.choose(gaps.argmin(axis=0), [street.everywhere for street in streets])
+        return cls(heights, grid.cell, grid.low, gaps.min(axis=0) <= GAP)
 
     def __str__(self) -> str:
         if not self.known.any():
@@ -141,6 +139,122 @@ class Ground:
 LEVEL = Ground.level()
 
 
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Cells of points: ``low`` is the middle of the first."""
+
+    low: Float64[np.ndarray, " 2"]
+    cell: float
+    shape: tuple[int, ...]
+
+    @classmethod
+    def around(cls, places: Float64[np.ndarray, "N 2"]) -> _Grid:
+        low, high = places.min(axis=0) - BEYOND, places.max(axis=0) + BEYOND
+        cell = max(CELL, float(np.sqrt(np.prod(high - low) / CELLS)))
+        return cls(low, cell, tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 1))
+
+    def cells(self, points: Float64[np.ndarray, "N C"]) -> Int64[np.ndarray, " N"]:
+        """Numbers of the cells of points."""
+        column, row = np.round((points[:, :2] - self.low) / self.cell).astype(int).T
+        return row * self.shape[1] + column
+
+    def level(self, plane: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "R C"]:
+        """Heights of a plane."""
+        rows, columns = np.indices(self.shape)
+        return plane[0] * (self.low[0] + self.cell * columns) + plane[1] * (self.low[1] + self.cell * rows) + plane[2]
+
+    def lowest(self, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "R C"]:
+        """A low quantile of the heights of each cell's points; NaN where there are none."""
+        index = self.cells(points)
+        order = np.lexsort((points[:, 2], index))
+        cells, first, size = np.unique(index[order], return_index=True, return_counts=True)
+        heights = np.full(self.shape[0] * self.shape[1], np.nan)
+        heights[cells] = points[order[first + (LOW * (size - 1)).astype(int)], 2]
+        return heights.reshape(self.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _Street:
+    """Ground that is joined by small steps.
+
+    Attributes:
+        measured: heights; NaN where there are none.
+        level: heights of the plane that it passes into.
+        cell: side of a cell in metres.
+    """
+
+    measured: Float64[np.ndarray, "R C"]
+    level: Float64[np.ndarray, "R C"]
+    cell: float
+
+    @classmethod
+    def of(cls, points: Float64[np.ndarray, "N 3"], below: Bool[np.ndarray, " N"], grid: _Grid) -> _Street:
+        """The street of most of the points below cameras, followed from its plane to all that is joined to it."""
+        level = grid.level(_plane(points[below]))
+        street = cls(np.full(grid.shape, np.nan), level, grid.cell)
+        index = grid.cells(points)
+        near = below & (np.abs(points[:, 2] - level.ravel()[index]) < BAND)
+        while near.any():
+            heights = grid.lowest(points[near])
+            heights[~_joined(heights - level, max(round(GAP / grid.cell), 1))] = np.nan
+            longer = cls(heights, level, grid.cell)
+            if longer.area <= street.area:
+                return street
+            street = longer
+            near = np.abs(points[:, 2] - street.nearest.ravel()[index]) < BAND
+        return street
+
+    @property
+    def area(self) -> float:
+        """Measured square metres."""
+        return float(np.isfinite(self.measured).sum() * self.cell**2)
+
+    @cached_property
+    def _next(self) -> tuple[Float64[np.ndarray, "R C"], Int64[np.ndarray, "2 R C"]]:
+        """Distance in cells to the nearest measured cell, and that cell."""
+        return distance_transform_edt(np.isnan(self.measured), return_indices=True)  # pyright: ignore
+
+    @property
+    def gap(self) -> Float64[np.ndarray, "R C"]:
+        """Distance in metres to the nearest measured cell."""
+        return self._next[0] * self.cell
+
+    @property
+    def nearest(self) -> Float64[np.ndarray, "R C"]:
+        """Height of the nearest measured cell."""
+        return self.measured[tuple(self._next[1])]
+
+    @property
+    def everywhere(self) -> Float64[np.ndarray, "R C"]:
+        """Heights, which pass into those of the plane where none is measured."""
+        smooth = median_filter(self.nearest - self.level, size=3)
+        return self.level + smooth * np.exp(-np.maximum(self.gap - GAP, 0) / FADE)
+
+
+def _streets(points: Float64[np.ndarray, "N 3"], below: Bool[np.ndarray, " N"], grid: _Grid) -> Iterator[_Street]:
+    """Level surfaces that are begun below cameras, that of most points first."""
+    for _ in range(STREETS):
+        if below.sum() < 3:
+            return
+        street = _Street.of(points, below, grid)
+        if street.area < LEAST:
+            return
+        yield street
+        below = below & (np.abs(points[:, 2] - street.nearest.ravel()[grid.cells(points)]) > BAND)
+
+
+def _stood_on(streets: list[_Street], eyes: Float64[np.ndarray, "E 3"], grid: _Grid) -> list[_Street]:
+    """The streets that cameras stand on, each on one; if they stand on none, the lowest."""
+    found, cells, free = [], grid.cells(eyes), np.ones(len(eyes), bool)
+    for street in streets:
+        above = eyes[:, 2] - street.nearest.ravel()[cells]
+        stand = free & (above > 0) & (above < STANDING) & (street.gap.ravel()[cells] < ASIDE)
+        if stand.mean() >= STOOD_ON:
+            found.append(street)
+            free &= ~stand
+    return found or sorted(streets, key=lambda street: np.nanmedian(street.measured))[:1]
+
+
 def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:
     """Slopes along x and y, and height at the origin, of the plane of most of the points that are lowest."""
     squares, square = np.unique(np.floor(points[:, :2]), axis=0, return_inverse=True)
@@ -157,19 +271,6 @@ def _plane(points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, " 3"]:
     slope = least_squares(off, np.zeros(3), loss="cauchy", f_scale=0.1).x
     slope[:2] *= 1 / (1 + STEADY / np.square(spread[:, :2]).sum(axis=0).clip(1e-9))  # few points do not show a slope
     return np.array([slope[0], slope[1], middle[2] + slope[2] - slope[:2] @ middle[:2]])
-
-
-def _lowest(
-    points: Float64[np.ndarray, "N 3"], low: Float64[np.ndarray, " 2"], cell: float, shape: tuple[int, ...]
-) -> Float64[np.ndarray, "R C"]:
-    """A low quantile of the heights of each cell's points; NaN where there are none."""
-    column, row = np.round((points[:, :2] - low) / cell).astype(int).T
-    index = row * shape[1] + column
-    order = np.lexsort((points[:, 2], index))
-    cells, first, size = np.unique(index[order], return_index=True, return_counts=True)
-    heights = np.full(shape[0] * shape[1], np.nan)
-    heights[cells] = points[order[first + (LOW * (size - 1)).astype(int)], 2]
-    return heights.reshape(shape)
 
 
 def _joined(heights: Float64[np.ndarray, "R C"], reach: int) -> Bool[np.ndarray, "R C"]:

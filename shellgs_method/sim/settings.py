@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Optional
+from typing import Annotated, Optional
 
+from shellgs_method.bounds import TINY, Bounds, FromOne, Length, bounds_of
 from shellgs_method.errors import SceneError
 
 
@@ -13,27 +13,25 @@ from shellgs_method.errors import SceneError
 class SimSettings:
     """Settings of a simulation folder."""
 
-    parts: float = 200
+    parts: Annotated[float, Bounds(TINY, 1e6)] = 200
     """Maximum number of convex collision parts for 100 square metres of surface."""
-    faces: int = 50_000
+    faces: FromOne = 50_000
     """Number of triangles to decimate the reconstruction to."""
-    voxel: Optional[float] = None
+    voxel: Optional[Length] = None
     """Voxel size in metres for fusing the views, at least half of what the photographs resolve. If not set: a pixel's
     size on the facade."""
-    texel: Optional[float] = None
+    texel: Optional[Length] = None
     """Size of a texture pixel in metres. If not set: a little finer than the photographs."""
-    megabytes: float = 30.0
+    megabytes: Annotated[float, Bounds(TINY, 1e6)] = 30.0
     """Maximum size of visual.glb; its texture is scaled down to fit."""
-    ground: Optional[float] = None
+    ground: Optional[Annotated[float, Bounds(-1e6, 1e6)]] = None
     """Height of level ground in the shell's coordinates. If not set: the ground as scan and photographs show it."""
     test: bool = False
     """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that nothing can be made with, before hours of work."""
-        for name in ("parts", "faces", "voxel", "texel", "megabytes"):
+        for name, bounds in bounds_of(type(self)).items():
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise SceneError(f"--{name} {value:g} cannot be: give a number above 0")
-        if self.ground is not None and not math.isfinite(self.ground):
-            raise SceneError(f"--ground {self.ground:g} is no height: give it in the shell's coordinates, in metres")
+            if value is not None and not bounds.hold(value):
+                raise SceneError(f"--{name} {value:g} cannot be: give {bounds}")

@@ -139,7 +139,8 @@ def _world(
     buildings = {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}
     home.write(out, {"buildings": buildings, "trusted": trusted.facts})
     parts = [part.vertices for chapter in chapters for part in chapter.collider.parts]
-    FreeSpace.of(parts, ground, trusted.eyes[:, :2]).write(out)
+    paths = trusted.eyes[:, :2]
+    FreeSpace.of(parts, ground, paths).write(out, paths)
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")
     metrics = write_report(out, chapters, ground, settings.test, log)
     write_readme(out, assets, home, metrics)

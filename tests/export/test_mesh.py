@@ -22,8 +22,9 @@ from shellgs_method.export.runs import TrainedRun, mesh_errors
 from shellgs_method.geometry import tsdf
 from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.decimation import decimated_mesh
 from shellgs_method.geometry.similarity import transformed
-from shellgs_method.geometry.tsdf import DepthView, decimate, fuse
+from shellgs_method.geometry.tsdf import DepthView, fuse
 from shellgs_method.shell import Alignment, ShellCaster, ShellMesh, load_shell
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.synthetic.building import Layout, building
@@ -149,7 +150,7 @@ def test_views_without_a_common_surface_are_refused():
 
 
 def test_decimation_keeps_the_surface_and_its_colours(sphere):
-    small = decimate(sphere, 2000)
+    small = decimated_mesh(sphere, 2000)
     assert len(small.faces) <= 2000 < len(sphere.faces)
     assert abs(np.median(np.linalg.norm(small.vertices, axis=1)) - 1.5) < 0.02
     np.testing.assert_allclose(np.median(small.visual.vertex_colors[:, :3], axis=0), [255, 128, 0], atol=2)  # pyright: ignore
@@ -158,7 +159,7 @@ def test_decimation_keeps_the_surface_and_its_colours(sphere):
 
 def test_a_mesh_without_triangles_and_voxels_of_negative_size_are_refused(sphere):
     with pytest.raises(SceneError, match="nothing is left"):
-        decimate(sphere, 0)
+        decimated_mesh(sphere, 0)
     with pytest.raises(SceneError, match="a voxel cannot be -1"):
         fuse([], ROOM, -1)
 

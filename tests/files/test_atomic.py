@@ -106,6 +106,12 @@ def test_contents_replace_those_of_the_same_names_once_they_are_complete(tmp_pat
     assert (folder / "page").read_text() == "new"
 
 
+def test_a_folder_that_is_a_link_to_nothing_is_refused(tmp_path: Path):
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(SceneError, match="nowhere, which does not exist"), atomic.atomic_contents(tmp_path / "link"):
+        pass
+
+
 def fill(folder: Path, names: tuple[str, ...], content: str) -> None:
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from worlds import frame_at, some_splats, uneven, write_folder
 from shellgs_method.errors import SceneError
 from shellgs_method.files.splats import write_splats
 from shellgs_method.sim.env import NAME
-from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings
+from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
 from shellgs_method.sim.free_space import CELL, FreeSpace
 from shellgs_method.sim.ground import LEVEL
@@ -123,7 +123,7 @@ def test_the_obstacle_is_between_start_and_goal_and_the_shortest_way_goes_around
     env = make(folder, depth=False, obstacle=True)
     for seed in range(5):
         _, info = env.reset(seed=seed)
-        box = env.data.mocap_pos[env._mocap("obstacle"), :2]
+        box = env.data.mocap_pos[env.world.mocap("obstacle"), :2]
         away, ahead = box - env._place, env.goal - env._place
         assert abs(np.cross(away, ahead)) / np.linalg.norm(ahead) < 0.05
         assert info["shortest"] >= np.linalg.norm(ahead) - NEAR - CELL
@@ -142,13 +142,24 @@ def test_the_length_on_the_grid_is_that_of_the_way_around_a_wall():
 
 def test_a_part_is_occupied_on_the_map_of_nav2_where_it_stands(tmp_path):
     corners = np.array([[x, y, z] for x in (1.0, 2.0) for y in (3.0, 3.4) for z in (0.0, 2.0)])
-    FreeSpace.of([corners], LEVEL, np.array([[0.0, 0.0]])).write(tmp_path)
+    place = np.array([[0.0, 0.0]])
+    FreeSpace.of([corners], LEVEL, place).write(tmp_path, place)
     facts = dict(line.split(": ") for line in (tmp_path / "map.yaml").read_text().splitlines())
     image, origin = np.asarray(Image.open(tmp_path / facts["image"])), json.loads(facts["origin"])
     rows, columns = np.nonzero(image == 0)
     x = origin[0] + (columns + 0.5) * float(facts["resolution"])
     y = origin[1] + (len(image) - rows - 0.5) * float(facts["resolution"])
     assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((1, 2, 3, 3.4), abs=CELL)
+
+
+def test_the_inside_of_a_building_is_unknown_on_the_map(tmp_path):
+    occupied = np.zeros((9, 9), bool)
+    occupied[2:7, 2:7] = True
+    occupied[3:6, 3:6] = False
+    FreeSpace(occupied, np.zeros(2)).write(tmp_path, np.zeros((1, 2)))
+    image = np.asarray(Image.open(tmp_path / "map.pgm"))
+    assert (image[3:6, 3:6] == 205).all()  # as nav2 reads it: (255 - 205) / 255 is above free_thresh
+    assert [(image == grey).sum() for grey in (0, 205, 254)] == [16, 9, 56]
 
 
 def test_spawns_are_inside_the_trusted_workspace_and_views_away_from_the_facade_are_not_trusted(folder):
@@ -176,10 +187,45 @@ def test_a_pedestrian_before_the_camera_hides_the_splats_and_noise_is_the_seeds(
     one, same = (env.reset(seed=3, options=options)[0]["rgb"] for _ in range(2))
     np.testing.assert_array_equal(one, same)
     camera = camera_of(env.model, env.data, env._camera, 32, 18)
-    env._put(env._walkers[0], np.array([4.0, -4.8]), 0.85)
+    env.world.put(env.data, "pedestrian_0", np.array([4.0, -4.8]), 0.85)
     mujoco.mj_forward(env.model, env.data)  # pyright: ignore[reportAttributeAccessIssue]
     image = env._images.image(env.model, env.data, camera)
     assert image[12:, 15:17, 2].mean() > image[12:, 15:17, 0].mean() + 0.2  # blue
+
+
+THIRD_PERSON = """
+<mujoco model="seen">
+  <asset><material name="paint" rgba="1 0 0 1"/></asset>
+  <worldbody>
+    <body name="ball" pos="0 0 0.5">
+      <freejoint name="free"/>
+      <geom type="sphere" size="0.3" mass="5" material="paint"/>
+      <geom type="sphere" size="0.2" pos="-2 0 0" mass="0" contype="0" conaffinity="0" rgba="0 1 0 1"/>
+      <site name="lidar" pos="0 0 0.4"/>
+      <camera name="camera" pos="-2 0 0" xyaxes="0 -1 0 0 0 1"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="free" gear="1 0 0 0 0 0" ctrlrange="-9 9"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_camera_behind_the_robot_sees_it_in_its_materials_colour_and_not_its_own_housing(folder, tmp_path):
+    (tmp_path / "seen.xml").write_text(THIRD_PERSON)
+    env = make(folder, robot=tmp_path / "seen.xml", depth=False, rgb=CameraSettings(32, 18))
+    image = env.reset(seed=0, options={"start": (4, -6), "goal": (9, -6), "heading": 0.0})[0]["rgb"].astype(int)
+    red = (image[..., 0] > 100) & (image[..., 1:].max(axis=-1) < 10)
+    focal = 9 / np.tan(np.radians(45 / 2))
+    assert red[8:10, 15:17].all()
+    assert np.sqrt(red.sum() / np.pi) == pytest.approx(focal * 0.3 / np.sqrt(2**2 - 0.3**2), abs=0.5)
+    assert not ((image[..., 1] > 100) & (image[..., [0, 2]].max(axis=-1) < 10)).any()
+
+
+def test_an_unknown_option_and_a_mode_that_is_not_rendered_are_refused(folder):
+    with pytest.raises(SceneError, match="no option gaol"):
+        make(folder, depth=False).reset(options={"gaol": (9, -6)})
+    with pytest.raises(SceneError, match="'human' cannot be"):
+        FacadeNav(folder, render_mode="human")
 
 
 def test_another_robot_is_attached_and_its_actuators_are_the_actions(folder, tmp_path):
@@ -227,13 +273,15 @@ def test_the_vectorised_form_steps_all(folder):
     envs.close()
 
 
-def test_ppo_learns_some_updates_without_fault(folder):
+@pytest.mark.parametrize("sensor", ["depth", "lidar"])
+def test_ppo_learns_some_updates_without_fault(folder, sensor):
     from stable_baselines3 import PPO
 
-    from benchmarks.nav import Flat
+    from benchmarks.nav import make as flat
 
-    env = Flat(gymnasium.make(NAME, world=folder, depth=False, obstacle=True))
-    model = PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0, device="cpu").learn(128)
+    model = PPO("MlpPolicy", flat(folder, sensor), n_steps=64, batch_size=32, n_epochs=2, seed=0, device="cpu").learn(
+        128
+    )
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
 
 

@@ -146,3 +146,34 @@ def test_files_of_a_ground_are_removed_with_it(ground, tmp_path):
     write_world(tmp_path, [], frame_at())
     assert not [*tmp_path.glob("ground.*")]
     assert "hfield" not in (tmp_path / "world.xml").read_text()
+
+
+def level_points(x: tuple[float, float], y: tuple[float, float], z: float, density: int = 300) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    low, high = np.array([x, y]).T
+    places = rng.uniform(low, high, (int(density * np.prod(high - low)), 2))
+    return np.insert(places, 2, z + rng.normal(0, 0.01, len(places)), axis=1)
+
+
+def test_stairs_of_three_metres_are_climbed():
+    """Sixteen stairs of 18 cm to a terrace, between the street and a wall."""
+    treads = [level_points((-2, 2), (-6 + 0.3 * k, -5.7 + 0.3 * k), 0.18 * (k + 1)) for k in range(16)]
+    terrace, pavement = level_points((-6, 6), (-1.2, 2), 0.18 * 16), level_points((-8, 8), (-12, -6), 0.0)
+    made = Ground.of(np.concatenate([pavement, *treads, terrace]), EYES - np.array([0, 5, 0]))
+    stairs = np.array([[0.0, -5.85 + 0.3 * k] for k in range(16)])
+    assert made.at(stairs) == pytest.approx(0.18 * np.arange(1, 17), abs=0.12)
+    assert made.at(np.array([[4.0, 0], [4.0, -8]])) == pytest.approx([2.88, 0], abs=0.03)
+
+
+def test_a_street_and_that_above_its_wall_are_both_ground_where_cameras_stand_on_both():
+    streets = np.concatenate([level_points((-8, 8), (-12, -6), 0.0), level_points((-8, 8), (-6, -1), 4.0)])
+    below, above = EYES - np.array([0, 5, 0]), EYES + np.array([0, 0, 4])
+    places = np.array([[0.0, -9], [0.0, -3]])
+    assert Ground.of(streets, np.concatenate([below, above])).at(places) == pytest.approx([0, 4], abs=0.03)
+    assert Ground.of(streets, above).at(places)[1] == pytest.approx(4, abs=0.03)
+
+
+def test_a_flat_roof_below_a_drone_is_not_the_ground():
+    roof, street = level_points((-8, 8), (0, 14), 9.0), level_points((-8, 8), (-5, 0), 0.0)
+    made = Ground.of(np.concatenate([roof, street]), EYES + np.array([0, 4, 18]))
+    assert made.at(np.array([[0.0, -3], [0.0, 7]])) == pytest.approx([0, 0], abs=0.05)

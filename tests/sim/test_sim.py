@@ -17,12 +17,12 @@ import torch
 import trimesh
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
-from walls import ARCH, GATE, eyes_before, wall_with_bays
 
+from benchmarks.walls import ARCH, GATE, eyes_before, wall_with_bays
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.colours import GREY
-from shellgs_method.export.frame import Frame
-from shellgs_method.geometry.axes import likely_up
+from shellgs_method.export.frame import Frame, Z
+from shellgs_method.geometry.axes import likely_up, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
@@ -285,7 +285,7 @@ def test_a_setting_that_nothing_can_be_made_with_is_refused_at_once(name, value)
 
 
 def test_a_ground_that_is_no_height_is_refused():
-    with pytest.raises(SceneError, match="is no height"):
+    with pytest.raises(SceneError, match="--ground nan cannot be: give a number"):
         SimSettings(ground=math.nan)
 
 
@@ -304,6 +304,20 @@ def test_a_surface_that_a_file_has_twice_keeps_its_door(nothing):
     middle, _, springing = GATE
     through = [each.surface.blocked(np.array([[middle, -3, springing / 2]]), np.array([[0, 1.0, 0]])) for each in made]
     assert not np.any(through)
+
+
+@pytest.mark.parametrize("eyes", [[[0.0, -4, 1.6], [4.4, -4, 1.6]], [[0.0, -4, 1.6], [4.4, -4, 1.6], [2, 4, 1.6]]])
+def test_the_gaps_of_a_fence_are_open(eyes):
+    """Twenty pickets with gaps of 12 cm, and two rails: their backs are not seen, or from one place alone."""
+    pickets = [box([0.22 * k, 0, 0], [0.22 * k + 0.1, 0.04, 1.2]) for k in range(20)]
+    rails = [box([0, 0.04, z], [4.28, 0.07, z + 0.08]) for z in (0.3, 0.9)]
+    vertices = np.concatenate([each.vertices for each in (*pickets, *rails)])
+    faces = np.concatenate([each.faces + 8 * k for k, each in enumerate((*pickets, *rails))])
+    fence, seen = outward(Triangles(vertices, faces), np.array(eyes))
+    made = make_collider(None, fence, seen, density=2000)
+    gaps = np.stack([0.16 + 0.22 * np.arange(19), np.full(19, -3), np.full(19, 0.6)], axis=1)
+    assert not made.surface.blocked(gaps, np.array([0, 1.0, 0])).any()
+    assert made.surface.blocked(gaps + np.array([0.11, 0, 0]), np.array([0, 1.0, 0])).all()
 
 
 def test_a_cellar_is_no_ground():
@@ -367,6 +381,13 @@ def test_national_coordinates_are_recovered():
     np.testing.assert_allclose(transformed(transformed(points, motion), made.to_national), national, atol=1e-6)
     np.testing.assert_array_equal(made.to_national[:3, :3], np.eye(3))  # the offset alone is enough
     assert not np.mod(made.offset[:2], 1).any()
+
+
+def test_coordinates_and_offset_add_up_to_those_of_the_exported_mesh_with_z_up():
+    frame, points = metric_frame("y")
+    made, motion = sim_frame(frame, points, cameras_of_scene())
+    expected = (points + frame.offset) @ turn(frame.up, Z).T
+    np.testing.assert_allclose(transformed(points, motion) + made.offset, expected, atol=1e-6)
 
 
 def test_a_scene_without_a_shell_is_turned_upright():

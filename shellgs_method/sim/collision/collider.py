@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.geometry.decimation import decimated
 from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.machine.open3d import import_open3d
 from shellgs_method.sim.collision.clusters import ROUND, clusters, connected, flattest
 from shellgs_method.sim.collision.parts import Part, joined
 from shellgs_method.sim.ground import LEVEL, Ground
@@ -22,7 +22,8 @@ DENSITY = 200.0
 FINENESS = 16
 """Triangles for each part that a surface is decimated to before they are clustered."""
 THICKNESS = 0.3
-"""Depth of parts behind a surface in metres, unless the building is known to be thinner."""
+"""Depth of parts behind a surface in metres, unless the building is known to be thinner. What is seen from one side
+alone is taken for no deeper than it is wide: bars have air behind them."""
 THINNEST = 0.03
 """Minimum thickness in metres: fast bodies pass through thinner parts between two time steps."""
 SKIN = 0.002
@@ -115,18 +116,6 @@ def _together(one: Triangles, other: Triangles) -> Triangles:
     return Triangles(vertices, np.concatenate([one.faces, other.faces + len(one.vertices)]))
 
 
-def decimated(surface: Triangles, faces: int) -> Triangles:
-    """About ``faces`` triangles by quadric error (Garland and Heckbert 1997); the surface itself if it has no more."""
-    if len(surface.faces) <= faces:
-        return surface
-    o3d = import_open3d()
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(surface.vertices), o3d.utility.Vector3iVector(surface.faces.astype(np.int32))
-    )
-    mesh = mesh.remove_duplicated_vertices().simplify_quadric_decimation(faces)
-    return Triangles(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
-
-
 def _thickened(solid: Triangles, surface: Triangles, faces: Int64[np.ndarray, " _"]) -> Part | None:
     """The hull of triangles and of their copies farther back; None if it has no volume."""
     corners = surface.vertices[surface.faces[faces]]
@@ -135,11 +124,19 @@ def _thickened(solid: Triangles, surface: Triangles, faces: Int64[np.ndarray, " 
         normal, length = flattest(corners.reshape(-1, 3)), 1.0
     normal /= length
     depth = depths(solid, corners - SKIN * surface.normals[faces, None], normal)
+    depth[depth == THICKNESS] = min(THICKNESS, max(_width(corners.reshape(-1, 3), normal), THINNEST))
     facing = surface.normals[faces] @ normal > 0.5
     depth = np.minimum(depth, np.quantile(depth[facing], 0.1) if facing.any() else THICKNESS)
     depth = np.maximum(depth, THINNEST - np.ptp(corners @ normal))
     behind = corners - depth[..., None] * normal
     return Part.hull(np.unique(np.concatenate([corners, behind]).reshape(-1, 3), axis=0))
+
+
+def _width(points: Float64[np.ndarray, "P 3"], normal: Float64[np.ndarray, " 3"]) -> float:
+    """Least extent of points across a direction, along the axes of their spread."""
+    flat = points - points.mean(axis=0)
+    flat -= (flat @ normal)[:, None] * normal
+    return float(np.ptp(flat @ np.linalg.svd(flat, full_matrices=False)[2][1]))
 
 
 def depths(

@@ -12,13 +12,11 @@ from gymnasium import spaces
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.sim.env.course import Course, Pedestrians
 from shellgs_method.sim.env.sensors import SplatCamera, as_bytes, camera_of, cast, depth_image, splats_of
 from shellgs_method.sim.env.world import (
-    BOX,
     COLLISION,
-    HALF_HEIGHT,
     MOVING,
-    PERSON,
     PREFIX,
     TIMESTEP,
     World,
@@ -26,7 +24,6 @@ from shellgs_method.sim.env.world import (
     robot_geoms,
     root_of,
 )
-from shellgs_method.sim.free_space import FreeSpace
 
 STEP = 0.2
 """Seconds between actions."""
@@ -38,10 +35,6 @@ NEAR = 0.5
 """Distance in metres at which a goal is reached."""
 SUCCESS, COLLISION_COST = 10.0, 0.5
 """Reward of a reached goal, and cost of a step with a collision; a metre of progress is 1."""
-WALK = 1.0
-"""Speed of pedestrians in metres a second."""
-TRIES = 200
-"""Spawns and goals that are tried for an episode."""
 
 
 @dataclass(frozen=True)
@@ -106,23 +99,19 @@ class FacadeNav(gymnasium.Env):
         everywhere: bool = False,
         render_mode: str | None = None,
     ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise SceneError(f"render_mode {render_mode!r} cannot be: give 'rgb_array'; its images can be shown")
         self.world = World.load(Path(world), Path(robot) if robot else None, pedestrians, obstacle)
         self.model = self.world.model
         self.data = mujoco.MjData(self.model)
-        self.render_mode, self._distance, self._rgb, self._depth = render_mode, distance, rgb, depth
-        self._obstacle, self._walkers = obstacle, [self._mocap(f"pedestrian_{k}") for k in range(pedestrians)]
+        self.render_mode, self._rgb, self._depth = render_mode, rgb, depth
         self._root = root_of(self.model)
         joint = self.model.body_jntadr[self._root]
         self._qpos = self.model.jnt_qposadr[joint]
         self._lidar, self._camera = self._sensor("site", "lidar"), self._sensor("camera", "camera")
         self._robot = np.isin(np.arange(self.model.ngeom), robot_geoms(self.model))
-        self._space = self.world.space.reachable(self.world.radius, self.world.workspace.eyes)
-        allowed = ~self._space.occupied
-        if not everywhere:
-            allowed &= self.world.workspace.has(self._space.centres)
-        self._allowed = self._space.centres[allowed]
-        if len(self._allowed) == 0:
-            raise SceneError(f"{world}: no free ground in the trusted workspace: give everywhere=True")
+        self.course = Course(self.world, distance, obstacle, everywhere)
+        self._pedestrians = Pedestrians(self.world, self.course, pedestrians)
         buildings = [self.world.folder / name / "splats.ply" for name in self.world.buildings]
         self._images = SplatCamera(splats_of(buildings)) if rgb or render_mode else None
         self.action_space = spaces.Box(-1, 1, (self.model.nu,), np.float32)
@@ -145,17 +134,16 @@ class FacadeNav(gymnasium.Env):
         super().reset(seed=seed)
         options = options or {}
         mujoco.mj_resetData(self.model, self.data)
-        start, self.goal = self._drawn(options)
+        self._episode = self.course.drawn(self.data, self.np_random, options)
+        start, self.goal = self._episode.start, self._episode.goal
         heading = float(options.get("heading", self.np_random.uniform(-np.pi, np.pi)))
         height = float(self.world.ground.at(start[None])[0]) + self.model.qpos0[self._qpos + 2] + 0.01
         self.data.qpos[self._qpos : self._qpos + 7] = *start, height, np.cos(heading / 2), 0, 0, np.sin(heading / 2)
         stops = self._rgb.exposure if self._rgb else 0.0
         self._gain = 2 ** (stops * self.np_random.uniform(-1, 1))
-        self._ways = [self._way() for _ in self._walkers]
-        for walker in self._walkers:
-            self._put(walker, self._allowed[self.np_random.integers(len(self._allowed))], HALF_HEIGHT + PERSON)
+        self._pedestrians.spread(self.data, self.np_random)
         mujoco.mj_forward(self.model, self.data)
-        self._left = float(self._episode.at(self._field, start))
+        self._left = self._episode.left(start)
         self._shortest = max(0.0, self._left - NEAR)
         self._driven, self._collisions, self._was = 0.0, 0, start
         return self._observed(), self._info()
@@ -164,14 +152,14 @@ class FacadeNav(gymnasium.Env):
         """Drive for a fifth of a second."""
         low, high = self.model.actuator_ctrlrange.T
         self.data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
-        self._walk()
+        self._pedestrians.walk(self.data, self.np_random, STEP)
         mujoco.mj_step(self.model, self.data, round(STEP / TIMESTEP))
         now = self._place
         self._driven += float(np.linalg.norm(now - self._was))
         self._was = now
         collides = self._collides()
         self._collisions += collides
-        left = float(self._episode.at(self._field, now))
+        left = self._episode.left(now)
         progress = self._left - left if np.isfinite(left) else 0.0
         self._left = left if np.isfinite(left) else self._left
         success = bool(np.linalg.norm(self.goal - now) < NEAR)
@@ -189,58 +177,6 @@ class FacadeNav(gymnasium.Env):
     @property
     def _place(self) -> Float64[np.ndarray, " 2"]:
         return self.data.xpos[self._root, :2].copy()
-
-    def _drawn(self, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Start and goal; keeps the episode's free space and the lengths of the ways to the goal."""
-        for _ in range(TRIES):
-            goal = np.asarray(options.get("goal", self._allowed[self.np_random.integers(len(self._allowed))]), float)
-            start = options.get("start")
-            if start is None:
-                off = np.linalg.norm(self._allowed - goal, axis=1)
-                far = self._allowed[(off > self._distance[0]) & (off < self._distance[1])]
-                if len(far) == 0:
-                    continue
-                start = far[self.np_random.integers(len(far))]
-            start = np.asarray(start, float)
-            self._episode = self._space
-            if self._obstacle:
-                self._episode = self._blocked(start, goal)
-            self._field = self._episode.distances(goal)
-            length = float(self._episode.at(self._field, start))
-            given = "goal" in options and "start" in options
-            if np.isfinite(length) and (given or self._distance[0] <= length <= self._distance[1]):
-                return start, goal
-        low, high = self._distance
-        raise SceneError(f"{self.world.folder}: found no start and goal with a free way of {low:g} to {high:g} m")
-
-    def _blocked(self, start: np.ndarray, goal: np.ndarray) -> FreeSpace:
-        """Put the obstacle half way between, and return the free space beside it."""
-        middle = start + (goal - start) * self.np_random.uniform(0.4, 0.6)
-        ahead = goal - start
-        self._put(self._mocap("obstacle"), middle, 1.0, float(np.arctan2(ahead[1], ahead[0])))
-        return self._space.without(middle, np.sqrt(2) * BOX + self.world.radius)
-
-    def _way(self) -> np.ndarray:
-        """Lengths of the ways to a place where a pedestrian goes."""
-        return self._space.distances(self._allowed[self.np_random.integers(len(self._allowed))])
-
-    def _walk(self) -> None:
-        """Move the pedestrians along the grid's shortest ways."""
-        for k, walker in enumerate(self._walkers):
-            here = self.data.mocap_pos[walker, :2].copy()
-            ahead = self._space.downhill(self._ways[k], here) - here
-            length = float(np.linalg.norm(ahead))
-            if length < 1e-6 or self._space.at(self._ways[k], here) == 0:
-                self._ways[k] = self._way()
-                continue
-            self._put(walker, here + ahead * min(1, WALK * STEP / length), HALF_HEIGHT + PERSON)
-
-    def _put(self, mocap: int, place: np.ndarray, height: float, heading: float = 0.0) -> None:
-        self.data.mocap_pos[mocap] = *place, self.world.ground.at(place[None])[0] + height
-        self.data.mocap_quat[mocap] = np.cos(heading / 2), 0, 0, np.sin(heading / 2)
-
-    def _mocap(self, name: str) -> int:
-        return int(self.model.body_mocapid[self.model.body(name).id])
 
     def _sensor(self, kind: str, name: str) -> int:
         """Number of a sensor of the robot.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from shellgs_method.files.splats import Splats, read_splats
@@ -15,35 +15,63 @@ from shellgs_method.geometry.camera import Camera, world_rays
 from shellgs_method.render.view import ViewRenderer
 from shellgs_method.sim.env.world import MOVING, World, mujoco
 
+DRAWN = (0, 1, 2, MOVING)
+"""Groups of geoms in the camera's image: those that MuJoCo draws, and what moves."""
+HIDDEN = 5
+"""A group that is in no image."""
+STATIC = 0
+"""Rays pass geoms that are fixed to the world: of the groups that are drawn, they meet the robot alone."""
 SKY = 0.7, 0.8, 0.9
 """Colour behind the splats."""
 SUN = np.array([0.3, -0.4, 0.87])
 """Unit vector to the light on what moves."""
+UNSET = 0.5, 0.5, 0.5, 1.0
+"""Colour of a geom in MuJoCo that has none of its own."""
 AMBIENT = 0.5
 """Share of the light on what moves that is from everywhere."""
 
 
 def cast_at_moving(
-    model, data, origin: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"]
+    model, data, origin: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"], groups: Sequence[int] = (MOVING,)
 ) -> tuple[Float64[np.ndarray, " R"], np.ndarray, Float64[np.ndarray, "R 3"]]:
-    """Cast rays of any length from a point at what moves beside the robot.
+    """Cast rays of any length from a point at what moves.
+
+    Args:
+        model: MuJoCo's model.
+        data: its state.
+        origin: where the rays begin, in metres.
+        rays: their directions.
+        groups: of geoms; with those that are drawn, the robot is among what moves.
 
     Returns:
         For each ray the distance in lengths of the ray, infinite where nothing is hit, the number of the geom, and the
         normal.
     """
-    distances, geoms, normals = np.full(len(rays), -1.0), np.zeros(len(rays), np.int32), np.zeros((len(rays), 3))
-    if model.nmocap == 0:
-        return np.full(len(rays), np.inf), geoms, normals
-    mask = np.zeros(6, np.uint8)
-    mask[MOVING] = 1
     lengths = np.linalg.norm(rays, axis=1)
     directions = rays / lengths[:, None]
-    mujoco.mj_multiRay(
-        model, data, origin[:, None], directions.reshape(-1, 1), mask, 1, -1, geoms, distances,
-        normals.reshape(-1, 1), len(rays), 1e3,
-    )  # fmt: skip
-    return np.where(distances < 0, np.inf, distances / lengths), geoms, normals
+    near = np.flatnonzero(_aimed(model, data, origin, directions, groups))
+    found, hit, normal = np.empty(len(near)), np.zeros(len(near), np.int32), np.zeros((len(near), 3))
+    if len(near):
+        mask = np.isin(np.arange(6), groups).astype(np.uint8)
+        mujoco.mj_multiRay(
+            model, data, origin[:, None], directions[near].reshape(-1, 1), mask, STATIC, -1, hit, found,
+            normal.reshape(-1, 1), len(near), 1e3,
+        )  # fmt: skip
+    distances, geoms, normals = np.full(len(rays), np.inf), np.zeros(len(rays), np.int32), np.zeros((len(rays), 3))
+    distances[near] = np.where(found < 0, np.inf, found / lengths[near])
+    geoms[near], normals[near] = hit, normal
+    return distances, geoms, normals
+
+
+def _aimed(
+    model, data, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "R 3"], groups: Sequence[int]
+) -> Bool[np.ndarray, " R"]:
+    """Which rays pass the sphere around a geom that moves: MuJoCo takes its time with each of the others too."""
+    moving = np.isin(model.geom_group, groups) & (model.body_weldid[model.geom_bodyid] != 0)
+    away, radius = data.geom_xpos[moving] - origin, model.geom_rbound[moving]
+    distance = np.linalg.norm(away, axis=1)
+    beside = np.sqrt(np.maximum(distance**2 - radius**2, 0))  # along a ray that touches the sphere
+    return (directions @ away.T >= beside - 1e-9).any(axis=1) | bool((distance <= radius).any())
 
 
 def cast(
@@ -67,7 +95,7 @@ def camera_of(model, data, number: int, width: int, height: int) -> Camera:
 
 
 class SplatCamera:
-    """Renders images of splats with MuJoCo's moving bodies among them."""
+    """Renders images of splats with MuJoCo's moving bodies and the robot among them."""
 
     def __init__(self, splats: Splats) -> None:
         self._renderer = ViewRenderer("2d" if splats.discs else "3d", "expected")
@@ -94,11 +122,32 @@ class SplatCamera:
         colours, depth = self.splats(camera)
         image, far = colours.double().numpy(), depth.double().numpy()
         eye, rays = world_rays(camera)
-        distances, geoms, normals = cast_at_moving(model, data, eye, rays.reshape(-1, 3))
+        rays = rays.reshape(-1, 3)
+        distances, geoms, normals = _drawn(model, data, eye, rays)
         nearer = distances < far.ravel()
         light = AMBIENT + (1 - AMBIENT) * np.abs(normals[nearer] @ SUN)
-        image.reshape(-1, 3)[nearer] = model.geom_rgba[geoms[nearer], :3] * light[:, None]
+        image.reshape(-1, 3)[nearer] = _colours(model)[geoms[nearer]] * light[:, None]
         return (image * gain).clip(0, 1)
+
+
+def _drawn(model, data, eye: Float64[np.ndarray, " 3"], rays: Float64[np.ndarray, "R 3"]):
+    """What :func:`cast_at_moving` returns of the robot and what moves; a camera looks out of the geoms around it."""
+    groups = model.geom_group.copy()
+    try:
+        while True:
+            distances, geoms, normals = cast_at_moving(model, data, eye, rays, DRAWN)
+            inside = np.isfinite(distances) & (np.einsum("rc,rc->r", rays, normals) > 0)
+            if not inside.any():
+                return distances, geoms, normals
+            model.geom_group[geoms[inside]] = HIDDEN
+    finally:
+        model.geom_group[:] = groups
+
+
+def _colours(model) -> Float64[np.ndarray, "G 3"]:
+    """Colours of geoms: their own, or else their materials'."""
+    plain = (model.geom_rgba == UNSET).all(axis=1) & (model.geom_matid >= 0)
+    return np.where(plain[:, None], model.mat_rgba[model.geom_matid], model.geom_rgba)[:, :3]
 
 
 def as_bytes(image: Float64[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from jaxtyping import Float64
 from scipy.spatial import ConvexHull
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import read_json
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.env.robot import DEFAULT_ROBOT
 from shellgs_method.sim.frame import FRAME
@@ -75,10 +75,7 @@ class World:
         """
         if not (folder / "world.xml").is_file() or not (folder / FRAME).is_file():
             raise SceneError(f"{folder} has no world.xml and frame.json: give a folder that shellgs sim wrote")
-        try:
-            facts = json.loads((folder / FRAME).read_text())
-        except ValueError as error:
-            raise SceneError(f"{folder / FRAME} is damaged ({error}): write the folder again") from error
+        facts = read_json(folder / FRAME)
         workspace = Workspace.read(facts, folder / FRAME)
         spec = read_spec(folder / "world.xml")
         spec.option.timestep = TIMESTEP
@@ -101,6 +98,15 @@ class World:
         solid = _solid(ground, parts)
         buildings = list(facts.get("buildings") or ["facade"])
         return cls(model, solid, ground, workspace, grid, _radius(model), buildings, folder)
+
+    def mocap(self, name: str) -> int:
+        """Number of a body that is moved from outside: the obstacle, or a pedestrian."""
+        return int(self.model.body_mocapid[self.model.body(name).id])
+
+    def put(self, data, name: str, place: Float64[np.ndarray, " 2"], height: float, heading: float = 0.0) -> None:
+        """Put such a body somewhere, its middle a height in metres above the ground, turned by a heading in radians."""
+        data.mocap_pos[self.mocap(name)] = *place, self.ground.at(place[None])[0] + height
+        data.mocap_quat[self.mocap(name)] = np.cos(heading / 2), 0, 0, np.sin(heading / 2)
 
 
 def root_of(model) -> int:

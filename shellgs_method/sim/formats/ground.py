@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.geometry.decimation import decimated
 from shellgs_method.geometry.triangles import Triangles
-from shellgs_method.sim.collision.collider import decimated
 from shellgs_method.sim.formats.asset import write_obj
 from shellgs_method.sim.ground import Ground
 
