@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -66,7 +67,7 @@ class Sights:
         return cls(transformed(seen, np.linalg.inv(to_scene)), views, [*points], to_scene)
 
 
-def sights(views: Sequence[View], read: Callable[[View], CueMap | None]) -> Iterator[tuple[str, np.ndarray]]:
+def sights(views: Iterable[View], read: Callable[[View], CueMap | None]) -> Iterator[tuple[str, np.ndarray]]:
     """Points of the shell that each photograph shows, spread over its supported pixels, in the scene's frame."""
     for view in views:
         cue = read(view)
@@ -80,7 +81,9 @@ def sights(views: Sequence[View], read: Callable[[View], CueMap | None]) -> Iter
         yield view.name, transformed(in_camera, np.linalg.inv(view.camera.viewmat.double().numpy()))
 
 
-def cut(seen: Sights, length: float, overlap: float, photographs: int | None = None) -> Blocks:
+def cut(
+    seen: Sights, length: float, overlap: float, photographs: int | None = None, held_out: Collection[str] = ()
+) -> Blocks:
     """Cut a scene into blocks of about a length.
 
     The scene is cut across its length until no part is longer than one and a half lengths (or has more than one and a
@@ -92,6 +95,7 @@ def cut(seen: Sights, length: float, overlap: float, photographs: int | None = N
         length: length of a block in metres.
         overlap: how far a block reaches beyond its core, in metres.
         photographs: number of photographs of a block, which then decides in place of the length.
+        held_out: names of the photographs that are held out, of which each block has one.
     """
     thinned, share = _occupied(seen.points), 1 / np.bincount(seen.views)[seen.views]
 
@@ -108,24 +112,29 @@ def cut(seen: Sights, length: float, overlap: float, photographs: int | None = N
 
     everything = np.ones(len(thinned), bool), np.ones(len(seen.points), bool)
     scale = float(np.linalg.norm(seen.to_scene[:3, 0]))
-    return assigned(Blocks(_numbered(split(*everything)), overlap * scale), seen)
+    return assigned(Blocks(_numbered(split(*everything)), overlap * scale), seen, held_out)
 
 
-def assigned(blocks: Blocks, seen: Sights, least: int = WEAK) -> Blocks:
+def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least: int = WEAK) -> Blocks:
     """The blocks with the photographs that see enough of each, those with too few joined with a neighbour.
 
     Args:
         blocks: the blocks, whose photographs are replaced.
         seen: what the photographs show.
+        held_out: names of the photographs that are held out, of which each block has one: the one that sees most of it.
         least: photographs that a block needs.
     """
-    points = transformed(seen.points, seen.to_scene)
-    shown = np.maximum(np.bincount(seen.views, minlength=len(seen.names)), 1)
+    points, count = transformed(seen.points, seen.to_scene), len(seen.names)
+    shown = np.maximum(np.bincount(seen.views, minlength=count), 1)
+    measured = np.flatnonzero([name in held_out for name in seen.names])
     while True:
         chosen: dict[str, tuple[str, ...]] = {}
         for cell in blocks.cells:
-            inside = np.bincount(seen.views[cell.extended(points)], minlength=len(seen.names)) / shown
-            chosen[cell.block.name] = tuple(seen.names[k] for k in np.flatnonzero(inside >= SHARE))
+            inside = np.bincount(seen.views[cell.extended(points)], minlength=count) / shown
+            belong = inside >= SHARE
+            if len(measured) and not belong[measured].any():
+                belong[measured[inside[measured].argmax()]] = True
+            chosen[cell.block.name] = tuple(compress(seen.names, belong))
         weak = min(chosen, key=lambda name: len(chosen[name]))
         if len(chosen[weak]) >= least or len(chosen) == 1:
             return replace(blocks, tree=_filled(blocks.tree, chosen))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -18,6 +17,7 @@ from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.splats import DEGREE_0, Splats
 from shellgs_method.gaussians.pruning import contributions
 from shellgs_method.gaussians.seeds import photograph_of
+from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.machine.progress import tell, track
 from shellgs_method.render.maps import DISC_LOG_THICKNESS
@@ -158,7 +158,7 @@ def _pairs(mixture: _Mixture, most: int) -> tuple[Int[np.ndarray, " M"], Int[np.
     """At least one and at most so many pairs of neighbours, each the cheapest of both."""
     count = len(mixture.means)
     k = min(NEIGHBOURS + 1, count)
-    _, near = KDTree(mixture.means).query(mixture.means, k=k)
+    _, near = point_tree(mixture.means).query(mixture.means, k=k)
     pairs = np.stack([np.repeat(np.arange(count), k), np.ravel(near)])
     pairs = np.sort(pairs[:, pairs[0] != pairs[1]], axis=0)
     first, second = np.divmod(np.unique(pairs[0] * count + pairs[1]), count)

@@ -173,3 +173,11 @@ def test_without_maps_and_tracks_nothing_tells_what_photographs_show(scene: Path
 def test_settings_that_no_scene_can_be_cut_by_are_refused(scene: Path, flags: dict):
     with pytest.raises(SceneError, match="--length must be above 0"):
         command(scene, **flags)
+
+
+def test_each_block_has_a_photograph_that_is_held_out(street: np.ndarray):
+    seen = Sights.of(walk(street), UP, 1.0)
+    blocks = cut(seen, length=35.0, overlap=0.0, held_out={seen.names[2]})
+    assert all(seen.names[2] in cell.block.photographs for cell in blocks.cells)
+    usual = cut(seen, length=35.0, overlap=0.0)
+    assert sum(seen.names[2] in cell.block.photographs for cell in usual.cells) == 1
