@@ -18,19 +18,16 @@ import tyro
 from jaxtyping import Float64
 from numpy import ndarray
 from PIL import Image
-from scipy.ndimage import gaussian_filter1d
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.compare.measure import measure
 from shellgs_method.files.atomic import unfinished
 from shellgs_method.files.photographs import read_image
 from shellgs_method.files.transfer import linear_of, srgb
-from shellgs_method.synthetic.appearance import developed, exposed
-from shellgs_method.synthetic.scene import Facade, FacadeConfig, _generators, settings_of
+from shellgs_method.synthetic.appearance import developed, exposed, log_gains
+from shellgs_method.synthetic.scene import Facade, FacadeConfig, settings_of
+from shellgs_method.synthetic.site import generators
 
-STOPS, BALANCE = 0.7, 0.08
-"""Largest change of exposure in stops, and of red and blue against green."""
-JUMPS = 3
 GOALS = {"cc_psnr_seen": 0.3, "chamfer_m": 0.002, "f_score_5cm": 0.005}
 """Differences that are wanted at most between a run with changing light and one without."""
 SHOWN = ("psnr_seen", "cc_psnr_seen", "cc_psnr_on_shell", "cc_psnr_before_shell", "chamfer_m", "f_score_5cm")
@@ -82,21 +79,6 @@ def main(
             print(f"  {key:22} {difference:+.4f}, goal {goal} at most")
 
 
-def log_gains(count: int, seed: int = 0) -> Float64[ndarray, "V 3"]:
-    """Logarithms of gains in linear light, along a walk: smooth, with jumps."""
-    rng = np.random.default_rng(seed)
-
-    def walk() -> Float64[ndarray, " V"]:
-        smooth = gaussian_filter1d(rng.normal(size=count), count / 10, mode="wrap")
-        jumps = (np.arange(count)[:, None] >= rng.choice(count, JUMPS)) @ rng.choice([-1.0, 1.0], JUMPS)
-        found = smooth / smooth.std() + 0.7 * (jumps - jumps.mean())
-        return found / np.abs(found).max()
-
-    stops, red, blue = walk(), walk(), walk()
-    balance = np.stack([1 + BALANCE * red, np.ones(count), 1 + BALANCE * blue], axis=1)
-    return np.log(2) * STOPS * stops[:, None] + np.log(balance)
-
-
 def write_in_changing_light(scene: Path, target: Path) -> None:
     """Copy a scene; of its photographs, the synthetic facade's are taken again, others are changed in linear light."""
     copy = unfinished(target)
@@ -105,7 +87,7 @@ def write_in_changing_light(scene: Path, target: Path) -> None:
     gains = np.exp(log_gains(len(views)))
     if (scene / "facade.json").exists():
         config = FacadeConfig(**settings_of(scene))
-        facade, sensor = Facade.build(config), _generators(config.seed + 1, 3)[0]
+        facade, sensor = Facade.build(config), generators(config.seed + 1, 3)[0]
         images = [
             developed(gain * exposed(facade.daylight, camera, config.supersampling), sensor)
             for gain, camera in zip(gains, facade.cameras, strict=True)

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from scipy.ndimage import map_coordinates
+from jaxtyping import Float, Float64, UInt8
+from scipy.ndimage import gaussian_filter1d, map_coordinates
 
 from shellgs_method.geometry.camera import Camera, world_rays
 from shellgs_method.synthetic.building import BAY, STOREY
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.street import CAR, HOUSE, KERB
-from shellgs_method.synthetic.world import World
+from shellgs_method.synthetic.world import Frames, World
 
 SUN = np.array([-0.42, -0.55, 0.72], dtype=np.float32)
 _SUNLIGHT = np.array([0.42, 0.39, 0.34], dtype=np.float32)
@@ -26,6 +26,10 @@ _GROUNDLIGHT = np.array([0.42, 0.40, 0.37], dtype=np.float32)
 
 _REFLECTANCE = 0.32
 """Reflectance of sun-protection glazing at normal incidence; bare glass has 0.04 per surface."""
+
+STOPS, BALANCE = 0.7, 0.08
+"""Largest change of exposure in stops, and of red and blue against green."""
+JUMPS = 3
 
 
 @dataclass(frozen=True)
@@ -52,11 +56,14 @@ class Daylight:
         hit = np.flatnonzero(~missed)
         material, normal, towards = self.world.material[hits.triangle[hit]], hits.normal[hit], directions[hit]
         points = np.broadcast_to(origins, directions.shape)[hit] + hits.t[hit, None] * towards
-        colour[hit] = self._albedo(material, points) * self._irradiance(points, normal)
+        frames = self.world.frames(hits.triangle[hit])
+        local = frames.points(points)
+        albedo = frames.tint * self._albedo(material, local)
+        colour[hit] = albedo * self._irradiance(points, normal, recess=np.clip(local[:, 1:2], 0.0, 0.25))
 
         pane = material == Material.GLASS
         if pane.any() and bounces:
-            colour[hit[pane]] = self._glass(points[pane], normal[pane], towards[pane], bounces - 1)
+            colour[hit[pane]] = self._glass(points[pane], normal[pane], towards[pane], frames[pane], bounces - 1)
         return colour
 
     def _albedo(self, material: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -66,30 +73,34 @@ class Daylight:
             albedo[chosen] = _ALBEDO[Material(kind)](points[chosen], self._noise)
         return albedo
 
-    def _irradiance(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    def _irradiance(self, points: np.ndarray, normal: np.ndarray, recess: np.ndarray) -> np.ndarray:
         sun = SUN / np.linalg.norm(SUN)
         cosine = np.maximum(normal @ sun, 0.0)
         cosine[self.world.blocked(points + 1e-3 * normal, sun)] = 0.0
         up = 0.5 + 0.5 * normal[:, 2:]
         ambient = up * _SKYLIGHT + (1 - up) * _GROUNDLIGHT
         # Recesses get less skylight.
-        ambient = ambient * (1.0 - 1.4 * np.clip(points[:, 1:2], 0.0, 0.25))
+        ambient = ambient * (1.0 - 1.4 * recess)
         return ambient + cosine[:, None] * _SUNLIGHT
 
-    def _glass(self, points: np.ndarray, normal: np.ndarray, towards: np.ndarray, bounces: int) -> np.ndarray:
+    def _glass(
+        self, points: np.ndarray, normal: np.ndarray, towards: np.ndarray, frames: Frames, bounces: int
+    ) -> np.ndarray:
         """Mix the room behind a pane and the reflected street by Schlick's approximation of Fresnel's law."""
-        x, z = points[:, 0], points[:, 2]
+        local = frames.points(points)
+        x, z = local[:, 0], local[:, 2]
         # Real casements are not quite parallel, nor panes quite flat; only the shading has this, not the geometry.
         tilt = np.stack([self._random(2 * x / BAY, z / STOREY, k) for k in range(2)], axis=-1)
         bow = np.stack([self._noise(x, z, 0.5), self._noise(z, x, 0.5)], axis=-1)
-        optical = normal.copy()
+        optical = frames.inwards(normal)
         optical[:, [0, 2]] += 0.012 * tilt + 0.004 * bow
+        optical = frames.outwards(optical)
         optical /= np.linalg.norm(optical, axis=-1, keepdims=True)
 
         cosine = np.sum(optical * towards, axis=-1, keepdims=True)
         fresnel = _REFLECTANCE + (1 - _REFLECTANCE) * (1 - np.abs(cosine)) ** 5
         mirrored = towards - 2 * cosine * optical
-        return (1 - fresnel) * self._room(points, towards) + fresnel * self.radiance(
+        return (1 - fresnel) * self._room(local, frames.inwards(towards)) + fresnel * self.radiance(
             points + 1e-3 * normal, mirrored, bounces
         )
 
@@ -146,6 +157,26 @@ def developed(
     """Turn the radiance into a photograph: gamma 2.2, a little sensor noise."""
     image = 255 * np.clip(radiance, 0.0, 1.0) ** (1 / 2.2)
     return np.clip(image + rng.normal(0.0, 1.5, image.shape), 0, 255).round().astype(np.uint8)
+
+
+def log_gains(count: int, seed: int = 0) -> Float64[np.ndarray, "V 3"]:
+    """Logarithms of gains in linear light, along a walk: smooth, with jumps."""
+    rng = np.random.default_rng(seed)
+
+    def walk() -> Float64[np.ndarray, " V"]:
+        smooth = gaussian_filter1d(rng.normal(size=count), count / 10, mode="wrap")
+        jumps = (np.arange(count)[:, None] >= rng.choice(count, JUMPS)) @ rng.choice([-1.0, 1.0], JUMPS)
+        found = smooth / smooth.std() + 0.7 * (jumps - jumps.mean())
+        return found / np.abs(found).max()
+
+    stops, red, blue = walk(), walk(), walk()
+    balance = np.stack([1 + BALANCE * red, np.ones(count), 1 + BALANCE * blue], axis=1)
+    return np.log(2) * STOPS * stops[:, None] + np.log(balance)
+
+
+def noise_lattice(rng: np.random.Generator) -> Float[np.ndarray, "S S"]:
+    """Random numbers for :class:`Daylight`."""
+    return rng.uniform(-1.0, 1.0, (256, 256)).astype(np.float32)
 
 
 def rays(camera: Camera) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "height width 3"]]:

@@ -49,10 +49,12 @@ class Layout:
     Attributes:
         bays: number of windows along the facade.
         storeys: number of windows above each other.
+        first: number of the first bay, at ``first * BAY`` along x: no two windows of different numbers are alike.
     """
 
     bays: int
     storeys: int
+    first: int = 0
 
     @property
     def length(self) -> float:
@@ -67,7 +69,7 @@ class Layout:
     @property
     def ends(self) -> tuple[float, float]:
         """Start and end of the wall along x."""
-        return -_MARGIN, self.length + _MARGIN
+        return self.first * BAY - _MARGIN, (self.first + self.bays) * BAY + _MARGIN
 
     @property
     def openings(self) -> list[Opening]:
@@ -75,7 +77,7 @@ class Layout:
         return [self._opening(bay, storey) for storey in range(self.storeys) for bay in range(self.bays)]
 
     def _opening(self, bay: int, storey: int) -> Opening:
-        centre, floor = (bay + 0.5) * BAY, storey * STOREY
+        centre, floor = (self.first + bay + 0.5) * BAY, storey * STOREY
         if storey == 0 and bay == self.bays // 2:
             return Opening(centre - 0.65, centre + 0.65, 0.0, 2.65, is_door=True)
         return Opening(centre - 0.75, centre + 0.75, floor + 0.6, floor + 2.65, is_door=False)
@@ -83,7 +85,7 @@ class Layout:
     @property
     def columns(self) -> list[float]:
         """Positions of the columns along x: on every second edge between bays."""
-        return [bay * BAY for bay in range(0, self.bays + 1, 2)]
+        return [(self.first + bay) * BAY for bay in range(0, self.bays + 1, 2)]
 
     @property
     def slabs(self) -> list[float]:

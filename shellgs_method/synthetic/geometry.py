@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
+
+from shellgs_method.geometry.similarity import transformed
 
 
 class Material(IntEnum):
@@ -55,6 +57,11 @@ def merge(meshes: Iterable[Mesh]) -> Mesh:
         np.concatenate([mesh.triangles + offset for mesh, offset in zip(meshes, first, strict=True)]),
         np.concatenate([mesh.material for mesh in meshes]),
     )
+
+
+def moved(mesh: Mesh, motion: Float64[np.ndarray, "4 4"]) -> Mesh:
+    """A mesh after a rigid motion."""
+    return replace(mesh, vertices=transformed(mesh.vertices, motion))
 
 
 def parallelogram(corner: Sequence[float], a: Sequence[float], b: Sequence[float], material: Material) -> Mesh:

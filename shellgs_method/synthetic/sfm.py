@@ -68,7 +68,7 @@ def triangulate(
 ) -> Points:
     """At most ``count`` features, each visible in three views or more, with noise proportional to the distance."""
     points = Points(*(np.concatenate([getattr(view, f) for view in views]) for f in Points.__annotations__))
-    visible = np.stack([_is_visible(world, camera, points) for camera in cameras])
+    visible = observations(world, cameras, points)
     centres = np.stack([camera.position.numpy() for camera in cameras])
     distance = np.linalg.norm(points.positions - centres[:, None], axis=-1)
     nearest = np.where(visible, distance, np.inf).min(axis=0)
@@ -77,6 +77,11 @@ def triangulate(
     noise = rng.normal(0.0, NOISE, (len(kept), 3)) * nearest[kept, None]
     points = points[kept]
     return Points(points.positions + noise, points.colours, points.is_mirrored)
+
+
+def observations(world: World, cameras: Sequence[Camera], points: Points) -> Bool[np.ndarray, "V N"]:
+    """Which views observe which points."""
+    return np.stack([_is_visible(world, camera, points) for camera in cameras])
 
 
 def _is_visible(world: World, camera: Camera, points: Points) -> np.ndarray:

@@ -46,13 +46,17 @@ def _street(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
 
 
 def _pavement(layout: Layout, rng: np.random.Generator) -> Iterator[Mesh]:
-    """The ground, a pole and a tree in front of the building."""
     middle = layout.length / 2
     yield parallelogram((middle - 80, -60, 0), (160, 0, 0), (0, 140, 0), Material.GROUND)
-    yield cylinder((0.3 * layout.length, -2.4, 0), 0.075, 7.0, Material.POLE)
-    yield box((0.3 * layout.length - 0.05, -3.6, 6.9), (0.3 * layout.length + 0.05, -2.4, 7.0), Material.POLE)
-    yield cylinder((0.76 * layout.length, -2.2, 0), 0.07, 2.6, Material.TRUNK)
-    yield _crown(np.array([0.76 * layout.length, -2.2, 3.0]), rng)
+    yield from pole_and_tree(layout.length, rng)
+
+
+def pole_and_tree(length: float, rng: np.random.Generator) -> Iterator[Mesh]:
+    """What stands on the pavement in front of a building that begins at 0 along x and is ``length`` metres long."""
+    yield cylinder((0.3 * length, -2.4, 0), 0.075, 7.0, Material.POLE)
+    yield box((0.3 * length - 0.05, -3.6, 6.9), (0.3 * length + 0.05, -2.4, 7.0), Material.POLE)
+    yield cylinder((0.76 * length, -2.2, 0), 0.07, 2.6, Material.TRUNK)
+    yield _crown(np.array([0.76 * length, -2.2, 3.0]), rng)
 
 
 def car(x: float, y: float) -> Mesh:
