@@ -136,7 +136,7 @@ def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least
                 belong[measured[inside[measured].argmax()]] = True
             chosen[cell.block.name] = tuple(compress(seen.names, belong))
         weak = min(chosen, key=lambda name: len(chosen[name]))
-        if len(chosen[weak]) >= least or len(chosen) == 1:
+        if len(chosen[weak]) >= least or len(chosen) == 1:  # one block is the whole scene
             return replace(blocks, tree=_filled(blocks.tree, chosen))
         blocks = replace(blocks, tree=_joined(blocks.tree, weak))
 

@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from shellgs_method.compare.runs import Run, Variant
+from dataparsers.facade import FacadeDataParserConfig, held_out_names
+from shellgs_method.compare.runs import Run, Variant, recorded_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_contents, content_hash
-from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.scene import ScenePaths
 from shellgs_method.runs.checkpoints import find_checkpoint
 
@@ -28,6 +29,8 @@ class BlockJob(Run):
 
     coarse: Path = Path()
     """Folder of the coarse run."""
+    region: str = ""
+    """Fingerprint of the block's cell and photographs when the street began."""
 
     def _train(self) -> list[str]:
         script, method, *flags = super()._train()
@@ -40,16 +43,20 @@ class BlockJob(Run):
         Raises:
             SceneError: the flags set what the street sets, or there is no coarse run.
         """
-        cell = Blocks.read(self.scene / BLOCKS).cell(self.variant.name)
         coarse = content_hash(find_checkpoint(self.coarse / "nerfstudio_models"))
-        return {**super().settings, "block": cell.fingerprint, "coarse": coarse}
+        return {**super().settings, "block": self.region, "coarse": coarse}
 
     def settle(self) -> None:
         """Write the settings into the run's folder, and the coarse run's last checkpoint.
 
         Raises:
-            SceneError: the folder holds another run.
+            SceneError: the folder holds another run, or one of this block before it was cut anew.
         """
+        name, plan = self.variant.name, self.scene / BLOCKS
+        if self.region not in {cell.fingerprint for cell in Blocks.read(plan).cells}:
+            raise SceneError(f"{plan} has changed since the street began: run the same command again")
+        if self.begun and recorded_settings(self.recorded).get("block") != self.region:
+            raise SceneError(f"{name} was cut anew since {self.folder} was trained: remove that folder")
         super().settle()
         checkpoint = find_checkpoint(self.coarse / "nerfstudio_models")
         with atomic_contents(self.folder / COARSE) as folder:
@@ -96,7 +103,7 @@ class Street:
             paths: paths of the scene's files.
 
         Raises:
-            SceneError: the scene has no blocks, or the method is none of ShellGS.
+            SceneError: the scene has no blocks or one that cannot be trained, or the method is none of ShellGS.
         """
         variant = Variant.parse(method)
         if not variant.ours:
@@ -115,10 +122,28 @@ class Street:
                 output / "blocks",
                 paths=paths,
                 coarse=coarse.folder,
+                region=cell.fingerprint,
             )
-            for name in (cell.block.name for cell in Blocks.read(scene / BLOCKS).cells)
+            for cell in _checked(scene, paths)
+            for name in [cell.block.name]
         ]
         return cls(coarse, blocks)
+
+
+def _checked(scene: Path, paths: ScenePaths) -> Sequence[Cell]:
+    """The blocks of a scene, each of which has photographs to train on and some that are held out."""
+    path, layout = scene / BLOCKS, FacadeDataParserConfig(**vars(paths), data=scene)
+    cells, held_out = Blocks.read(path).cells, held_out_names(layout)
+    known = {frame.name for frame in layout.read().frames}
+    if len(cells) == 1:
+        raise SceneError(f"{path} has one block: train the scene as it is, with ns-train")
+    for name, listed in ((cell.block.name, {*cell.block.photographs}) for cell in cells):
+        if unknown := sorted(listed - known):
+            raise SceneError(f"{path}: {name} has {unknown[0]}, which is no photograph of the scene: take it out")
+        if not listed - held_out or not listed & held_out:
+            what = "that is held out" if listed - held_out else "to train on"
+            raise SceneError(f"{path}: {name} has no photograph {what}: run `shellgs blocks {scene}` to find them")
+    return cells
 
 
 Launch = Callable[[Sequence[Run]], Mapping[Run, str]]

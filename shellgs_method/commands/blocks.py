@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Optional
+from typing import TYPE_CHECKING, Optional
 
 from shellgs_method.commands.common import PATHS, Paths, Scene, console
 from shellgs_method.errors import SceneError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from dataparsers.facade import FacadeDataParserConfig
+    from shellgs_method.blocks.cut import Sights
+    from shellgs_method.files.photographs import View
 
 
 def blocks(
@@ -19,8 +26,8 @@ def blocks(
     """Cut a large scene into blocks that are trained one by one, with `shellgs street`.
 
     Cuts are vertical, across the street, where buildings end. They are written to scene/blocks.json and drawn from
-    above in scene/blocks.png. A cut may be moved by hand: the same command keeps the cuts of a blocks.json that is
-    there, and finds which photographs show each block.
+    above in scene/blocks.png. A cut may be moved by hand: the same command keeps cuts and overlap of a blocks.json
+    that is there, and finds which photographs show each block.
 
     Args:
         scene: Scene folder with the shell's maps (`shellgs cast`), or else with SfM points that have tracks.
@@ -30,48 +37,30 @@ def blocks(
         again: Cut anew.
         paths: Paths of the scene's files.
     """
-    from dataclasses import replace
-
     import numpy as np
 
-    from dataparsers.facade import read_views
-    from shellgs_method.blocks.cut import WEAK, Sights, assigned, cut, sights
+    from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
+    from shellgs_method.blocks.cut import WEAK, assigned, cut
     from shellgs_method.blocks.plan import draw
     from shellgs_method.files.blocks import BLOCKS, Blocks
-    from shellgs_method.files.cue_maps import CueMaps, find_cues
-    from shellgs_method.files.sparse_points import find_sparse_points
-    from shellgs_method.geometry.axes import likely_up
-    from shellgs_method.machine.progress import track
 
     if not (length > 0 and overlap >= 0 and (photographs is None or photographs >= WEAK)):
         raise SceneError(f"--length must be above 0, --overlap at least 0, and --photographs at least {WEAK}")
-    layout = paths.of(scene)
-    views, metres = read_views(layout), None
-    if "shell" in find_cues(scene):
-        maps = CueMaps.open(scene, "shell")
-        metres, size = maps.manifest.metres_per_unit, maps.manifest.max_image_size
-        shrunk = [replace(view, camera=view.camera.shrunk(size)) for view in views]
-        read = sights(
-            track(shrunk, "Reading the shell's maps", len(views)), lambda view: maps.read(view.name, view.camera)
-        )
-        shown = dict(read)
+    layout, file = FacadeDataParserConfig(**vars(paths), data=scene), scene / BLOCKS
+    before = Blocks.read(file) if file.exists() and not again else None
+    views, held_out = read_views(layout), held_out_names(layout)
+    seen = _seen(layout, views)
+    if before is None:
+        found = cut(seen, length, overlap, photographs, held_out)
     else:
-        points = find_sparse_points(layout)
-        if points.observed is None:
-            raise SceneError(
-                f"{scene} has neither maps of a shell nor tracks of its SfM points, which tell what each photograph "
-                f"shows: run `shellgs cast {scene}` first"
-            )
-        shown = {name: points.positions[of].astype(np.float64) for name, of in points.observed.items() if len(of)}
-    if not shown:
-        raise SceneError(f"no photograph of {scene} shows the shell: look at it with `shellgs align`")
-    if metres is None:
-        console.print("The scene's unit is not known, without maps of an aligned shell: lengths are in scene units.")
-    seen = Sights.of(shown, likely_up(view.camera for view in views), metres or 1.0)
-    file = scene / BLOCKS
-    found = (
-        assigned(Blocks.read(file), seen) if file.exists() and not again else cut(seen, length, overlap, photographs)
-    )
+        found = assigned(before, seen, held_out, least=0)
+        for cell in found.cells:
+            if (count := len(cell.block.photographs)) < WEAK:
+                raise SceneError(
+                    f"{file}: {cell.block.name} has {count} of the {WEAK} photographs that it needs: move its cuts, or "
+                    "cut anew with --again"
+                )
+        console.print(f"The cuts and the overlap of {file} are kept; --again cuts anew.", highlight=False)
     found.write(file)
     draw(file.with_suffix(".png"), found, seen, np.stack([view.camera.position.double().numpy() for view in views]))
     for cell in found.cells:
@@ -79,3 +68,37 @@ def blocks(
     if len(found.cells) == 1:
         console.print("The scene is one block: train it as it is, with ns-train.")
     console.print(f"Written: {file}, {file.with_suffix('.png')}.", highlight=False)
+
+
+def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
+    """What the photographs of a scene show of the shell, by its maps, or else of the SfM points."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from shellgs_method.blocks.cut import Sights, sights
+    from shellgs_method.files.cue_maps import CueMaps, find_cues
+    from shellgs_method.files.sparse_points import find_sparse_points
+    from shellgs_method.geometry.axes import likely_up
+    from shellgs_method.machine.progress import track
+
+    scene, metres = layout.data, None
+    if "shell" in find_cues(scene):
+        maps = CueMaps.open(scene, "shell")
+        metres, size = maps.manifest.metres_per_unit, maps.manifest.max_image_size
+        shrunk = [replace(view, camera=view.camera.shrunk(size)) for view in views]
+        reading = track(shrunk, "Reading the shell's maps", len(views))
+        shown = dict(sights(reading, lambda view: maps.read(view.name, view.camera)))
+    else:
+        points = find_sparse_points(layout)
+        if points.observed is None:
+            raise SceneError(
+                f"{scene} has neither maps of a shell nor tracks of its SfM points, which tell what each photograph "
+                f"shows: align a shell, and run `shellgs cast {scene}` first"
+            )
+        shown = {name: points.positions[of].astype(np.float64) for name, of in points.observed.items() if len(of)}
+    if not shown:
+        raise SceneError(f"no photograph of {scene} shows the shell: look at it with `shellgs align`")
+    if metres is None:
+        console.print("The scene's unit is not known, without maps of an aligned shell: lengths are in scene units.")
+    return Sights.of(shown, likely_up(view.camera for view in views), metres or 1.0)

@@ -246,9 +246,9 @@ class Run:
             DamagedRunError: the settings in the folder cannot be read.
         """
         recover_folder(self.folder)
-        path, settings = self._recorded, self.settings
-        if self._begun:
-            before = renamed(_recorded_settings(path), settings)
+        path, settings = self.recorded, self.settings
+        if self.begun:
+            before = renamed(recorded_settings(path), settings)
             # An earlier version did not write all settings: those that it lacks had their defaults or did not exist.
             known = settings | default_settings(self.variant.method) | before
             changed = [key for key in settings if settings[key] != known[key]]
@@ -270,22 +270,28 @@ class Run:
             SceneError: as :meth:`check`.
         """
         self.check()
-        if not self._begun:
+        if not self.begun:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with atomic_write(self._recorded) as file:
+            with atomic_write(self.recorded) as file:
                 file.write(json.dumps(self.settings, indent=2).encode())
 
     @property
-    def _recorded(self) -> Path:
+    def recorded(self) -> Path:
+        """File of the run's settings, in its folder."""
         return self.folder / "settings.json"
 
     @property
-    def _begun(self) -> bool:
+    def begun(self) -> bool:
         """Whether a comparison trained this run up to a checkpoint."""
-        return self._recorded.exists() and any(self.checkpoints.glob("step-*.ckpt"))
+        return self.recorded.exists() and any(self.checkpoints.glob("step-*.ckpt"))
 
 
-def _recorded_settings(path: Path) -> dict:
+def recorded_settings(path: Path) -> dict:
+    """Settings that were written into a run's folder.
+
+    Raises:
+        DamagedRunError: the file is damaged.
+    """
     try:
         before = json.loads(path.read_text())
         if isinstance(before, dict):

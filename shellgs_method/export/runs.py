@@ -69,7 +69,7 @@ class TrainedRun:
         if done < all_of:
             notice(f"{config.parent} was trained for {done} of {all_of} iterations: it was stopped, or is going on.")
         elif done < SHORT:
-            notice(f"{config.parent} was trained for {done} iterations only: give ns-train {SHORT} or more.")
+            notice(f"{config.parent} was trained for {done} iterations only: give it {SHORT} or more.")
         model, datamanager = pipeline.model, pipeline.datamanager
         if not isinstance(model, FacadeModel) or not isinstance(datamanager, FacadeDataManager):
             raise SceneError(f"{config} is not a run of a ShellGS method: only these render the depth that is needed")

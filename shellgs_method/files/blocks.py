@@ -26,7 +26,7 @@ from shellgs_method.files.atomic import atomic_write, fingerprint, read_json
 from shellgs_method.geometry.similarity import scale_of
 
 BLOCKS = "blocks.json"
-_NAME = re.compile(r"[\w.+-]*\w[\w.+-]*")
+_NAME = re.compile(r"\w[\w.+-]*")
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,12 @@ class Blocks:
         contents = read_json(path)
         try:
             blocks = cls(_node(contents["tree"]), _number(contents["overlap"]))
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise SceneError(f"{path} is damaged ({error!r}): mend it, or remove it and cut anew") from error
+        except KeyError as error:
+            raise SceneError(
+                f"{path} is damaged: {error} is missing in it; mend it, or remove it and cut anew"
+            ) from error
+        except (TypeError, ValueError, RecursionError) as error:
+            raise SceneError(f"{path} is damaged: {error}; mend it, or remove it and cut anew") from error
         names = [cell.block.name for cell in blocks.cells]
         if twice := {name for name in names if names.count(name) > 1}:
             raise SceneError(f"{path} has two blocks named {min(twice)}: give each its own name")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from two_blocks import HALVES, coarse_run, cut_in_two
 from shellgs_method.blocks.street import Street, script, train
 from shellgs_method.compare.settings import parsed
 from shellgs_method.errors import SceneError
+from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Fork
 from shellgs_method.files.scene import ScenePaths
 from shellgs_method.runs.checkpoints import find_checkpoint
 
@@ -76,8 +78,30 @@ def test_a_block_that_was_cut_anew_is_not_gone_on_with(cut, tmp_path):
         shutil.copytree(run.folder / "coarse" / "nerfstudio_models", run.checkpoints)
     assert len(script(planned(cut, tmp_path / "street"))) == 2
     cut_in_two(cut, overlap=0.7)
-    with pytest.raises(SceneError, match=r"a run with other settings \(block"):
+    with pytest.raises(SceneError, match=r"west was cut anew since .* was trained: remove that folder"):
         script(planned(cut, tmp_path / "street"))
+
+
+def test_a_plan_that_changes_while_a_street_is_trained_ends_it(cut, tmp_path):
+    street = planned(cut, tmp_path / "street")
+    finish_coarse(street, tmp_path / "coarse")
+    cut_in_two(cut, overlap=0.7)
+    with pytest.raises(SceneError, match=r"blocks\.json has changed since the street began"):
+        script(street)
+
+
+@pytest.mark.parametrize(
+    ("photographs", "said"),
+    [((), "no photograph to train on"), (("nope.png",), "nope.png, which is no photograph"), (None, "has one block")],
+)
+def test_a_block_that_cannot_be_trained_is_refused_before_the_coarse_run(cut, tmp_path, photographs, said):
+    blocks = Blocks.read(cut / BLOCKS)
+    assert isinstance(blocks.tree, Fork)
+    east = blocks.tree.above
+    tree = east if photographs is None else replace(blocks.tree, below=Block("west", photographs))
+    replace(blocks, tree=tree).write(cut / BLOCKS)
+    with pytest.raises(SceneError, match=said):
+        planned(cut, tmp_path / "street")
 
 
 def test_a_method_of_nerfstudio_trains_no_blocks(cut, tmp_path):

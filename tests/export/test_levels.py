@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from splat_files import some
 
+from shellgs_method.commands.splats import splats
 from shellgs_method.errors import SceneError
 from shellgs_method.export.levels import Level
 from shellgs_method.files.splats import Splats, encoded
@@ -79,3 +80,8 @@ def test_a_level_is_as_large_as_its_file_may_be(suffix: str):
     assert size(level.splats) <= half
     with pytest.raises(SceneError, match="no Gaussian fits into 1e-05 MB"):
         whole.within(1e-5, size)
+
+
+def test_no_level_is_refused_before_the_run_is_loaded():
+    with pytest.raises(SceneError, match="--levels must be at least 1, not 0"):
+        splats(Path("config.yml"), levels=0)
