@@ -26,9 +26,7 @@ from typing import Annotated, Optional
 
 import tyro
 
-from dataparsers.facade import read_views
 from shellgs_method.errors import SceneError, refusals_end_the_program
-from shellgs_method.files.scene import ScenePaths
 
 ROOT = Path(__file__).parents[1]
 TORCH = ("torch", "numpy", "scipy")
@@ -125,14 +123,10 @@ def download(packages: Iterable[str], python: str, folder: Path) -> None:
     """Fetch wheels for another Python; of a package whose version has none, the newest version that has."""
     platforms = [f"--platform=manylinux{tag}_x86_64" for tag in ("2014", "_2_17", "_2_28")]
     words = ["--no-deps", "--only-binary=:all:", f"--python-version={python}", *platforms, "-q", "-d", str(folder)]
+    fetch = [sys.executable, "-m", "pip", "download", *words]
     for package in packages:
-        for requirement in (package, package.partition("==")[0]):
-            if (
-                subprocess.run([sys.executable, "-m", "pip", "download", *words, requirement], check=False).returncode
-                == 0
-            ):
-                break
-        else:
+        choices = package, package.partition("==")[0]
+        if all(subprocess.run([*fetch, choice], check=False).returncode for choice in choices):
             raise SceneError(
                 f"{package} has no wheel for Python {python}: bring it another way, and name it in the file of --there"
             )
@@ -153,9 +147,7 @@ def copy_code(folder: Path) -> None:
 
 
 def copy_scene(scene: Path, folder: Path) -> None:
-    """A scene without what training does not read: photographs of no camera, and the folder of the capture."""
-    if not read_views(ScenePaths().of(scene)):
-        raise SceneError(f"{scene} has no cameras")
+    """A scene without the folder of its capture, which training does not read."""
     shutil.copytree(scene, folder, ignore=lambda path, names: {"capture"} & {*names} if Path(path) == scene else set())
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera
@@ -35,3 +38,10 @@ def pinhole_camera(camera: Cameras) -> Camera:
     viewmat[:3, 3] = -rotation @ pose[:, 3]
     K = camera.get_intrinsics_matrices()[0].to(pose.device)
     return Camera(viewmat, K, int(camera.width[0]), int(camera.height[0]))
+
+
+def scene_to_world(parsed: DataparserOutputs) -> Float64[np.ndarray, "4 4"]:
+    """Similarity from the scene to nerfstudio's rescaled world: scale · (transform @ scene)."""
+    similarity = np.eye(4)
+    similarity[:3] = parsed.dataparser_scale * parsed.dataparser_transform.double().numpy()
+    return similarity

@@ -208,13 +208,32 @@ def _of_block(
         return of_split, None
     path = config.data / BLOCKS
     cell = Blocks.read(path).cell(config.block)
-    listed = set(cell.block.photographs)
+    return _of_cell(cell, recording, of_split, split, path), cell
+
+
+def _of_cell(cell: Cell, recording: Recording, of_split: list[int], split: str, path: Path) -> list[int]:
+    name, listed = cell.block.name, set(cell.block.photographs)
     if unknown := sorted(listed - {frame.name for frame in recording.frames}):
-        raise SceneError(f"{path}: {config.block} has {unknown[0]}, which is no photograph of the scene: take it out")
+        raise SceneError(f"{path}: {name} has {unknown[0]}, which is no photograph of the scene: take it out")
     if not (chosen := [k for k in of_split if recording.frames[k].name in listed]):
         what = "to train on" if split == "train" else "that is held out"
-        raise SceneError(f"{path}: {config.block} has no photograph {what}: add one to it, or join it with a neighbour")
-    return chosen, cell
+        raise SceneError(f"{path}: {name} has no photograph {what}: add one to it, or join it with a neighbour")
+    return chosen
+
+
+def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
+    """The blocks of a scene, each of which has photographs to train on and some that are held out.
+
+    Raises:
+        SceneError: one has not, or names what is no photograph of the scene.
+    """
+    path, recording = config.data / BLOCKS, config.read()
+    cells = Blocks.read(path).cells
+    for split in ("train", "test"):
+        of_split = _of_split(recording, split, config)
+        for cell in cells:
+            _of_cell(cell, recording, of_split, split, path)
+    return cells
 
 
 def _refuse_missing_images(frames: Sequence[Frame], scene: Path) -> None:

@@ -21,7 +21,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from dataparsers.cameras import pinhole_camera, pinhole_cameras
+from dataparsers.cameras import pinhole_camera, pinhole_cameras, scene_to_world
 from shellgs_method.bounds import Length
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import Covisibility
@@ -294,10 +294,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
 
     @property
     def scene_to_world(self) -> Float64[np.ndarray, "4 4"]:
-        """Similarity from the scene to nerfstudio's rescaled world: scale · (transform @ scene)."""
-        parsed, similarity = self.train_dataparser_outputs, np.eye(4)
-        similarity[:3] = parsed.dataparser_scale * parsed.dataparser_transform.double().numpy()
-        return similarity
+        """Similarity from the scene to nerfstudio's rescaled world."""
+        return scene_to_world(self.train_dataparser_outputs)
 
     @cached_property
     def _covisibility(self) -> Covisibility:

@@ -34,12 +34,17 @@ def coarse_run(
 ) -> FacadeTrainer:
     """A finished run of the whole scene."""
     trainer = trainer_of(scene, folder, method, iterations, change=change)
+    save_config(trainer)
+    trainer.train()
+    return trainer
+
+
+def save_config(trainer: FacadeTrainer) -> None:
+    """Write what ns-train writes before it trains."""
     trainer.config.save_config()
     trainer.pipeline.datamanager.train_dataparser_outputs.save_dataparser_transform(
         trainer.base_dir / "dataparser_transforms.json"
     )
-    trainer.train()
-    return trainer
 
 
 def block_run(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
+from itertools import compress, count
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from shellgs_method.files.blocks import Block, Blocks, Cut, Fork
 from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import world_rays
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.planes import across
 from shellgs_method.geometry.similarity import transformed
@@ -75,10 +76,9 @@ def sights(views: Iterable[View], read: Callable[[View], CueMap | None]) -> Iter
             continue
         rows, columns = np.nonzero(cue.mask)
         chosen = np.linspace(0, len(rows) - 1, min(PIXELS, len(rows))).astype(int)
-        rows, columns = rows[chosen], columns[chosen]
-        rays = view.camera.rays()[rows, columns].double().numpy()
-        in_camera = cue.depth[rows, columns, None].astype(np.float64) * rays
-        yield view.name, transformed(in_camera, np.linalg.inv(view.camera.viewmat.double().numpy()))
+        pixels = rows[chosen], columns[chosen]
+        position, rays = world_rays(view.camera)
+        yield view.name, position + cue.depth[pixels][:, None] * rays[pixels]
 
 
 def cut(
@@ -124,13 +124,13 @@ def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least
         held_out: names of the photographs that are held out, of which each block has one: the one that sees most of it.
         least: photographs that a block needs.
     """
-    points, count = transformed(seen.points, seen.to_scene), len(seen.names)
-    shown = np.maximum(np.bincount(seen.views, minlength=count), 1)
+    points, total = transformed(seen.points, seen.to_scene), len(seen.names)
+    shown = np.maximum(np.bincount(seen.views, minlength=total), 1)
     measured = np.flatnonzero([name in held_out for name in seen.names])
     while True:
         chosen: dict[str, tuple[str, ...]] = {}
         for cell in blocks.cells:
-            inside = np.bincount(seen.views[cell.extended(points)], minlength=count) / shown
+            inside = np.bincount(seen.views[cell.extended(points)], minlength=total) / shown
             belong = inside >= SHARE
             if len(measured) and not belong[measured].any():
                 belong[measured[inside[measured].argmax()]] = True
@@ -183,7 +183,7 @@ def _cut_through(points: np.ndarray, along: np.ndarray, at: float) -> float:
 
 def _numbered(tree: Fork | Block) -> Fork | Block:
     """The tree with names in its order."""
-    numbers = iter(range(1, 10**6))
+    numbers = count(1)
 
     def named(node: Fork | Block) -> Fork | Block:
         if isinstance(node, Block):

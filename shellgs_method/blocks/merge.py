@@ -5,14 +5,15 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
+from dataparsers.cameras import scene_to_world
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.compare.settings import config_settings
 from shellgs_method.errors import SceneError
@@ -20,11 +21,9 @@ from shellgs_method.files.atomic import atomic_contents
 from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.gaussians.surroundings import Region
 from shellgs_method.machine.progress import track
-from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.runs.checkpoints import GAUSSIANS, SURFACE, finished_checkpoint, gaussians_in, load_checkpoint
 from shellgs_method.runs.coarse import CoarseRun
 from shellgs_method.runs.run_folder import open_run, written_config
-
-_PARAMETERS = "_model.gauss_params."
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,8 @@ class BlockRun:
     """A finished run of a block, whose checkpoint is not loaded yet."""
 
     config: TrainerConfig
-    checkpoint: Path
+    path: Path
+    """Its config.yml."""
 
     @classmethod
     def open(cls, path: Path) -> BlockRun:
@@ -42,18 +42,16 @@ class BlockRun:
             FileNotFoundError: there is no such file.
             SceneError: it is no run of a block, or unfinished.
         """
-        config = open_run(path)
-        run = cls(config, find_checkpoint(config.get_checkpoint_dir()))
-        if run.dataparser.block is None or getattr(config.pipeline.model, "coarse", None) is None:
+        run = cls(open_run(path), path)
+        if run.dataparser.block is None or getattr(run.config.pipeline.model, "coarse", None) is None:
             raise SceneError(f"{path} is no run of a block from a coarse run: name those of the blocks alone")
-        done = 1 + int(run.checkpoint.stem.removeprefix("step-"))
-        if done < config.max_num_iterations:
-            raise SceneError(
-                f"the run of {run.name}, {path.parent}, has {done} of its {config.max_num_iterations} iterations: "
-                f"train it to its end with `ns-train {config.method_name} --load-config {path} "
-                f"--load-dir {run.checkpoint.parent}`"
-            )
+        _ = run.checkpoint
         return run
+
+    @cached_property
+    def checkpoint(self) -> Path:
+        """Its last checkpoint."""
+        return finished_checkpoint(self.config, self.path, f"the run of {self.name}, {self.path.parent},")
 
     @property
     def dataparser(self) -> FacadeDataParserConfig:
@@ -111,8 +109,7 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
         _check_settings(first, run)
     parsed = replace(first.dataparser, block=None).setup().get_dataparser_outputs("train")
     coarse = CoarseRun.load(first.coarse, first.config.pipeline.model, parsed)
-    points, to_world = parsed.metadata["points3D_xyz"].double().numpy(), np.eye(4)
-    to_world[:3] = parsed.dataparser_scale * parsed.dataparser_transform.double().numpy()
+    points, to_world = parsed.metadata["points3D_xyz"].double().numpy(), scene_to_world(parsed)
     parts, state = [], {}
     for cell in track(blocks.cells, "Merging block", len(blocks.cells)):
         run = by_name[cell.block.name]
@@ -126,13 +123,13 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
                 "trained again: train it again"
             )
         region = Region.of(cell.moved(to_world), parsed.metadata["centre"], points)
-        gaussians = _gaussians(state)
+        gaussians = gaussians_in(state)
         parts.append({name: values[region.core(gaussians["means"])] for name, values in gaussians.items()})
     far = ~region.near(coarse.gaussians["means"])
     parts.append({name: coarse.gaussians[name][far] for name in parts[0]})
-    state = {name: each for name, each in state.items() if not name.startswith(("_model.surroundings.", _PARAMETERS))}
+    state = {name: each for name, each in state.items() if not name.startswith(("_model.surroundings.", GAUSSIANS))}
     for name in parts[0]:
-        key = "_model.surface" if name == "surface" else f"{_PARAMETERS}{name}"
+        key = SURFACE if name == "surface" else f"{GAUSSIANS}{name}"
         state[key] = torch.cat([part[name] for part in parts])
     _write(first, state, output)
     return output / "config.yml"
@@ -156,11 +153,6 @@ def _check_settings(first: BlockRun, run: BlockRun) -> None:
             f"{run.folder} has other settings than {first.folder} ({name}: {theirs.get(name)}, and {ours[name]} "
             "there): train all blocks with the same"
         )
-
-
-def _gaussians(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    found = {key.removeprefix(_PARAMETERS): each for key, each in state.items() if key.startswith(_PARAMETERS)}
-    return found | ({"surface": state["_model.surface"]} if "_model.surface" in state else {})
 
 
 def _write(first: BlockRun, state: Mapping[str, Tensor], output: Path) -> None:

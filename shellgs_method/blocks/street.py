@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from dataparsers.facade import FacadeDataParserConfig, held_out_names
+from dataparsers.facade import FacadeDataParserConfig, trainable_cells
 from shellgs_method.compare.runs import Run, Variant, recorded_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_contents, content_hash
-from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
+from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.files.scene import ScenePaths
 from shellgs_method.runs.checkpoints import find_checkpoint
 
@@ -112,11 +112,14 @@ class Street:
         scale = ("--pipeline.datamanager.camera-res-scale-factor", f"{coarse_scale:g}")
         of_whole = replace(variant, name=COARSE, flags=(*scale, *variant.flags))
         coarse = Run(scene, of_whole, seed, coarse_iterations, output / COARSE, paths=paths)
+        cells = trainable_cells(FacadeDataParserConfig(**vars(paths), data=scene))
+        if len(cells) == 1:
+            raise SceneError(f"{scene / BLOCKS} has one block: train the scene as it is, with ns-train")
         parser = () if _PARSER in variant.flags else (_PARSER,)
         blocks = [
             BlockJob(
                 scene,
-                replace(variant, name=name, flags=(*variant.flags, *parser, "--block", name)),
+                replace(variant, name=cell.block.name, flags=(*variant.flags, *parser, "--block", cell.block.name)),
                 seed,
                 iterations,
                 output / "blocks",
@@ -124,26 +127,9 @@ class Street:
                 coarse=coarse.folder,
                 region=cell.fingerprint,
             )
-            for cell in _checked(scene, paths)
-            for name in [cell.block.name]
+            for cell in cells
         ]
         return cls(coarse, blocks)
-
-
-def _checked(scene: Path, paths: ScenePaths) -> Sequence[Cell]:
-    """The blocks of a scene, each of which has photographs to train on and some that are held out."""
-    path, layout = scene / BLOCKS, FacadeDataParserConfig(**vars(paths), data=scene)
-    cells, held_out = Blocks.read(path).cells, held_out_names(layout)
-    known = {frame.name for frame in layout.read().frames}
-    if len(cells) == 1:
-        raise SceneError(f"{path} has one block: train the scene as it is, with ns-train")
-    for name, listed in ((cell.block.name, {*cell.block.photographs}) for cell in cells):
-        if unknown := sorted(listed - known):
-            raise SceneError(f"{path}: {name} has {unknown[0]}, which is no photograph of the scene: take it out")
-        if not listed - held_out or not listed & held_out:
-            what = "that is held out" if listed - held_out else "to train on"
-            raise SceneError(f"{path}: {name} has no photograph {what}: run `shellgs blocks {scene}` to find them")
-    return cells
 
 
 Launch = Callable[[Sequence[Run]], Mapping[Run, str]]

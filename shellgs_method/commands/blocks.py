@@ -37,12 +37,11 @@ def blocks(
         again: Cut anew.
         paths: Paths of the scene's files.
     """
-    import numpy as np
-
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
     from shellgs_method.blocks.cut import WEAK, assigned, cut
     from shellgs_method.blocks.plan import draw
     from shellgs_method.files.blocks import BLOCKS, Blocks
+    from shellgs_method.geometry.camera import positions
 
     if not (length > 0 and overlap >= 0 and (photographs is None or photographs >= WEAK)):
         raise SceneError(f"--length must be above 0, --overlap at least 0, and --photographs at least {WEAK}")
@@ -62,7 +61,7 @@ def blocks(
                 )
         console.print(f"The cuts and the overlap of {file} are kept; --again cuts anew.", highlight=False)
     found.write(file)
-    draw(file.with_suffix(".png"), found, seen, np.stack([view.camera.position.double().numpy() for view in views]))
+    draw(file.with_suffix(".png"), found, seen, positions(view.camera for view in views))
     for cell in found.cells:
         console.print(f"{cell.block.name}: {len(cell.block.photographs)} photographs", highlight=False)
     if len(found.cells) == 1:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _REBUILD_SCALAR: Any = np.float64(0).__reduce__()[0]
 torch.serialization.add_safe_globals([_REBUILD_SCALAR, np.dtype, type(np.dtype(np.float64))])
 
+GAUSSIANS, SURFACE = "_model.gauss_params.", "_model.surface"
+"""Names in a pipeline's state: of the parameters of Gaussians, which these begin, and of their weights."""
 _GAUSSIANS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 
 
@@ -42,6 +44,32 @@ def find_checkpoint(folder: Path, step: int | None = None) -> Path:
             "config.yml, which --load-dir takes, and a run that was stopped before its first save has none"
         )
     return folder / f"step-{max(steps) if step is None else step:09d}.ckpt"
+
+
+def finished_checkpoint(config: TrainerConfig, path: Path, called: str) -> Path:
+    """The last checkpoint of a run that was trained to its end.
+
+    Args:
+        config: its config, which lies at ``path``.
+        path: its config.yml.
+        called: the run, in a sentence.
+
+    Raises:
+        SceneError: it has none, or is unfinished.
+    """
+    checkpoint = find_checkpoint(config.get_checkpoint_dir())
+    if (done := 1 + int(checkpoint.stem.removeprefix("step-"))) < config.max_num_iterations:
+        raise SceneError(
+            f"{called} has {done} of its {config.max_num_iterations} iterations: train it to its end with `ns-train "
+            f"{config.method_name} --load-config {path} --load-dir {checkpoint.parent}`"
+        )
+    return checkpoint
+
+
+def gaussians_in(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Parameters of the Gaussians of a pipeline's state, and their weights ``surface`` where it has them."""
+    found = {key.removeprefix(GAUSSIANS): each for key, each in state.items() if key.startswith(GAUSSIANS)}
+    return found | ({"surface": state[SURFACE]} if SURFACE in state else {})
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash
-from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.runs.checkpoints import finished_checkpoint, gaussians_in, load_checkpoint
 from shellgs_method.runs.run_folder import check_world, open_run
 
 if TYPE_CHECKING:
@@ -53,21 +53,12 @@ class CoarseRun:
         if (block := config.pipeline.datamanager.dataparser.block) is not None:  # pyright: ignore
             raise SceneError(f"{path.parent} is a run of {block}: the coarse run is one of the whole scene")
         check_world(path.parent, parsed, f"coarse run, or train {path.parent} again")
-        checkpoint = find_checkpoint(config.get_checkpoint_dir())
-        state = load_checkpoint(checkpoint)
-        if (done := state["step"] + 1) < config.max_num_iterations:
-            raise SceneError(
-                f"the coarse run {path.parent} has {done} of its {config.max_num_iterations} iterations: train it to "
-                f"its end with `ns-train {config.method_name} --load-config {path} --load-dir {checkpoint.parent}`"
-            )
-        stored = {name.removeprefix("_model."): values for name, values in state["pipeline"].items()}
-        gaussians = {name.rpartition(".")[2]: each for name, each in stored.items() if name.startswith("gauss_params.")}
-        if "surface" in stored:
-            gaussians["surface"] = stored["surface"]
-        exposures, count = stored.get("exposures.parameter"), parsed.metadata["split"][0]
+        checkpoint = finished_checkpoint(config, path, f"the coarse run {path.parent}")
+        state = load_checkpoint(checkpoint)["pipeline"]
+        exposures, count = state.get("_model.exposures.parameter"), parsed.metadata["split"][0]
         if exposures is not None and len(exposures) != count:
             raise SceneError(
                 f"the coarse run {path.parent} has exposures of {len(exposures)} photographs, and the scene has "
                 f"{count} to train on: train it again"
             )
-        return cls(gaussians, exposures, content_hash(checkpoint))
+        return cls(gaussians_in(state), exposures, content_hash(checkpoint))

@@ -10,14 +10,13 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.errors import SceneError
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.synthetic.appearance import Daylight, log_gains, noise_lattice
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.geometry import Material, Mesh, merge, moved, parallelogram
 from shellgs_method.synthetic.path import walk
-from shellgs_method.synthetic.site import Site, generators
+from shellgs_method.synthetic.site import Site, check_least, generators
 from shellgs_method.synthetic.street import pole_and_tree
 from shellgs_method.synthetic.world import Place, World
 
@@ -53,9 +52,7 @@ class StreetConfig:
     def __post_init__(self) -> None:
         """Refuse settings that no scene can be made with."""
         least = {"width": 16, "height": 16, "views": 6, "seed": 0, "houses": 2, "points": 1, "supersampling": 1}
-        for name, minimum in least.items():
-            if getattr(self, name) < minimum:
-                raise SceneError(f"a synthetic street's {name} must be at least {minimum}, not {getattr(self, name)}")
+        check_least(self, "street", least)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from shellgs_method.synthetic.houses import Street, StreetConfig
 from shellgs_method.synthetic.monocular import predicted_disparity
 from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.sfm import Points, features, observations, triangulate
-from shellgs_method.synthetic.site import Site, generators
+from shellgs_method.synthetic.site import Site, check_least, generators
 from shellgs_method.synthetic.street import court, street
 from shellgs_method.synthetic.world import World
 
@@ -70,9 +70,7 @@ class FacadeConfig:
     def __post_init__(self) -> None:
         """Refuse settings that no scene can be made with."""
         least = {"width": 16, "height": 16, "views": 3, "seed": 0, "bays": 1, "storeys": 1, "points": 1}
-        for name, minimum in {**least, "supersampling": 1}.items():
-            if getattr(self, name) < minimum:
-                raise SceneError(f"a synthetic facade's {name} must be at least {minimum}, not {getattr(self, name)}")
+        check_least(self, "facade", {**least, "supersampling": 1})
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from training_runs import model_of
-from two_blocks import HALVES, block_run, coarse_run, cut_in_two
+from two_blocks import HALVES, block_run, coarse_run, cut_in_two, save_config
 
 from shellgs_method.blocks.merge import merge
 from shellgs_method.blocks.seams import from_cuts, on_another
@@ -47,10 +47,7 @@ def trained_block(coarse: FacadeTrainer, name: str, folder: Path, **kwargs: Any)
 
 def finished(trainer: FacadeTrainer, train: bool) -> Path:
     """The config of a run that was trained to its end, or that is said to be."""
-    trainer.config.save_config()
-    trainer.pipeline.datamanager.train_dataparser_outputs.save_dataparser_transform(
-        trainer.base_dir / "dataparser_transforms.json"
-    )
+    save_config(trainer)
     if train:
         trainer.train()
     else:
