@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from itertools import compress, count
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
+from shellgs_method.blocks.walls import REACH, areas, end_of_walls, extent, middle_of_street
 from shellgs_method.files.blocks import Block, Blocks, Cut, Fork
 from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import world_rays
-from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.planes import across
 from shellgs_method.geometry.similarity import transformed
 
@@ -23,16 +23,8 @@ WEAK = 8
 """Photographs below which a block is joined with a neighbour."""
 PIXELS = 2000
 """Points of the shell that are taken of each photograph."""
-CELL = 0.25
-"""Metres: size of the cells that points are thinned to, and step between the cuts that are compared."""
-_ASIDE = 1.5
-"""Metres on both sides of a cut within which a wall that is the same on both is cut through."""
-_SAME = np.array([0.2, 0.5])
-"""Metres: how near in depth and in height points on both sides are, if they are of the same wall."""
-_LONGER = 0.5
-"""What a cut may cost, in areas of the usual cut, to be at an end of its range rather than in the middle."""
-_TURNS = np.radians(np.linspace(-15, 15, 61))
-"""Angles between the direction in which points are spread most and that of the walls."""
+THROUGH = 0.25
+"""Share of a usual cut's walls through which no cut goes if both sides of the street can be cut apart."""
 
 
 @dataclass(frozen=True)
@@ -87,8 +79,9 @@ def cut(
     """Cut a scene into blocks of about a length.
 
     The scene is cut across its length until no part is longer than one and a half lengths (or has more than one and a
-    half times as many photographs). A cut is where least of a wall goes on in the same plane on its other side: at
-    steps and gaps between buildings.
+    half times as many photographs). A cut is where least of the walls goes on in the same plane on its other side: at
+    steps and gaps between buildings. Where those of both sides of a street are not opposite, the sides are cut apart
+    first, in the middle of the street.
 
     Args:
         seen: what the photographs show.
@@ -97,22 +90,24 @@ def cut(
         photographs: number of photographs of a block, which then decides in place of the length.
         held_out: names of the photographs that are held out, of which each block has one.
     """
-    thinned, share = _occupied(seen.points), 1 / np.bincount(seen.views)[seen.views]
+    area, share = areas(seen.points), 1 / np.bincount(seen.views)[seen.views]
 
-    def split(cells: Bool[np.ndarray, " C"], of: Bool[np.ndarray, " N"]) -> Fork | Block:
-        along, low, high = _extent(thinned[cells])
-        parts = share[of].sum() / photographs if photographs else (high - low) / length
-        if parts < 1.5 or high - low < 4 * _ASIDE:
+    def split(of: Int64[np.ndarray, " M"]) -> Fork | Block:
+        points = seen.points[of]
+        along, low, high = extent(points, area[of])
+        parts = round(share[of].sum() / photographs if photographs else (high - low) / length)
+        if parts < 2 or high - low < 2 * REACH:
             return Block("", ())
-        at = _least(thinned[cells], along, low, high, round(parts))
-        sides = thinned @ along >= at, seen.points @ along >= at
-        below, above = (split(cells & (sides[0] == up), of & (sides[1] == up)) for up in (False, True))
+        step = (high - low) / parts
+        at, through = end_of_walls(points, area[of], along, low + step * (parts // 2), step / 2)
+        if through > THROUGH and (street := middle_of_street(points, area[of], along)):
+            along, at = street
+        above = points @ along >= at
         plane = Cut((float(along[0]), float(along[1]), float(along[2])), at)
-        return Fork(plane.moved(seen.to_scene), below, above)
+        return Fork(plane.moved(seen.to_scene), split(of[~above]), split(of[above]))
 
-    everything = np.ones(len(thinned), bool), np.ones(len(seen.points), bool)
     scale = float(np.linalg.norm(seen.to_scene[:3, 0]))
-    return assigned(Blocks(_numbered(split(*everything)), overlap * scale), seen, held_out)
+    return assigned(Blocks(_numbered(split(np.arange(len(seen.points)))), overlap * scale), seen, held_out)
 
 
 def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least: int = WEAK) -> Blocks:
@@ -139,46 +134,6 @@ def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least
         if len(chosen[weak]) >= least or len(chosen) == 1:  # one block is the whole scene
             return replace(blocks, tree=_filled(blocks.tree, chosen))
         blocks = replace(blocks, tree=_joined(blocks.tree, weak))
-
-
-def _occupied(points: np.ndarray) -> np.ndarray:
-    """Centres of the cells that hold points."""
-    return (np.unique(np.floor(points / CELL).astype(np.int64), axis=0) + 0.5) * CELL
-
-
-def _extent(points: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """The horizontal direction of the walls along which points are spread most, and between which coordinates."""
-    flat = points[:, :2] - points[:, :2].mean(axis=0)
-    x, y = np.linalg.eigh(flat.T @ flat)[1][:, -1]
-    angles = np.arctan2(y, x) + _TURNS
-    beside = flat @ np.stack([-np.sin(angles), np.cos(angles)])
-    # Seen along the walls, points are in the fewest places.
-    peaks = [(np.bincount(np.floor((of - of.min()) / CELL).astype(np.int64)) ** 2).sum() for of in beside.T]
-    best = angles[np.argmax(peaks)]
-    along = np.array([np.cos(best), np.sin(best), 0.0])
-    along *= np.sign(along[np.abs(along).argmax()])
-    low, high = np.percentile(points @ along, (0.5, 99.5))
-    return along, float(low), float(high)
-
-
-def _least(points: np.ndarray, along: np.ndarray, low: float, high: float, parts: int) -> float:
-    """The coordinate of the cut through the least of walls, near one that leaves whole lengths on both sides."""
-    step = (high - low) / parts
-    ideal = low + step * (parts // 2)
-    candidates = np.arange(ideal - step / 2, ideal + step / 2, CELL)
-    walls = np.array([_cut_through(points, along, at) for at in candidates])
-    return float(candidates[(walls + _LONGER * np.median(walls) * (2 * (candidates - ideal) / step) ** 2).argmin()])
-
-
-def _cut_through(points: np.ndarray, along: np.ndarray, at: float) -> float:
-    """Metres of wall that a cut goes through: those at which there is a wall in the same place on its other side."""
-    near = points[np.abs(points @ along - at) < _ASIDE]
-    if not len(near):
-        return 0.0
-    beside = np.stack([near @ np.cross([0, 0, 1.0], along), near[:, 2]], axis=1) / _SAME
-    above = near @ along >= at
-    same = point_tree(beside[above]).query(beside[~above], p=np.inf, distance_upper_bound=1.0)[0] <= 1.0
-    return float(same.sum() * CELL**2 / _ASIDE)
 
 
 def _numbered(tree: Fork | Block) -> Fork | Block:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,16 +39,16 @@ def draw(path: Path, blocks: Blocks, seen: Sights, cameras: Float64[np.ndarray, 
         if len(x):
             axes.annotate(label, (np.median(x), np.median(y)), ha="center", bbox={"facecolor": "white", "alpha": 0.8})
     edges = axes.get_xlim(), axes.get_ylim()
-    for cell in blocks.cells:
+    foot = seen.points.mean(axis=0)
+    along = np.linspace(-1, 1, 2001) * np.hypot(np.ptp(edges[0]), np.ptp(edges[1]))
+    for cell in (cell.moved(upright) for cell in blocks.cells):
         for cut, _ in cell.sides:
-            normal, offset = np.array((moved := cut.moved(upright)).normal), moved.offset
-            axes.axline(
-                tuple(normal[:2] * offset),
-                slope=None,
-                xy2=tuple(normal[:2] * offset + [-normal[1], normal[0]]),
-                color="gray",
-                lw=0.8,
+            normal = np.array(cut.normal)
+            line = (
+                cut.offset * normal + np.outer(along, np.cross([0, 0, 1.0], normal)) + foot - (foot @ normal) * normal
             )
+            apart = replace(cell, sides=tuple(side for side in cell.sides if side[0] != cut))
+            axes.plot(*line[apart.core(line)].T[:2], color="gray", lw=0.8)
     axes.set(xlim=edges[0], ylim=edges[1], title=f"{len(blocks.cells)} blocks, and their photographs; dots are cameras")
     with atomic_write(path) as file:
         figure.savefig(file, format="png", dpi=120)

@@ -80,6 +80,7 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
     from shellgs_method.files.sparse_points import find_sparse_points
     from shellgs_method.geometry.axes import likely_up
     from shellgs_method.machine.progress import track
+    from shellgs_method.shell import ALIGNMENT, Alignment
 
     scene, metres = layout.data, None
     if "shell" in find_cues(scene):
@@ -100,4 +101,7 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
         raise SceneError(f"no photograph of {scene} shows the shell: look at it with `shellgs align`")
     if metres is None:
         console.print("The scene's unit is not known, without maps of an aligned shell: lengths are in scene units.")
-    return Sights.of(shown, likely_up(view.camera for view in views), metres or 1.0)
+    up = likely_up(view.camera for view in views)
+    if metres and (scene / ALIGNMENT).is_file() and (known := Alignment.load(scene / ALIGNMENT)).up is not None:
+        up = known.rotation @ known.up  # exactly
+    return Sights.of(shown, up, metres or 1.0)
