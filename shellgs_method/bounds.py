@@ -1,10 +1,17 @@
-"""Ranges of settings, written in the annotations of their fields."""
+"""Ranges of settings, written in the annotations of fields and of arguments of commands."""
 
 from __future__ import annotations
 
+import inspect
 import math
-from functools import cache
-from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
+from collections.abc import Callable, Mapping
+from functools import cache, wraps
+from typing import Annotated, Any, NamedTuple, ParamSpec, TypeVar, get_args, get_type_hints
+
+from shellgs_method.errors import SceneError
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 TINY = 1e-30
 
@@ -20,7 +27,7 @@ class Bounds(NamedTuple):
     def __str__(self) -> str:
         what = {int: "an odd whole number" if self.odd else "a whole number", float: "a number"}[self.kind]
         least = "above 0" if self.least == TINY else f"from {self.least:g}"
-        return f"{what} {least}" + (f" to {self.most:g}" if self.most < math.inf else "")
+        return f"{what} {least}" + (f" to {self.most:,.10g}" if self.most < math.inf else "")
 
     def hold(self, value: Any) -> bool:
         """Whether a value is in the range."""
@@ -31,6 +38,7 @@ class Bounds(NamedTuple):
 
 COUNT, FROM_ONE = Bounds(0, 1e9, int), Bounds(1, 1e9, int)
 WEIGHT, SHARE, LENGTH, RATE = Bounds(0, 1e6), Bounds(0, 1), Bounds(TINY, 1e6), Bounds(TINY, 1e3)
+PORT, SEED = Bounds(1, 65535, int), Bounds(0, 2**32 - 1, int)
 
 Count = Annotated[int, COUNT]
 FromOne = Annotated[int, FROM_ONE]
@@ -38,13 +46,39 @@ Weight = Annotated[float, WEIGHT]
 Share = Annotated[float, SHARE]
 Length = Annotated[float, LENGTH]
 Rate = Annotated[float, RATE]
+Port = Annotated[int, PORT]
+Seed = Annotated[int, SEED]
 
 
 @cache
-def bounds_of(config: type) -> dict[str, Bounds]:
-    """Bounds in the annotations of a class of settings and its bases, by the names of its fields."""
-    found = {name: _bounds_in(hint) for name, hint in get_type_hints(config, include_extras=True).items()}
+def bounds_of(settings: Any) -> dict[str, Bounds]:
+    """Bounds in the annotations of a class of settings and its bases, or of a function, by their names."""
+    found = {name: _bounds_in(hint) for name, hint in get_type_hints(settings, include_extras=True).items()}
     return {name: bounds for name, bounds in found.items() if bounds is not None}
+
+
+def check_bounds(settings: Any, values: Mapping[str, Any]) -> None:
+    """Refuse numbers out of the bounds in the annotations of a class of settings or of a command.
+
+    Raises:
+        SceneError: names the first such setting as a flag, and its bounds.
+    """
+    for name, bounds in bounds_of(settings).items():
+        given = values.get(name)
+        for value in given if isinstance(given, tuple) else (given,):
+            if value is not None and not bounds.hold(value):
+                raise SceneError(f"--{name.replace('_', '-')} cannot be {value:g}: give {bounds}")
+
+
+def bounded(command: Callable[P, T]) -> Callable[P, T]:
+    """Let a command refuse numbers that nothing can be made with, before any work."""
+
+    @wraps(command)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+        check_bounds(command, inspect.signature(command).bind(*args, **kwargs).arguments)
+        return command(*args, **kwargs)
+
+    return checked
 
 
 def _bounds_in(hint: Any) -> Bounds | None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Optional
+from typing import Annotated, Literal, Optional
 
-from shellgs_method.errors import SceneError
+from shellgs_method.bounds import Bounds, FromOne, check_bounds
 
 Matching = Literal["auto", "sequential", "exhaustive"]
 Cameras = Literal["auto", "single", "folder", "rig", "image"]
@@ -20,13 +20,13 @@ LEAST_SHARE, LEAST_REGISTERED = 0.6, 3
 class CaptureConfig:
     """Settings of structure from motion and of the frames taken from a video."""
 
-    frames: int = 200
+    frames: Annotated[int, Bounds(LEAST_REGISTERED, 1e9, int)] = 200
     """Maximum number of frames taken from a video; never more than five per second, and fewer where the picture moves
     little."""
     matching: Matching = "auto"
     """Photographs to match: neighbours in the order of their names, then those that see the same by a first model
     (sequential), or all pairs (exhaustive). If auto: sequential for a video and for more than 60 photographs."""
-    overlap: int = 10
+    overlap: FromOne = 10
     """Number of next photographs to match each with, and of others that see the same, if sequential. Reduce it if
     identical windows are confused."""
     cameras: Cameras = "auto"
@@ -44,7 +44,4 @@ class CaptureConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that no scene can be made with."""
-        if self.frames < LEAST_REGISTERED:
-            raise SceneError(f"a scene needs at least {LEAST_REGISTERED} frames, not {self.frames}")
-        if self.overlap < 1:
-            raise SceneError(f"--overlap must be at least 1, not {self.overlap}")
+        check_bounds(CaptureConfig, vars(self))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import tyro
 from rich.table import Table
 
+from shellgs_method.bounds import Length, bounded
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
 from shellgs_method.errors import SceneError
 
@@ -18,21 +19,24 @@ if TYPE_CHECKING:
     from shellgs_method.registration.validation import Validation
 
 
+@bounded
 def align(
     scene: Scene,
-    shell: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL ...]")] = (),
+    shell: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SHELL ...]", help_behavior_hint="")
+    ] = (),
     matrix: Optional[Path] = None,
     picks: Optional[Path] = None,
     positions: Optional[Path] = None,
-    refine: Optional[float] = None,
+    refine: Optional[Length] = None,
     bundle_adjust: bool = False,
     accept: bool = False,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    metres_per_shell_unit: float = 1.0,
+    metres_per_shell_unit: Length = 1.0,
     same_frame: bool = False,
     crs: Optional[str] = None,
     mesher: Optional[Mesher] = None,
-    spacing: Optional[float] = None,
+    spacing: Optional[Length] = None,
     paths: Paths = PATHS,
 ) -> None:
     """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
+from shellgs_method.bounds import Bounds, Length, Weight, bounded
 from shellgs_method.commands.common import PATHS, Paths, Scene, console
 from shellgs_method.errors import SceneError
 
@@ -15,11 +16,12 @@ if TYPE_CHECKING:
     from shellgs_method.files.photographs import View
 
 
+@bounded
 def blocks(
     scene: Scene,
-    length: float = 30.0,
-    photographs: Optional[int] = None,
-    overlap: float = 5.0,
+    length: Length = 30.0,
+    photographs: Optional[Annotated[int, Bounds(8, 1e9, int)]] = None,
+    overlap: Weight = 5.0,
     again: bool = False,
     paths: Paths = PATHS,
 ) -> None:
@@ -43,8 +45,6 @@ def blocks(
     from shellgs_method.files.blocks import BLOCKS, Blocks
     from shellgs_method.geometry.camera import positions
 
-    if not (length > 0 and overlap >= 0 and (photographs is None or photographs >= WEAK)):
-        raise SceneError(f"--length must be above 0, --overlap at least 0, and --photographs at least {WEAK}")
     layout, file = FacadeDataParserConfig(**vars(paths), data=scene), scene / BLOCKS
     before = Blocks.read(file) if file.exists() and not again else None
     views, held_out = read_views(layout), held_out_names(layout)

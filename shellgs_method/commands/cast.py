@@ -8,6 +8,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Optional
 
+from shellgs_method.bounds import FromOne, Length, bounded
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
 from shellgs_method.commands.panels import save_panel, views_with_maps
 from shellgs_method.errors import SceneError
@@ -23,16 +24,17 @@ LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
 
 
+@bounded
 def cast(
     scene: Scene,
     shell: tuple[Path, ...] = (),
     matrix: Optional[Path] = None,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    metres_per_shell_unit: float = 1.0,
+    metres_per_shell_unit: Length = 1.0,
     truth: tuple[Path, ...] = (),
-    max_image_size: Optional[int] = None,
+    max_image_size: Optional[FromOne] = None,
     mesher: Optional[Mesher] = None,
-    spacing: Optional[float] = None,
+    spacing: Optional[Length] = None,
     check: bool = True,
     paths: Paths = PATHS,
 ) -> None:
@@ -68,8 +70,6 @@ def cast(
     from shellgs_method.files.cue_maps import CueMaps, relative_path
     from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 
-    if max_image_size is not None and max_image_size < 1:
-        raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
     files = truth or shell
     if truth and shell:
         raise SceneError("the truth is cast after the shell: give --shell or --truth")

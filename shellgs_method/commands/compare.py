@@ -8,19 +8,20 @@ from typing import Annotated, Literal, Optional
 
 import tyro
 
+from shellgs_method.bounds import Count, FromOne, Seed, bounded
 from shellgs_method.commands.common import PATHS, Paths, console, open_page
-from shellgs_method.errors import SceneError
 
 
+@bounded
 def compare(
     scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE [SCENE ...]")],
     methods: tuple[str, ...] = ("photo-gs", "mono-gs", "2dgs", "shellgs"),
-    seeds: tuple[int, ...] = (0,),
-    iterations: int = 30_000,
+    seeds: tuple[Seed, ...] = (0,),
+    iterations: FromOne = 30_000,
     output: Path = Path("compare"),
-    curve_points: int = 5,
+    curve_points: Count = 5,
     launcher: Literal["local", "ray"] = "local",
-    jobs: int = 1,
+    jobs: FromOne = 1,
     address: Optional[str] = None,
     wandb: Optional[str] = None,
     open: bool = False,
@@ -52,8 +53,6 @@ def compare(
     from shellgs_method.compare.wandb_report import log_comparison, log_in
     from shellgs_method.launch.local import launch_locally
 
-    if jobs < 1:
-        raise SceneError(f"--jobs must be at least 1, not {jobs}")
     if wandb:
         log_in()
     runs = grid(scenes, methods, seeds, iterations, output, curve_points, paths)

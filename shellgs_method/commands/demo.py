@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from shellgs_method.bounds import FromOne, Seed, bounded
 from shellgs_method.commands.common import console, open_page
 from shellgs_method.errors import SceneError
 
@@ -20,13 +21,14 @@ if TYPE_CHECKING:
 METHODS = ("photo-gs", "shellgs-metric")
 
 
+@bounded
 def demo(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[FOLDER]")] = Path("demo"),
-    iterations: int = 750,
+    iterations: FromOne = 750,
     width: int = 320,
     height: int = 180,
     views: int = 40,
-    seed: int = 0,
+    seed: Seed = 0,
     open: bool = False,
 ) -> None:
     """Make a synthetic facade, run the whole pipeline on it, and show tables and images.
@@ -48,8 +50,6 @@ def demo(
     from shellgs_method.launch.local import BIN, CommandError, follow, launch_locally
     from shellgs_method.synthetic import FacadeConfig
 
-    if iterations < 1:
-        raise SceneError(f"--iterations must be at least 1, not {iterations}")
     scene = folder / "scene"
     _make(scene, FacadeConfig(width, height, views, seed))
     console.print(f"[bold]$ shellgs cast {scene}", highlight=False)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from math import inf
 from pathlib import Path
 from typing import Optional
 
+from shellgs_method.bounds import Length, bounded
 from shellgs_method.commands.common import RunConfig, console
-from shellgs_method.errors import SceneError
 
 
+@bounded
 def elevation(
     config: RunConfig,
     output: Optional[Path] = None,
-    pixel: Optional[float] = None,
+    pixel: Optional[Length] = None,
 ) -> None:
     """Draw the walls of a trained run to scale: colours, depth, and deviations from the shell.
 
@@ -30,8 +30,6 @@ def elevation(
     from shellgs_method.geometry.triangles import Triangles
     from shellgs_method.machine.progress import track
 
-    if pixel is not None and not 0 < pixel < inf:
-        raise SceneError("--pixel must be above 0")
     output, run = output or config.with_name("elevation"), TrainedRun.load(config)
     (shell, walls), mesh = shell_and_walls(run), run.surface(MARGIN)
     surface, pixel, facts = Triangles(mesh.vertices, mesh.faces), pixel or usual_pixel(run, walls), {}

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from math import inf
 from pathlib import Path
-from typing import Optional
+from typing import Annotated, Optional
 
+from shellgs_method.bounds import Bounds, Length, Weight, bounded
 from shellgs_method.commands.common import RunConfig, console, place
-from shellgs_method.errors import SceneError
 
 
+@bounded
 def mesh(
     config: RunConfig,
     output: Optional[Path] = None,
-    voxel: Optional[float] = None,
-    faces: int = 200_000,
-    margin: float = 0.5,
+    voxel: Optional[Length] = None,
+    faces: Annotated[int, Bounds(4, 1e9, int)] = 200_000,
+    margin: Weight = 0.5,
 ) -> None:
     """Write a triangle mesh of a trained run, in metres in the shell's frame, and print its errors.
 
@@ -37,8 +37,6 @@ def mesh(
 
     output = output or config.with_name("mesh.ply")
     check_mesh_format(output)
-    if faces < 4 or not 0 <= margin < inf or not 0 < (1 if voxel is None else voxel) < inf:
-        raise SceneError("--faces must be at least 4, --voxel above 0 and --margin at least 0")
     run = TrainedRun.load(config)
     surface = decimated_mesh(run.surface(margin, voxel), faces)
     metrics = mesh_errors(run, surface)

@@ -6,10 +6,10 @@ from typing import Annotated, Optional, Union
 
 import tyro
 
+from shellgs_method.bounds import FromOne, bounded
 from shellgs_method.commands.common import PATHS, Paths, Scene, console
 from shellgs_method.commands.panels import save_panel
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
-from shellgs_method.errors import SceneError
 
 MonoSource = Annotated[
     Union[
@@ -22,7 +22,10 @@ MonoSource = Annotated[
 _MOGE = MoGe2()
 
 
-def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int] = None, paths: Paths = PATHS) -> None:
+@bounded
+def mono(
+    scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[FromOne] = None, paths: Paths = PATHS
+) -> None:
     """Make monocular depth and normals of every view, aligned to the SfM points, in scene/cues/mono.
 
     They come from a network (moge, depth-anything) or from existing maps (from FOLDER). A view whose depth does not fit
@@ -41,8 +44,6 @@ def mono(scene: Scene, source: MonoSource = _MOGE, max_image_size: Optional[int]
     from shellgs_method.files.sparse_points import read_sparse_points
     from shellgs_method.registration.sfm_frame import check_points
 
-    if max_image_size is not None and max_image_size < 1:
-        raise SceneError(f"--max-image-size must be at least 1 pixel, not {max_image_size}")
     layout = paths.of(scene)
     views, points, predictor = read_views(layout), read_sparse_points(layout), source.load()
     check_points(points, views)

@@ -9,17 +9,19 @@ from typing import Annotated, Optional
 
 import tyro
 
+from shellgs_method.bounds import Length, Port, bounded
 from shellgs_method.commands.common import PATHS, Paths, Scene, console
 from shellgs_method.errors import SceneError
 
 
+@bounded
 def pick(
     scene: Scene,
     shell: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SHELL ...")],
     picks: Path = Path("picks.txt"),
-    metres_per_shell_unit: float = 1.0,
+    metres_per_shell_unit: Length = 1.0,
     crs: Optional[str] = None,
-    port: int = 7070,
+    port: Port = 7070,
     open: bool = False,
     paths: Paths = PATHS,
 ) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import tyro
 
+from shellgs_method.bounds import FromOne, Length, check_bounds
 from shellgs_method.commands.align import align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
@@ -36,7 +37,11 @@ if TYPE_CHECKING:
 class Recipe:
     """Settings of all steps."""
 
-    sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[VIDEO SHELL [SHELL ...]]")] = ()
+    sources: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="[VIDEO SHELL [SHELL ...]]", help_behavior_hint=""),
+    ] = ()
     """Video or folder of photographs, then the files of the shell. Not again when the run goes on."""
     picks: Optional[Path] = None
     """Text file of picked points, as `shellgs align` takes it."""
@@ -46,19 +51,19 @@ class Recipe:
     """Text file of RTK camera positions."""
     same_frame: bool = False
     """The shell is in the frame and unit of the cameras."""
-    refine: Optional[float] = None
+    refine: Optional[Length] = None
     """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
     bundle_adjust: bool = False
     """Then adjust the cameras to the shell."""
-    metres_per_shell_unit: float = 1.0
+    metres_per_shell_unit: Length = 1.0
     """Length of the shell's unit in metres."""
     crs: Optional[str] = None
     """Coordinate reference system of the shell, such as EPSG:25832. If not set: as the shell's file says."""
-    max_image_size: Optional[int] = None
+    max_image_size: Optional[FromOne] = None
     """Longer side in pixels that photographs are resized to for training. If not set: full size."""
     method: str = "shellgs-metric"
     """Method to train."""
-    iterations: int = 30_000
+    iterations: FromOne = 30_000
     """Training iterations."""
     sim: bool = False
     """Also write a folder for simulators."""
@@ -128,8 +133,7 @@ class Recipe:
             )
         if len(self.starts) > 1:
             raise SceneError(f"the alignment starts from one of {', '.join(map(_flag, self.starts))}")
-        if self.iterations < 1:
-            raise SceneError(f"--iterations must be at least 1, not {self.iterations}")
+        check_bounds(Recipe, vars(self))
         if self.crs:
             given_crs(self.crs)
         Variant.parse(self.method)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Optional
 
-from shellgs_method.bounds import FromOne, Length
+from shellgs_method.bounds import FromOne, Length, bounded
 from shellgs_method.commands.common import RunConfig, console, place
-from shellgs_method.errors import SceneError
 
 
+@bounded
 def splats(
     config: RunConfig,
     output: Optional[Path] = None,
@@ -35,8 +35,6 @@ def splats(
     from shellgs_method.export.splats import moved
     from shellgs_method.files.splats import Y_UP, Splats, check_splats_format, encoded, write_splats
 
-    if levels < 1:
-        raise SceneError(f"--levels must be at least 1, not {levels}")
     output = output or config.with_name("splats.ply")
     check_splats_format(output)
     run = TrainedRun.load(config)

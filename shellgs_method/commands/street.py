@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Optional
+from typing import Annotated, Literal, Optional
 
+from shellgs_method.bounds import TINY, Bounds, FromOne, Seed, bounded
 from shellgs_method.commands.common import PATHS, Paths, Scene, console
 from shellgs_method.commands.merge import report_seams
 from shellgs_method.errors import SceneError
 
 
+@bounded
 def street(
     scene: Scene,
     method: str = "shellgs-metric",
-    iterations: int = 30_000,
-    coarse_iterations: int = 30_000,
-    coarse_scale: float = 0.5,
-    seed: int = 0,
+    iterations: FromOne = 30_000,
+    coarse_iterations: FromOne = 30_000,
+    coarse_scale: Annotated[float, Bounds(TINY, 1)] = 0.5,
+    seed: Seed = 0,
     output: Path = Path("street"),
     launcher: Literal["local", "ray", "script"] = "local",
-    jobs: int = 1,
+    jobs: FromOne = 1,
     address: Optional[str] = None,
     paths: Paths = PATHS,
 ) -> None:
@@ -48,11 +50,6 @@ def street(
     from shellgs_method.launch.local import launch_locally
     from shellgs_method.runs.folders import held
 
-    if min(jobs, iterations, coarse_iterations) < 1 or not 0 < coarse_scale <= 1 or seed < 0:
-        raise SceneError(
-            "--jobs, --iterations and --coarse-iterations must be at least 1, --coarse-scale above 0 and at most 1, "
-            "and --seed at least 0"
-        )
     plan = Street.plan(scene, method, iterations, coarse_iterations, coarse_scale, seed, output, paths)
     output.mkdir(parents=True, exist_ok=True)
     with held(output) as alone:

@@ -320,8 +320,6 @@ def grid(
     """
     if not names or not seeds:
         raise SceneError(f"there is nothing to compare: give {'methods' if seeds else 'seeds'}")
-    if iterations < 1 or curve_points < 0 or min(seeds) < 0:
-        raise SceneError("--iterations must be at least 1, and --seeds and --curve-points at least 0")
     for scene in scenes:
         if not scene.is_dir():
             raise FileNotFoundError(f"{scene} is not a folder; `shellgs compare` takes scene folders.")

@@ -15,11 +15,9 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
 from dataparsers.facade import FacadeDataParserConfig
-from shellgs_method.bounds import COUNT, FROM_ONE, LENGTH, RATE, TINY, WEIGHT, Bounds, bounds_of
+from shellgs_method.bounds import COUNT, FROM_ONE, LENGTH, PORT, RATE, SEED, TINY, WEIGHT, Bounds, bounds_of
 from shellgs_method.errors import SceneError
 from shellgs_method.machine.gsplat_kernels import TORCH_COSTS, kernels_fault
-
-PORT, SEED = Bounds(1, 65535, int), Bounds(0, 2**32 - 1, int)
 
 OF_NERFSTUDIO: dict[type, dict[str, Bounds]] = {
     TrainerConfig: {

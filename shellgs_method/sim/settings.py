@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Optional
 
-from shellgs_method.bounds import TINY, Bounds, FromOne, Length, bounds_of
-from shellgs_method.errors import SceneError
+from shellgs_method.bounds import TINY, Bounds, FromOne, Length, check_bounds
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,4 @@ class SimSettings:
 
     def __post_init__(self) -> None:
         """Refuse numbers that nothing can be made with, before hours of work."""
-        for name, bounds in bounds_of(type(self)).items():
-            value = getattr(self, name)
-            if value is not None and not bounds.hold(value):
-                raise SceneError(f"--{name} {value:g} cannot be: give {bounds}")
+        check_bounds(type(self), vars(self))

@@ -92,7 +92,7 @@ def test_without_a_browser_the_page_is_named(monkeypatch, capsys):
     [
         (["--width", 640], "was made with --width 64, not 640: give another folder"),
         (["--views", 12, "--seed", 3], "--views 10, not 12, --seed 0, not 3"),
-        (["--iterations", -5], "--iterations must be at least 1, not -5"),
+        (["--iterations", -5], "--iterations cannot be -5"),
         (["--width", 0], "width must be at least 16, not 0"),
     ],
 )

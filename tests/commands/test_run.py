@@ -154,7 +154,7 @@ def test_settings_are_read_as_they_were_written_wherever_the_folder_is(tmp_path)
     [
         ([], "there is no scene.run to go on with: give a video (or a folder of photographs) and a scan"),
         (["{photographs}", "shell.ply", "--picks", "no.txt"], "no.txt does not exist"),
-        (["{photographs}", "shell.ply", "--iterations", "0"], "--iterations must be at least 1"),
+        (["{photographs}", "shell.ply", "--iterations", "0"], "--iterations cannot be 0"),
         (["{photographs}", "shell.ply", "--method", "shelgs"], "there is no method 'shelgs'"),
         (["{photographs}", "shell.ply", "--matrix", "matrix.txt", "--same-frame"], "starts from one of"),
         (

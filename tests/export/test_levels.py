@@ -83,5 +83,5 @@ def test_a_level_is_as_large_as_its_file_may_be(suffix: str):
 
 
 def test_no_level_is_refused_before_the_run_is_loaded():
-    with pytest.raises(SceneError, match="--levels must be at least 1, not 0"):
+    with pytest.raises(SceneError, match="--levels cannot be 0: give a whole number from 1"):
         splats(Path("config.yml"), levels=0)

@@ -130,7 +130,7 @@ def test_a_trained_run_with_an_unused_setting_still_loads():
 @pytest.mark.parametrize(
     ("path", "value", "sentence"),
     [
-        ("viewer.websocket_port", 99_999, "give a whole number from 1 to 65535"),
+        ("viewer.websocket_port", 99_999, "give a whole number from 1 to 65,535"),
         ("viewer.websocket_host", "999.1.1.1", "the viewer cannot listen at 999.1.1.1 .*websocket-host 127.0.0.1"),
         ("machine.device_type", "mps", "torch finds no such device here.*--machine.device-type cpu"),
         ("machine.device_type", "cuda", "torch finds no such device here"),

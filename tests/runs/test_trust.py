@@ -342,9 +342,9 @@ def test_a_missing_config_is_named(tmp_path, monkeypatch):
         (["splats", "--output", "dangling/a.ply"], "dangling is a link to gone, which does not exist"),
         (["splats", "--output", "dangling.ply"], "dangling.ply is a link to gone, which does not exist"),
         (["splats", "--output", f"{'a' * 240}.ply"], "is too long for a file's name"),
-        (["mesh", "--faces", "0"], "--faces must be at least 4"),
-        (["mesh", "--voxel", "nan"], "--voxel above 0"),
-        (["mesh", "--margin", "-1"], "--margin at least 0"),
+        (["mesh", "--faces", "0"], "--faces cannot be 0: give a whole number from 4"),
+        (["mesh", "--voxel", "nan"], "--voxel cannot be nan: give a number above 0"),
+        (["mesh", "--margin", "-1"], "--margin cannot be -1: give a number from 0"),
     ],
 )
 def test_an_invalid_output_or_number_is_refused_before_the_work(run, monkeypatch, words, why):
