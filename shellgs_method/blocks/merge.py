@@ -22,7 +22,7 @@ from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.gaussians.surroundings import Region
 from shellgs_method.machine.progress import track
 from shellgs_method.runs.checkpoints import GAUSSIANS, SURFACE, finished_checkpoint, gaussians_in, load_checkpoint
-from shellgs_method.runs.coarse import CoarseRun
+from shellgs_method.runs.coarse import CoarseRun, config_of
 from shellgs_method.runs.run_folder import open_run, written_config
 
 
@@ -71,8 +71,8 @@ class BlockRun:
 
     @property
     def coarse(self) -> Path:
-        """The coarse run that it started from."""
-        return self.config.pipeline.model.coarse  # pyright: ignore[reportAttributeAccessIssue]
+        """The config.yml of the coarse run that it started from."""
+        return config_of(self.config.pipeline.model.coarse)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def merge(paths: Sequence[Path], output: Path) -> Path:
@@ -119,8 +119,8 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
             raise SceneError(f"{run.name} was cut anew since its run {run.folder} was trained: train it again")
         if trained_as.get("coarse") != coarse.hash:
             raise SceneError(
-                f"{run.folder} started from another coarse run than {first.coarse}, or from this one before it was "
-                "trained again: train it again"
+                f"{run.folder} started from another coarse run than {first.coarse.parent}, or from this one before it "
+                "was trained again: train it again"
             )
         region = Region.of(cell.moved(to_world), parsed.metadata["centre"], points)
         gaussians = gaussians_in(state)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -28,41 +29,119 @@ DOUBLE = 0.1
 """Distance of two centres, in units of the larger one's extent, below which two blocks show the same twice."""
 
 
+PARTS = ("near", "elsewhere")
+"""What is within :data:`NEAR` of a cut, and the rest of the shell."""
+Parts = Mapping[str, Mapping[str, float]]
+"""Metrics of each of the :data:`PARTS` by name."""
+
+
+class Criterion(NamedTuple):
+    """How much worse a metric may be near the cuts because of them."""
+
+    key: str
+    title: str
+    worse: Literal["higher", "lower", "either"]
+    most: float
+    """What may be lost at most, in the metric's unit."""
+    scales: bool = False
+    """Whether a better run has all of it smaller, and what is near the cuts by the same factor."""
+
+
+CRITERIA = (
+    Criterion("psnr", "PSNR", "lower", 0.3),
+    Criterion("normal_deg", "Normal °", "higher", 1.0, scales=True),
+    Criterion("chamfer_m", "Chamfer m", "higher", 0.003, scales=True),
+    Criterion("gap_mm", "Gap mm", "either", 3.0),
+    Criterion("holes", "Holes", "higher", 0.005),
+)
+DOUBLES = 0.01
+"""Share of the Gaussians near a cut that may lie on one of another block."""
+
+
+class Seam(NamedTuple):
+    """A metric along the cuts."""
+
+    criterion: Criterion
+    near: float
+    elsewhere: float
+    lost: float
+    """How much worse it is near the cuts because of them."""
+
+    @property
+    def good(self) -> bool:
+        """Whether no more is lost than may be."""
+        return self.lost <= self.criterion.most
+
+
+def judged(merged: Parts, coarse: Parts) -> list[Seam]:
+    """What is lost at the cuts.
+
+    Walls near the cuts are not like others: they are ends of buildings. What that costs is known from the coarse run,
+    which has no cuts: what the merged run has near them is compared with what it would have if it differed from
+    elsewhere as the coarse run does.
+
+    Args:
+        merged: metrics of the merged run, of :func:`along_cuts`.
+        coarse: those of the coarse run.
+    """
+    found = []
+    for criterion in CRITERIA:
+        if all(criterion.key in of[part] for of in (merged, coarse) for part in PARTS):
+            near, elsewhere, near_coarse, elsewhere_coarse = (
+                of[part][criterion.key] for of in (merged, coarse) for part in PARTS
+            )
+            if criterion.scales and elsewhere_coarse > 0:
+                expected = elsewhere * near_coarse / elsewhere_coarse
+            else:
+                expected = elsewhere + near_coarse - elsewhere_coarse
+            more = near - expected
+            lost = {"higher": more, "lower": -more, "either": abs(more)}[criterion.worse]
+            found.append(Seam(criterion, near, elsewhere, lost))
+    return found
+
+
 @torch.no_grad()
-def seams(config: Path) -> dict[str, dict[str, float]]:
-    """Errors of a merged run in the held-out views, ``near`` its cuts and ``elsewhere``, and its ``doubles``.
+def along_cuts(run: TrainedRun) -> dict[str, dict[str, float]]:
+    """Errors of a run of a scene in blocks in the held-out views, ``near`` its cuts and ``elsewhere``.
 
     Both have ``psnr`` and the metrics of :func:`geometry_errors` against the shell, and
 
-    * ``gap_mm``: mean distance along the camera's axis of what is rendered from the shell, with its sign: above 0 it is
-      behind the shell. In thousandths of scene units where metres are unknown;
+    * ``gap_mm``: median distance along the camera's axis of what is rendered from the shell, with its sign: above 0 it
+      is behind the shell. In thousandths of scene units where metres are unknown;
     * ``holes``: share of the shell's pixels that are less than half opaque.
 
-    ``doubles`` has ``count``, the number of Gaussians that lie on one of another block (:data:`DOUBLE`), and ``share``
-    of those near a cut. Of a scene without shell maps, or where no held-out view shows a part, the others are empty.
+    Of a scene without shell maps, or where no held-out view shows a part, that part is empty.
     """
-    run = TrainedRun.load(config)
     model, held_out = run.model, run.datasets[1]
-    cells = _cells(run)
-    metres = model.metres_per_unit or 1 / run.model_scale
-    views: dict[str, list[dict[str, float]]] = {"near": [], "elsewhere": []}
+    cells, metres = _cells(run), _metres(run)
+    views: dict[str, list[dict[str, float]]] = {part: [] for part in PARTS}
     for index in track(range(len(held_out)), "Looking at the seams in view", len(held_out)):
         batch, camera = held_out.get_data(index), held_out.camera(index).to(dtype=torch.float32)
-        outputs = {name: each.cpu() for name, each in _render(run, index).items()}
         if (shell := references(batch, torch.device("cpu")).get("")) is None:
             continue
+        outputs = {name: each.cpu() for name, each in _render(run, index).items()}
         near = _near(camera, shell.depth, cells, NEAR / metres)
         rgb, normal = outputs["rgb"], colours_to_normals(outputs["normal"])
         rendering = Rendering(rgb, outputs["depth"], outputs["accumulation"], normal)
         target = batch["image"][..., :3] / (255 if batch["image"].dtype == torch.uint8 else 1)
-        for name, part in (("near", near), ("elsewhere", ~near)):
-            mask = shell.mask & part & kept_pixels(batch, target)
+        for part, pixels in zip(PARTS, (near, ~near), strict=True):
+            mask = shell.mask & pixels & kept_pixels(batch, target)
             if mask.any():
                 of_part = geometry_errors(rendering, camera, shell._replace(mask=mask), model.metres_per_unit)
-                views[name].append(of_part | _more(rendering, target, shell.depth, mask, 1000 * metres))
-    count, of = _doubles(model.means.cpu(), model.scales.exp().cpu(), run, cells, NEAR / metres)
-    found = {name: mean_over_views(each) for name, each in views.items()}
-    return found | {"doubles": {"count": float(count), "share": count / max(of, 1)}}
+                views[part].append(of_part | _more(rendering, target, shell.depth, mask, 1000 * metres))
+    return {part: mean_over_views(each) for part, each in views.items()}
+
+
+@torch.no_grad()
+def doubles(run: TrainedRun) -> dict[str, float]:
+    """Number of Gaussians near a cut that lie on one of another block (:data:`DOUBLE`), and their share of those."""
+    count, of = _doubles(run.model.means.cpu(), run.model.scales.exp().cpu(), run, _cells(run), NEAR / _metres(run))
+    return {"count": float(count), "share": count / max(of, 1)}
+
+
+def _metres(run: TrainedRun) -> float:
+    """Metres, or where they are unknown scene units, in a unit of the model."""
+    return run.model.metres_per_unit or 1 / run.model_scale
 
 
 def _cells(run: TrainedRun) -> Sequence[Cell]:
@@ -106,7 +185,7 @@ def _more(
         "holes": float((~opaque)[mask].float().mean()),
     }
     if (mask & opaque).any():
-        more["gap_mm"] = mm * float((rendering.depth - shell)[mask & opaque].mean())
+        more["gap_mm"] = mm * float((rendering.depth - shell)[mask & opaque].median())
     return more
 
 

@@ -12,8 +12,12 @@ import tyro
 from rich.console import Console
 
 from shellgs_method.files.scene import ScenePaths
+from shellgs_method.launch.resources import Cluster
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from shellgs_method.compare.runs import Run
     from shellgs_method.export.frame import Frame
 
 # Without a terminal rich assumes 80 columns, which cut the tables of a log.
@@ -23,7 +27,24 @@ Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 RunConfig = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG")]
 Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
 PATHS = ScenePaths()
+ClusterFlags = Annotated[Cluster, tyro.conf.arg(name="")]
+CLUSTER = Cluster()
 Mesher = Literal["planes", "bpa", "poisson"]
+
+
+def launch(
+    launcher: Literal["local", "ray"], jobs: int, cluster: Cluster
+) -> Callable[[Sequence[Run]], Mapping[Run, str]]:
+    """What finishes runs, ``jobs`` at once on this machine or on a cluster, and returns those that failed."""
+    from functools import partial
+
+    if launcher == "ray":
+        from shellgs_method.launch.cluster import launch_on_ray
+
+        return partial(launch_on_ray, cluster=cluster, console=console)
+    from shellgs_method.launch.local import launch_locally
+
+    return partial(launch_locally, jobs=jobs, console=console)
 
 
 def open_page(path: Path) -> None:

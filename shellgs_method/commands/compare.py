@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Optional
 import tyro
 
 from shellgs_method.bounds import Count, FromOne, Seed, bounded
-from shellgs_method.commands.common import PATHS, Paths, console, open_page
+from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, console, launch, open_page
 
 
 @bounded
@@ -22,9 +22,9 @@ def compare(
     curve_points: Count = 5,
     launcher: Literal["local", "ray"] = "local",
     jobs: FromOne = 1,
-    address: Optional[str] = None,
     wandb: Optional[str] = None,
     open: bool = False,
+    cluster: ClusterFlags = CLUSTER,
     paths: Paths = PATHS,
 ) -> None:
     """Train and evaluate methods on scenes, and write the paper's tables and figures and an HTML report.
@@ -41,28 +41,19 @@ def compare(
         curve_points: Evaluations on all held-out views during a training run, for the curves; 0 for none.
         launcher: Where to run: on this machine (local) or on a Ray cluster (ray).
         jobs: Number of runs at once, with the local launcher.
-        address: Address of a running Ray cluster, or auto. If not set: one is started on this machine.
         wandb: Weights & Biases project to log the tables and figures to, as a run. If not set: none.
         open: Open the report in a browser at the end.
+        cluster: The Ray cluster.
         paths: Paths of the scenes' files.
     """
-    from functools import partial
-
     from shellgs_method.compare.results import compare as compare_runs
     from shellgs_method.compare.runs import grid
     from shellgs_method.compare.wandb_report import log_comparison, log_in
-    from shellgs_method.launch.local import launch_locally
 
     if wandb:
         log_in()
     runs = grid(scenes, methods, seeds, iterations, output, curve_points, paths)
-    if launcher == "ray":
-        from shellgs_method.launch.cluster import launch_on_ray
-
-        launch = partial(launch_on_ray, address=address, console=console)
-    else:
-        launch = partial(launch_locally, jobs=jobs, console=console)
-    comparison = compare_runs(runs, launch, output, console)
+    comparison = compare_runs(runs, launch(launcher, jobs, cluster), output, console)
     console.print(f"Tables: {output / 'results.md'}, {output / 'tables'}. Report: {output / 'report.html'}.")
     if wandb:
         log_comparison(wandb, comparison, runs)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.table import Table
 
 from shellgs_method.commands.common import console
 
@@ -23,27 +24,37 @@ def merge(
         configs: The config.yml of a run of each block.
         output: Folder of the merged run.
     """
+    from shellgs_method.blocks.merge import BlockRun
     from shellgs_method.blocks.merge import merge as merged
 
-    report_seams(merged(configs, output))
+    report_seams(merged(configs, output), BlockRun.open(configs[0]).coarse)
 
 
-def report_seams(config: Path) -> None:
-    """Print how a merged run is along its cuts, and write it to seams.json beside its config."""
-    from shellgs_method.blocks.seams import NEAR, seams
+def report_seams(config: Path, coarse: Path) -> None:
+    """Print how a merged run is along its cuts, and write it to seams.json beside its config.
+
+    Args:
+        config: config.yml of the merged run.
+        coarse: that of the coarse run, which has no cuts.
+    """
+    from shellgs_method.blocks.seams import DOUBLES, NEAR, along_cuts, doubles, judged
+    from shellgs_method.export.runs import TrainedRun
     from shellgs_method.files.atomic import atomic_write
 
-    found, path = seams(config), config.with_name("seams.json")
+    run = TrainedRun.load(config)
+    merged, double = along_cuts(run), doubles(run)
+    without = along_cuts(TrainedRun.load(coarse))
+    seams, path = judged(merged, without), config.with_name("seams.json")
+    found = merged | {"doubles": double, "coarse": without, "lost": {seam.criterion.key: seam.lost for seam in seams}}
     with atomic_write(path) as file:
         file.write((json.dumps(found, indent=1) + "\n").encode())
-    columns = {"psnr": "PSNR", "normal_deg": "Normal °", "depth_mae_m": "Depth m", "gap_mm": "Gap mm", "holes": "Holes"}
-    for name in ("near", "elsewhere"):
-        shown = ", ".join(f"{label} {found[name][key]:.3f}" for key, label in columns.items() if key in found[name])
-        where = f"Within {NEAR:g} m of a cut" if name == "near" else "Elsewhere on the shell"
-        console.print(f"{where}: {shown or 'nothing is seen'}.", highlight=False)
-    doubles = found["doubles"]
-    console.print(
-        f"{doubles['count']:.0f} Gaussians near a cut ({doubles['share']:.1%}) lie on one of another block.",
-        highlight=False,
-    )
+    table = Table("", f"Within {NEAR:g} m of a cut", "Elsewhere", "Lost at the cuts", "")
+    for criterion, *values, lost in seams:
+        good = "good" if lost <= criterion.most else f"[bold]more than {criterion.most:g}"
+        table.add_row(criterion.title, *(f"{value:.3f}" for value in (*values, lost)), good)
+    good = "good" if double["share"] <= DOUBLES else f"[bold]more than {DOUBLES:.0%}"
+    table.add_row("Doubles", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
+    console.print(table)
+    if not seams:
+        console.print("No held-out view shows the shell near a cut: the rest is not measured.")
     console.print(f"{config}: the merged run. {path}: this report.", highlight=False, soft_wrap=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Literal
 
 from shellgs_method.bounds import TINY, Bounds, FromOne, Seed, bounded
-from shellgs_method.commands.common import PATHS, Paths, Scene, console
+from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, Scene, launch
 from shellgs_method.commands.merge import report_seams
 from shellgs_method.errors import SceneError
 
@@ -22,7 +22,7 @@ def street(
     output: Path = Path("street"),
     launcher: Literal["local", "ray", "script"] = "local",
     jobs: FromOne = 1,
-    address: Optional[str] = None,
+    cluster: ClusterFlags = CLUSTER,
     paths: Paths = PATHS,
 ) -> None:
     """Train a scene that `shellgs blocks` has cut: a coarse run of everything, then each block, and merge them.
@@ -40,14 +40,11 @@ def street(
         launcher: Where to run: on this machine (local), on a Ray cluster (ray), or nowhere (script): the commands that
             can be started now are printed, one line a run, for a queue of your own.
         jobs: Number of runs at once, with the local launcher; each has a GPU of its own, if there are as many.
-        address: Address of a running Ray cluster, or auto. If not set: one is started on this machine.
+        cluster: The Ray cluster.
         paths: Paths of the scene's files.
     """
-    from functools import partial
-
     from shellgs_method.blocks.merge import merge
     from shellgs_method.blocks.street import Street, script, train
-    from shellgs_method.launch.local import launch_locally
     from shellgs_method.runs.folders import held
 
     plan = Street.plan(scene, method, iterations, coarse_iterations, coarse_scale, seed, output, paths)
@@ -59,10 +56,6 @@ def street(
             if lines := script(plan):
                 print(*lines, sep="\n")
                 return
-        elif launcher == "ray":
-            from shellgs_method.launch.cluster import launch_on_ray
-
-            train(plan, partial(launch_on_ray, address=address, console=console))
         else:
-            train(plan, partial(launch_locally, jobs=jobs, console=console))
-        report_seams(merge([run.config for run in plan.blocks], output / "merged"))
+            train(plan, launch(launcher, jobs, cluster))
+        report_seams(merge([run.config for run in plan.blocks], output / "merged"), plan.coarse.config)

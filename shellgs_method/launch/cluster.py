@@ -1,9 +1,12 @@
-"""Runs on a Ray cluster: one task per run, which returns the run's folder.
+"""Runs on a Ray cluster: one task per run. The package must be installed on all nodes.
 
-A scene is packed and put into Ray's object store; a node unpacks it once, into its own temporary folder, which is
-removed when the comparison ends. No file system needs to be shared, but the package must be installed on all nodes. A
-task whose worker is killed is retried: on the same node it resumes from its last checkpoint, on another from what the
-run's folder held at the start.
+Where all nodes see the folders of the scenes and of the runs, as on a shared file system or on one machine, runs are
+trained there: nothing is sent, and a task whose worker or node is killed is retried and resumes from the run's last
+checkpoint.
+
+Elsewhere a scene is packed and put into Ray's object store; a node unpacks it once, into its own temporary folder,
+which is removed at the end, and a task returns the run's folder. A task that is retried on the same node resumes from
+its last checkpoint, on another from what the run's folder held at the start.
 """
 
 from __future__ import annotations
@@ -17,14 +20,13 @@ import subprocess
 import tarfile
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
-import yaml
 from jaxtyping import UInt8
 from rich.console import Console
 
@@ -33,10 +35,11 @@ from shellgs_method.files.atomic import atomic_write, content_hash
 from shellgs_method.launch.display import Display
 from shellgs_method.launch.job import Job, JobT
 from shellgs_method.launch.local import BIN, CommandError, finish
+from shellgs_method.launch.resources import Cluster
 from shellgs_method.machine.extras import import_extra
 from shellgs_method.machine.progress import Stage
-from shellgs_method.runs.config_file import load_config
 from shellgs_method.runs.folders import replace_folder
+from shellgs_method.runs.run_folder import open_run, written_config
 
 RETRIES = 3
 """Retries of a task whose worker was killed. The killed worker's command ends when its next line cannot be written."""
@@ -54,21 +57,23 @@ Archive = UInt8[np.ndarray, " N"]
 """A tar file."""
 
 
-def launch_on_ray(runs: Sequence[JobT], address: str | None, console: Console) -> dict[JobT, str]:
+def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> dict[JobT, str]:
     """Finish all runs on a cluster; return those that failed, with the end of their output.
 
     Args:
         runs: runs to finish, settled.
-        address: address of a running cluster; None starts one on this machine, which ends with the runs.
+        cluster: which cluster, and what a run takes of it.
         console: where progress is printed.
 
     Raises:
-        SceneError: Ray is not installed, or too old, or there is no cluster at the address.
+        SceneError: Ray is not installed, or too old, or there is no cluster at the address, or this machine alone has
+            not what a run takes.
     """
     ray = import_extra("ray", "ray", "ray", "the ray launcher")
     from ray.exceptions import RayError
 
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    address = cluster.address
     if address:
         _check_cluster(address)
     try:
@@ -80,26 +85,35 @@ def launch_on_ray(runs: Sequence[JobT], address: str | None, console: Console) -
     from ray.util.queue import Queue
 
     failures: dict[JobT, str] = {}
-    launch = uuid4().hex  # another comparison must not resume what this one leaves on a node
+    launch = uuid4().hex  # another launch must not resume what this one leaves on a node
     try:
-        resources = ray.cluster_resources()
-        gpus = min(1, int(resources.get("GPU", 0)))  # every method trains on one GPU, if there is one
-        at_once = max(1, int(resources.get("GPU" if gpus else "CPU", 1)))
-        task = ray.remote(num_gpus=gpus, max_retries=RETRIES)(_finish_on_node)
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        takes = cluster.per_run(nodes)
+        if (lacking := takes.lacking(nodes)) and not address:
+            raise SceneError(
+                f"a run takes {lacking}, which this machine has not: give less, or the --address of a cluster"
+            )
+        if lacking:
+            console.print(f"No node has {lacking} now: runs wait until one joins the cluster.", highlight=False)
+        task = ray.remote(max_retries=RETRIES, **takes.options)(_finish_on_node)
         waiting, pending, scenes, stages = list(runs), {}, {}, Queue(actor_options={"num_cpus": 0})
         tell: dict[str, Callable[[Stage], None]] = {}  # by the run's key
-        with Display(console) as display:
+        with _marked(runs, launch) as marks, Display(console) as display:
+            in_place = marks and all(_on_each_node(_sees, marks))
+            # What must be sent is packed late, to save memory; one run waits for a node that may join.
+            most = len(runs) if in_place else takes.room(nodes) + 1
             while waiting or pending:
-                while waiting and len(pending) < at_once:  # waiting runs are not packed yet, to save memory
-                    run = waiting.pop(0)
-                    if run.scene not in scenes:
-                        scenes[run.scene] = content_hash(run.scene), _packed(run.scene, ray.put)
-                    packed = *scenes[run.scene], _packed(run.folder, ray.put)
-                    pending[task.remote(run, launch, run.key, *packed, stages)] = run
+                while waiting and len(pending) < most:
+                    run, packed = waiting.pop(0), None
+                    if not in_place:
+                        if run.scene not in scenes:
+                            scenes[run.scene] = content_hash(run.scene), _packed(run.scene, ray.put)
+                        packed = *scenes[run.scene], _packed(run.folder, ray.put)
+                        if run.scene not in {later.scene for later in waiting}:
+                            del scenes[run.scene]
+                    pending[task.remote(run, launch, run.key, packed or marks, stages)] = run
                     tell[run.key] = display.begin(run.label)
                     tell[run.key](Stage("Waiting for a node"))
-                    if run.scene not in {later.scene for later in waiting}:
-                        del scenes[run.scene]
                 ended, _ = ray.wait(list(pending), timeout=LOOK_EVERY)
                 for key, stage in stages.get_nowait_batch(stages.qsize()):
                     tell[key](stage)
@@ -110,7 +124,8 @@ def launch_on_ray(runs: Sequence[JobT], address: str | None, console: Console) -
                 tell[run.key] = lambda _: None  # what it told before it ended may come later
                 try:
                     folder, error = ray.get(done)
-                    _store_result(folder, run)
+                    if folder is not None:
+                        _store_result(folder, run)
                 except (RayError, tarfile.TarError, OSError) as failure:
                     failures[run] = str(failure)
                     continue
@@ -119,9 +134,31 @@ def launch_on_ray(runs: Sequence[JobT], address: str | None, console: Console) -
                 left = len(pending) + len(waiting)
                 console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
     finally:
-        _remove_copies(launch)
+        _on_each_node(_remove_copies, launch)
         ray.shutdown()
     return {run: failures[run] for run in runs if run in failures}
+
+
+@contextmanager
+def _marked(runs: Sequence[Job], launch: str) -> Iterator[list[Path]]:
+    """Files in all folders of the runs, by which a node tells that it sees these; none if one cannot be written to."""
+    marks = [folder / f".{launch}" for folder in {each for run in runs for each in (run.scene, run.output)}]
+    try:
+        try:
+            for mark in marks:
+                mark.touch()
+        except OSError:
+            yield []
+        else:
+            yield marks
+    finally:
+        for mark in marks:
+            with suppress(OSError):
+                mark.unlink(missing_ok=True)
+
+
+def _sees(files: Sequence[Path]) -> bool:
+    return all(file.exists() for file in files)
 
 
 def _check_cluster(address: str) -> None:
@@ -143,41 +180,66 @@ def _check_cluster(address: str) -> None:
         raise SceneError(refusal) from error
 
 
-def _remove_copies(launch: str) -> None:
-    """Remove what a comparison unpacked, on each node that answers."""
+def _on_each_node(function: Callable[[Any], Any], argument: object) -> list[Any]:
+    """Call a function on each node; return what those return that answer."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    task = ray.remote(num_cpus=0)(lambda: shutil.rmtree(_own_folder() / launch, ignore_errors=True))
+    task = ray.remote(num_cpus=0)(function)
     nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"]]
-    removals = [
-        task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote() for node in nodes
+    calls = [
+        task.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(argument)
+        for node in nodes
     ]
-    ray.wait(removals, num_returns=len(removals), timeout=TIMEOUT)
+    ended, _ = ray.wait(calls, num_returns=len(calls), timeout=TIMEOUT)
+    return ray.get(ended)
+
+
+def _remove_copies(launch: str) -> None:
+    """Remove what a launch unpacked on this node."""
+    shutil.rmtree(_own_folder() / launch, ignore_errors=True)
+
+
+Packed = tuple[str, Pieces, Pieces]
+"""A key of a scene's content, and the folders of the scene and the run, packed."""
 
 
 def _finish_on_node(
-    run: Job, launch: str, key: str, scene_key: str, scene: Pieces, folder: Pieces, stages: Any
-) -> tuple[Archive, str | None]:
-    """The Ray task: finish a run; return its packed folder and, if a command failed, the end of its output.
+    run: Job, launch: str, key: str, given: Packed | list[Path], stages: Any
+) -> tuple[Archive | None, str | None]:
+    """The Ray task: finish a run.
 
     Args:
         run: the run, with the paths of the machine that submits it.
-        launch: identifies the comparison.
+        launch: identifies the launch.
         key: identifies the run; the same for every retry.
-        scene_key: identifies the scene's content.
-        scene: the scene's folder, packed.
-        folder: the run's folder at the start, packed.
+        given: what the run needs, packed, or files by which this node sees that it is there.
         stages: Ray's queue for pairs of the key and what the run is doing.
+
+    Returns:
+        The run's folder, packed if it was sent; and if a command failed, the end of its output.
     """
-    import ray
     from ray.exceptions import RayError
 
     def tell(stage: Stage) -> None:
         with suppress(RayError):  # the run counts, not what is told of it
             stages.put_nowait((key, stage))
 
-    root = _own_folder() / launch
+    if isinstance(given, list):
+        if not _sees(given):  # a node that joined later
+            folders = " and ".join(str(mark.parent) for mark in given)
+            return None, f"the node {socket.gethostname()} does not see {folders}, as the others do: mount them there"
+        return None, _finished(run, tell)
+    return _finish_copy(run, _own_folder() / launch, key, given, tell)
+
+
+def _finish_copy(
+    run: Job, root: Path, key: str, packed: Packed, tell: Callable[[Stage], None]
+) -> tuple[Archive, str | None]:
+    """Finish a run in a folder of this node, and pack it."""
+    import ray
+
+    scene_key, scene, folder = packed
     scenes = root / "scenes" / sha256(scene_key.encode()).hexdigest()
     local = run.moved(scenes / run.scene.name, root / "runs" / key)
     if not local.scene.exists():
@@ -185,14 +247,19 @@ def _finish_on_node(
     if not local.folder.exists():
         _unpack(map(ray.get, folder), local.folder)
         _set_paths_in_config(local)
-    error = None
-    try:
-        finish(local, tell=tell)
-    except CommandError as failure:
-        error = str(failure)
+    error = _finished(local, tell)
     result = np.concatenate(_packed(local.folder, lambda piece: piece))
     shutil.rmtree(local.output)
     return result, error
+
+
+def _finished(run: Job, tell: Callable[[Stage], None]) -> str | None:
+    """Finish a run; if a command fails, return the end of its output."""
+    try:
+        finish(run, tell=tell)
+    except CommandError as failure:
+        return str(failure)
+    return None
 
 
 def _own_folder() -> Path:
@@ -216,11 +283,11 @@ def _set_paths_in_config(run: Job) -> None:
     config_path = run.folder / "config.yml"
     if config_path.exists():
         with suppress(SceneError):  # a damaged config is refused where it is read
-            config = load_config(config_path)
+            config = open_run(config_path, find_scene=False)
             config.data = config.pipeline.datamanager.data = run.scene
             config.output_dir, config.load_dir = run.output / "runs" / run.scene.name, None
             with atomic_write(config_path) as file:
-                file.write(yaml.dump(config).encode())
+                file.write(written_config(config).encode())
 
 
 class _Pieces(io.RawIOBase):

@@ -42,7 +42,7 @@ class CoarseRun:
             FileNotFoundError: there is no such run.
             SceneError: it is unfinished, or of another scene or other settings.
         """
-        path = path / "config.yml" if path.is_dir() else path
+        path = config_of(path)
         config = open_run(path, find_scene=False)
         theirs = config.pipeline.model
         for name in ("primitive", "sh_degree", "exposure", "trust"):
@@ -62,3 +62,8 @@ class CoarseRun:
                 f"{count} to train on: train it again"
             )
         return cls(gaussians_in(state), exposures, content_hash(checkpoint))
+
+
+def config_of(run: Path) -> Path:
+    """The config.yml of a run that is named by it, or by its folder."""
+    return run / "config.yml" if run.is_dir() else run

@@ -40,7 +40,7 @@ def open_run(path: Path, find_scene: bool = True) -> TrainerConfig:
     """Config of the run on disk that a config.yml lies in: its folder is that one, and its scene is found.
 
     A relative path to the scene is taken from where it was relative to the run, or else from the working directory.
-    What is not there is looked for beside the run and the folders above it.
+    What is not there is looked for beside the run and the folders above it. So is the coarse run of a block.
 
     Args:
         path: the run's config.yml.
@@ -60,6 +60,9 @@ def open_run(path: Path, find_scene: bool = True) -> TrainerConfig:
     for name in ("load_dir", "load_checkpoint"):
         if given := getattr(config, name):
             setattr(config, name, _find(given, written, folder) or given)
+    model: Any = config.pipeline.model
+    if given := getattr(model, "coarse", None):
+        model.coarse = _find(given, written, folder) or given
     manager: Any = config.pipeline.datamanager
     stored = manager.data or getattr(getattr(manager, "dataparser", None), "data", None)
     if stored is None:  # a method that needs no scene

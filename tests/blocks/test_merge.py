@@ -14,7 +14,7 @@ from training_runs import model_of
 from two_blocks import HALVES, block_run, coarse_run, cut_in_two, save_config
 
 from shellgs_method.blocks.merge import merge
-from shellgs_method.blocks.seams import from_cuts, on_another
+from shellgs_method.blocks.seams import CRITERIA, from_cuts, judged, on_another
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
@@ -107,11 +107,53 @@ def test_other_commands_take_a_merged_run(configs, tmp_path, shellgs, in_process
 
 def test_the_seams_are_reported_beside_the_run(configs, tmp_path, shellgs):
     printed = shellgs("merge", *configs, "--output", tmp_path / "merged")
-    assert "Within 1 m of a cut: PSNR" in printed
+    assert "Within 1 m of a cut" in printed
     report = json.loads((tmp_path / "merged" / "seams.json").read_text())
-    for part in ("near", "elsewhere"):
-        assert {"psnr", "normal_deg", "chamfer_m", "holes"} <= report[part].keys()
+    for of in (report, report["coarse"]):
+        for part in ("near", "elsewhere"):
+            assert {"psnr", "normal_deg", "chamfer_m", "holes"} <= of[part].keys()
     assert report["doubles"]["count"] >= 0
+    assert report["lost"].keys() == {criterion.key for criterion in CRITERIA}
+
+
+COARSE = {
+    "near": {"psnr": 22.0, "normal_deg": 12.0, "chamfer_m": 0.06, "gap_mm": 20.0, "holes": 0.01},
+    "elsewhere": {"psnr": 24.0, "normal_deg": 8.0, "chamfer_m": 0.03, "gap_mm": 10.0, "holes": 0.0},
+}
+
+
+def test_what_the_coarse_run_has_near_the_cuts_too_is_not_lost_there():
+    better = {
+        part: of | {"psnr": of["psnr"] + 3, "normal_deg": of["normal_deg"] / 4, "chamfer_m": of["chamfer_m"] / 4}
+        for part, of in COARSE.items()
+    }
+    for merged in (COARSE, better):
+        seams = judged(merged, COARSE)
+        np.testing.assert_allclose([seam.lost for seam in seams], 0, atol=1e-9)
+        assert all(seam.good for seam in seams)
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "good"),
+    [
+        ("psnr", -0.5, False),
+        ("psnr", 0.5, True),
+        ("chamfer_m", 0.01, False),
+        ("chamfer_m", -0.01, True),
+        ("gap_mm", 4.0, False),
+        ("gap_mm", -4.0, False),
+        ("holes", 0.01, False),
+    ],
+)
+def test_what_is_worse_near_the_cuts_than_in_the_coarse_run_is_lost_there(key, change, good):
+    merged = COARSE | {"near": COARSE["near"] | {key: COARSE["near"][key] + change}}
+    for seam in judged(merged, COARSE):
+        assert seam.lost == pytest.approx(abs(change) * (1 if not good else -1) if seam.criterion.key == key else 0)
+        assert seam.good == (good or seam.criterion.key != key)
+
+
+def test_of_a_scene_whose_shell_is_not_seen_nothing_is_judged():
+    assert judged({"near": {}, "elsewhere": {}}, {"near": {}, "elsewhere": {}}) == []
 
 
 def test_the_nearest_cut_is_one_that_bounds_the_core_of_a_point():

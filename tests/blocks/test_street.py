@@ -112,11 +112,11 @@ def test_a_method_of_nerfstudio_trains_no_blocks(cut, tmp_path):
 @pytest.mark.slow
 def test_a_street_is_trained_and_merged_by_one_command(cut, tmp_path, shellgs):
     words = (cut, "--iterations", 6, "--coarse-iterations", 4, "--output", tmp_path / "street")
-    assert "Elsewhere on the shell: PSNR" in shellgs("street", *words)
+    assert "Lost at the cuts" in shellgs("street", *words)
     report = json.loads((tmp_path / "street" / "merged" / "seams.json").read_text())
     assert report["elsewhere"]["psnr"] > 5
     logs = {
         run.folder / "log.txt": (run.folder / "log.txt").read_text() for run in planned(cut, tmp_path / "street").blocks
     }
-    assert "Elsewhere on the shell: PSNR" in shellgs("street", *words)  # merges again, and trains nothing
+    assert "Lost at the cuts" in shellgs("street", *words)  # merges again, and trains nothing
     assert all(path.read_text() == text for path, text in logs.items())

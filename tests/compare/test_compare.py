@@ -469,12 +469,19 @@ def fake_environment(tmp_path) -> Path:
     return home / "bin"
 
 
+SENT = "from shellgs_method.launch import cluster; cluster._sees = lambda files: False; "
+"""Lets no node see the folders of scenes and runs, so that they are sent to it."""
+
+
 @pytest.mark.slow
-def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pristine_scene, tmp_path, fake_environment):
+@pytest.mark.parametrize("before", [SENT, ""], ids=["sent", "in place"])
+def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(
+    pristine_scene, tmp_path, fake_environment, before
+):
     """photo-gs kills its worker at its first start, mono-gs always fails, and all results are returned."""
     pytest.importorskip("ray")
     words = ["compare", pristine_scene, "--methods", "photo-gs", "mono-gs", "shellgs", "--iterations", "20"]
-    command = [fake_environment / "python", "-c", "from shellgs_method.cli import main; main()", *words]
+    command = [fake_environment / "python", "-c", f"{before}from shellgs_method.cli import main; main()", *words]
     environment = os.environ | {"KILL_PARENT": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
     environment |= {"TMPDIR": str(tmp_path), "RAY_TMPDIR": tempfile.gettempdir()}  # a socket's path must be short
     done = subprocess.run(
@@ -492,7 +499,15 @@ def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(pris
     assert "--load-dir" in (photo_gs.checkpoints / "step-000000019.ckpt").read_text()
     assert shellgs.finished
     assert not list((tmp_path / f"shellgs-{os.getuid()}").iterdir())  # the node keeps no copies
+    assert not list(tmp_path.rglob(".[0-9a-f]*"))  # and no marks
     assert "mono-gs needs maps" in (mono_gs.folder / "log.txt").read_text()
+
+
+def test_a_node_that_joins_later_and_does_not_see_the_folders_says_so(pristine_scene, tmp_path):
+    (run,) = fake_grid([pristine_scene], ["photo-gs"], tmp_path)
+    folder, error = cluster._finish_on_node(run, "launch", run.key, [tmp_path / "elsewhere" / ".mark"], None)
+    assert folder is None
+    assert f"does not see {tmp_path / 'elsewhere'}" in (error or "")
 
 
 # what is refused
