@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from shellgs_method.evaluation import Rendering, colours_to_normals, mean_over_views
 from shellgs_method.evaluation.pixels import kept_pixels
-from shellgs_method.evaluation.regions import references
+from shellgs_method.evaluation.regions import references, regions
 from shellgs_method.evaluation.view import OPAQUE, geometry_errors
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
@@ -40,19 +40,18 @@ class Criterion(NamedTuple):
 
     key: str
     title: str
-    worse: Literal["higher", "lower", "either"]
     most: float
     """What may be lost at most, in the metric's unit."""
-    scales: bool = False
-    """Whether a better run has all of it smaller, and what is near the cuts by the same factor."""
+    is_error: bool = True
+    """Whether it is an error, of any sign, which a better run has smaller near the cuts as elsewhere."""
 
 
 CRITERIA = (
-    Criterion("psnr", "PSNR", "lower", 0.3),
-    Criterion("normal_deg", "Normal °", "higher", 1.0, scales=True),
-    Criterion("chamfer_m", "Chamfer m", "higher", 0.003, scales=True),
-    Criterion("gap_mm", "Gap mm", "either", 3.0),
-    Criterion("holes", "Holes", "higher", 0.005),
+    Criterion("psnr", "PSNR", 0.3, is_error=False),
+    Criterion("normal_deg", "Normal °", 1.0),
+    Criterion("chamfer_m", "Chamfer m", 0.003),
+    Criterion("gap_mm", "Gap mm", 3.0),
+    Criterion("holes", "Holes", 0.005),
 )
 DOUBLES = 0.01
 """Share of the Gaussians near a cut that may lie on one of another block."""
@@ -78,7 +77,7 @@ def judged(merged: Parts, coarse: Parts) -> list[Seam]:
 
     Walls near the cuts are not like others: they are ends of buildings. What that costs is known from the coarse run,
     which has no cuts: what the merged run has near them is compared with what it would have if it differed from
-    elsewhere as the coarse run does.
+    elsewhere as the coarse run does, an error by the same factor, but is no larger than the coarse run's.
 
     Args:
         merged: metrics of the merged run, of :func:`along_cuts`.
@@ -87,24 +86,27 @@ def judged(merged: Parts, coarse: Parts) -> list[Seam]:
     found = []
     for criterion in CRITERIA:
         if all(criterion.key in of[part] for of in (merged, coarse) for part in PARTS):
-            near, elsewhere, near_coarse, elsewhere_coarse = (
-                of[part][criterion.key] for of in (merged, coarse) for part in PARTS
-            )
-            if criterion.scales and elsewhere_coarse > 0:
-                expected = elsewhere * near_coarse / elsewhere_coarse
-            else:
-                expected = elsewhere + near_coarse - elsewhere_coarse
-            more = near - expected
-            lost = {"higher": more, "lower": -more, "either": abs(more)}[criterion.worse]
-            found.append(Seam(criterion, near, elsewhere, lost))
+            values = [of[part][criterion.key] for of in (merged, coarse) for part in PARTS]
+            lost = _lost_error(*map(abs, values)) if criterion.is_error else _lost_quality(*values)
+            found.append(Seam(criterion, *values[:2], lost))
     return found
+
+
+def _lost_error(near: float, elsewhere: float, near_coarse: float, elsewhere_coarse: float) -> float:
+    alike = elsewhere * near_coarse / elsewhere_coarse if elsewhere_coarse else near_coarse
+    return near - min(alike, max(near_coarse, elsewhere))
+
+
+def _lost_quality(near: float, elsewhere: float, near_coarse: float, elsewhere_coarse: float) -> float:
+    return elsewhere + near_coarse - elsewhere_coarse - near
 
 
 @torch.no_grad()
 def along_cuts(run: TrainedRun) -> dict[str, dict[str, float]]:
     """Errors of a run of a scene in blocks in the held-out views, ``near`` its cuts and ``elsewhere``.
 
-    Both have ``psnr`` and the metrics of :func:`geometry_errors` against the shell, and
+    Both have, over what training views show on the shell (``on_shell`` of :func:`regions`), ``psnr``, the metrics of
+    :func:`geometry_errors` against the shell, and
 
     * ``gap_mm``: median distance along the camera's axis of what is rendered from the shell, with its sign: above 0 it
       is behind the shell. In thousandths of scene units where metres are unknown;
@@ -124,8 +126,9 @@ def along_cuts(run: TrainedRun) -> dict[str, dict[str, float]]:
         rgb, normal = outputs["rgb"], colours_to_normals(outputs["normal"])
         rendering = Rendering(rgb, outputs["depth"], outputs["accumulation"], normal)
         target = batch["image"][..., :3] / (255 if batch["image"].dtype == torch.uint8 else 1)
+        on_shell = shell.mask & regions(batch, model.metres_per_unit, near.device).get("on_shell", shell.mask)
         for part, pixels in zip(PARTS, (near, ~near), strict=True):
-            mask = shell.mask & pixels & kept_pixels(batch, target)
+            mask = on_shell & pixels & kept_pixels(batch, target)
             if mask.any():
                 of_part = geometry_errors(rendering, camera, shell._replace(mask=mask), model.metres_per_unit)
                 views[part].append(of_part | _more(rendering, target, shell.depth, mask, 1000 * metres))

@@ -110,8 +110,11 @@ def squared_depths(depths: Float[Tensor, "N 1"]) -> tuple[Float[Tensor, "N 1"], 
 def depth_powers(
     depths: Float[Tensor, "N 1"], weights: Float[Tensor, "N 1"] | None = None
 ) -> tuple[Float[Tensor, "N 4"], Float[Tensor, ""]]:
-    """Powers 0 to 3 of t = z / (z + median), which is below 1 however far the sky is, times weights; and the median."""
-    median = depths.detach().median().clamp_min(1e-6)
+    """Powers 0 to 3 of t = z / (z + median), which is below 1 however far the sky is, times weights; and the median.
+
+    The median is of distances before and behind the camera: in a street more may lie behind it.
+    """
+    median = depths.detach().abs().median().clamp_min(1e-6)
     z = depths.clamp_min(0)
     t = z / (z + median) - 0.5  # about the median, for accuracy in float32
     powers = torch.cat([torch.ones_like(t), t, t.square(), t**3], dim=-1)

@@ -89,6 +89,10 @@ def test_the_mode_is_the_depth_of_the_heavier_of_two_layers():
     assert mode_of([5.0], [0.5]) == pytest.approx(5, rel=1e-5)
 
 
+def test_what_is_behind_the_camera_does_not_matter_to_the_mode_however_much_it_is():
+    assert mode_of([5.0, 10.0, *[-12.0] * 9], [0.56, 0.14, *[0.0] * 9]) == pytest.approx(5, rel=1e-3)
+
+
 def test_the_mode_of_one_thin_layer_is_close_to_its_mean():
     random = torch.Generator().manual_seed(0)
     for spread, limit in ((0.001, 0.0001), (0.003, 0.001)):
