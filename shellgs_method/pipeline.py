@@ -21,9 +21,17 @@ from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.gaussians.initial import BEHIND_SPACING, MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
-from shellgs_method.gaussians.seeds import shell_seeds, view_behind_shell, view_of_shell, view_of_surface
+from shellgs_method.gaussians.seeds import (
+    SeededView,
+    Seeds,
+    shell_seeds,
+    view_behind_shell,
+    view_of_shell,
+    view_of_surface,
+)
 from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import SurfaceWeights
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.progress import track
 from shellgs_method.model import FacadeModel
 from shellgs_method.runs.checkpoints import check_gaussians, guard_checkpoint_loading
@@ -108,15 +116,18 @@ class FacadePipeline(VanillaPipeline):
 
     def _add_seeds(self, seed_views: Callable[..., tuple[Iterator, int]]) -> None:
         model, data = self.model, self.datamanager
-        config = model.config
+        config, region = model.config, model.region
+
+        def seeds(view_of: Callable[[Camera, dict], SeededView], spacing: float) -> Seeds:
+            views, pixels = seed_views(view_of, "shell")
+            return shell_seeds(views if region is None else map(region.shown, views), pixels, spacing, MAX_SEEDS)
+
         if config.init == "shell":
             view_of = view_of_shell if config.trust == "shell" else view_of_surface
-            model.add_seeds(shell_seeds(*seed_views(view_of, "shell"), SEED_SPACING, MAX_SEEDS))
+            model.add_seeds(seeds(view_of, SEED_SPACING))
         if config.trust == "photographs" and config.primitive == "3d":
-            shell = shell_seeds(*seed_views(view_of_shell, "shell"), SEED_SPACING, MAX_SEEDS)
-            model.surface_weights = SurfaceWeights(shell, model.metres_per_unit)
-            behind = seed_views(view_behind_shell, "shell")
-            model.add_seeds(shell_seeds(*behind, BEHIND_SPACING, MAX_SEEDS))
+            model.surface_weights = SurfaceWeights(seeds(view_of_shell, SEED_SPACING), model.metres_per_unit)
+            model.add_seeds(seeds(view_behind_shell, BEHIND_SPACING))
         if config.init == "shell" and model.surroundings is None:
             points = data.sfm_points.double().numpy()
             model.add_seeds(skybox_seeds(*seed_views(view_of_sky), points, SKYBOX_SEEDS))

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from shellgs_method.files.blocks import Cell
-from shellgs_method.gaussians.seeds import Seeds
+from shellgs_method.gaussians.seeds import SeededView, Seeds
 from shellgs_method.gaussians.skybox import skybox_radius
 from shellgs_method.geometry.nearest import point_tree
 
@@ -56,6 +56,13 @@ class Region:
 
     def _near(self, points: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
         return np.linalg.norm(points - self.centre, axis=1) < self.far
+
+    def shown(self, view: SeededView) -> SeededView:
+        """A view whose mask is what shows the block, which seeds are made from: their number is bounded."""
+        rotation = view.camera.viewmat[:3, :3]
+        points = (view.shell.depth * view.camera.rays()) @ rotation + view.camera.position
+        inside = self.extended(points.reshape(-1, 3)).reshape(view.shell.mask.shape)
+        return view._replace(shell=view.shell._replace(mask=view.shell.mask & inside))
 
     def lacking(self, seeds: Seeds, means: Float[Tensor, "N 3"]) -> Seeds:
         """Those seeds in the block whose place has no Gaussian nearer than they are to each other."""

@@ -78,7 +78,7 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
         _check_cluster(address)
     try:
         ray.init(address or "local", include_dashboard=None if address else False, log_to_driver=False)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except Exception as error:  # which Ray itself raises where a node does not start in time
         if not address:
             raise SceneError(f"Ray cannot start on this machine ({error})") from error
         raise SceneError(f"there is no Ray cluster at {address}: start one with `ray start --head`") from error

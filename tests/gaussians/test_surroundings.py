@@ -17,8 +17,10 @@ from two_blocks import HALVES, block_run, coarse_run, copied, cut_in_two
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cell, Cut
-from shellgs_method.gaussians.seeds import Seeds
+from shellgs_method.gaussians.seeds import SeededView, Seeds, shell_seeds
 from shellgs_method.gaussians.surroundings import Region
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.reference import Reference
 from shellgs_method.trainer import FacadeTrainer
 
 
@@ -162,6 +164,22 @@ def test_seeds_of_a_block_lie_in_it_where_it_has_no_gaussian_as_near():
     seeds = Seeds(points, points, points, np.full(5, 0.1))
     lacking = region.lacking(seeds, torch.tensor([[3.05, 0, 0], [5.2, 0, 0]]))
     np.testing.assert_array_equal(lacking.points, points[:2])
+
+
+def test_the_bound_on_seeds_is_one_on_those_of_the_block_whatever_else_its_photographs_show():
+    region = Region(Cell(Block("east", ()), ((Cut((1.0, 0.0, 0.0), 6.0), True),), 1.0), np.zeros(3), 100.0)
+    K = torch.tensor([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]], dtype=torch.float64)
+    wall = Reference(
+        torch.full((60, 80, 1), 12.0, dtype=torch.float64),
+        torch.tensor([0.0, 0, -1], dtype=torch.float64).expand(60, 80, 3),
+        torch.ones(60, 80, 1, dtype=torch.bool),
+    )
+    view = SeededView(Camera(torch.eye(4, dtype=torch.float64), K, 80, 60), torch.zeros(60, 80, 3), wall)
+    everywhere, shown = (shell_seeds([each], 80 * 60, 1.0, 60).points for each in (view, region.shown(view)))
+    inside = region.extended(torch.from_numpy(everywhere)).numpy()
+    assert region.extended(torch.from_numpy(shown)).all()
+    assert 0 < inside.sum() < 20
+    assert 40 < len(shown) <= 60
 
 
 @pytest.mark.parametrize(
