@@ -30,7 +30,7 @@ from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.sim.building import _level_points, moved_into
 from shellgs_method.sim.collision.clusters import clusters
-from shellgs_method.sim.collision.collider import Collider, depths, leaks, make_collider, standing_before
+from shellgs_method.sim.collision.collider import THINNEST, Collider, depths, leaks, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
 from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.collision.parts import Part
@@ -243,6 +243,14 @@ def test_parts_stay_inside_the_wall():
     front = wall.faces[wall.normals[:, 1] < -0.9]
     inside = wall.vertices[front] + [0, 0.01, 0]
     np.testing.assert_allclose(depths(wall, inside, np.array([0.0, -1, 0])), 0.09, atol=1e-6)
+
+
+def test_no_part_is_thinner_than_fast_bodies_need():
+    """A canopy of 1 cm of sheet, whose edge is seen too."""
+    canopy, seen = outward(box([0, -0.3, 3], [4, 0, 3.01]), np.array([[2.0, -5, 1.6]]))
+    (part,) = make_collider(canopy, canopy, np.zeros(len(canopy.faces), bool), seen).parts
+    thickness = min(np.ptp(part.vertices @ normal) for normal in part.planes[:, :3])
+    assert thickness == pytest.approx(THINNEST, abs=1e-4)
 
 
 def test_surfaces_in_front_of_the_shell_are_in_the_collider_but_not_those_beside_it(facade, eyes):

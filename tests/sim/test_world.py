@@ -25,7 +25,7 @@ from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.winding import outward
 from shellgs_method.shell import Alignment, load_shell
 from shellgs_method.sim.building import Reconstruction
-from shellgs_method.sim.collision.collider import Collider, make_collider
+from shellgs_method.sim.collision.collider import THINNEST, Collider, make_collider
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.front import Front
@@ -33,8 +33,9 @@ from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import rendered
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import OUTDATED, simulate
+from shellgs_method.sim.trials import trials
 from shellgs_method.sim.trials.engine import compiled, import_mujoco, load, warnings_kept
-from shellgs_method.sim.trials.trials import throw, walk
+from shellgs_method.sim.trials.trials import SIZES, Passages, throw, walk
 from shellgs_method.synthetic.frames import SCENE_FROM_BUILDING, SHELL_FROM_BUILDING
 from shellgs_method.synthetic.path import walk as stroll
 
@@ -70,6 +71,38 @@ def test_throwing_finds_a_hole_in_the_wall(collider, eyes, tmp_path):
     holed = [part for part in collider.parts if np.ptp(part.vertices, axis=0).max() < 2]
     write_folder(tmp_path, Collider(holed, 0.0))
     assert throw(tmp_path / "world.xml", collider.surface, Ground.level(), eyes, count=30, seconds=1).through > 3
+
+
+@pytest.mark.parametrize(("sizes", "thickness", "passed"), [((0.01, 0.02), 0.01, True), (SIZES, THINNEST, False)])
+def test_throwing_finds_a_sheet_that_bodies_pass_and_none_of_the_least_thickness(
+    sizes, thickness, passed, tmp_path, monkeypatch
+):
+    """A fast, small body is beyond the middle of a thin sheet before a contact pushes it out, to the other side."""
+    monkeypatch.setattr(trials, "SIZES", sizes)
+    sheet = Part.hull(np.array([[x, y, z] for x in (0, 4) for y in (0, thickness) for z in (0.3, 2.5)]))
+    assert sheet is not None
+    collider = Collider([sheet], 0.0)
+    write_folder(tmp_path, collider)
+    eyes = np.stack([np.linspace(0, 4, 6), np.full(6, -5.0), np.full(6, 1.6)], axis=1)
+    thrown = throw(tmp_path / "world.xml", collider.surface, Ground.level(), eyes, seconds=0.8)
+    assert thrown.hits > 100
+    assert (thrown.through > 0) == passed
+
+
+def test_a_point_that_comes_out_where_it_went_in_has_not_passed_and_one_that_crosses_at_once_has():
+    slab = Part.hull(np.array([[x, y, z] for x in (0.0, 4) for y in (0, 0.03) for z in (0.0, 2)]))
+    assert slab is not None
+    y = np.array(
+        [[-0.01, -0.01, -0.01, -0.01], [0.01, 0.01, 0.04, 0.01], [-0.01, 0.02, 0.05, 0.01], [-0.01, 0.04, 0.06, 0.01]]
+    )
+    passages = Passages(Triangles(slab.vertices, slab.faces), _at(y[0]))
+    for row in y[1:]:
+        passages.move(_at(row))
+    assert passages.through.tolist() == [False, True, True, False]
+
+
+def _at(y: np.ndarray) -> np.ndarray:
+    return np.stack([1 + 0.1 * np.arange(len(y)), y, np.full(len(y), 0.7)], axis=1)
 
 
 def test_the_facades_front_is_its_wall(collider, eyes):

@@ -127,7 +127,8 @@ def _thickened(solid: Triangles, surface: Triangles, faces: Int64[np.ndarray, " 
     depth[depth == THICKNESS] = min(THICKNESS, max(_width(corners.reshape(-1, 3), normal), THINNEST))
     facing = surface.normals[faces] @ normal > 0.5
     depth = np.minimum(depth, np.quantile(depth[facing], 0.1) if facing.any() else THICKNESS)
-    depth = np.maximum(depth, THINNEST - np.ptp(corners @ normal))
+    least = np.where(facing | ~facing.any(), THINNEST, 0)[:, None]  # sides end where the front's copies do
+    depth = np.maximum(depth, least)
     behind = corners - depth[..., None] * normal
     return Part.hull(np.unique(np.concatenate([corners, behind]).reshape(-1, 3), axis=0))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.geometry.triangles import Triangles
@@ -19,6 +19,10 @@ from shellgs_method.sim.trials.engine import compiled, import_mujoco, read_spec
 GRAVITY = 9.81
 PROJECTILES = 2, 1
 """contype and conaffinity of thrown bodies: they collide with the world, but not with each other."""
+SIZES = 0.02, 0.15
+"""Smallest and largest radius of thrown bodies, in metres."""
+OPPOSITE = -0.5
+"""Cosine between the normals where a body went into a part and came out below which it has passed it."""
 SINKING = 0.01
 """Penetration in metres above which a body counts as stuck: contacts are soft."""
 GAIN = 0.02
@@ -32,7 +36,7 @@ class Throws:
     Attributes:
         thrown: number of bodies.
         hits: bodies that touched a building.
-        through: bodies whose centre crossed a surface.
+        through: bodies whose centre went into a part and out at its back, or ended below the ground.
         stuck: bodies held at the end by something not below them, or penetrating it by more than a centimetre.
         gained: bodies with more energy after a contact than when they were thrown.
         deepest: largest penetration at a contact, in metres.
@@ -92,6 +96,8 @@ def throw(
 ) -> Throws:
     """Throw spheres and boxes at 5 to 15 m/s at the visible surface of a world: half at any point, half at corners.
 
+    Their radii, and half the sides of the boxes, are 2 to 15 cm: the foot of a small robot and a football.
+
     Args:
         path: model file.
         surface: its collision geometry.
@@ -108,7 +114,7 @@ def throw(
         body.add_freejoint()
         kind = mujoco.mjtGeom.mjGEOM_SPHERE if number % 2 else mujoco.mjtGeom.mjGEOM_BOX
         contype, conaffinity = PROJECTILES
-        size = rng.uniform(0.05, 0.15, 3)
+        size = np.exp(rng.uniform(np.log(SIZES[0]), np.log(SIZES[1]), 3))  # as many from 2 to 5 cm as from 6 to 15
         body.add_geom(
             type=kind, size=size, density=300, contype=contype, conaffinity=conaffinity, group=1,
             solref=[STIFF, 1],  # for the ground, which leaves contacts to bodies; buildings have their own
@@ -120,17 +126,15 @@ def throw(
     data.qvel.reshape(-1, 6)[:, 3:] = rng.normal(0, 3, (count, 3))
     mujoco.mj_forward(model, data)
     launched, energy = _energy(model, data, bodies), np.zeros(count)
-    hit, through, deepest = np.zeros(count, bool), np.zeros(count, bool), 0.0
-    floor, before = model.geom("ground").id, data.xpos[bodies].copy()
-    solid = surface, ground.surface
+    hit, deepest = np.zeros(count, bool), 0.0
+    floor = model.geom("ground").id
+    parts, soil = (Passages(each, data.xpos[bodies]) for each in (surface, ground.surface))
     depth, support = np.zeros(count), np.zeros((count, 3))
     for _ in range(round(seconds / model.opt.timestep)):
         mujoco.mj_step(model, data)
         energy = np.maximum(energy, _energy(model, data, bodies) - launched)
-        now = data.xpos[bodies].copy()
-        for each in solid:
-            through |= each.cast(before, now - before).t <= 1
-        before = now
+        parts.move(data.xpos[bodies])
+        soil.move(data.xpos[bodies])
         depth[:], support[:] = 0, 0
         touching = model.geom_bodyid[data.contact.geom]
         mover, into = touching.max(axis=1) - bodies[0], -data.contact.dist
@@ -141,12 +145,42 @@ def throw(
         hit[mover[building]] = True
         deepest = max([deepest, *into[building]])
     speed = np.linalg.norm(data.qvel.reshape(-1, 6)[:, :3], axis=1)
-    above = before[:, 2] - ground.at(before)
+    above = parts.places[:, 2] - ground.at(parts.places)
     held = (speed < 0.05) & (above > 0.3) & (support[:, 2] < 0.3 * np.linalg.norm(support, axis=1))
-    gained = energy > GAIN * launched
+    through, gained = parts.through | soil.inside, energy > GAIN * launched
     return Throws(
         count, int(hit.sum()), int(through.sum()), int((held | (depth > SINKING)).sum()), int(gained.sum()), deepest
     )
+
+
+class Passages:
+    """Which of some points have gone into a part and out at its back, however far they move at once.
+
+    Attributes:
+        places: where the points are.
+        through: mask of those that have.
+        inside: mask of those that have gone in and not come out.
+    """
+
+    def __init__(self, surface: Triangles, places: Float64[np.ndarray, "N 3"]) -> None:
+        self._surface, self.places, self.through = surface, places.copy(), np.zeros(len(places), bool)
+        self._entered = np.zeros_like(places)  # normal where a point went in; 0 outside
+
+    @property
+    def inside(self) -> Bool[np.ndarray, " N"]:
+        return self._entered.any(axis=1)
+
+    def move(self, places: Float64[np.ndarray, "N 3"]) -> None:
+        """Move the points straight to other places."""
+        way = places - self.places
+        first, last = self._surface.cast(self.places, way), self._surface.cast(places, -way)
+        inward, outward = ((hits.normal * way).sum(axis=1) for hits in (first, last))
+        enters = (first.t <= 1) & (inward < 0) & ~self.inside
+        self._entered[enters] = first.normal[enters]
+        leaves = (last.t <= 1) & (outward > 0)
+        self.through |= leaves & ((last.normal * self._entered).sum(axis=1) < OPPOSITE)
+        self._entered[leaves] = 0
+        self.places = places.copy()
 
 
 def walk(path: Path, surface: Triangles, ground: Ground, front: Front, speed: float = 1.4) -> Walk:
