@@ -4,11 +4,13 @@
     python -m benchmarks.nav facade-sim/ lidar --steps 30000
 
 trains one policy a seed, and compares it with random actions over the same episodes. ``--measure-speed``
-measures the environment instead: steps a second without images, and images a second of the splat camera.
+measures the environment instead: steps a second without images, and images a second of the splat camera, elapsed and of
+CPU time, which counts on a busy machine.
 """
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Literal
@@ -25,6 +27,8 @@ from shellgs_method.sim.env.sensors import camera_of
 
 Sensor = Literal["depth", "lidar"]
 
+IMAGES = 100
+"""Images of the splat camera that are timed."""
 FIRST_EPISODE = 10_000
 """Seed of the first episode of the comparison: none is trained on."""
 
@@ -88,20 +92,26 @@ def speed(world: Path, steps: int) -> None:
     env = gymnasium.make(NAME, world=world, depth=False, obstacle=True, pedestrians=2)
     env.reset(seed=0)
     env.action_space.seed(0)
-    started = time.perf_counter()
+    started = time.perf_counter(), time.process_time()
     for _ in range(steps):
         _, _, terminated, truncated, _ = env.step(env.action_space.sample())
         if terminated or truncated:
             env.reset()
-    print(f"{steps / (time.perf_counter() - started):.0f} steps a second without images, resets included")
+    print(f"{_rates(steps, *started)} steps a second without images, resets included")
     nav = gymnasium.make(NAME, world=world, rgb=CameraSettings(), pedestrians=2).unwrapped
     nav.reset(seed=0, options={"heading": np.pi / 2})
     camera = camera_of(nav.model, nav.data, nav._camera, 160, 90)  # pyright: ignore
     nav._images.image(nav.model, nav.data, camera)  # pyright: ignore  # compiles
-    started = time.perf_counter()
-    for _ in range(50):
+    started = time.perf_counter(), time.process_time()
+    for _ in range(IMAGES):
         nav._images.image(nav.model, nav.data, camera)  # pyright: ignore
-    print(f"{50 / (time.perf_counter() - started):.1f} images of 160 x 90 a second, {torch.get_num_threads()} threads")
+    print(f"{_rates(IMAGES, *started)} images of 160 x 90 a second, {torch.get_num_threads()} threads")
+    print(f"load {os.getloadavg()[0]:.1f}")
+
+
+def _rates(count: int, elapsed: float, cpu: float) -> str:
+    """A count by the seconds since two clocks were at these."""
+    return f"{count / (time.perf_counter() - elapsed):.0f} ({count / (time.process_time() - cpu):.0f} by CPU time)"
 
 
 def main(

@@ -21,17 +21,23 @@ from shellgs_method.export.elevation import FULL
 QUALITY = 88
 
 
-def sim(folder: tyro.conf.Positional[Path], output: tyro.conf.Positional[Path], rows: tuple[int, ...] = (0, 2)) -> None:
+def sim(
+    folder: tyro.conf.Positional[Path],
+    output: tyro.conf.Positional[Path],
+    rows: tuple[int, ...] = (0, 2),
+    width: int = 480,
+) -> None:
     """Held-out photographs, MuJoCo's renders and edges of the collision geometry, as in the report of `shellgs sim`.
 
     Args:
         folder: folder that `shellgs sim` wrote.
         output: output image.
         rows: views of the report.
+        width: of each image in pixels.
     """
     page = (folder / "report.html").read_text()
     found = [Image.open(BytesIO(base64.b64decode(each))) for each in re.findall(r"image/jpeg;base64,([^\"]+)", page)]
-    save([found[3 * row : 3 * row + 3] for row in rows], output)
+    save([[resized(image, width) for image in found[3 * row : 3 * row + 3]] for row in rows], output)
 
 
 def elevation(
@@ -47,8 +53,11 @@ def elevation(
     """
     deviations = np.asarray(Image.open(folder / f"{wall}-deviations.tif"))
     halves = Image.open(folder / f"{wall}.png"), Image.fromarray(deviation_colours(deviations, FULL))
-    size = width, round(width * deviations.shape[0] / deviations.shape[1])
-    save([[half.convert("RGB").resize(size, Image.Resampling.LANCZOS) for half in halves]], output)
+    save([[resized(half.convert("RGB"), width) for half in halves]], output)
+
+
+def resized(image: Image.Image, width: int) -> Image.Image:
+    return image.resize((width, round(width * image.height / image.width)), Image.Resampling.LANCZOS)
 
 
 def save(rows: list[list[Image.Image]], output: Path) -> None:

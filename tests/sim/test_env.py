@@ -18,6 +18,7 @@ from worlds import frame_at, some_splats, uneven, write_folder
 from shellgs_method.errors import SceneError
 from shellgs_method.files.splats import write_splats
 from shellgs_method.sim.env import NAME
+from shellgs_method.sim.env.course import WALK
 from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
 from shellgs_method.sim.free_space import CELL, FreeSpace
@@ -98,6 +99,23 @@ def test_driving_into_the_wall_is_a_collision_each_step_and_the_wall_stands(fold
     assert info["collisions"] > 5
     assert reward < -0.3
     assert env._place[1] < collider.surface.vertices[:, 1].max()
+
+
+def test_a_pedestrian_that_walks_into_the_robot_is_a_collision_and_pushes_it_no_faster_than_it_walks(
+    folder, monkeypatch
+):
+    env = make(folder, depth=False, pedestrians=1)
+    env.reset(seed=0, options={"start": (4, -6), "goal": (9, -6), "heading": 0.0})
+
+    def straight(data, _, seconds: float) -> None:
+        env.world.put(data, "pedestrian_0", data.mocap_pos[0, :2] + [WALK * seconds, 0], 0.85)
+
+    env.world.put(env.data, "pedestrian_0", np.array([3.0, -6.05]), 0.85)
+    monkeypatch.setattr(env._pedestrians, "walk", straight)
+    for _ in range(8):
+        *_, info = env.step(np.zeros(3))
+    assert info["collisions"] > 3
+    assert info["driven"] < 1.3
 
 
 def test_lidar_and_depth_agree_with_the_collision_geometry(folder, collider):

@@ -27,6 +27,8 @@ from shellgs_method.sim.env.world import (
 
 STEP = 0.2
 """Seconds between actions."""
+MOVES = 10
+"""Moves of pedestrians between two actions; collisions are looked for after each, as what bounces off is soon away."""
 RANGE = 20.0
 """Range of lidar and depth in metres."""
 BEAMS = 36
@@ -110,6 +112,7 @@ class FacadeNav(gymnasium.Env):
         self._qpos = self.model.jnt_qposadr[joint]
         self._lidar, self._camera = self._sensor("site", "lidar"), self._sensor("camera", "camera")
         self._robot = np.isin(np.arange(self.model.ngeom), robot_geoms(self.model))
+        self._foreign = np.isin(self.model.geom_group, (COLLISION, MOVING)) & ~self._robot
         self.course = Course(self.world, distance, obstacle, everywhere)
         self._pedestrians = Pedestrians(self.world, self.course, pedestrians)
         buildings = [self.world.folder / name / "splats.ply" for name in self.world.buildings]
@@ -152,12 +155,16 @@ class FacadeNav(gymnasium.Env):
         """Drive for a fifth of a second."""
         low, high = self.model.actuator_ctrlrange.T
         self.data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
+        was, collides = self.data.mocap_pos.copy(), False
         self._pedestrians.walk(self.data, self.np_random, STEP)
-        mujoco.mj_step(self.model, self.data, round(STEP / TIMESTEP))
+        moved = self.data.mocap_pos - was
+        for k in range(MOVES):
+            self.data.mocap_pos[:] = was + (k + 1) / MOVES * moved
+            mujoco.mj_step(self.model, self.data, round(STEP / MOVES / TIMESTEP))
+            collides |= self._collides()
         now = self._place
         self._driven += float(np.linalg.norm(now - self._was))
         self._was = now
-        collides = self._collides()
         self._collisions += collides
         left = self._episode.left(now)
         progress = self._left - left if np.isfinite(left) else 0.0
@@ -192,11 +199,7 @@ class FacadeNav(gymnasium.Env):
     def _collides(self) -> bool:
         """Whether the robot touches anything but itself and the ground."""
         pairs = self.data.contact.geom
-        if len(pairs) == 0:
-            return False
-        groups = self.model.geom_group[pairs]
-        foreign = ~self._robot[pairs] & np.isin(groups, (COLLISION, MOVING))
-        return bool((self._robot[pairs].any(axis=1) & foreign.any(axis=1)).any())
+        return bool((self._robot[pairs].any(axis=1) & self._foreign[pairs].any(axis=1)).any())
 
     def _observed(self) -> dict[str, np.ndarray]:
         turn = self.data.xmat[self._root].reshape(3, 3)
