@@ -1,0 +1,98 @@
+"""A folder of `shellgs sim` in engines that others wrote: the rays of a lidar, against those on its collision geometry.
+
+    python -m benchmarks.engines facade-sim/
+
+MuJoCo reads the MJCF, PyBullet the URDF and Newton the USD; those that are not installed are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import tyro
+from jaxtyping import Float64
+
+from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.env.world import World
+from shellgs_method.sim.front import Front, places_before
+from shellgs_method.sim.trials.engine import beams, lidar
+
+FAR = 90.0
+"""Length in metres that rays are compared over."""
+Rays = Float64[np.ndarray, "N 3"]
+Distances = Float64[np.ndarray, " N"]
+
+
+def in_mujoco(folder: Path, origins: Rays, rays: Rays) -> Distances:
+    each = len(beams())
+    return lidar(folder / "world.xml", origins[::each], rays[:each], group=3).ravel()
+
+
+def in_pybullet(folder: Path, origins: Rays, rays: Rays) -> Distances:
+    import pybullet
+
+    pybullet.connect(pybullet.DIRECT)
+    pybullet.loadURDF(str(folder / "world.urdf"), useFixedBase=True)
+    share, most = np.empty(len(rays)), pybullet.MAX_RAY_INTERSECTION_BATCH_SIZE - 1
+    for first in range(0, len(rays), most):
+        some = slice(first, first + most)
+        hits = pybullet.rayTestBatch(origins[some].tolist(), (origins + FAR * rays)[some].tolist())
+        share[some] = [hit[2] for hit in hits]
+    return np.where(share < 1, FAR * share, np.inf)
+
+
+def in_newton(folder: Path, origins: Rays, rays: Rays) -> Distances:
+    import newton  # pyright: ignore[reportMissingImports]
+    import warp  # pyright: ignore[reportMissingImports]
+
+    builder = newton.ModelBuilder()
+    builder.add_usd(str(folder / "world.usda"), load_visual_shapes=False, force_show_colliders=True)
+    model = builder.finalize(device="cpu")
+    camera = newton.sensors.SensorCamera(model, load_textures=False)
+    depth = camera.allocate_image_depth(1, len(rays), 1)
+    bundle = np.stack([origins, rays], axis=1).astype(np.float32).reshape(1, -1, 1, 2, 3)
+    home = warp.array([warp.transform_identity()], dtype=warp.transformf, device="cpu")
+    camera.update(model.state(), home, warp.array(bundle, dtype=warp.vec3f, device="cpu"), depth_image=depth)
+    measured = depth.numpy()[0, 0]
+    return np.where(measured > 0, measured, np.inf)
+
+
+ENGINES: dict[str, Callable[[Path, Rays, Rays], Distances]] = {
+    "MuJoCo, MJCF": in_mujoco,
+    "PyBullet, URDF": in_pybullet,
+    "Newton, USD": in_newton,
+}
+
+
+def main(folder: tyro.conf.Positional[Path]) -> None:
+    """Print how far the distances in each engine are from those to the collision geometry.
+
+    Args:
+        folder: folder that `shellgs sim` wrote.
+    """
+    world = World.load(folder)
+    files = [each for name in world.buildings for each in (folder / name / "collision").glob("part_*.obj")]
+    building: Any = trimesh.util.concatenate([trimesh.load(each, process=False) for each in files])
+    surface = Triangles(np.asarray(building.vertices), np.asarray(building.faces))
+    places, directions = places_before(surface, Front.of(surface, world.workspace.eyes)), beams()
+    places[:, 2] += world.ground.at(places)
+    origins, rays = np.repeat(places, len(directions), axis=0), np.tile(directions, (len(places), 1))
+    expected = np.min([each.cast(origins, rays).t for each in (surface, world.ground.surface)], axis=0)
+    meets = expected < FAR
+    print(f"{len(files)} parts; {meets.sum()} rays from {len(places)} places meet ground or building within {FAR:g} m")
+    for name, measure in ENGINES.items():
+        try:
+            off = np.abs(measure(folder, origins, rays) - expected)[meets]
+        except ImportError as missing:
+            print(f"{name}: {missing}")
+            continue
+        most = 1000 * np.quantile(off, 0.99, method="higher")
+        print(f"{name}: {(off < 0.01).mean():.2%} within 1 cm, 99 % within {most:.2f} mm, all within {off.max():.3g} m")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
