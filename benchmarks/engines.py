@@ -44,6 +44,7 @@ def in_pybullet(folder: Path, origins: Rays, rays: Rays) -> Distances:
         some = slice(first, first + most)
         hits = pybullet.rayTestBatch(origins[some].tolist(), (origins + FAR * rays)[some].tolist())
         share[some] = [hit[2] for hit in hits]
+    pybullet.disconnect()
     return np.where(share < 1, FAR * share, np.inf)
 
 
