@@ -317,6 +317,14 @@ def test_a_scene_of_transforms_is_refused_in_a_sentence(scene: Path):
     assert not (scene / ADJUSTED).exists()
 
 
+def test_the_command_leaves_straight_cameras_as_they_are(tmp_path: Path, model: Model):
+    matrix = write(tmp_path, model, building(Layout(5, 3)))
+    align(tmp_path, (tmp_path / "shell.ply",), matrix=matrix, bundle_adjust=True)
+    assert "The cameras are left as they are" in (tmp_path / "shell/report/index.html").read_text()
+    assert not (tmp_path / ADJUSTED).exists()
+    assert ScenePaths().of(tmp_path).colmap_folder() == Path("colmap/sparse/0")
+
+
 @pytest.mark.parametrize("wrong", ["30 cm", "2 degrees", "another building"])
 def test_a_wrong_shell_does_not_bend_good_cameras(tmp_path: Path, model: Model, wrong: str):
     shift = np.eye(4)
