@@ -33,7 +33,7 @@ def main(
     houses: int = 4,
     method: str = "shellgs-metric",
     iterations: int = 1000,
-    coarse_iterations: int = 500,
+    coarse_iterations: int = 1000,
     length: float = 20.0,
     overlap: float = 3.0,
     seeds: tuple[int, ...] = (0,),

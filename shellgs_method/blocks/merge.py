@@ -143,7 +143,6 @@ def _check_settings(first: BlockRun, run: BlockRun) -> None:
             **config_settings(each.config),
             "method": each.config.method_name,
             "pipeline.datamanager.dataparser.block": None,
-            "iterations": each.config.max_num_iterations,
         }
         for each in (first, run)
     )

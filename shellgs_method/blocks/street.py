@@ -95,7 +95,8 @@ class Street:
         Args:
             scene: the scene's folder.
             method: one of ShellGS's, an ablation, or NAME='METHOD FLAGS'.
-            iterations: training iterations of each block.
+            iterations: training iterations of a block that has as many photographs as they have on average; others
+                have more or fewer, so that all photographs count alike.
             coarse_iterations: those of the coarse run.
             coarse_scale: size of its photographs, as a share of the blocks'.
             seed: seed of all runs.
@@ -115,13 +116,14 @@ class Street:
         cells = trainable_cells(FacadeDataParserConfig(**vars(paths), data=scene))
         if len(cells) == 1:
             raise SceneError(f"{scene / BLOCKS} has one block: train the scene as it is, with ns-train")
+        photographs = sum(len(cell.block.photographs) for cell in cells) / len(cells)
         parser = () if _PARSER in variant.flags else (_PARSER,)
         blocks = [
             BlockJob(
                 scene,
                 replace(variant, name=cell.block.name, flags=(*variant.flags, *parser, "--block", cell.block.name)),
                 seed,
-                iterations,
+                max(1, round(iterations * len(cell.block.photographs) / photographs)),
                 output / "blocks",
                 paths=paths,
                 coarse=coarse.folder,

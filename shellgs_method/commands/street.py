@@ -32,7 +32,7 @@ def street(
     Args:
         scene: Scene folder with a blocks.json.
         method: Method: one of ShellGS, an ablation (docs/methods.md), or NAME='METHOD FLAGS'.
-        iterations: Training iterations of each block.
+        iterations: Training iterations of a block on average; each has them by the number of its photographs.
         coarse_iterations: Training iterations of the coarse run.
         coarse_scale: Size of the coarse run's photographs, as a share of the blocks'.
         seed: Seed of all runs.

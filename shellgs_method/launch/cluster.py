@@ -96,7 +96,9 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
         if lacking:
             console.print(f"No node has {lacking} now: runs wait until one joins the cluster.", highlight=False)
         task = ray.remote(max_retries=RETRIES, **takes.options)(_finish_on_node)
-        waiting, pending, scenes, stages = list(runs), {}, {}, Queue(actor_options={"num_cpus": 0})
+        # On any node, which may be lost.
+        stages = Queue(actor_options={"num_cpus": 0, "max_restarts": -1})
+        waiting, pending, scenes = list(runs), {}, {}
         tell: dict[str, Callable[[Stage], None]] = {}  # by the run's key
         with _marked(runs, launch) as marks, Display(console) as display:
             in_place = marks and all(_on_each_node(_sees, marks))
@@ -115,8 +117,9 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
                     tell[run.key] = display.begin(run.label)
                     tell[run.key](Stage("Waiting for a node"))
                 ended, _ = ray.wait(list(pending), timeout=LOOK_EVERY)
-                for key, stage in stages.get_nowait_batch(stages.qsize()):
-                    tell[key](stage)
+                with suppress(RayError):  # the runs count, not what is told of them
+                    for key, stage in stages.get_nowait_batch(stages.qsize()):
+                        tell[key](stage)
                 if not ended:
                     continue
                 run = pending.pop(done := ended[0])
@@ -181,8 +184,9 @@ def _check_cluster(address: str) -> None:
 
 
 def _on_each_node(function: Callable[[Any], Any], argument: object) -> list[Any]:
-    """Call a function on each node; return what those return that answer."""
+    """Call a function on each node; return what those return that answer: one may be lost, and not known to be."""
     import ray
+    from ray.exceptions import RayError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     task = ray.remote(num_cpus=0)(function)
@@ -192,7 +196,11 @@ def _on_each_node(function: Callable[[Any], Any], argument: object) -> list[Any]
         for node in nodes
     ]
     ended, _ = ray.wait(calls, num_returns=len(calls), timeout=TIMEOUT)
-    return ray.get(ended)
+    answers = []
+    for call in ended:
+        with suppress(RayError):
+            answers.append(ray.get(call))
+    return answers
 
 
 def _remove_copies(launch: str) -> None:

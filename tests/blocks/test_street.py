@@ -104,6 +104,16 @@ def test_a_block_that_cannot_be_trained_is_refused_before_the_coarse_run(cut, tm
         planned(cut, tmp_path / "street")
 
 
+def test_a_block_is_trained_for_as_long_as_it_has_photographs(cut, tmp_path):
+    blocks = Blocks.read(cut / BLOCKS)
+    assert isinstance(blocks.tree, Fork)
+    assert isinstance(blocks.tree.below, Block)
+    few = Block("west", blocks.tree.below.photographs[:3])
+    replace(blocks, tree=replace(blocks.tree, below=few)).write(cut / BLOCKS)
+    street = Street.plan(cut, "shellgs-metric", 1000, 4, 0.5, 0, tmp_path / "street", ScenePaths())
+    assert [run.iterations for run in street.blocks] == [600, 1400]
+
+
 def test_a_method_of_nerfstudio_trains_no_blocks(cut, tmp_path):
     with pytest.raises(SceneError, match="splatfacto trains no blocks"):
         planned(cut, tmp_path, "splatfacto")
