@@ -86,13 +86,15 @@ def judged(merged: Parts, coarse: Parts) -> list[Seam]:
     found = []
     for criterion in CRITERIA:
         if all(criterion.key in of[part] for of in (merged, coarse) for part in PARTS):
-            values = [of[part][criterion.key] for of in (merged, coarse) for part in PARTS]
-            lost = _lost_error(*map(abs, values)) if criterion.is_error else _lost_quality(*values)
-            found.append(Seam(criterion, *values[:2], lost))
+            near, elsewhere = (merged[part][criterion.key] for part in PARTS)
+            near_coarse, elsewhere_coarse = (coarse[part][criterion.key] for part in PARTS)
+            lost = _lost_error if criterion.is_error else _lost_quality
+            found.append(Seam(criterion, near, elsewhere, lost(near, elsewhere, near_coarse, elsewhere_coarse)))
     return found
 
 
 def _lost_error(near: float, elsewhere: float, near_coarse: float, elsewhere_coarse: float) -> float:
+    near, elsewhere, near_coarse, elsewhere_coarse = map(abs, (near, elsewhere, near_coarse, elsewhere_coarse))
     alike = elsewhere * near_coarse / elsewhere_coarse if elsewhere_coarse else near_coarse
     return near - min(alike, max(near_coarse, elsewhere))
 

@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from shellgs_method import cli
 from shellgs_method.cli import main
 from shellgs_method.commands.common import open_page
 from shellgs_method.machine import doctor
@@ -199,3 +200,15 @@ def test_doctor_ends_with_what_is_needed_and_missing(shellgs, monkeypatch):
     assert shellgs("doctor") == (
         "refused: shellgs: nothing runs here until this is fixed: Open3D: no libGL: apt-get install libgl1"
     )
+
+
+def test_a_command_that_is_stopped_by_its_user_says_so_without_a_traceback(monkeypatch, capsys):
+    def street() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "COMMANDS", (street, *cli.COMMANDS[-1:]))
+    monkeypatch.setattr("sys.argv", ["shellgs", "street"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == cli.INTERRUPTED
+    assert capsys.readouterr().err.splitlines() == ["shellgs: stopped"]
