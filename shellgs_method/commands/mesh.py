@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Optional
 
-from shellgs_method.bounds import Bounds, Length, Weight, bounded
+from shellgs_method.bounds import Bounds, Length, bounded
 from shellgs_method.commands.common import RunConfig, console, place
 
 
@@ -15,7 +15,7 @@ def mesh(
     output: Optional[Path] = None,
     voxel: Optional[Length] = None,
     faces: Annotated[int, Bounds(4, 1e9, int)] = 200_000,
-    margin: Weight = 0.5,
+    margin: Annotated[float, Bounds(0, 1e9)] = 0.5,
 ) -> None:
     """Write a triangle mesh of a trained run, in metres in the shell's frame, and print its errors.
 

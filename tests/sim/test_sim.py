@@ -288,12 +288,12 @@ def test_an_empty_collider_is_refused(nothing):
 @pytest.mark.parametrize("name", ["parts", "faces", "voxel", "texel", "megabytes"])
 @pytest.mark.parametrize("value", [0, -1, math.nan, math.inf])
 def test_a_setting_that_nothing_can_be_made_with_is_refused_at_once(name, value):
-    with pytest.raises(SceneError, match=rf"--{name} .* cannot be"):
+    with pytest.raises(SceneError, match=rf"--{name} cannot be"):
         SimSettings(**{name: value})
 
 
 def test_a_ground_that_is_no_height_is_refused():
-    with pytest.raises(SceneError, match="--ground nan cannot be: give a number"):
+    with pytest.raises(SceneError, match="--ground cannot be nan: give a number"):
         SimSettings(ground=math.nan)
 
 
