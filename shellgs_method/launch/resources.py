@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Optional
 
+from shellgs_method.bounds import Weight, check_bounds
 from shellgs_method.errors import SceneError
 
 GB = 10**9
@@ -17,11 +18,11 @@ class Cluster:
 
     address: Optional[str] = None
     """Address of a running Ray cluster, or auto. If not set: one is started on this machine."""
-    gpus_per_run: Optional[float] = None
+    gpus_per_run: Optional[Weight] = None
     """GPUs that a run takes of a Ray cluster. If not set: 1 if a node has one now, else 0."""
-    cpus_per_run: float = 1.0
+    cpus_per_run: Weight = 1.0
     """CPU cores that a run takes of a Ray cluster."""
-    memory_per_run: Optional[float] = None
+    memory_per_run: Optional[Weight] = None
     """Memory in GB that a run takes of a Ray cluster. If not set: memory is not looked at."""
 
     def __post_init__(self) -> None:
@@ -30,11 +31,10 @@ class Cluster:
         Raises:
             SceneError: a number is negative, or of more than one GPU not whole.
         """
+        check_bounds(Cluster, vars(self))
         gpus = self.gpus_per_run or 0.0
-        if min(gpus, self.cpus_per_run, self.memory_per_run or 0.0) < 0 or (gpus > 1 and gpus % 1):
-            raise SceneError(
-                "--gpus-per-run, --cpus-per-run and --memory-per-run must be at least 0, and GPUs above 1 whole"
-            )
+        if gpus > 1 and gpus % 1:
+            raise SceneError(f"--gpus-per-run cannot be {gpus:g}: above 1 it must be whole")
 
     def per_run(self, nodes: Sequence[Mapping[str, float]]) -> Share:
         """What a run takes, where these nodes have the resources that Ray names."""
