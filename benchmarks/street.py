@@ -1,4 +1,4 @@
-"""A street in blocks against one run of all of it, with as many iterations per block as the one run has per area.
+"""A street in blocks against one run of all of it, which sees each photograph as often as a block does.
 
 python -m benchmarks.street outputs/street
 python -m benchmarks.street outputs/street --seeds 0 1 2
@@ -50,7 +50,7 @@ def main(
         height: their height in pixels.
         houses: number of houses in the scan; one more is missing from it.
         method: method to train.
-        iterations: length of a block's run; the one run has as many for each block.
+        iterations: length of the run of a block with as many photographs as blocks have on average.
         coarse_iterations: length of the coarse run.
         length: length of a block in metres.
         overlap: how far a block reaches beyond its core, in metres.
@@ -63,14 +63,16 @@ def main(
         write_scene(scene, StreetConfig(width, height, views, houses=houses, points=100 * views))
     _call("shellgs", "cast", scene)
     _call("shellgs", "blocks", scene, "--length", length, "--overlap", overlap)
-    blocks = len(Blocks.read(scene / BLOCKS).cells)
+    cells = Blocks.read(scene / BLOCKS).cells
+    photographs = sum(len(cell.block.photographs) for cell in cells) / len(cells)
+    of_one = round(iterations * views / photographs)
     if runs:
-        pairs = [_pair(work, scene, method, iterations, coarse_iterations, blocks, seed) for seed in seeds]
-        _tell(f"{method}, {blocks} blocks of {iterations} iterations", pairs)
+        pairs = [_pair(work, scene, method, iterations, coarse_iterations, of_one, seed) for seed in seeds]
+        _tell(f"{method}, {len(cells)} blocks of {iterations} iterations, one run of {of_one}", pairs)
 
 
 def _pair(
-    work: Path, scene: Path, method: str, iterations: int, coarse: int, blocks: int, seed: int
+    work: Path, scene: Path, method: str, iterations: int, coarse: int, of_one: int, seed: int
 ) -> tuple[dict[str, float], dict[str, float], dict]:
     """Metrics of the merged run and of the one run, and the report of the seams."""
     output = work / f"{method}-{iterations}-{coarse}" / f"seed-{seed}"
@@ -79,7 +81,7 @@ def _pair(
     one = output / "one"
     if not any(one.rglob("*.ckpt")):
         words = ["--output-dir", one.parent, "--experiment-name", "one", "--timestamp", ".", "--machine.seed", seed]
-        words += ["--max-num-iterations", blocks * iterations, "--vis", "tensorboard", "--steps-per-eval-image", 0]
+        words += ["--max-num-iterations", of_one, "--vis", "tensorboard", "--steps-per-eval-image", 0]
         _call("ns-train", method, "--data", scene, *words)
     (config,) = one.rglob("config.yml")
     seams = json.loads((output / "merged/seams.json").read_text())
