@@ -253,7 +253,7 @@ def test_a_broken_colmap_model_is_refused_in_a_sentence(scene, shellgs, fault):
     [
         ({"eval_interval": 0}, lambda scene: None, "eval_interval must be at least 2, not 0"),
         ({"eval_interval": 1}, lambda scene: None, "eval_interval must be at least 2, not 1"),
-        ({"max_image_size": 0}, lambda scene: None, "at least 1 pixel, not 0"),
+        ({"max_image_size": 0}, lambda scene: None, "--max-image-size cannot be 0"),
         ({}, lambda scene: change(scene, None, train_filenames=["images/x.png"]), "lists images/x.png, which has no"),
         ({}, lambda scene: change(scene, None, test_filenames=["images/frame_00001.png"]), "lists no photographs"),
     ],
@@ -428,11 +428,11 @@ def test_outliers_among_sfm_points_are_left_out_and_counted(scene, caplog):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("align", "{scene}", "--refine", -1), "more than 0, not -1"),
-        (("align", "{scene}", "--refine", "nan"), "more than 0, not nan"),
-        (("cast", "{scene}", "--max-image-size", 0), "at least 1 pixel, not 0"),
-        (("cast", "{scene}", "--max-image-size", -5), "at least 1 pixel, not -5"),
-        (("mono", "{scene}", "--max-image-size", 0, "from", "{scene}/predictions"), "at least 1 pixel, not 0"),
+        (("align", "{scene}", "--refine", -1), "--refine cannot be -1: give a number above 0"),
+        (("align", "{scene}", "--refine", "nan"), "--refine cannot be nan: give a number above 0"),
+        (("cast", "{scene}", "--max-image-size", 0), "--max-image-size cannot be 0"),
+        (("cast", "{scene}", "--max-image-size", -5), "--max-image-size cannot be -5"),
+        (("mono", "{scene}", "--max-image-size", 0, "from", "{scene}/predictions"), "--max-image-size cannot be 0"),
         (
             ("align", "{scene}", "{scene}/shell/facade.ply", "--picks", "{scene}/sparse_pc.ply"),
             "is not a text file of picks",
