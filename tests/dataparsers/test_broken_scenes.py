@@ -253,7 +253,7 @@ def test_a_broken_colmap_model_is_refused_in_a_sentence(scene, shellgs, fault):
     [
         ({"eval_interval": 0}, lambda scene: None, "eval_interval must be at least 2, not 0"),
         ({"eval_interval": 1}, lambda scene: None, "eval_interval must be at least 2, not 1"),
-        ({"max_image_size": 0}, lambda scene: None, "--max-image-size cannot be 0"),
+        ({"max_image_size": 0}, lambda scene: None, "at least 1 pixel, not 0"),
         ({}, lambda scene: change(scene, None, train_filenames=["images/x.png"]), "lists images/x.png, which has no"),
         ({}, lambda scene: change(scene, None, test_filenames=["images/frame_00001.png"]), "lists no photographs"),
     ],
