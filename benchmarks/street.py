@@ -84,8 +84,9 @@ def _pair(
         words += ["--max-num-iterations", of_one, "--vis", "tensorboard", "--steps-per-eval-image", 0]
         _call("ns-train", method, "--data", scene, *words)
     (config,) = one.rglob("config.yml")
-    seams = json.loads((output / "merged/seams.json").read_text())
-    return measure(output / "merged/config.yml")["results"], measure(config)["results"], seams
+    (merged,) = (output / "merged").rglob("config.yml")
+    seams = json.loads(merged.with_name("seams.json").read_text())
+    return measure(merged)["results"], measure(config)["results"], seams
 
 
 def _tell(title: str, pairs: list[tuple[dict[str, float], dict[str, float], dict]]) -> None:

@@ -38,7 +38,7 @@ class Bounds(NamedTuple):
 
 COUNT, FROM_ONE = Bounds(0, 1e9, int), Bounds(1, 1e9, int)
 WEIGHT, SHARE, LENGTH, RATE = Bounds(0, 1e6), Bounds(0, 1), Bounds(TINY, 1e6), Bounds(TINY, 1e3)
-PORT, SEED = Bounds(1, 65535, int), Bounds(0, 2**32 - 1, int)
+PORT, SEED, JOBS = Bounds(1, 65535, int), Bounds(0, 2**32 - 1, int), Bounds(1, 1024, int)
 
 Count = Annotated[int, COUNT]
 FromOne = Annotated[int, FROM_ONE]
@@ -48,6 +48,7 @@ Length = Annotated[float, LENGTH]
 Rate = Annotated[float, RATE]
 Port = Annotated[int, PORT]
 Seed = Annotated[int, SEED]
+Jobs = Annotated[int, JOBS]
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -96,8 +97,7 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
     if not runs:
         raise SceneError("there is nothing to merge: name the config.yml of the run of each block")
     first = runs[0]
-    if output.resolve() in {run.folder.resolve() for run in runs}:
-        raise SceneError(f"{output} is the folder of a run that is merged: name another one")
+    check_free(output)
     scene = first.dataparser.data
     blocks = Blocks.read(scene / BLOCKS)
     by_name = {run.name: run for run in runs}
@@ -135,6 +135,18 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
     return output / "config.yml"
 
 
+def check_free(output: Path) -> None:
+    """Refuse to write a merged run where another run is.
+
+    Raises:
+        SceneError: the folder is a file, or holds a run that was not merged, which has no blocks.json.
+    """
+    if output.is_file():
+        raise SceneError(f"{output} is a file: name a folder for the merged run")
+    if (output / "config.yml").exists() and not (output / BLOCKS).exists():
+        raise SceneError(f"{output} is the folder of a run that was trained: name another one for the merged run")
+
+
 def _check_settings(first: BlockRun, run: BlockRun) -> None:
     if run.dataparser.data.resolve() != first.dataparser.data.resolve():
         raise SceneError(f"{run.folder} is of the scene {run.dataparser.data}, and {first.folder} of another one")
@@ -162,11 +174,21 @@ def _write(first: BlockRun, state: Mapping[str, Tensor], output: Path) -> None:
     data.data = data.data.resolve()
     config.experiment_name, config.timestamp = output.resolve().parent.name, output.resolve().name
     step = config.max_num_iterations - 1
+    checkpoint = config.relative_model_dir / f"step-{step:09d}.ckpt"
     with atomic_contents(output) as folder:
-        checkpoints = folder / config.relative_model_dir
-        checkpoints.mkdir()
+        (folder / checkpoint).parent.mkdir()
         whole = {"step": step, "pipeline": dict(state), "optimizers": {}, "scalers": {}}
-        torch.save(whole, checkpoints / f"step-{step:09d}.ckpt")
+        try:
+            torch.save(whole, folder / checkpoint)
+        except RuntimeError as error:  # which does not mention the disk
+            free = shutil.disk_usage(folder).free
+            raise SceneError(
+                f"the merged run cannot be written to {output}; the disk has {free / 1e6:.0f} MB free: make room, and "
+                "merge again"
+            ) from error
+        shutil.copyfile(data.data / BLOCKS, folder / BLOCKS)
         world = "dataparser_transforms.json"
         (folder / world).write_bytes((first.folder / world).read_bytes())
         (folder / "config.yml").write_text(written_config(config), "utf8")
+    for older in {output / "seams.json", *(output / checkpoint).parent.glob("*.ckpt")} - {output / checkpoint}:
+        older.unlink(missing_ok=True)

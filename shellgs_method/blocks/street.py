@@ -21,6 +21,7 @@ from shellgs_method.runs.checkpoints import find_checkpoint
 COARSE = "coarse"
 """Name of the coarse run, and of its copy in the folder of a block's run."""
 _PARSER = "facade-data"
+_SCALE = "camera-res-scale-factor"
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class BlockJob(Run):
     """Folder of the coarse run."""
     region: str = ""
     """Fingerprint of the block's cell and photographs when the street began."""
+    usual_iterations: int = 0
+    """Iterations of a block with as many photographs as blocks have on average."""
 
     def _train(self) -> list[str]:
         script, method, *flags = super()._train()
@@ -44,7 +47,15 @@ class BlockJob(Run):
             SceneError: the flags set what the street sets, or there is no coarse run.
         """
         coarse = content_hash(find_checkpoint(self.coarse / "nerfstudio_models"))
-        return {**super().settings, "block": self.region, "coarse": coarse}
+        of_street = {"block": self.region, "coarse": coarse, "usual_iterations": self.usual_iterations}
+        return {**super().settings, **of_street}
+
+    @property
+    def as_begun(self) -> BlockJob:
+        """The same run, as long as when it was begun: other blocks may have been cut anew since."""
+        before = recorded_settings(self.recorded) if self.begun else {}
+        same = before.get("block") == self.region and before.get("usual_iterations") == self.usual_iterations
+        return replace(self, iterations=before["iterations"]) if same else self
 
     def settle(self) -> None:
         """Write the settings into the run's folder, and the coarse run's last checkpoint.
@@ -73,10 +84,12 @@ class Street:
     Attributes:
         coarse: the run of the whole scene.
         blocks: the runs of its blocks, in their order.
+        merged: folder of the merged run.
     """
 
     coarse: Run
     blocks: Sequence[BlockJob]
+    merged: Path
 
     @classmethod
     def plan(
@@ -109,8 +122,12 @@ class Street:
         variant = Variant.parse(method)
         if not variant.ours:
             raise SceneError(f"{variant.method} trains no blocks: use a method of ShellGS")
+        if any(_SCALE in flag for flag in variant.flags):
+            raise SceneError(
+                f"{method} sets {_SCALE}: leave it out; `shellgs cast --max-image-size` sets the size of photographs"
+            )
         scene, output = scene.resolve(), output.resolve()
-        scale = ("--pipeline.datamanager.camera-res-scale-factor", f"{coarse_scale:g}")
+        scale = (f"--pipeline.datamanager.{_SCALE}", f"{coarse_scale:g}")
         of_whole = replace(variant, name=COARSE, flags=(*scale, *variant.flags))
         coarse = Run(scene, of_whole, seed, coarse_iterations, output / COARSE, paths=paths)
         cells = trainable_cells(FacadeDataParserConfig(**vars(paths), data=scene))
@@ -128,10 +145,11 @@ class Street:
                 paths=paths,
                 coarse=coarse.folder,
                 region=cell.fingerprint,
-            )
+                usual_iterations=iterations,
+            ).as_begun
             for cell in cells
         ]
-        return cls(coarse, blocks)
+        return cls(coarse, blocks, output / "merged" / scene.name / variant.method / f"seed-{seed}")
 
 
 Launch = Callable[[Sequence[Run]], Mapping[Run, str]]

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Optional
 
 import tyro
 
-from shellgs_method.bounds import Count, FromOne, Seed, bounded
+from shellgs_method.bounds import Count, FromOne, Jobs, Seed, bounded
 from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, console, launch, open_page
 
 
@@ -21,7 +21,7 @@ def compare(
     output: Path = Path("compare"),
     curve_points: Count = 5,
     launcher: Literal["local", "ray"] = "local",
-    jobs: FromOne = 1,
+    jobs: Jobs = 1,
     wandb: Optional[str] = None,
     open: bool = False,
     cluster: ClusterFlags = CLUSTER,

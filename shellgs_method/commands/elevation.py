@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Optional
+from typing import Annotated, Optional
 
-from shellgs_method.bounds import Length, bounded
+from shellgs_method.bounds import Bounds, bounded
 from shellgs_method.commands.common import RunConfig, console
 
 
@@ -13,7 +13,7 @@ from shellgs_method.commands.common import RunConfig, console
 def elevation(
     config: RunConfig,
     output: Optional[Path] = None,
-    pixel: Optional[Length] = None,
+    pixel: Optional[Annotated[float, Bounds(1e-4, 1)]] = None,
 ) -> None:
     """Draw the walls of a trained run to scale: colours, depth, and deviations from the shell.
 

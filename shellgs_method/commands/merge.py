@@ -55,6 +55,7 @@ def report_seams(config: Path, coarse: Path) -> None:
     good = "good" if double["share"] <= DOUBLES else f"[bold]more than {DOUBLES:.0%}"
     table.add_row("Doubles", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
     console.print(table)
+    console.print("What to do if more is lost: docs/street.md, Along the cuts.", highlight=False)
     if not seams:
         console.print("No held-out view shows the shell near a cut: the rest is not measured.")
     console.print(f"{config}: the merged run. {path}: this report.", highlight=False, soft_wrap=True)

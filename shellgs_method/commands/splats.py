@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Optional
+from typing import Annotated, Optional
 
-from shellgs_method.bounds import FromOne, Length, bounded
+from shellgs_method.bounds import Bounds, Length, bounded
 from shellgs_method.commands.common import RunConfig, console, place
 
 
@@ -13,7 +13,7 @@ from shellgs_method.commands.common import RunConfig, console, place
 def splats(
     config: RunConfig,
     output: Optional[Path] = None,
-    levels: FromOne = 1,
+    levels: Annotated[int, Bounds(1, 32, int)] = 1,
     megabytes: Optional[Length] = None,
 ) -> None:
     """Write the Gaussians of a trained run for splat viewers, in metres in the shell's frame.

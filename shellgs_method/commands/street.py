@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from shellgs_method.bounds import TINY, Bounds, FromOne, Seed, bounded
+from shellgs_method.bounds import TINY, Bounds, FromOne, Jobs, Seed, bounded
 from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, Scene, launch
 from shellgs_method.commands.merge import report_seams
 from shellgs_method.errors import SceneError
@@ -21,7 +21,7 @@ def street(
     seed: Seed = 0,
     output: Path = Path("street"),
     launcher: Literal["local", "ray", "script"] = "local",
-    jobs: FromOne = 1,
+    jobs: Jobs = 1,
     cluster: ClusterFlags = CLUSTER,
     paths: Paths = PATHS,
 ) -> None:
@@ -36,18 +36,19 @@ def street(
         coarse_iterations: Training iterations of the coarse run.
         coarse_scale: Size of the coarse run's photographs, as a share of the blocks'.
         seed: Seed of all runs.
-        output: Folder of all runs; the merged one is in merged/ below it.
+        output: Folder of all runs; the merged one is in merged/SCENE/METHOD/seed-SEED below it.
         launcher: Where to run: on this machine (local), on a Ray cluster (ray), or nowhere (script): the commands that
             can be started now are printed, one line a run, for a queue of your own.
         jobs: Number of runs at once, with the local launcher; each has a GPU of its own, if there are as many.
         cluster: The Ray cluster.
         paths: Paths of the scene's files.
     """
-    from shellgs_method.blocks.merge import merge
+    from shellgs_method.blocks.merge import check_free, merge
     from shellgs_method.blocks.street import Street, script, train
     from shellgs_method.runs.folders import held
 
     plan = Street.plan(scene, method, iterations, coarse_iterations, coarse_scale, seed, output, paths)
+    check_free(plan.merged)
     output.mkdir(parents=True, exist_ok=True)
     with held(output) as alone:
         if not alone:
@@ -58,4 +59,4 @@ def street(
                 return
         else:
             train(plan, launch(launcher, jobs, cluster))
-        report_seams(merge([run.config for run in plan.blocks], output / "merged"), plan.coarse.config)
+        report_seams(merge([run.config for run in plan.blocks], plan.merged), plan.coarse.config)

@@ -186,8 +186,8 @@ def _written(node: Fork | Block) -> dict[str, Any]:
 def _node(record: dict[str, Any]) -> Fork | Block:
     if "cut" not in record:
         name, photographs = record["name"], record["photographs"]
-        if not isinstance(name, str) or not _NAME.fullmatch(name):
-            raise ValueError(f"{name!r} cannot name a folder")
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 100 or name == "None":
+            raise ValueError(f"{name!r:.120} cannot name a block")
         if not isinstance(photographs, list) or not all(isinstance(path, str) for path in photographs):
             raise ValueError(f"the photographs of {name} are no list of paths")
         return Block(name, tuple(photographs))
@@ -195,6 +195,8 @@ def _node(record: dict[str, Any]) -> Fork | Block:
     length = float(np.linalg.norm((x, y, z)))
     if length == 0:
         raise ValueError("the normal of a cut is 0")
+    if abs(length - 1) < 1e-12:  # as we write it: what is read and written again has the same fingerprint
+        length = 1.0
     cut = Cut((x / length, y / length, z / length), _number(record["cut"]["offset"]) / length)
     return Fork(cut, _node(record["below"]), _node(record["above"]))
 

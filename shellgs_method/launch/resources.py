@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Optional
 
-from shellgs_method.bounds import Weight, check_bounds
+from shellgs_method.bounds import Length, Weight, check_bounds
 from shellgs_method.errors import SceneError
 
 GB = 10**9
@@ -20,7 +20,7 @@ class Cluster:
     """Address of a running Ray cluster, or auto. If not set: one is started on this machine."""
     gpus_per_run: Optional[Weight] = None
     """GPUs that a run takes of a Ray cluster. If not set: 1 if a node has one now, else 0."""
-    cpus_per_run: Weight = 1.0
+    cpus_per_run: Length = 1.0
     """CPU cores that a run takes of a Ray cluster."""
     memory_per_run: Optional[Weight] = None
     """Memory in GB that a run takes of a Ray cluster. If not set: memory is not looked at."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Optional
 
-from shellgs_method.bounds import TINY, Bounds, FromOne, Length, check_bounds
+from shellgs_method.bounds import TINY, Bounds, Length, check_bounds
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class SimSettings:
 
     parts: Annotated[float, Bounds(TINY, 1e6)] = 200
     """Maximum number of convex collision parts for 100 square metres of surface."""
-    faces: FromOne = 50_000
+    faces: Annotated[int, Bounds(4, 1e9, int)] = 50_000
     """Number of triangles to decimate the reconstruction to."""
     voxel: Optional[Length] = None
     """Voxel size in metres for fusing the views, at least half of what the photographs resolve. If not set: a pixel's

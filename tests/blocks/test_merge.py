@@ -97,6 +97,18 @@ def test_a_merged_run_has_of_each_block_its_core_and_of_the_coarse_run_what_is_f
     assert merged.model.surroundings is None
 
 
+def test_a_merge_leaves_nothing_of_one_before_it_and_overwrites_no_trained_run(configs, coarse, tmp_path):
+    folder = merge(configs, tmp_path / "merged").parent
+    (checkpoint,) = folder.rglob("*.ckpt")
+    shutil.copyfile(checkpoint, checkpoint.with_name("step-000099999.ckpt"))
+    (folder / "seams.json").touch()
+    merge(configs, folder)
+    assert list(folder.rglob("*.ckpt")) == [checkpoint]
+    assert not (folder / "seams.json").exists()
+    with pytest.raises(SceneError, match="is the folder of a run that was trained"):
+        merge(configs, coarse.base_dir)
+
+
 def test_other_commands_take_a_merged_run(configs, tmp_path, shellgs, in_process):
     config = merge(configs, tmp_path / "merged")
     in_process("ns-eval", "--load-config", config, "--output-path", tmp_path / "eval.json")
