@@ -113,7 +113,7 @@ class SceneLayout(ScenePaths):
             SceneError: the shell was aligned to adjusted cameras, which are missing.
         """
         if not self.data.is_dir():
-            raise FileNotFoundError(f"{self.data} is not a folder; --data takes a scene folder.")
+            raise FileNotFoundError(f"{self.data} is not a folder: give a scene folder")
         if self.colmap_path is not None or not self._is_adjusted():
             return self.unadjusted_folder()
         if not (self.data / ADJUSTED).is_dir():
@@ -144,7 +144,7 @@ class SceneLayout(ScenePaths):
         from shellgs_method.files import colmap, transforms
 
         if not self.data.is_dir():
-            raise FileNotFoundError(f"{self.data} is not a folder; --data takes a scene folder.")
+            raise FileNotFoundError(f"{self.data} is not a folder: give a scene folder")
         if (self.data / transforms.NAME).is_file() and self.colmap_path is None:
             return None
         folder = colmap.find_folder(self.data, self.colmap_path)
