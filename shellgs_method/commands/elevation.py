@@ -13,7 +13,7 @@ from shellgs_method.commands.common import RunConfig, console
 def elevation(
     config: RunConfig,
     output: Optional[Path] = None,
-    pixel: Optional[Annotated[float, Bounds(1e-4, 1)]] = None,
+    pixel: Optional[Annotated[float, Bounds(1e-6, 1)]] = None,
 ) -> None:
     """Draw the walls of a trained run to scale: colours, depth, and deviations from the shell.
 

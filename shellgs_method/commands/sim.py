@@ -26,11 +26,11 @@ def sim(
         paths: config.yml of each run, then the output folder.
         settings: Settings.
     """
+    check_packages()  # fail before hours of work
     *configs, out = paths or (Path(),)  # one list: of two, the first takes all paths that an option follows
-    for config in configs:  # fail before hours of work
+    for config in configs:
         if not config.exists():
             raise FileNotFoundError(f"{config} does not exist")
-    check_packages()
     from shellgs_method.machine.progress import tell
 
     tell("Importing what simulates")

@@ -52,7 +52,7 @@ def test_a_file_is_read_as_it_was_written(tmp_path: Path):
         ('{"overlap": 1}', "damaged"),
         ('{"overlap": "1", "tree": {"name": "a", "photographs": []}}', "no number"),
         ('{"overlap": -1, "tree": {"name": "a", "photographs": []}}', "negative"),
-        ('{"overlap": 1, "tree": {"name": "../a", "photographs": []}}', "cannot name a folder"),
+        ('{"overlap": 1, "tree": {"name": "../a", "photographs": []}}', "cannot name a block"),
         ('{"overlap": 1, "tree": {"name": "a", "photographs": "b"}}', "no list of paths"),
         ('{"overlap": 1, "tree": {"cut": {"normal": [0, 0, 0], "offset": 1}}}', "is 0"),
         (
