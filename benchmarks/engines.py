@@ -49,12 +49,23 @@ def in_pybullet(folder: Path, origins: Rays, rays: Rays) -> Distances:
 
 
 def in_newton(folder: Path, origins: Rays, rays: Rays) -> Distances:
+    return newton_lidar(newton_model(folder / "world.usda"), origins, rays)
+
+
+def newton_model(file: Path) -> Any:
+    """Newton's model of a USD, with its collision geometry in the images of sensors."""
+    import newton  # pyright: ignore[reportMissingImports]
+
+    builder = newton.ModelBuilder()
+    builder.add_usd(str(file), load_visual_shapes=False, force_show_colliders=True)
+    return builder.finalize(device="cpu")
+
+
+def newton_lidar(model: Any, origins: Rays, rays: Rays) -> Distances:
+    """Distances along rays in a model of Newton."""
     import newton  # pyright: ignore[reportMissingImports]
     import warp  # pyright: ignore[reportMissingImports]
 
-    builder = newton.ModelBuilder()
-    builder.add_usd(str(folder / "world.usda"), load_visual_shapes=False, force_show_colliders=True)
-    model = builder.finalize(device="cpu")
     camera = newton.sensors.SensorCamera(model, load_textures=False)
     depth = camera.allocate_image_depth(1, len(rays), 1)
     bundle = np.stack([origins, rays], axis=1).astype(np.float32).reshape(1, -1, 1, 2, 3)

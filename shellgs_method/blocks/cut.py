@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import compress, count
 
 import numpy as np
@@ -15,7 +16,7 @@ from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import world_rays
 from shellgs_method.geometry.planes import across
-from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.similarity import scale_of, transformed
 
 SHARE = 0.05
 """Share of a photograph's points that lie in a block's extended region from which it belongs to the block."""
@@ -58,6 +59,11 @@ class Sights:
         views = np.repeat(np.arange(len(points)), [len(of) for of in points.values()])
         seen = np.concatenate([*points.values(), np.empty((0, 3))])
         return cls(transformed(seen, np.linalg.inv(to_scene)), views, [*points], to_scene)
+
+    @cached_property
+    def in_scene(self) -> Float64[np.ndarray, "N 3"]:
+        """The points in the scene's frame and units, as cuts are."""
+        return transformed(self.points, self.to_scene)
 
 
 def sights(views: Iterable[View], read: Callable[[View], CueMap | None]) -> Iterator[tuple[str, np.ndarray]]:
@@ -106,8 +112,8 @@ def cut(
         plane = Cut((float(along[0]), float(along[1]), float(along[2])), at)
         return Fork(plane.moved(seen.to_scene), split(of[~above]), split(of[above]))
 
-    scale = float(np.linalg.norm(seen.to_scene[:3, 0]))
-    return assigned(Blocks(_numbered(split(np.arange(len(seen.points)))), overlap * scale), seen, held_out)
+    tree = _numbered(split(np.arange(len(seen.points))))
+    return assigned(Blocks(tree, overlap * scale_of(seen.to_scene)), seen, held_out)
 
 
 def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least: int = WEAK) -> Blocks:
@@ -119,7 +125,7 @@ def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least
         held_out: names of the photographs that are held out, of which each block has one: the one that sees most of it.
         least: photographs that a block needs.
     """
-    points, total = transformed(seen.points, seen.to_scene), len(seen.names)
+    points, total = seen.in_scene, len(seen.names)
     shown = np.maximum(np.bincount(seen.views, minlength=total), 1)
     measured = np.flatnonzero([name in held_out for name in seen.names])
     while True:

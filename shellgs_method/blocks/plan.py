@@ -26,7 +26,7 @@ def draw(path: Path, blocks: Blocks, seen: Sights, cameras: Float64[np.ndarray, 
     from matplotlib.figure import Figure
 
     upright = np.linalg.inv(seen.to_scene)
-    points, centres = transformed(seen.points, seen.to_scene), transformed(cameras, upright)
+    points, centres = seen.in_scene, transformed(cameras, upright)
     figure = Figure(figsize=(10, 6), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel="m", ylabel="m")
     axes.plot(centres[:, 0], centres[:, 1], ".", color="black", markersize=3)

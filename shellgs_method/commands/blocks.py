@@ -44,7 +44,6 @@ def blocks(
     from shellgs_method.blocks.plan import draw
     from shellgs_method.files.blocks import BLOCKS, Blocks
     from shellgs_method.geometry.camera import positions
-    from shellgs_method.geometry.similarity import transformed
 
     layout, file = FacadeDataParserConfig(**vars(paths), data=scene), scene / BLOCKS
     before = Blocks.read(file) if file.exists() and not again else None
@@ -54,9 +53,8 @@ def blocks(
         found = cut(seen, length, overlap, photographs, held_out)
     else:
         found = assigned(before, seen, held_out, least=0)
-        points = transformed(seen.points, seen.to_scene)
         for cell in found.cells:
-            if not cell.core(points).any():
+            if not cell.core(seen.in_scene).any():
                 raise SceneError(
                     f"{file}: no photograph shows anything between the cuts of {cell.block.name}: move them, or cut "
                     "anew with --again"

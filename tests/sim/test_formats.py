@@ -17,6 +17,7 @@ import yourdfpy
 from PIL import Image
 from worlds import check_rays, frame_at, painted, some_splats, uneven, write_building, write_folder
 
+from benchmarks.engines import newton_lidar, newton_model
 from shellgs_method.errors import SceneError
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.sim.collision.collider import Collider
@@ -150,21 +151,12 @@ def test_a_lidar_in_pybullet_agrees_with_ray_casting(street, collider, lidar_ray
 def test_a_lidar_in_newton_agrees_with_ray_casting(street, collider, lidar_rays):
     """From the USD; ``pip install newton newton-usd-schemas``, and a minute the first time, for its kernels."""
     newton = pytest.importorskip("newton")
-    warp = pytest.importorskip("warp")
     (world, ground), (origins, rays) = street, lidar_rays
-    builder = newton.ModelBuilder()
-    builder.add_usd(str(world / "world.usda"), load_visual_shapes=False, force_show_colliders=True)
-    model = builder.finalize(device="cpu")
+    model = newton_model(world / "world.usda")
     kinds = model.shape_type.numpy().tolist()
     assert kinds.count(newton.GeoType.CONVEX_MESH) == len(kinds) - 1 == len(collider.parts)
     np.testing.assert_allclose(model.shape_material_mu.numpy(), FRICTION)
-    camera = newton.sensors.SensorCamera(model, load_textures=False)
-    depth = camera.allocate_image_depth(1, len(rays), 1)
-    bundle = np.stack([origins, rays], axis=1).astype(np.float32).reshape(1, -1, 1, 2, 3)
-    home = warp.array([warp.transform_identity()], dtype=warp.transformf, device="cpu")
-    camera.update(model.state(), home, warp.array(bundle, dtype=warp.vec3f, device="cpu"), depth_image=depth)
-    measured = depth.numpy()[0, 0]
-    check_rays(np.where(measured > 0, measured, np.inf), collider.surface, ground, origins, rays)
+    check_rays(newton_lidar(model, origins, rays), collider.surface, ground, origins, rays)
 
 
 def files_named(path: Path) -> set[Path]:
