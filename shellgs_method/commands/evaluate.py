@@ -43,7 +43,7 @@ def evaluate(
     metrics, truth = measured["results"], against_truth(measured["results"])
     rows = {"against the shell": metrics, "against the truth": truth} if truth else {"run": metrics}
     for columns in (MAIN_COLUMNS, SURFACE_COLUMNS):
-        console.print(rich_table(rows, columns))
+        console.print(rich_table(rows, columns, console.width))
     console.print(f"All metrics: {output_path}", highlight=False, soft_wrap=True)
     if points:
         _print_surveyed(measured["surveyed"])
@@ -53,7 +53,7 @@ def _print_surveyed(surveyed: Surveyed) -> None:
     """Print a table of the points, and what the pairs of them say."""
     import numpy as np
 
-    table = Table("Point", "Surface before it (m)")
+    table = Table("Point", "Surface in front of the point (m)")
     for name, before in surveyed.before.items():
         table.add_row(escape(name), "no surface near it" if before is None else f"{before:+.3f}")
     console.print(table)

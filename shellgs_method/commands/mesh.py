@@ -48,6 +48,6 @@ def mesh(
     if not run.frame.metric and output.suffix.lower() in METRE_FORMATS:
         console.print(f"A {output.suffix} file is in metres, so programs take this unit for the metre: scale it there.")
     if rows:
-        console.print(rich_table(rows, SURFACE_COLUMNS, "Mesh in the held-out views, against"))
+        console.print(rich_table(rows, SURFACE_COLUMNS, console.width, "Mesh in the held-out views, against"))
     if "area_near_shell" in metrics:
         console.print(f"{metrics['area_near_shell']:.0%} of its area is within 20 cm of the shell.")

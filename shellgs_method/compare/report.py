@@ -40,6 +40,7 @@ _KINDS = {"image": "image", "normals": "normals", "error": "angular error of the
 
 def write_report(
     path: Path,
+    opening: str,
     tables: Sequence[MetricsTable],
     figures: Mapping[str, Path],
     views: Mapping[str, Sequence[Run]],
@@ -49,12 +50,14 @@ def write_report(
 
     Args:
         path: the HTML file.
+        opening: what is compared, in a sentence.
         tables: tables to show, in order.
         figures: PNG files by caption.
         views: runs to show in the slider of each scene, by the scene's name; views that one run lacks are left out.
         failures: reason of each failure, by run.
     """
-    parts = [f"<p>Failed: {escape(run)}</p><pre>{escape(why)}</pre>" for run, why in failures.items()]
+    parts = [f"<p>{escape(opening)}</p>"]
+    parts += [f"<p>Failed: {escape(run)}</p><pre>{escape(why)}</pre>" for run, why in failures.items()]
     parts += [f'<div class="numbers">{table.html}</div>' for table in tables]
     parts += [captioned(img(file.read_bytes(), ""), escape(caption)) for caption, file in figures.items()]
     parts += [_links(scene, pages, path.parent) for scene, runs in views.items() if (pages := _pages(runs))]

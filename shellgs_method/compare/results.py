@@ -26,7 +26,7 @@ PANELS = (
     (
         "checked",
         "contradicted",
-        "where photographs contradict the shell (red; blue: what moved) and where they confirm it (green).",
+        "where photographs contradict the shell, and where they confirm it.",
     ),
 )
 """Panels of a scene's maps: kind of the maps, name of the copy, caption."""
@@ -79,7 +79,7 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
     with console.status(WRITING):
         comparison = write_results(runs, output, failures)
     for table in comparison.tables:
-        console.print(rich_table(table.rows, table.columns, table.title))
+        console.print(rich_table(table.rows, table.columns, console.width, table.title))
     for run, why in failures.items():
         console.print(f"[red]{run.label} failed.[/red] All of its output is in {run.folder / 'log.txt'}.")
         console.print(why, markup=False, highlight=False)
@@ -105,10 +105,11 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
     """Write results.md, tables/, the images and report.html from all metrics so far."""
     layouts = {run.scene: run.paths.of(run.scene) for run in runs}
     all_tables = list(tables(runs, {scene: measure_shell(layout) for scene, layout in layouts.items()}))
+    opening = _opening([*runs, *failures])
     for table in all_tables:
         table.save(output / "tables")
     with atomic_write(output / "results.md") as file:
-        file.write("\n".join(table.markdown for table in all_tables).encode())
+        file.write("\n".join([f"{opening}\n", *(table.markdown for table in all_tables)]).encode())
     figures: dict[str, Path] = {}
     shown: dict[str, list[Run]] = {}
     for index, scene in enumerate(dict.fromkeys(run.scene for run in runs)):
@@ -116,8 +117,18 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
         of_scene = [run for run in runs if run.scene == scene]
         shown[scene.name] = _shown(of_scene)
         figures |= _figures(scene, [run for run in of_scene if not run.variant.is_ablation], output, suffix)
-    write_report(output / "report.html", all_tables, figures, shown, {run.label: why for run, why in failures.items()})
+    reasons = {run.label: why for run, why in failures.items()}
+    write_report(output / "report.html", opening, all_tables, figures, shown, reasons)
     return Comparison(all_tables, figures, failures)
+
+
+def _opening(runs: Sequence[Run]) -> str:
+    """What is compared, in a sentence."""
+    methods, seeds = dict.fromkeys(run.variant.name for run in runs), dict.fromkeys(run.seed for run in runs)
+    return (
+        f"{', '.join(methods)}: each trained on the same photographs for {runs[0].iterations:,} iterations with seed "
+        f"{', '.join(map(str, seeds))}, and measured in held-out views, photographs that no run was trained on."
+    )
 
 
 def _shown(runs: Sequence[Run]) -> list[Run]:

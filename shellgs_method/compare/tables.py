@@ -1,4 +1,4 @@
-"""The paper's tables of a grid of runs, with the paper's own metrics beside them."""
+"""The paper's tables of a grid of runs, with the paper's own metrics below them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from shellgs_method.evaluation.tables import (
     Column,
     Rows,
     csv_table,
+    footnote,
     html_table,
     latex_table,
     markdown_table,
@@ -34,7 +35,8 @@ TRUTH_COLUMNS = tuple(
     replace(column, key=f"truth_{column.key}") for column in (*GEOMETRY_COLUMNS, *SURFACE_COLUMNS[3:])
 )
 
-
+PAPER = "The paper's own scene, to compare the order of the methods with"
+"""What the table of the paper's metrics is headed by."""
 SHELL = "the shell itself"
 """Name of the row of a scene's shell, measured on the pixels that it covers."""
 
@@ -52,19 +54,31 @@ class MetricsTable:
     """The paper's metrics of its own scene with the same role."""
 
     @property
-    def heading(self) -> str:
-        """Title, with a note if there are rows of the paper."""
-        return self.title + (" (rows of the paper: its own scene)" if self.paper else "")
-
-    @property
     def markdown(self) -> str:
-        """The table in Markdown, with its title."""
-        return f"**{self.heading}**\n\n{markdown_table(self.rows, self.columns, self.paper)}"
+        """The table in Markdown, with its title, and the paper's below it."""
+        parts = [f"**{self.title}**\n", markdown_table(self.rows, self.columns)]
+        parts += [f"{note}\n"] if (note := footnote(self.rows, self.columns)) else []
+        parts += [f"{PAPER}:\n", markdown_table({}, self._of_paper, self.paper)] if self.paper else []
+        return "\n".join(parts)
 
     @property
     def html(self) -> str:
-        """The table in HTML, with its title."""
-        return f"<h3>{html.escape(self.heading)}</h3>\n{html_table(self.rows, self.columns, self.paper)}"
+        """The table in HTML, with its title, and the paper's below it."""
+        parts = [f"<h3>{html.escape(self.title)}</h3>", html_table(self.rows, self.columns)]
+        parts += [f"<small>{html.escape(note)}</small>"] if (note := footnote(self.rows, self.columns)) else []
+        parts += [f"<p>{PAPER}:</p>", html_table({}, self._of_paper, self.paper)] if self.paper else []
+        return "\n".join(parts)
+
+    @property
+    def latex(self) -> str:
+        """The table in LaTeX, with its title in a comment, and the paper's below it."""
+        parts = [f"% {self.title}", latex_table(self.rows, self.columns)]
+        parts += [f"% {PAPER}", latex_table({}, self._of_paper, self.paper)] if self.paper else []
+        return "\n".join(parts)
+
+    @property
+    def _of_paper(self) -> Sequence[Column]:
+        return [column for column in self.columns if any(column.key in row for row in self.paper.values())]
 
     def save(self, folder: Path) -> None:
         """Write the table as md, tex, csv and json."""
@@ -72,7 +86,7 @@ class MetricsTable:
         everything = {"title": self.title, "metrics": self.rows, "paper": self.paper}
         texts = {
             "md": self.markdown,
-            "tex": f"% {self.heading}\n{latex_table(self.rows, self.columns, self.paper)}",
+            "tex": self.latex,
             "csv": csv_table(self.rows, self.columns),
             "json": json.dumps(everything, indent=2),
         }

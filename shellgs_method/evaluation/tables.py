@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from shellgs_method.evaluation.image import SMALLEST_LPIPS_IMAGE
 
 Rows = Mapping[str, Mapping[str, float | Sequence[float]]]
 """Metrics of each method by name: one number, or one per seed, shown as mean ± sample standard deviation."""
@@ -60,9 +63,9 @@ REGION_COLUMNS = (
     Column("ssim_on_shell", "SSIM on the shell", max),
     Column("psnr_off_shell", "PSNR off the shell", max, ".2f"),
     Column("ssim_off_shell", "SSIM off the shell", max),
-    Column("psnr_before_shell", "PSNR before it", max, ".2f"),
+    Column("psnr_before_shell", "PSNR in front of the shell", max, ".2f"),
     Column("truth_f_score_5cm_on_shell", "F5 to the truth, on the shell", max),
-    Column("truth_f_score_5cm_before_shell", "F5 to the truth, before it", max),
+    Column("truth_f_score_5cm_before_shell", "F5 to the truth, in front of the shell", max),
 )
 """Metrics by image region; pixels not covered by the training views are excluded."""
 
@@ -129,15 +132,50 @@ def plain_table(rows: Rows, columns: Sequence[Column]) -> tuple[list[str], list[
     return head, lines
 
 
-def rich_table(rows: Rows, columns: Sequence[Column], title: str | None = None) -> Table:
-    """The table of :func:`markdown_table` for the terminal."""
-    table = Table(title=title)
-    table.add_column("Method", no_wrap=True)
-    for column in columns:
-        table.add_column(column.heading, justify="right")
+def rich_table(rows: Rows, columns: Sequence[Column], width: int, title: str | None = None) -> Table:
+    """The table of :func:`markdown_table` for a terminal; where it would be too wide, with a row per metric.
+
+    Args:
+        rows: metrics of the methods.
+        columns: metrics to show.
+        width: width of the terminal in characters.
+        title: title of the table.
+    """
+    lines = [["Method", *(column.heading for column in columns)]]
     for method, cells in _cells(rows, columns):
-        table.add_row(escape(method), *(f"[bold]{text}[/bold]" if best else text for text, best in cells))
+        lines.append([escape(method), *(f"[bold]{text}[/bold]" if best else text for text, best in cells)])
+    (_, *headings), *methods = lines
+    wide, narrow = (
+        _rich(each, title, footnote(rows, columns))
+        for each in (lines, list(zip(["Metric", *headings], *methods, strict=True)))
+    )
+    return wide if _width(wide) <= max(width, _width(narrow)) else narrow
+
+
+def _rich(lines: Sequence[Sequence[str]], title: str | None, caption: str | None) -> Table:
+    (first, *others), *rows = lines
+    table = Table(title=title, caption=caption)
+    table.add_column(first, no_wrap=True)
+    for heading in others:
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(*row)
     return table
+
+
+def _width(table: Table) -> int:
+    """Width of a table of which nothing is wrapped."""
+    return Console(width=10_000).measure(table).maximum
+
+
+def footnote(rows: Rows, columns: Sequence[Column]) -> str | None:
+    """Why LPIPS is missing from a table, if it is."""
+    if any(column.key == "lpips" for column in columns) and not any("lpips" in row for row in rows.values()):
+        return (
+            "LPIPS needs the weights of AlexNet, which `shellgs doctor` looks for, and images of at least "
+            f"{SMALLEST_LPIPS_IMAGE} pixels."
+        )
+    return None
 
 
 def _cells(

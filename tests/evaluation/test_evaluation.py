@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import math
@@ -14,6 +15,7 @@ import torchvision
 from kornia.geometry.depth import depth_to_normals
 from kornia.metrics import ssim
 from PIL import Image
+from rich.console import Console
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
@@ -33,7 +35,7 @@ from shellgs_method.evaluation import (
 )
 from shellgs_method.evaluation.colours import GREY
 from shellgs_method.evaluation.figures import Panel, save_strip
-from shellgs_method.evaluation.tables import Column, markdown_table, rich_table
+from shellgs_method.evaluation.tables import MAIN_COLUMNS, REGION_COLUMNS, Column, markdown_table, rich_table
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_from_depth
 from shellgs_method.geometry.reference import Reference
@@ -392,12 +394,28 @@ def test_markdown_table_has_the_best_in_bold_and_dashes_for_missing_metrics():
 
 
 def test_terminal_table_has_the_same_cells():
-    table = rich_table(ROWS, COLUMNS)
+    table = rich_table(ROWS, COLUMNS, 80)
     assert [list(column.cells) for column in table.columns] == [
         ["shellgs", "photo-gs"],
         ["[bold]25.0[/bold]", "[bold]25.0[/bold]"],
         ["[bold]0.052[/bold]", "–"],
     ]
+
+
+def test_a_terminal_table_too_wide_for_its_terminal_has_a_row_per_metric_and_wraps_nothing():
+    rows = {method: {column.key: 1.0 for column in REGION_COLUMNS} for method in ("photo-gs", "shellgs-metric")}
+    output = io.StringIO()
+    Console(file=output, width=80).print(rich_table(rows, REGION_COLUMNS, 80))
+    lines = output.getvalue().splitlines()
+    for column in REGION_COLUMNS:
+        assert any(column.heading in line for line in lines)
+    assert all("shell" in column.title for column in REGION_COLUMNS if "_shell" in column.key)
+
+
+def test_a_table_says_why_lpips_is_missing_and_only_then():
+    assert "AlexNet" in str(rich_table(ROWS, MAIN_COLUMNS, 80).caption)
+    assert rich_table({"shellgs": {"lpips": 0.2}, "photo-gs": {}}, MAIN_COLUMNS, 80).caption is None
+    assert rich_table(ROWS, COLUMNS, 80).caption is None
 
 
 def test_strip_is_written_in_one_file_and_grey_outside_the_mask(tmp_path):
