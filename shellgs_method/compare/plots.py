@@ -94,10 +94,11 @@ def exposures(runs: Sequence[Run], path: Path) -> bool:
         return False
     figure = Figure(figsize=(4 * len(found), 3), layout="constrained")
     for axis, (name, stops) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items(), strict=True):
-        for channel, colour in zip(stops.T, ("tab:red", "tab:green", "tab:blue"), strict=True):
-            axis.plot(channel, ".-", color=colour)
+        for channel, colour in zip(stops.T, ("red", "green", "blue"), strict=True):
+            axis.plot(channel, ".-", color=f"tab:{colour}", label=colour)
         axis.set(title=name, xlabel="training photograph", ylabel="exposure (stops)")
         axis.grid(alpha=0.3)
+    figure.axes[0].legend(fontsize=8)
     save_figure(path, figure, dpi=130)
     return True
 

@@ -16,6 +16,15 @@ from shellgs_method.evaluation.colours import CLASS_COLOURS, GREY, normal_colour
 from shellgs_method.files.cue_maps import CueMap, Findings
 from shellgs_method.geometry.surface_classes import SurfaceClass
 
+FINDINGS = (
+    ("in front of the shell", "r", 0.7),
+    ("moved", "b", 0.7),
+    ("background", "y", 0.7),
+    ("shell confirmed", "g", 0.25),
+    ("behind the shell", "m", 0.5),
+)
+"""Name, colour and opacity of each of :class:`~shellgs_method.files.map_files.Findings` in a panel."""
+
 
 def supervision_panel(
     image: UInt8[np.ndarray, "H W 3"], cue: CueMap, metres_per_unit: float | None = None, kind: str = "shell"
@@ -27,9 +36,13 @@ def supervision_panel(
         cue: its maps.
         metres_per_unit: scale of the scene, for depth in metres; None for scene units.
         kind: source of the maps, for the titles.
+
+    The mask is left out if it is set everywhere.
     """
     height, width = cue.mask.shape
-    titles = ["RGB", f"{kind} depth", "camera-space normal", f"valid mask ({cue.mask.mean():.0%})"]
+    titles = ["RGB", f"{kind} depth", "camera-space normal"]
+    masked = not cue.mask.all()
+    titles += [f"valid mask ({cue.mask.mean():.0%})"] if masked else []
     titles += [] if cue.classes is None else ["class"]
     figure = Figure(figsize=(4 * len(titles), 4.2 * height / width + 0.9), dpi=120, layout="constrained")
     axes = figure.subplots(1, len(titles))
@@ -44,11 +57,12 @@ def supervision_panel(
     bar = figure.colorbar(shown, cax=axes[1].inset_axes((0.0, -0.09, 1.0, 0.05)), orientation="horizontal")
     bar.set_label("metres" if metres_per_unit else "scene units")
     axes[2].imshow(normal_colours(cue.normal, cue.mask), interpolation="nearest")
-    axes[3].imshow(cue.mask, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-    axes[3].set_axis_on()  # a frame, without which a mask that is white everywhere is not there on white paper
-    axes[3].set(xticks=[], yticks=[])
+    if masked:
+        axes[3].imshow(cue.mask, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes[3].set_axis_on()  # a frame, as white is on white paper
+        axes[3].set(xticks=[], yticks=[])
     if cue.classes is not None:
-        _show_classes(axes[4], np.where(cue.mask, cue.classes, len(SurfaceClass)))
+        _show_classes(axes[-1], np.where(cue.mask, cue.classes, len(SurfaceClass)))
     return figure
 
 
@@ -62,9 +76,7 @@ def _show_classes(ax: Axes, classes: UInt8[np.ndarray, "H W"]) -> None:
 
 
 def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:
-    """Plot what photographs show at the shell: occluders (red), what moved (blue), the background (yellow), it (green).
-
-    Magenta is what they show behind it, in windows.
+    """Plot what photographs show at the shell, in the colours of :data:`FINDINGS`.
 
     Args:
         views: photograph, map by :func:`~shellgs_method.occlusion.check_views` and shell map of each.
@@ -75,16 +87,17 @@ def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap
     height, width = views[0][1].mask.shape
     columns = 2
     rows = -(-len(views) // columns)
-    figure = Figure(figsize=(16, (8 * height / width + 0.3) * rows), dpi=100, layout="constrained")
+    figure = Figure(figsize=(16, (8 * height / width + 0.3) * rows + 0.5), dpi=100, layout="constrained")
     for ax in figure.subplots(rows, columns, squeeze=False).flat:
         ax.set_axis_off()
     for ax, (image, cue, shell) in zip(figure.axes, views, strict=False):
         shown = image / 255
         found = Findings.of(cue, shell)
-        for mask, colour, alpha in zip(found, "rbygm", (0.7, 0.7, 0.7, 0.25, 0.5), strict=True):
+        for mask, (_, colour, alpha) in zip(found, FINDINGS, strict=True):
             shown[mask] = (1 - alpha) * shown[mask] + alpha * np.array(to_rgb(colour))
         ax.imshow(shown)
-        names = "occluders", "moved", "background", "confirmed", "behind it"
-        shares = (f"{name} {mask.mean():.1%}" for name, mask in zip(names, found, strict=True))
-        ax.set_title(", ".join(shares))
+        shares = (f"{name} {mask.mean():.1%}" for mask, (name, *_) in zip(found, FINDINGS, strict=True))
+        ax.set_title(", ".join(shares), fontsize=10)
+    handles = [Patch(color=colour, label=name) for name, colour, _ in FINDINGS]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure

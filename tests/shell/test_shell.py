@@ -546,7 +546,13 @@ def test_the_panel_shows_photograph_depth_normal_and_mask(tmp_path: Path, metres
     shown = np.ma.masked_array(figure.axes[1].images[0].get_array())
     assert shown.compressed() == pytest.approx(7 * (metres_per_unit or 1))
     assert label in [child.get_xlabel() for child in figure.axes[1].child_axes]
-    assert figure.axes[3].axison  # else a mask that is white everywhere cannot be seen
+
+
+def test_a_panel_shows_no_mask_that_is_white_everywhere():
+    cue = ShellCaster(box(), np.eye(4)).cast(camera_at([0, 0, 0]))
+    figure = supervision_panel(np.zeros((48, 64, 3), np.uint8), replace(cue, mask=np.ones_like(cue.mask)))
+    assert [ax.get_title() for ax in figure.axes[:3]] == ["(a) RGB", "(b) shell depth", "(c) camera-space normal"]
+    assert len(figure.axes) == 3
 
 
 def test_a_view_that_sees_nothing_has_a_panel(tmp_path: Path):
