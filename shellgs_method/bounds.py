@@ -46,6 +46,10 @@ Weight = Annotated[float, WEIGHT]
 Share = Annotated[float, SHARE]
 Length = Annotated[float, LENGTH]
 Rate = Annotated[float, RATE]
+Pixels = Annotated[int, Bounds(16, 32768, int)]
+"""Width or height of a synthetic photograph."""
+Views = Annotated[int, Bounds(3, 1e6, int)]
+"""Number of synthetic photographs."""
 Port = Annotated[int, PORT]
 Seed = Annotated[int, SEED]
 Jobs = Annotated[int, JOBS]

@@ -67,6 +67,17 @@ def check_output(path: Path) -> None:
         raise SceneError(f"{path} cannot be written: you may not write to {above}; name a file elsewhere")
 
 
+def check_output_folder(path: Path) -> None:
+    """Refuse an output folder that is a file or lies below one, before the work starts.
+
+    Raises:
+        SceneError: names the file.
+    """
+    there = next(each for each in (path, *path.absolute().parents) if each.exists())
+    if not there.is_dir():
+        raise SceneError(f"{there} is a file: name a folder to write to")
+
+
 def _stdout_is_closed() -> bool:
     """Whether nobody reads the output any more, as after `shellgs --help | head`; what is buffered is then dropped."""
     try:

@@ -289,12 +289,9 @@ class FacadeTrainer(Trainer):
                 super().save_checkpoint(step)
                 (saved,) = Path(partial).iterdir()
                 os.replace(saved, folder / saved.name)
-        except (OSError, RuntimeError) as error:  # torch's error does not mention the disk
-            free = shutil.disk_usage(self.base_dir).free
-            raise SceneError(
-                f"the checkpoint of step {step} cannot be written to {folder} ({str(error).splitlines()[0][:200]}; the "
-                f"disk has {free / 1e6:.0f} MB free): make room, then resume with --load-dir {folder} if it has one"
-            ) from error
+        except (OSError, RuntimeError) as error:
+            remedy = f"resume with --load-dir {folder} if it has one"
+            raise unwritten(f"the checkpoint of step {step}", self.base_dir, error, remedy) from error
         finally:
             self.checkpoint_dir = folder
         if self.config.save_only_latest_checkpoint:

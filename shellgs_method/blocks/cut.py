@@ -10,6 +10,7 @@ from itertools import compress, count
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from shellgs_method.blocks import WEAK
 from shellgs_method.blocks.walls import REACH, areas, end_of_walls, extent, middle_of_street
 from shellgs_method.files.blocks import Block, Blocks, Cut, Fork
 from shellgs_method.files.map_files import CueMap
@@ -20,8 +21,6 @@ from shellgs_method.geometry.similarity import scale_of, transformed
 
 SHARE = 0.05
 """Share of a photograph's points that lie in a block's extended region from which it belongs to the block."""
-WEAK = 8
-"""Photographs below which a block is joined with a neighbour."""
 PIXELS = 2000
 """Points of the shell that are taken of each photograph."""
 THROUGH = 0.25

@@ -17,12 +17,19 @@ from torch import Tensor
 from dataparsers.cameras import scene_to_world
 from dataparsers.facade import FacadeDataParserConfig
 from shellgs_method.compare.settings import config_settings
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, check_output_folder
 from shellgs_method.files.atomic import atomic_contents
 from shellgs_method.files.blocks import BLOCKS, Blocks
 from shellgs_method.gaussians.surroundings import Region
-from shellgs_method.machine.progress import track
-from shellgs_method.runs.checkpoints import GAUSSIANS, SURFACE, finished_checkpoint, gaussians_in, load_checkpoint
+from shellgs_method.machine.progress import tell, track
+from shellgs_method.runs.checkpoints import (
+    GAUSSIANS,
+    SURFACE,
+    finished_checkpoint,
+    gaussians_in,
+    load_checkpoint,
+    unwritten,
+)
 from shellgs_method.runs.coarse import CoarseRun, config_of
 from shellgs_method.runs.run_folder import open_run, written_config
 
@@ -107,6 +114,7 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
         raise SceneError(f"there is {what} of {scene / BLOCKS} among those to merge: name one run of each block")
     for run in runs[1:]:
         _check_settings(first, run)
+    tell("Reading the scene and the coarse run")
     parsed = replace(first.dataparser, block=None).setup().get_dataparser_outputs("train")
     coarse = CoarseRun.load(first.coarse, first.config.pipeline.model, parsed)
     points, to_world = parsed.metadata["points3D_xyz"].double().numpy(), scene_to_world(parsed)
@@ -141,8 +149,7 @@ def check_free(output: Path) -> None:
     Raises:
         SceneError: the folder is a file, or holds a run that was not merged, which has no blocks.json.
     """
-    if output.is_file():
-        raise SceneError(f"{output} is a file: name a folder for the merged run")
+    check_output_folder(output)
     if (output / "config.yml").exists() and not (output / BLOCKS).exists():
         raise SceneError(f"{output} is the folder of a run that was trained: name another one for the merged run")
 
@@ -180,12 +187,8 @@ def _write(first: BlockRun, state: Mapping[str, Tensor], output: Path) -> None:
         whole = {"step": step, "pipeline": dict(state), "optimizers": {}, "scalers": {}}
         try:
             torch.save(whole, folder / checkpoint)
-        except RuntimeError as error:  # which does not mention the disk
-            free = shutil.disk_usage(folder).free
-            raise SceneError(
-                f"the merged run cannot be written to {output}; the disk has {free / 1e6:.0f} MB free: make room, and "
-                "merge again"
-            ) from error
+        except (OSError, RuntimeError) as error:
+            raise unwritten("the merged run", output, error, "merge again") from error
         shutil.copyfile(data.data / BLOCKS, folder / BLOCKS)
         world = "dataparser_transforms.json"
         (folder / world).write_bytes((first.folder / world).read_bytes())

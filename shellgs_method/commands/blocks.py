@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Optional
 
+from shellgs_method.blocks import WEAK
 from shellgs_method.bounds import Bounds, Length, Weight, bounded
 from shellgs_method.commands.common import PATHS, Paths, Scene, console
 from shellgs_method.errors import SceneError
@@ -15,12 +16,15 @@ if TYPE_CHECKING:
     from shellgs_method.blocks.cut import Sights
     from shellgs_method.files.photographs import View
 
+SAME = 0.8
+"""Share of a scene's photographs that its blocks have on average, above which cuts save nothing."""
+
 
 @bounded
 def blocks(
     scene: Scene,
     length: Length = 30.0,
-    photographs: Optional[Annotated[int, Bounds(8, 1e9, int)]] = None,
+    photographs: Optional[Annotated[int, Bounds(WEAK, 1e9, int)]] = None,
     overlap: Weight = 5.0,
     again: bool = False,
     paths: Paths = PATHS,
@@ -40,7 +44,7 @@ def blocks(
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
-    from shellgs_method.blocks.cut import WEAK, assigned, cut
+    from shellgs_method.blocks.cut import assigned, cut
     from shellgs_method.blocks.plan import draw
     from shellgs_method.files.blocks import BLOCKS, Blocks
     from shellgs_method.geometry.camera import positions
@@ -71,6 +75,11 @@ def blocks(
         console.print(f"{cell.block.name}: {len(cell.block.photographs)} photographs", highlight=False)
     if len(found.cells) == 1:
         console.print("The scene is one block: train it as it is, with ns-train.")
+    elif sum(len(cell.block.photographs) for cell in found.cells) > SAME * len(views) * len(found.cells):
+        console.print(
+            f"Each block has about as many photographs as the whole scene, {len(views)}, so cuts save nothing: train "
+            "the scene as it is, with ns-train."
+        )
     console.print(f"Written: {file}, {file.with_suffix('.png')}.", highlight=False)
 
 

@@ -10,6 +10,7 @@ import tyro
 
 from shellgs_method.bounds import Count, FromOne, Jobs, Seed, bounded
 from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, console, launch, open_page
+from shellgs_method.errors import check_output_folder
 
 
 @bounded
@@ -46,6 +47,7 @@ def compare(
         cluster: The Ray cluster.
         paths: Paths of the scenes' files.
     """
+    check_output_folder(output)
     from shellgs_method.compare.results import compare as compare_runs
     from shellgs_method.compare.runs import grid
     from shellgs_method.compare.wandb_report import log_comparison, log_in

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -11,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from shellgs_method.bounds import FromOne, Seed, bounded
+from shellgs_method.bounds import FromOne, Pixels, Seed, Views, bounded
 from shellgs_method.commands.common import console, open_page
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, check_output_folder
 
 if TYPE_CHECKING:
     from shellgs_method.synthetic import FacadeConfig
@@ -25,9 +24,9 @@ METHODS = ("photo-gs", "shellgs-metric")
 def demo(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[FOLDER]")] = Path("demo"),
     iterations: FromOne = 750,
-    width: int = 320,
-    height: int = 180,
-    views: int = 40,
+    width: Pixels = 320,
+    height: Pixels = 180,
+    views: Views = 40,
     seed: Seed = 0,
     open: bool = False,
 ) -> None:
@@ -44,16 +43,17 @@ def demo(
         seed: Seed of the facade and of the walk past it.
         open: Open the report in a browser at the end.
     """
+    check_output_folder(folder)
     import torch
 
     from shellgs_method.launch.display import Display
-    from shellgs_method.launch.local import BIN, CommandError, follow, launch_locally
+    from shellgs_method.launch.local import BIN, CommandError, follow, following, launch_locally
     from shellgs_method.synthetic import FacadeConfig
 
     scene = folder / "scene"
     _make(scene, FacadeConfig(width, height, views, seed))
     console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
-    with Display(console) as display, display.work("scene") as tell, ThreadPoolExecutor() as pool:
+    with Display(console) as display, display.work("scene") as tell, following(1) as pool:
         cast = pool.submit(follow, [["shellgs", "cast", str(scene)]], tell=tell)
         # Slow to import, so while the shell is cast; nerfstudio first, as its import takes longer from deep in others.
         import nerfstudio.configs.method_configs  # noqa: F401

@@ -10,6 +10,7 @@ import tyro
 from rich.table import Table
 
 from shellgs_method.commands.common import console
+from shellgs_method.machine.progress import tell
 
 
 def merge(
@@ -24,6 +25,7 @@ def merge(
         configs: The config.yml of a run of each block.
         output: Folder of the merged run.
     """
+    tell("Reading the runs of the blocks")
     from shellgs_method.blocks.merge import BlockRun
     from shellgs_method.blocks.merge import merge as merged
 

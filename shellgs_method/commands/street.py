@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from shellgs_method.bounds import TINY, Bounds, FromOne, Jobs, Seed, bounded
 from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, Scene, launch
 from shellgs_method.commands.merge import report_seams
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, check_output_folder
 
 
 @bounded
@@ -43,6 +43,7 @@ def street(
         cluster: The Ray cluster.
         paths: Paths of the scene's files.
     """
+    check_output_folder(output)
     from shellgs_method.blocks.merge import check_free, merge
     from shellgs_method.blocks.street import Street, script, train
     from shellgs_method.runs.folders import held

@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from shellgs_method.machine.progress import tell_imports
-
 PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
 
 
@@ -37,7 +35,6 @@ def heading(command: Sequence[str]) -> str:
 
 def _main() -> None:
     _end_with_parent()
-    tell_imports()
     scripts, commands = Path(sys.argv[1]), json.loads(sys.argv[2])
     for name, *words in commands:
         sys.stdout.write(heading([name, *words]))

@@ -7,9 +7,9 @@ import shlex
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -21,9 +21,11 @@ from shellgs_method.launch.display import Display
 from shellgs_method.launch.in_turn import command_in_turn, heading
 from shellgs_method.launch.job import Job, JobT
 from shellgs_method.machine.progress import ITERATION, Stage
+from shellgs_method.machine.threads import stoppable
 
 BIN = Path(sys.executable).parent
 LAST_LINES = 30
+_RUNNING: set[subprocess.Popen[str]] = set()
 
 
 class CommandError(RuntimeError):
@@ -35,19 +37,15 @@ def launch_locally(runs: Iterable[JobT], jobs: int, console: Console) -> dict[Jo
     runs = list(runs)
     failures: dict[JobT, str] = {}
     devices = _devices(jobs)
-    with Display(console) as display, ThreadPoolExecutor(max(jobs, 1)) as pool:
+    with Display(console) as display, following(max(jobs, 1)) as pool:
         futures = {pool.submit(_finish_visibly, run, console, display, devices): run for run in runs}
-        try:
-            for done, future in enumerate(as_completed(futures), 1):
-                run, outcome = futures[future], "finished"
-                if isinstance(error := future.exception(), (CommandError, OSError)):
-                    failures[run], outcome = str(error), "failed"
-                else:
-                    future.result()
-                console.print(f"{run.label} {outcome}, {done} of {len(runs)}.", highlight=False)
-        except BaseException:  # Ctrl-C, which also ends the running commands: start no others
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+        for done, future in enumerate(as_completed(futures), 1):
+            run, outcome = futures[future], "finished"
+            if isinstance(error := future.exception(), (CommandError, OSError)):
+                failures[run], outcome = str(error), "failed"
+            else:
+                future.result()
+            console.print(f"{run.label} {outcome}, {done} of {len(runs)}.", highlight=False)
     return {run: failures[run] for run in runs if run in failures}
 
 
@@ -77,6 +75,19 @@ def finish(
             tell(stage)
 
         follow(commands, announce, tell_of_run, run.folder / "log.txt", device)
+
+
+@contextmanager
+def following(count: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads that :func:`follow` commands, which end if the context ends by an exception, such as that of Ctrl-C."""
+    with stoppable(count) as pool:
+        try:
+            yield pool
+        except BaseException:
+            # A terminal's Ctrl-C reaches them too, but nerfstudio does not end at it, nor do some imports.
+            for process in [*_RUNNING]:
+                process.terminate()
+            raise
 
 
 def follow(
@@ -113,6 +124,7 @@ def follow(
         ) as process,
     ):
         assert process.stdout is not None
+        _RUNNING.add(process)
         try:
             for line in process.stdout:
                 output.append(line)
@@ -130,6 +142,8 @@ def follow(
         except BaseException:
             process.terminate()
             raise
+        finally:
+            _RUNNING.remove(process)
     if process.returncode:
         raise CommandError(f"{current[0]} failed:\n{''.join(output)}")
 

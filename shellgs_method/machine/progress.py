@@ -7,7 +7,6 @@ import re
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from importlib.abc import MetaPathFinder
 from typing import NamedTuple, TypeVar
 
 from rich import progress
@@ -47,30 +46,7 @@ class Stage(NamedTuple):
 
 def tell(what: str) -> None:
     """Print what is done next."""
-    _say(f"{what} ...")
-
-
-def tell_imports() -> None:
-    """Print from time to time which package is imported, up to the first line about something else."""
-    sys.meta_path.insert(0, _Imports())
-
-
-class _Imports(MetaPathFinder):
-    """Finds no module, and says for which package one is looked for."""
-
-    def __init__(self) -> None:
-        self._package, self._printed = "", time.monotonic()
-
-    def find_spec(self, fullname: str, *_: object) -> None:
-        package, now = fullname.partition(".")[0], time.monotonic()
-        if package != self._package and now >= self._printed + EVERY:
-            print(f"Importing {package} ...", flush=True)
-            self._package, self._printed = package, now
-
-
-def _say(line: str) -> None:
-    sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _Imports)]
-    print(line, flush=True)
+    print(f"{what} ...", flush=True)
 
 
 class Lines:
@@ -87,7 +63,7 @@ class Lines:
         """The work is with this item, counted from 1."""
         now = time.monotonic()
         if not self._terminal and (now >= self._printed + EVERY or item == self._total):
-            _say(f"{self._what}: {item} of {self._total}")
+            print(f"{self._what}: {item} of {self._total}", flush=True)
             self._printed = now
 
 

@@ -90,13 +90,24 @@ def ahead(make: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 
 
 @contextmanager
+def stoppable(count: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads that begin nothing more once the context ends by an exception, such as that of Ctrl-C."""
+    with ThreadPoolExecutor(count) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+@contextmanager
 def workers() -> Iterator[ThreadPoolExecutor]:
     """Threads for independent items that share torch's threads; without such items, they would all work on one."""
     threads = torch.get_num_threads()
     count = min(threads, MAX_WORKERS)
     torch.set_num_threads(threads // count)
     try:
-        with ThreadPoolExecutor(count) as pool:
+        with stoppable(count) as pool:
             yield pool
     finally:
         torch.set_num_threads(threads)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,6 +95,22 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     except SceneError as error:
         raise SceneError(f"{path}: {error}; {remedy}") from error
     return state
+
+
+def unwritten(what: str, folder: Path, error: Exception, remedy: str) -> SceneError:
+    """The refusal of a checkpoint that cannot be written; torch's own error does not mention the disk.
+
+    Args:
+        what: which one, to begin the sentence with.
+        folder: folder that it is for.
+        error: why not.
+        remedy: what to do once there is room.
+    """
+    free = shutil.disk_usage(folder).free
+    return SceneError(
+        f"{what} cannot be written to {folder} ({str(error).splitlines()[0][:200]}; the disk has {free / 1e6:.0f} MB "
+        f"free): make room, then {remedy}"
+    )
 
 
 def load_into(pipeline: Pipeline, path: Path, state: Mapping[str, Any]) -> None:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from shellgs_method.bounds import Bounds, FromOne, Pixels, Seed, check_bounds
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.synthetic.appearance import Daylight, log_gains, noise_lattice
 from shellgs_method.synthetic.building import Layout, building, shell
 from shellgs_method.synthetic.geometry import Material, Mesh, merge, moved, parallelogram
 from shellgs_method.synthetic.path import walk
-from shellgs_method.synthetic.site import Site, check_least, generators
+from shellgs_method.synthetic.site import Site, generators
 from shellgs_method.synthetic.street import pole_and_tree
 from shellgs_method.synthetic.world import Place, World
 
@@ -34,25 +36,24 @@ _NUMBERS = 20  # between the first bays of two houses
 class StreetConfig:
     """A procedural street, a walk past either side of it in light that changes, and a scan that lacks one house."""
 
-    width: int = 320
+    width: Pixels = 320
     """Image width in pixels."""
-    height: int = 180
+    height: Pixels = 180
     """Image height in pixels."""
-    views: int = 160
+    views: Annotated[int, Bounds(6, 1e6, int)] = 160
     """Number of photographs."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of houses, trees, textures, walk, light and noise; the same seed gives the same files."""
-    houses: int = 4
+    houses: Annotated[int, Bounds(2, 1e3, int)] = 4
     """Number of houses in the scan; one more, the second of the far side, is missing from it."""
-    points: int = 16000
+    points: FromOne = 16000
     """Maximum number of SfM points."""
-    supersampling: int = 3
+    supersampling: FromOne = 3
     """Rays per pixel along each image axis."""
 
     def __post_init__(self) -> None:
         """Refuse settings that no scene can be made with."""
-        least = {"width": 16, "height": 16, "views": 6, "seed": 0, "houses": 2, "points": 1, "supersampling": 1}
-        check_least(self, "street", least)
+        check_bounds(type(self), vars(self))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from shellgs_method.bounds import FromOne, Pixels, Seed, Views, check_bounds
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash, unfinished
 from shellgs_method.files.bound_cameras import BoundCameras
@@ -35,7 +36,7 @@ from shellgs_method.synthetic.houses import Street, StreetConfig
 from shellgs_method.synthetic.monocular import predicted_disparity
 from shellgs_method.synthetic.path import walk
 from shellgs_method.synthetic.sfm import Points, features, observations, triangulate
-from shellgs_method.synthetic.site import Site, check_least, generators
+from shellgs_method.synthetic.site import Site, generators
 from shellgs_method.synthetic.street import court, street
 from shellgs_method.synthetic.world import World
 
@@ -48,29 +49,28 @@ PREDICTIONS = "predictions"  # simulated disparity of a monocular network
 class FacadeConfig:
     """A procedural facade and a walk past it."""
 
-    width: int = 320
+    width: Pixels = 320
     """Image width in pixels."""
-    height: int = 180
+    height: Pixels = 180
     """Image height in pixels."""
-    views: int = 40
+    views: Views = 40
     """Number of photographs."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the tree, the textures, the walk and the noise; the same seed gives the same files."""
-    bays: int = 6
+    bays: FromOne = 6
     """Windows side by side, 3 m apart."""
-    storeys: int = 3
+    storeys: FromOne = 3
     """Windows above each other, 3.3 m apart."""
-    points: int = 4000
+    points: FromOne = 4000
     """Maximum number of SfM points."""
-    supersampling: int = 3
+    supersampling: FromOne = 3
     """Rays per pixel along each image axis."""
     surroundings: Literal["street", "court"] = "street"
     """What is around the building: a street below the sky, or a court without sky."""
 
     def __post_init__(self) -> None:
         """Refuse settings that no scene can be made with."""
-        least = {"width": 16, "height": 16, "views": 3, "seed": 0, "bays": 1, "storeys": 1, "points": 1}
-        check_least(self, "facade", {**least, "supersampling": 1})
+        check_bounds(type(self), vars(self))
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMap
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.synthetic.appearance import Daylight, rays
@@ -44,17 +42,6 @@ class Site(ABC):
         depth = np.where(np.isfinite(hits.t), UNITS_PER_METRE * hits.t, 0.0).astype(np.float32)
         normal = hits.normal @ camera.viewmat[:3, :3].numpy().T
         return CueMap(depth, normal.astype(np.float16), world.material[hits.triangle] <= Material.RAILING)
-
-
-def check_least(config: object, called: str, least: Mapping[str, int]) -> None:
-    """Refuse settings that no scene can be made with: those below the least of each.
-
-    Raises:
-        SceneError: says which.
-    """
-    for name, minimum in least.items():
-        if getattr(config, name) < minimum:
-            raise SceneError(f"a synthetic {called}'s {name} must be at least {minimum}, not {getattr(config, name)}")
 
 
 def generators(seed: int, count: int) -> list[np.random.Generator]:

@@ -94,7 +94,7 @@ def test_without_a_browser_the_page_is_named(monkeypatch, capsys):
         (["--width", 640], "was made with --width 64, not 640: give another folder"),
         (["--views", 12, "--seed", 3], "--views 10, not 12, --seed 0, not 3"),
         (["--iterations", -5], "--iterations cannot be -5"),
-        (["--width", 0], "width must be at least 16, not 0"),
+        (["--width", 0], "--width cannot be 0: give a whole number from 16"),
     ],
 )
 def test_a_demo_with_other_settings_is_refused_and_changes_nothing(demo, monkeypatch, flags, sentence):
@@ -104,6 +104,26 @@ def test_a_demo_with_other_settings_is_refused_and_changes_nothing(demo, monkeyp
     with pytest.raises(SystemExit, match=rf"^shellgs: .*{sentence}"):
         main()
     assert {path: path.stat().st_mtime_ns for path in demo.rglob("*")} == before
+
+
+@pytest.mark.parametrize("words", [["demo", "FILE"], ["compare", "scene", "--output", "FILE/below"]])
+def test_a_file_in_place_of_an_output_folder_is_refused_by_its_name(tmp_path, monkeypatch, words):
+    file = tmp_path / "notes.txt"
+    file.touch()
+    monkeypatch.setattr("sys.argv", ["shellgs", *(word.replace("FILE", str(file)) for word in words)])
+    with pytest.raises(SystemExit, match=rf"^shellgs: {file} is a file: name a folder"):
+        main()
+
+
+@pytest.mark.parametrize("words", [["--width", "5"], ["--views", "2"], ["log.txt"]])
+def test_what_no_demo_can_be_made_with_is_refused_before_slow_imports(tmp_path, words):
+    (tmp_path / "log.txt").touch()
+    code = (
+        "import sys; from shellgs_method.cli import main\ntry:\n    main()\nfinally:\n    print('torch' in sys.modules)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code, "demo", *words], cwd=tmp_path, text=True, capture_output=True)
+    assert ended.returncode == 1
+    assert ended.stdout.split() == ["False"]
 
 
 def test_ns_eval_writes_all_metrics(demo):

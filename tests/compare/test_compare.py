@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import stat
 import subprocess
@@ -130,8 +131,17 @@ def test_the_papers_rows_are_beside_scenes_of_the_same_role(pristine_scene, tmp_
     assert found["ablation"].paper["shellgs-depth (paper)"]["depth_mae_m"] == 0.113
     assert found["copy-main"].paper["shellgs (paper)"]["normal_deg"] == 23.44
     assert not found["copy-ablation"].paper
-    assert list(found["main"].rows) == ["photo-gs", "shellgs"]
-    assert list(found["ablation"].rows) == ["photo-gs", "shellgs", "shellgs-depth"]
+
+
+def test_the_papers_rows_have_a_table_of_their_own(pristine_scene, tmp_path):
+    runs = fake_grid([pristine_scene], ["photo-gs", "shellgs"], tmp_path)
+    for run in runs:
+        fabricate(run, psnr=20.0)
+    (main,) = (table for table in tables(runs) if table.name == "main")
+    for text, start in ((main.markdown, "| Method"), (main.html, "<table>"), (main.latex, r"\begin{tabular}")):
+        _, ours, papers = text.split(start)
+        assert "(paper)" not in ours
+        assert papers.count("(paper)") == 4
 
 
 def test_the_shell_itself_has_a_row_against_the_truth(pristine_scene, tmp_path):
@@ -342,21 +352,37 @@ def test_commands_start_without_python_in_a_fork(tmp_path, monkeypatch):
     assert not (tmp_path / "cleaned in a fork").exists()
 
 
+def follow_sleep(folder: Path, follow: str) -> tuple[subprocess.Popen, psutil.Process]:
+    """A process that follows a command that no Ctrl-C ends, by a line of Python, and that command."""
+    write_script(
+        folder / "sleep",
+        "import os, signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+        f"open({str(folder / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)",
+    )
+    code = (
+        f"import pathlib; from shellgs_method.launch import local; local.BIN = pathlib.Path({str(folder)!r})\n{follow}"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    while not (folder / "pid").exists() or not (folder / "pid").read_text():
+        assert process.poll() is None
+        time.sleep(0.05)
+    return process, psutil.Process(int((folder / "pid").read_text()))
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
 def test_killing_a_comparison_ends_its_commands(tmp_path):
-    sleep = f"import os, time; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
-    write_script(tmp_path / "sleep", sleep)
-    following = (
-        "import pathlib; from shellgs_method.launch import local; "
-        f"local.BIN = pathlib.Path({str(tmp_path)!r}); local.follow([['sleep']])"
-    )
-    comparison = subprocess.Popen([sys.executable, "-c", following])
-    while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
-        assert comparison.poll() is None
-        time.sleep(0.05)
-    command = psutil.Process(int((tmp_path / "pid").read_text()))
+    comparison, command = follow_sleep(tmp_path, "local.follow([['sleep']])")
     comparison.kill()
     comparison.wait()
+    command.wait(timeout=10)
+
+
+def test_interrupting_a_comparison_ends_commands_that_do_not_end_by_themselves(tmp_path):
+    """Nerfstudio catches Ctrl-C, and one who interrupts this process alone does not interrupt them."""
+    in_thread = "with local.following(1) as pool: pool.submit(local.follow, [['sleep']]).result()"
+    comparison, command = follow_sleep(tmp_path, in_thread)
+    comparison.send_signal(signal.SIGINT)
+    assert comparison.wait(timeout=10) == -signal.SIGINT
     command.wait(timeout=10)
 
 
@@ -790,6 +816,7 @@ def test_the_report_is_self_contained_and_shows_every_view(measured, tmp_path):
     report = (tmp_path / "report.html").read_text()
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", report)
     assert "http" not in report
+    assert "photo-gs, shellgs: each trained on the same photographs for 4 iterations with seed 0" in report
     (data,) = re.findall(r'<script type="application/json">(.*?)</script>', report, re.DOTALL)
     views = json.loads(data)
     assert len(views) == 2

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 
 import pytest
 
 from shellgs_method.machine import progress
-from shellgs_method.machine.progress import Stage, tell, tell_imports, track
+from shellgs_method.machine.progress import Stage, tell, track
 
 
 @pytest.fixture
@@ -59,23 +58,3 @@ def test_what_is_printed_is_read_as_a_stage(clock, capsys):
 def test_a_line_of_a_training_is_read_as_a_stage_or_none(line, stage):
     read = Stage.read(line + "\n")
     assert (read and str(read)) == stage
-
-
-def test_a_long_import_says_of_which_package_until_something_else_is_told(clock, capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
-    monkeypatch.syspath_prepend(tmp_path)
-    for name in ("quick", "slow", "slower", "later"):
-        (tmp_path / f"{name}_import").mkdir()
-        (tmp_path / f"{name}_import/__init__.py").touch()
-        (tmp_path / f"{name}_import/part.py").touch()
-    tell_imports()
-    importlib.import_module("quick_import.part")
-    clock[0] += 3
-    importlib.import_module("slow_import.part")
-    clock[0] += 3
-    importlib.import_module("slower_import")
-    tell("Reading the scene")
-    clock[0] += 3
-    importlib.import_module("later_import")
-    expected = ["Importing slow_import ...", "Importing slower_import ...", "Reading the scene ..."]
-    assert capsys.readouterr().out.splitlines() == expected

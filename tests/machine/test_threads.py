@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from shellgs_method.machine import threads
-from shellgs_method.machine.threads import MAX_WORKERS, Load, ThreadsByLoad, ahead, workers
+from shellgs_method.machine.threads import MAX_WORKERS, Load, ThreadsByLoad, ahead, stoppable, workers
 
 
 @pytest.fixture
@@ -125,3 +125,21 @@ def test_an_item_that_cannot_be_made_ends_what_uses_it_in_its_turn():
     assert [next(made), next(made)] == [0.5, 1.0]
     with pytest.raises(ZeroDivisionError):
         next(made)
+
+
+def test_threads_begin_nothing_more_after_an_interrupt():
+    begun, cancelled = [], threading.Event()
+
+    def work(item: int) -> None:
+        begun.append(item)
+        cancelled.wait(10)
+
+    def interrupted() -> None:
+        with stoppable(1) as pool:
+            for item in range(3):
+                pool.submit(work, item).add_done_callback(lambda future: future.cancelled() and cancelled.set())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert begun in ([], [0])

@@ -139,5 +139,5 @@ def test_the_same_seed_gives_the_same_street_and_another_one_does_not(street: St
 
 
 def test_a_street_of_one_house_is_refused():
-    with pytest.raises(SceneError, match="houses must be at least 2, not 1"):
+    with pytest.raises(SceneError, match="--houses cannot be 1: give a whole number from 2"):
         StreetConfig(houses=1)

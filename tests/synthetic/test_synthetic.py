@@ -270,5 +270,5 @@ def test_failure_leaves_nothing_behind(tmp_path, monkeypatch):
 
 
 def test_invalid_configuration_is_refused():
-    with pytest.raises(ValueError, match="views must be at least 3, not 2"):
+    with pytest.raises(ValueError, match="--views cannot be 2: give a whole number from 3"):
         FacadeConfig(views=2)
