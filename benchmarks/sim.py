@@ -94,7 +94,7 @@ def _budgets(console: Console, chapter: Chapter, coacd: bool) -> None:
         made = make()
         seconds = time.perf_counter() - started
         ways = both_ways(made.surface, shell, shell, chapter.made.cameras, 0.05)
-        errors = [f"{100 * ways[way].p95:.1f}" for way in ("to the collider", "from the collider")]
+        errors = [f"{100 * ways[way].p95:.1f}" for way in ("to the collision geometry", "from the collision geometry")]
         share = f"{leaks(made.surface, shell, eyes).share:.2%}"
         table.add_row(name, str(len(made.parts)), f"{seconds:.1f}", f"{made.filled:.2f}", *errors, share)
     console.print(table)

@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Collection, Iterator
 from contextlib import closing
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -238,18 +238,27 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
         count, is_global = opened.num_images(), has_parallax and not _has_rigs(opened)
         known = {camera.camera_id for camera in opened.read_all_cameras() if camera.model.name == _CALIBRATED}
         rigs = {rig.rig_id for rig in opened.read_all_rigs() if rig.ref_sensor_id.id in known}
+    weakest = cache(partial(_weakest, database))
+
+    def fitting(models: Collection[pycolmap.Reconstruction]) -> tuple[int, float]:
+        """Number of photographs of the largest model, and the share of matches that it confirms where it does least."""
+        if not models:
+            return 0, 0.0
+        largest = max(models, key=pycolmap.Reconstruction.num_reg_images)
+        return largest.num_reg_images(), weakest(largest).confirmed
+
     with TemporaryDirectory(dir=output) as folder:
         models = []
         if is_global:
             options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
             models = pycolmap.global_mapping(_calibrated(database, folder), photographs, folder, options).values()
-        if _fitting(database, models) < (count, CONFIRMED):
+        if fitting(models) < (count, CONFIRMED):
             options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
             options.constant_cameras, options.constant_rigs = known, rigs
             others = pycolmap.incremental_mapping(
                 database, photographs, folder, options, next_image_callback=lambda: print(flush=True)
             ).values()
-            models = max(models, others, key=partial(_fitting, database))
+            models = max(models, others, key=fitting)
     ranked = sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     for k, model in enumerate(ranked):
         (Path(output) / str(k)).mkdir()
@@ -262,18 +271,10 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
             "points": model.num_points3D(),
             "reprojection_error": model.compute_mean_reprojection_error(),
             "track_length": model.compute_mean_track_length(),
-            "torn": weakest.between if (weakest := _weakest(database, model)).confirmed < CONFIRMED else None,
+            "torn": weakest(model).between if weakest(model).confirmed < CONFIRMED else None,
         }
         for model in ranked
     ]
-
-
-def _fitting(database: str, models: Collection[pycolmap.Reconstruction]) -> tuple[int, float]:
-    """Number of photographs of the largest model, and the share of matches that it confirms where it does least."""
-    if not models:
-        return 0, 0.0
-    largest = max(models, key=pycolmap.Reconstruction.num_reg_images)
-    return largest.num_reg_images(), _weakest(database, largest).confirmed
 
 
 class _Weakest(NamedTuple):

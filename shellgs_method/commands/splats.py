@@ -34,9 +34,11 @@ def splats(
     from shellgs_method.export.runs import TrainedRun
     from shellgs_method.export.splats import moved
     from shellgs_method.files.splats import Y_UP, Splats, check_splats_format, encoded, write_splats
+    from shellgs_method.runs.run_folder import open_run
 
     output = output or config.with_name("splats.ply")
     check_splats_format(output)
+    check_splats_format(output, discs=getattr(open_run(config).pipeline.model, "primitive", None) == "2d")
     run = TrainedRun.load(config)
     gaussians, frame, facts = run.splats(), run.frame, {}
     if output.suffix.lower() in Y_UP:

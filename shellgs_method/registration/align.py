@@ -285,14 +285,12 @@ def misplaced(placement: Placement, mesh: ShellMesh, views: Sequence[View], poin
 def refined(
     placement: Placement, mesh: ShellMesh, views: Sequence[View], points: SparsePoints, reach: float
 ) -> Placement:
-    """Refine a placement against the SfM points.
+    """Refine a placement, which is off by ``reach`` metres at most, against the SfM points.
 
     Raises:
-        SceneError: ``reach`` is not a positive number, the coordinates of the points or the shell are too coarse to
-            follow, or too few points are within ``reach`` metres of the shell.
+        SceneError: the coordinates of the points or the shell are too coarse to follow, or too few points are within
+            ``reach`` metres of the shell.
     """
-    if not 0 < reach < np.inf:
-        raise SceneError(f"--refine must be the largest error of the start in metres, more than 0, not {reach:g}")
     alignment = placement.alignment
     steps = steps_in_metres(mesh, alignment, views, points)
     for what, step in steps.items():

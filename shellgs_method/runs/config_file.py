@@ -80,7 +80,8 @@ def load_config(path: Path) -> TrainerConfig:
         if lacking:
             raise SceneError(f"it is cut off: {lacking[0]} is missing")
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        what = " ".join(str(error).split())
+        mark = getattr(error, "problem_mark", None)  # YAML's own text quotes the file
+        what = f"line {mark.line + 1}: {error.problem}" if mark else " ".join(str(error).split())  # pyright: ignore
         raise SceneError(
             f"{path} cannot be read as the config.yml of a run ({what}): name one that ns-train wrote, or train again"
         ) from error

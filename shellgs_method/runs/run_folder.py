@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 import yaml
-from jaxtyping import Float64
 from nerfstudio.configs.experiment_config import ExperimentConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from wrapt import register_post_import_hook
 
+from dataparsers.cameras import scene_to_world
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.runs.config_file import load_config
 
@@ -122,10 +122,11 @@ def check_world(folder: Path, parsed: DataparserOutputs, what: str) -> None:
         return
     try:
         stored = json.loads(path.read_text("utf8"))
-        trained = _similarity(stored["transform"], stored["scale"])
+        trained = np.eye(4)
+        trained[:3] = stored["scale"] * np.array(stored["transform"], dtype=float)
     except (ValueError, TypeError, KeyError) as error:
         raise SceneError(f"{path} is damaged ({error}): remove it, or train again") from error
-    between = trained @ np.linalg.inv(_similarity(parsed.dataparser_transform.tolist(), parsed.dataparser_scale))
+    between = trained @ np.linalg.inv(scene_to_world(parsed))
     cameras = parsed.cameras.camera_to_worlds[..., 3].double().numpy()
     moved = np.abs(cameras @ (between[:3, :3] - np.eye(3)).T + between[:3, 3]).max()
     if not moved < SAME_WORLD:
@@ -236,12 +237,6 @@ def _parsed(pipeline: Pipeline) -> DataparserOutputs | None:
     """What the pipeline's dataparser read, where it has one."""
     parsed = getattr(pipeline.datamanager, "train_dataparser_outputs", None)
     return parsed if isinstance(parsed, DataparserOutputs) else None
-
-
-def _similarity(transform: list[list[float]], scale: float) -> Float64[np.ndarray, "4 4"]:
-    similarity = np.eye(4)
-    similarity[:3] = np.array(transform, dtype=float) * scale
-    return similarity
 
 
 def _get_base_dir(self: ExperimentConfig) -> Path:

@@ -90,8 +90,8 @@ class Alignment:
 
     @property
     def named(self) -> str:
-        """The shell's files, for people."""
-        return ", ".join(self.shells)
+        """The shell's files, for people: relative to the scene, or by their names where they are elsewhere."""
+        return ", ".join(path.name if path.is_absolute() else str(path) for path in map(Path, self.shells))
 
     def files(self, scene: Path) -> list[Path]:
         """The shell's files."""

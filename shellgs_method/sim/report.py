@@ -132,7 +132,7 @@ def lidar_errors(world: Path, collider: Triangles, front: Front, truth: Triangle
     ground = lidar(world, places, rays, 0).ravel()
     meets = true < ground
     found = {}
-    for name, group in (("collider", 3), ("visual mesh", 2)):
+    for name, group in (("collision geometry", 3), ("visual mesh", 2)):
         measured = lidar(world, places, rays, group).ravel()
         error = np.abs(measured[meets] - true[meets])
         median, p95 = np.quantile(np.where(np.isfinite(error), error, 1e3), [0.5, 0.95])

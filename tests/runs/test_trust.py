@@ -106,6 +106,12 @@ def test_a_program_in_config_yml_is_not_run_by_nerfstudios_commands(tmp_path, re
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_file_that_is_no_yaml_is_refused_without_quoting_it(tmp_path):
+    (tmp_path / "README.md").write_text("# Title\n\nText\nkey: value: more\n")
+    with pytest.raises(SceneError, match=r"README.md cannot be read as the config.yml of a run \(line \d: [^\n\"]*\):"):
+        load_config(tmp_path / "README.md")
+
+
 @pytest.mark.parametrize("name", [name for name, config in all_methods.items() if isinstance(config, TrainerConfig)])
 def test_the_config_of_every_method_is_read_as_it_was_written(name, tmp_path):
     config = copy.deepcopy(all_methods[name])

@@ -480,9 +480,9 @@ def wall() -> Triangles:
 def test_distances_are_measured_where_cameras_look(wall):
     half = box([-2, 0, 0], [0.0, 0.2, 2], subdivided=0.2)  # what is reconstructed: the wall's left half
     left = [frontal(-1.1, 1.5)]  # sees x from -1.85 to -0.35
-    assert both_ways(wall, half, None, left, 0.05)["from the collider"].p95 < 1e-6
+    assert both_ways(wall, half, None, left, 0.05)["from the collision geometry"].p95 < 1e-6
     both = both_ways(wall, half, None, [*left, frontal(1.0, 1.5)], 0.05)
-    assert both["from the collider"].p95 > 1.0
+    assert both["from the collision geometry"].p95 > 1.0
     behind = replace(frontal(-1.1), viewmat=torch.diag(torch.tensor([1.0, 1, -1, 1]).double()) @ frontal(0.0).viewmat)
     assert both_ways(wall, half, None, [behind], 0.05) == {}
 
@@ -490,7 +490,7 @@ def test_distances_are_measured_where_cameras_look(wall):
 def test_distances_leave_out_what_cameras_look_along():
     house, front = box([-1, 0, 0], [0, 6, 2], subdivided=0.5), box([-1, 0, 0], [0, 0.2, 2])
     along = [frontal(0.2)]  # sees the side wall at a slant of 3° at most
-    assert both_ways(house, front, None, along, 0.05)["from the collider"].p95 < 1e-6
+    assert both_ways(house, front, None, along, 0.05)["from the collision geometry"].p95 < 1e-6
 
 
 def places(count: int = 400, width: float = 1.2) -> np.ndarray:

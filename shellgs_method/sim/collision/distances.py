@@ -56,7 +56,8 @@ def both_ways(
         before: distance in metres above which a point is in front of the shell.
     """
     found = {}
-    for name, one, two in (("from the collider", collider, other), ("to the collider", other, collider)):
+    both = ("from the collision geometry", collider, other), ("to the collision geometry", other, collider)
+    for name, one, two in both:
         points = visible(one, cameras)
         distance = two.distance(points)
         found[name] = Distances.of(distance)
