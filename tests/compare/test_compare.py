@@ -379,7 +379,10 @@ def test_killing_a_comparison_ends_its_commands(tmp_path):
 
 def test_interrupting_a_comparison_ends_commands_that_do_not_end_by_themselves(tmp_path):
     """Nerfstudio catches Ctrl-C, and one who interrupts this process alone does not interrupt them."""
-    in_thread = "with local.following(1) as pool: pool.submit(local.follow, [['sleep']]).result()"
+    in_thread = (  # the handler: a shell's background jobs ignore Ctrl-C
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "with local.following(1) as pool: pool.submit(local.follow, [['sleep']]).result()"
+    )
     comparison, command = follow_sleep(tmp_path, in_thread)
     comparison.send_signal(signal.SIGINT)
     assert comparison.wait(timeout=10) == -signal.SIGINT
