@@ -45,7 +45,8 @@ class Work:
     def for_log(self) -> str | None:
         """What a log should tell now, if anything."""
         now = self._clock()
-        interval = min(max(OFTEN, GROWTH * (now - self._start)), SELDOM)
+        counts = self.stage.item is not None  # else there is nothing new to tell
+        interval = min(max(OFTEN, GROWTH * (now - self._start)), SELDOM) if counts else SELDOM
         if self._told and self._told[0] == self.stage.what and now - self._told[1] < interval:
             return None
         self._told = self.stage.what, now

@@ -235,6 +235,13 @@ def test_the_command_draws_the_plan_and_keeps_a_cut_that_was_moved(scene: Path, 
     assert Blocks.read(scene / BLOCKS) == found
 
 
+def test_the_command_says_where_cuts_save_nothing(scene: Path, capsys: pytest.CaptureFixture):
+    command(scene, length=6.0, overlap=100.0)
+    assert "as many photographs as the whole scene, 10, so cuts save nothing" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
 def test_without_maps_and_tracks_nothing_tells_what_photographs_show(scene: Path):
     shutil.rmtree(scene / "cues")
     with pytest.raises(SceneError, match="run `shellgs cast"):
