@@ -29,7 +29,7 @@ from shellgs_method.files.atomic import atomic_write
 from shellgs_method.gaussians.pruning import broken, hardly_shown, unshaped
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.progress import ITERATION, Lines, tell, track
-from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint, unwritten
 from shellgs_method.runs.folders import held
 from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers
 from shellgs_method.runs.host import wandb_refusals
