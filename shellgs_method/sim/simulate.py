@@ -24,6 +24,7 @@ from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import GROUND, LEAKY, Collider, Leaks, leaks, make_collider, standing_before
 from shellgs_method.sim.collision.distances import both_ways
 from shellgs_method.sim.collision.outside import from_outside
+from shellgs_method.sim.collision.parts import pieces
 from shellgs_method.sim.deviations import Deviations, find_deviations
 from shellgs_method.sim.formats.asset import Asset, write_parts
 from shellgs_method.sim.formats.readme import write_readme
@@ -206,14 +207,7 @@ def _building(
 
 def _report_gaps(collider: Collider, scene: str, log: Callable[[str], None]) -> None:
     """Report collision geometry in pieces that are far from each other."""
-    low = np.array([part.vertices.min(0) for part in collider.parts])
-    high = np.array([part.vertices.max(0) for part in collider.parts])
-    gaps = np.linalg.norm(np.maximum(0, np.maximum(low[:, None] - high[None], low[None] - high[:, None])), axis=2)
-    group = np.arange(len(low))
-    for k in range(len(low)):
-        near = np.unique(group[gaps[k] < MAX_GAP])
-        group[np.isin(group, near)] = near.min()
-    if (count := len(np.unique(group))) > 1:
+    if (count := pieces(collider.parts, MAX_GAP)) > 1:
         log(f"The collision geometry of {scene} is in {count} pieces, more than {MAX_GAP:g} m apart.")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from shellgs_method.geometry.winding import outward
 from shellgs_method.shell import Alignment, load_shell
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import THINNEST, Collider, make_collider
-from shellgs_method.sim.collision.parts import Part
+from shellgs_method.sim.collision.parts import Part, pieces
 from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.front import Front
 from shellgs_method.sim.ground import Ground
@@ -330,3 +331,16 @@ def test_walls_far_apart_are_reported(collider):
     assert not said
     _report_gaps(Collider([*collider.parts, *away], 0.0), "street", said.append)
     assert "2 pieces" in said[0]
+
+
+def test_pieces_of_many_parts_are_counted_in_memory_that_is_not_squared():
+    tetrahedron = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    places = np.random.default_rng(0).permutation(5000)  # 1.5 m apart, but one gap of 3 m
+    parts = [
+        Part(tetrahedron + np.array([0, 1.5 * place + 3 * (place >= 2000), 0]), np.empty((0, 3), int), np.empty((0, 4)))
+        for place in places
+    ]
+    tracemalloc.start()
+    assert (pieces(parts, 2.0), pieces(parts, 4.0), pieces(parts, 0.1)) == (2, 1, 5000)
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 MOST_VERTICES = 64
@@ -70,3 +72,18 @@ def joined(parts: Sequence[Part]) -> tuple[Float64[np.ndarray, "V 3"], Int64[np.
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces + offset for part, offset in zip(parts, first, strict=True)]),
     )
+
+
+def pieces(parts: Sequence[Part], gap: float) -> int:
+    """Number of pieces that parts form if those whose boxes are less than a gap in metres apart are joined."""
+    low, high = (np.array([end(part.vertices, axis=0) for part in parts]) for end in (np.min, np.max))
+    along = int((high.max(axis=0) - low.min(axis=0)).argmax())
+    order = low[:, along].argsort()
+    low, high = low[order], high[order]
+    near = []
+    for k, end in enumerate(np.searchsorted(low[:, along], high[:, along] + gap)):  # only these: memory is not squared
+        apart = np.maximum(0, np.maximum(low[k + 1 : end] - high[k], low[k] - high[k + 1 : end]))
+        near.append(k + 1 + np.flatnonzero(np.linalg.norm(apart, axis=1) < gap))
+    starts = np.cumsum([0, *map(len, near)])
+    joins = csr_array((np.ones(starts[-1], bool), np.concatenate(near), starts), shape=(len(parts), len(parts)))
+    return connected_components(joins, directed=False)[0]
