@@ -55,7 +55,7 @@ def report_seams(config: Path, coarse: Path) -> None:
         good = "good" if lost <= criterion.most else f"[bold]more than {criterion.most:g}"
         table.add_row(criterion.title, *(f"{value:.3f}" for value in (*values, lost)), good)
     good = "good" if double["share"] <= DOUBLES else f"[bold]more than {DOUBLES:.0%}"
-    table.add_row("Doubles", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
+    table.add_row("Gaussians on one of another block", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
     console.print(table)
     console.print("What to do if more is lost: docs/street.md, Along the cuts.", highlight=False)
     if not seams:

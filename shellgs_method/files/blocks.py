@@ -27,6 +27,8 @@ from shellgs_method.geometry.similarity import scale_of
 
 BLOCKS = "blocks.json"
 _NAME = re.compile(r"\w[\w.+-]*")
+LARGEST = 1e12
+"""Largest number in the file: what is beyond cannot be a place in a scene."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ class Blocks:
     def __post_init__(self) -> None:
         """Refuse extended regions that are smaller than their cores."""
         if self.overlap < 0:
-            raise ValueError(f"the overlap is negative: {self.overlap}")
+            raise ValueError(f"the overlap is negative: {self.overlap:g}")
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
@@ -153,13 +155,11 @@ class Blocks:
             raise SceneError(f"{path} is not there: run `shellgs blocks {path.parent}` first")
         contents = read_json(path)
         try:
-            blocks = cls(_node(contents["tree"]), _number(contents["overlap"]))
-        except KeyError as error:
-            raise SceneError(
-                f"{path} is damaged: {error} is missing in it; mend it, or remove it and cut anew"
-            ) from error
-        except (TypeError, ValueError, RecursionError) as error:
-            raise SceneError(f"{path} is damaged: {error}; mend it, or remove it and cut anew") from error
+            tree = _node(_item(contents, "tree", "it"), "tree")
+            blocks = cls(tree, _number(_item(contents, "overlap", "it"), "overlap"))
+        except (ValueError, RecursionError) as error:
+            why = error if isinstance(error, ValueError) else "its tree is too deep"
+            raise SceneError(f"{path} is damaged: {why}; mend it, or remove it and cut anew") from error
         names = [cell.block.name for cell in blocks.cells]
         if twice := {name for name in names if names.count(name) > 1}:
             raise SceneError(f"{path} has two blocks named {min(twice)}: give each its own name")
@@ -183,25 +183,49 @@ def _written(node: Fork | Block) -> dict[str, Any]:
     return {"cut": cut, "below": _written(node.below), "above": _written(node.above)}
 
 
-def _node(record: dict[str, Any]) -> Fork | Block:
-    if "cut" not in record:
-        name, photographs = record["name"], record["photographs"]
-        if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 100 or name == "None":
-            raise ValueError(f"{name!r:.120} cannot name a block")
-        if not isinstance(photographs, list) or not all(isinstance(path, str) for path in photographs):
-            raise ValueError(f"the photographs of {name} are no list of paths")
-        return Block(name, tuple(photographs))
-    x, y, z = map(_number, record["cut"]["normal"])
+def _node(record: object, where: str) -> Fork | Block:
+    """The part of the tree that ``where`` names in messages, as ``tree.below.above``."""
+    if isinstance(record, dict) and "cut" in record:
+        cut = _cut(record["cut"], f"{where}.cut")
+        below, above = (_node(_item(record, side, where), f"{where}.{side}") for side in ("below", "above"))
+        return Fork(cut, below, above)
+    name = _item(record, "name", where)
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 100 or name == "None":
+        raise ValueError(f"{where}.name is {_shown(name)}, which cannot name a block")
+    photographs = _item(record, "photographs", name)
+    if not isinstance(photographs, list) or not all(isinstance(path, str) for path in photographs):
+        raise ValueError(f"the photographs of {name} are {_shown(photographs)}, no list of paths")
+    return Block(name, tuple(photographs))
+
+
+def _cut(record: object, where: str) -> Cut:
+    normal, offset = _item(record, "normal", where), _number(_item(record, "offset", where), f"{where}.offset")
+    if not isinstance(normal, list) or len(normal) != 3:
+        raise ValueError(f"{where}.normal is {_shown(normal)}, no list of three numbers")
+    x, y, z = (_number(value, f"{where}.normal") for value in normal)
     length = float(np.linalg.norm((x, y, z)))
     if length == 0:
-        raise ValueError("the normal of a cut is 0")
+        raise ValueError(f"{where}.normal is 0")
     if abs(length - 1) < 1e-12:  # as we write it: what is read and written again has the same fingerprint
         length = 1.0
-    cut = Cut((x / length, y / length, z / length), _number(record["cut"]["offset"]) / length)
-    return Fork(cut, _node(record["below"]), _node(record["above"]))
+    return Cut((x / length, y / length, z / length), offset / length)
 
 
-def _number(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise ValueError(f"{value!r} is no number")
+def _item(record: object, key: str, where: str) -> object:
+    if not isinstance(record, dict):
+        raise ValueError(f"{where} is {_shown(record)}, no object with {key!r}")
+    if key not in record:
+        raise ValueError(f"{where} lacks {key!r}")
+    return record[key]
+
+
+def _number(value: object, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+        raise ValueError(f"{where} is {_shown(value)}, no number up to {LARGEST:g}")
     return float(value)
+
+
+def _shown(value: object) -> str:
+    """A value as it stands in the file, its beginning if it is long."""
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else f"{text[:60]}…"

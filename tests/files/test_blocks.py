@@ -49,12 +49,28 @@ def test_a_file_is_read_as_it_was_written(tmp_path: Path):
     ("text", "said"),
     [
         ("[]", "damaged"),
-        ('{"overlap": 1}', "damaged"),
-        ('{"overlap": "1", "tree": {"name": "a", "photographs": []}}', "no number"),
+        ('{"overlap": 1}', "lacks 'tree'"),
+        ('{"overlap": "1", "tree": {"name": "a", "photographs": []}}', 'overlap is "1", no number'),
+        ('{"overlap": NaN, "tree": {"name": "a", "photographs": []}}', "overlap is NaN, no number"),
         ('{"overlap": -1, "tree": {"name": "a", "photographs": []}}', "negative"),
         ('{"overlap": 1, "tree": {"name": "../a", "photographs": []}}', "cannot name a block"),
         ('{"overlap": 1, "tree": {"name": "a", "photographs": "b"}}', "no list of paths"),
-        ('{"overlap": 1, "tree": {"cut": {"normal": [0, 0, 0], "offset": 1}}}', "is 0"),
+        ('{"overlap": 1, "tree": null}', "tree is null, no object with 'name'"),
+        ('{"overlap": 1, "tree": {"name": "a"}}', "a lacks 'photographs'"),
+        ('{"overlap": 1, "tree": {"cut": null}}', "tree.cut is null, no object with 'normal'"),
+        ('{"overlap": 1, "tree": {"cut": [1, 0, 0]}}', r"tree.cut is \[1, 0, 0\], no object with 'normal'"),
+        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0]}}}', "tree.cut lacks 'offset'"),
+        ('{"overlap": 1, "tree": {"cut": {"normal": 1, "offset": 1}}}', "tree.cut.normal is 1, no list of three"),
+        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0], "offset": 1}}}', "no list of three numbers"),
+        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, []], "offset": 1}}}', r"tree.cut.normal is \[\], no number"),
+        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1' + "0" * 400 + "}}}", "offset is 1000"),
+        ('{"overlap": 1, "tree": {"cut": {"normal": [0, 0, 0], "offset": 1}}}', "tree.cut.normal is 0"),
+        ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}}}', "tree lacks 'below'"),
+        (
+            '{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}, '
+            '"below": {"name": "a", "photographs": []}, "above": []}}',
+            r"tree.above is \[\], no object with 'name'",
+        ),
         (
             '{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}, '
             '"below": {"name": "a", "photographs": []}, "above": {"name": "a", "photographs": []}}}',
@@ -64,8 +80,9 @@ def test_a_file_is_read_as_it_was_written(tmp_path: Path):
 )
 def test_a_file_that_cannot_be_is_refused(tmp_path: Path, text: str, said: str):
     (tmp_path / BLOCKS).write_text(text)
-    with pytest.raises(SceneError, match=said):
+    with pytest.raises(SceneError, match=said) as refused:
         Blocks.read(tmp_path / BLOCKS)
+    assert str(refused.value).startswith(f"{tmp_path / BLOCKS} ")
 
 
 def test_a_missing_file_or_block_is_said(tmp_path: Path):
