@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -40,8 +41,9 @@ MARGIN = 0.5
 """Margin around the shell, in metres, within which the fused surface is kept."""
 HIDDEN_SIZE = 800
 """Longer side of the occlusion masks, in pixels."""
-GROUND_STEP = 2
-"""Pixels between the points of a view that are taken for the ground."""
+GROUND_STEP, MOST_GROUND = 2, 20_000_000
+"""Pixels between the points of a view that are taken for the ground, and most pixels that are looked at for it in all
+views: with more, the step is larger."""
 PER_SQUARE_METRE, MOST_SAMPLES = 400.0, 500_000
 """Number of points of the shell that are, for each square metre and in all."""
 MAX_SEPARATION = 5000.0
@@ -213,6 +215,7 @@ def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray], below: list
     Append to ``below`` the points of its depth that are on level surfaces lower than the camera.
     """
     caster = ShellCaster(run.shell_in_frame, np.eye(4)) if run.shell else None
+    apart = ground_step(view.camera for dataset in run.datasets for view in dataset.views)
     for view in run.views():
         step = view.camera.thinning(HIDDEN_SIZE)
         occluded = np.zeros(view.depth[::step, ::step, 0].shape, bool)
@@ -222,15 +225,21 @@ def _views_and_occlusions(run: TrainedRun, hidden: list[np.ndarray], below: list
             nearer = shell.mask & (depth > 0) & (depth < shell.depth - MARGIN)
             occluded = binary_dilation(nearer, iterations=2)[::step, ::step]
         hidden.append(occluded)
-        below.append(_level_below(view, run.frame.up))
+        below.append(_level_below(view, run.frame.up, apart))
         yield view
 
 
-def _level_below(view: DepthView, up: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "P 3"]:
-    """Points of a view's depth on level surfaces below its camera, one in ``GROUND_STEP`` x ``GROUND_STEP`` pixels."""
+def ground_step(cameras: Iterable[Camera]) -> int:
+    """Pixels between the points of views that are taken for the ground."""
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    return max(GROUND_STEP, math.ceil(math.sqrt(pixels / MOST_GROUND)))
+
+
+def _level_below(view: DepthView, up: Float64[np.ndarray, " 3"], step: int) -> Float64[np.ndarray, "P 3"]:
+    """Points of a view's depth on level surfaces below its camera, one in ``step`` x ``step`` pixels."""
     camera, depth = view.camera.to(torch.float64), view.depth.double()
     to_world = np.linalg.inv(camera.viewmat.numpy())
-    every = slice(None, None, GROUND_STEP)
+    every = slice(None, None, step)
     normals = normals_from_depth(depth, camera)[every, every].numpy() @ to_world[:3, :3].T
     points = transformed((depth * camera.rays())[every, every].reshape(-1, 3).numpy(), to_world)
     level = (normals @ up > FLAT).ravel() & ((points - to_world[:3, 3]) @ up < 0)

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from worlds import frame_at
 
 from shellgs_method.files.usd import import_pxr
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.triangles import Triangles
+from shellgs_method.sim.building import MOST_GROUND, ground_step
 from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.formats.world import write_world
@@ -37,6 +40,13 @@ def points_of_street(count: int = 60_000, noise: float = 0.01) -> np.ndarray:
     under = (ground[:, 0] > 3) & (ground[:, 0] < 4) & (ground[:, 1] > -1.5) & (ground[:, 1] < -1)
     car = np.stack([rng.uniform(-4, 0, 4000), rng.uniform(-7, -5.5, 4000), rng.normal(1.4, 0.02, 4000)], axis=1)
     return np.concatenate([ground[~under], wall, flowers, car])
+
+
+@pytest.mark.parametrize(("views", "step"), [(10, 2), (1000, 11)])
+def test_of_many_photographs_fewer_pixels_each_are_taken_for_the_ground(views, step):
+    camera = Camera(torch.eye(4), torch.eye(3), 1920, 1080)
+    assert ground_step([camera] * views) == step
+    assert views * 1920 * 1080 / step**2 < MOST_GROUND
 
 
 @pytest.fixture(scope="module")
