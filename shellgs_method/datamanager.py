@@ -35,7 +35,14 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory, free_memory
 from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import ahead
-from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sightings_of_points, sightings_on_surface
+from shellgs_method.occlusion.exposure import (
+    Exposed,
+    exposed,
+    log_gains,
+    points_on_surface,
+    sightings_of_points,
+    sightings_on_surface,
+)
 from shellgs_method.runs.host import NoPixelSampler
 
 ViewT = TypeVar("ViewT", SeededView, SkyView)
@@ -328,7 +335,8 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         points, observed = self.sfm_points.float(), self.train_dataparser_outputs.metadata["observed"]
         of_points = sightings_of_points(exposures, points, observed)
         known = exif_log_gains([view.image for view in dataset.views])
-        gains = log_gains(of_points.with_others(sightings_on_surface(exposures)), known)
+        on_surface = sightings_on_surface(exposures, points_on_surface(exposures))
+        gains = log_gains(of_points.with_others(on_surface), known)
         return gains, of_points.mean_of_views(gains, len(points))
 
     def seed_views(

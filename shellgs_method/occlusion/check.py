@@ -35,13 +35,20 @@ from shellgs_method.occlusion.contradiction import (
     sweep,
     sweep_behind,
 )
-from shellgs_method.occlusion.exposure import Exposed, exposed, log_gains, sightings_on_surface
+from shellgs_method.occlusion.exposure import (
+    Exposed,
+    SurfaceColours,
+    exposed,
+    log_gains,
+    points_on_surface,
+    sightings_on_surface,
+)
 
 MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 11
+VERSION = 12
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -124,8 +131,8 @@ class _TrainingViews:
     """The training views at their mean exposure, their sweeps, and the colours in front of the shell and on it."""
 
     views: dict[str, ShellView]
-    exposures: list[Exposed]
-    """The views as they were taken."""
+    surface: SurfaceColours
+    """The shell's colours at their mean exposure."""
     sweeps: dict[str, Sweep]
     colours: ColourModel
     error: float
@@ -142,8 +149,7 @@ class _TrainingViews:
             cue = shell.require(view.name, view.camera.shrunk(size))
             taken[view.name] = _shell_view(view, cue)
             windows |= cue.classes is not None and bool((cue.classes == SurfaceClass.WINDOW).any())
-        exposures = [_exposed(seen) for seen in taken.values()]
-        gains = _gains(exposures)
+        gains, surface = _gains([_exposed(seen) for seen in taken.values()])
         shell_views = {
             name: _at_mean_exposure(seen, gain) for (name, seen), gain in zip(taken.items(), gains, strict=True)
         }
@@ -163,7 +169,7 @@ class _TrainingViews:
                     stream.write(content.getvalue())
         sweeps = {name: Sweep(*torch.from_numpy(np.load(file, allow_pickle=False))) for name, file in files.items()}
         colours = ColourModel(shell_views.values(), sweeps.values())
-        return cls(shell_views, exposures, sweeps, colours, _error(shell.manifest), windows)
+        return cls(shell_views, surface, sweeps, colours, _error(shell.manifest), windows)
 
     def compare(self, view: View, cue: CueMap) -> CueMap:
         """Make the map of a view."""
@@ -171,8 +177,7 @@ class _TrainingViews:
             seen, found = self.views[view.name], self.sweeps[view.name]
         else:
             seen = _shell_view(view, cue)
-            gains = _gains([*self.exposures, _exposed(seen)])
-            seen = _at_mean_exposure(seen, gains[-1] - gains[:-1].mean(axis=0))
+            seen = _at_mean_exposure(seen, self.surface.log_gain(_exposed(seen)))
             found = sweep(seen, list(self.views.values()))
         names = self._neighbours(seen)
         others, found_there = [self.views[name] for name in names], [self.sweeps[name] for name in names]
@@ -250,9 +255,12 @@ def _exposed(view: ShellView) -> Exposed:
     return Exposed.of(view.camera, view.image / 255, view.depth)
 
 
-def _gains(views: Sequence[Exposed]) -> Float64[np.ndarray, "V 3"]:
-    """Logarithms of the views' gains, by the shell that they show."""
-    return log_gains(sightings_on_surface(views), np.zeros(len(views)))
+def _gains(views: Sequence[Exposed]) -> tuple[Float64[np.ndarray, "V 3"], SurfaceColours]:
+    """Logarithms of the views' gains, by the shell that they show, and its colours at gains of 1."""
+    points = points_on_surface(views)
+    seen = sightings_on_surface(views, points)
+    gains = log_gains(seen, np.zeros(len(views)))
+    return gains, SurfaceColours.of(seen, gains, points)
 
 
 def _at_mean_exposure(view: ShellView, log_gain: Float64[np.ndarray, " 3"]) -> ShellView:

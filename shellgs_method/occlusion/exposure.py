@@ -80,10 +80,24 @@ class Sightings(NamedTuple):
         sums = [np.bincount(self.point, channel[self.view], num_points) for channel in values.T]
         return np.stack(sums, axis=1) / count[:, None]
 
+    def plain(self) -> Sightings:
+        """Those that say what a gain is, by :data:`UNCLIPPED`."""
+        low, high = UNCLIPPED
+        return Sightings(*(each[((self.colour > low) & (self.colour < high)).all(axis=1)] for each in self))
 
-def sightings_on_surface(views: Sequence[Exposed]) -> Sightings:
-    """Sightings of points spread over the surface that the views show, in all views that they are not hidden from."""
-    points = torch.cat([_spread(view, MAX_PROJECTIONS / len(views) ** 2) for view in views])
+    @property
+    def logs(self) -> Float64[ndarray, "S 3"]:
+        """Logarithms of the colours in linear light."""
+        return np.log((self.colour - BLACK) / (1 - BLACK)) / POWER
+
+
+def points_on_surface(views: Sequence[Exposed]) -> Float[Tensor, "N 3"]:
+    """Points spread over the surface that the views show."""
+    return torch.cat([_spread(view, MAX_PROJECTIONS / len(views) ** 2) for view in views])
+
+
+def sightings_on_surface(views: Sequence[Exposed], points: Float[Tensor, "N 3"]) -> Sightings:
+    """Sightings of points of the surface that the views show, in all views that they are not hidden from."""
     found = (_sightings(index, view, points, hidden_by_surface=True) for index, view in enumerate(views))
     return Sightings(*map(np.concatenate, zip(*found, strict=True)))
 
@@ -118,11 +132,9 @@ def log_gains(sightings: Sightings, known: Float64[ndarray, " V"]) -> Float64[nd
     Returns:
         Logarithms of the gains in linear light, with a mean of 0 over the views.
     """
-    low, high = UNCLIPPED
-    plain = ((sightings.colour > low) & (sightings.colour < high)).all(axis=1)
-    view, point, colour = (each[plain] for each in sightings)
-    point = np.unique(point, return_inverse=True)[1]
-    logs = np.log((colour - BLACK) / (1 - BLACK)) / POWER
+    sightings = sightings.plain()
+    view, logs = sightings.view, sightings.logs
+    point = np.unique(sightings.point, return_inverse=True)[1]
     known = (known - np.median(known)).clip(-MOST_KNOWN, MOST_KNOWN)
     found = np.stack([_fitted(view, point, logs[:, c], known) for c in range(3)], axis=1)
     told = np.bincount(view, minlength=len(known)) > 0
@@ -130,6 +142,31 @@ def log_gains(sightings: Sightings, known: Float64[ndarray, " V"]) -> Float64[nd
         return found - found.mean(axis=0)
     # A view that is clipped, black or apart from the others says nothing, and must not move their mean.
     return np.where(told[:, None], found - found[told].mean(axis=0), 0.0)
+
+
+class SurfaceColours(NamedTuple):
+    """Points of a surface, whose colours tell the gain of a further photograph without those of all others again."""
+
+    points: Float[Tensor, "N 3"]
+    """In the cameras' world."""
+    logs: Float64[ndarray, "N 3"]
+    """Logarithms of their colours in linear light, at gains of 1; NaN where no photograph tells."""
+
+    @classmethod
+    def of(cls, sightings: Sightings, gains: Float64[ndarray, "V 3"], points: Float[Tensor, "N 3"]) -> SurfaceColours:
+        """Means over the photographs that show each point, given the logarithms of their gains."""
+        seen = sightings.plain()
+        count = np.bincount(seen.point, minlength=len(points))
+        logs = (seen.logs - gains[seen.view]).T
+        with np.errstate(invalid="ignore"):
+            return cls(points, np.stack([np.bincount(seen.point, each, len(points)) / count for each in logs], axis=1))
+
+    def log_gain(self, view: Exposed) -> Float64[ndarray, " 3"]:
+        """Logarithm of a view's gain by most of the points that it shows; 0 where it shows none."""
+        seen = _sightings(0, view, self.points, hidden_by_surface=True).plain()
+        told = seen.logs - self.logs[seen.point]
+        told = told[np.isfinite(told).all(axis=1)]
+        return np.median(told, axis=0) if len(told) else np.zeros(3)
 
 
 def _fitted(

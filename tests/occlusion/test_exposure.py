@@ -11,8 +11,10 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.occlusion.exposure import (
     Exposed,
     Sightings,
+    SurfaceColours,
     exposed,
     log_gains,
+    points_on_surface,
     sightings_of_points,
     sightings_on_surface,
 )
@@ -118,7 +120,7 @@ def test_gains_are_found_on_a_surface_and_at_points_and_what_hides_it_does_not_c
     image = views[3].image.clone()
     image[:, :40] = 0.5
     views[3] = views[3]._replace(depth=hidden, image=image)
-    on_surface = sightings_on_surface(views)
+    on_surface = sightings_on_surface(views, points_on_surface(views))
     np.testing.assert_allclose(log_gains(on_surface, UNKNOWN), GAINS, atol=0.02)
     points = torch.from_numpy(RNG.uniform([-1, -1, 4], [7, 1, 4], (2000, 3))).float()
     everywhere = [slice(None)] * VIEWS
@@ -129,6 +131,19 @@ def test_gains_are_found_on_a_surface_and_at_points_and_what_hides_it_does_not_c
     assert len(np.unique(both.point)) == len(np.unique(of_points.point)) + len(np.unique(on_surface.point))
     observed = [np.arange(5), *[np.empty(0, int)] * (VIEWS - 1)]
     assert set(sightings_of_points(views, points, observed).point) <= set(range(5))
+
+
+def test_the_gain_of_a_further_photograph_is_found_by_the_surface_that_others_show():
+    views = [wall(0.5 * index, gain) for index, gain in enumerate(GAINS)]
+    points = points_on_surface(views)
+    surface = SurfaceColours.of(sightings_on_surface(views, points), GAINS, points)
+    gain = np.array([0.5, 0.3, 0.4])
+    further = wall(2.3, gain)
+    image = further.image.clone()
+    image[:, :30] = 0.5  # a third of it shows something else
+    np.testing.assert_allclose(surface.log_gain(further), gain, atol=0.01)
+    np.testing.assert_allclose(surface.log_gain(further._replace(image=image)), gain, atol=0.1)
+    assert (surface.log_gain(wall(99.0, gain)) == 0).all()
 
 
 def test_the_gain_of_a_point_is_the_mean_of_the_photographs_that_show_it():
