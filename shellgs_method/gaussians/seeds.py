@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int32
 from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -50,12 +50,12 @@ class Seeds(NamedTuple):
 NO_SEEDS = Seeds(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
 
-class _Samples(NamedTuple):
+class _Samples(NamedTuple):  # in the precision in which they were made: there are millions
     points: Float[ndarray, "S 3"]
     normals: Float[ndarray, "S 3"]
     colours: Float[ndarray, "S 3"]
     footprint: Float[ndarray, " S"]  # size of a pixel on the shell, as if seen from the front
-    view: Int[ndarray, " S"]
+    view: Int32[ndarray, " S"]
 
     def select(self, kept: Bool[ndarray, " S"]) -> _Samples:
         return _Samples(*(each[kept] for each in self))
@@ -127,6 +127,7 @@ def shell_seeds(views: Iterable[SeededView], num_pixels: int, spacing: float, mo
     if not any(len(samples.points) for samples in lifted):
         return NO_SEEDS
     samples = _Samples(*map(np.concatenate, zip(*lifted, strict=True)))
+    del lifted
     while True:
         points, normals, apart = _thinned(samples, spacing)
         if len(points) <= most:
@@ -150,21 +151,22 @@ def _lift(view: SeededView, index: int, stride: int) -> _Samples:
     points = (depth * rays)[kept] @ rotation + view.camera.position
     focal = view.camera.K[[0, 1], [0, 1]].mean()
     fields = points, normal[kept] @ rotation, image[kept], (depth / focal)[kept].squeeze(-1)
-    points, normals, colours, footprint = (each.double().cpu().numpy() for each in fields)
-    return _Samples(points, normals, colours, footprint, np.full(len(points), index))
+    points, normals, colours, footprint = (each.cpu().numpy() for each in fields)
+    return _Samples(points, normals, colours, footprint, np.full(len(points), index, np.int32))
 
 
 def _thinned(
     samples: _Samples, spacing: float
 ) -> tuple[Float[ndarray, "N 3"], Float[ndarray, "N 3"], Float[ndarray, " N"]]:
     """Thinned points, their unit normals, and the voxel side of each."""
-    wanted = spacing * samples.footprint
+    wanted = spacing * samples.footprint.astype(np.float64)
     finest = np.percentile(wanted, 1)
     levels = np.floor(np.log2(wanted / finest)).clip(0).astype(int)
     points, normals, apart = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
     for level in np.unique(levels):
         voxel = finest * 2.0**level
         new = samples.select(levels == level)
+        new = new._replace(points=new.points.astype(np.float64))
         if len(points):
             new = new.select(point_tree(points).query(new.points, distance_upper_bound=voxel, workers=-1)[0] == np.inf)
         means = cell_means(np.concatenate([new.points, new.normals], axis=1), voxel_cells(new.points, voxel))

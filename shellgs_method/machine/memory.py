@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
@@ -38,6 +40,12 @@ def available_memory(root: Path = Path("/")) -> int:
         root: folder of ``proc`` and ``sys``.
     """
     return max(0, min([psutil.virtual_memory().available, *_left_in_groups(root)]))
+
+
+def return_freed() -> None:
+    """Return freed memory to the system, which glibc keeps where something still used was placed after it."""
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):  # musl has none
+        trim(0)
 
 
 def _left_in_groups(root: Path) -> Iterator[int]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import platform
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
-from shellgs_method.machine.memory import available_memory
+from shellgs_method.machine.memory import available_memory, return_freed
 
 FREE = 64_000
 """Bytes that the machine has free."""
@@ -86,3 +88,20 @@ def test_a_group_beyond_its_limit_has_nothing_left(tmp_path):
 
 def test_the_memory_of_this_machine_can_be_read():
     assert 0 < available_memory() <= FREE
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="malloc_trim is glibc's")
+def test_memory_that_was_freed_between_what_is_kept_is_returned():
+    def resident() -> int:
+        return psutil.Process().memory_info().rss
+
+    del [np.ones(2_000_000)][:]  # from now on, glibc takes arrays of this size from its heap
+    before, kept, freed = resident(), [], []
+    for _ in range(20):
+        freed.append(np.ones(1_000_000))
+        kept.append(np.ones(1000))
+    taken = resident() - before
+    freed.clear()
+    return_freed()
+    assert resident() - before < taken / 2
+    assert len(kept) == 20
