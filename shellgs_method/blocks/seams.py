@@ -50,8 +50,8 @@ CRITERIA = (
     Criterion("psnr", "PSNR (dB)", 0.3, is_error=False),
     Criterion("normal_deg", "Normal error (°)", 1.0),
     Criterion("chamfer_m", "Chamfer distance (m)", 0.003),
-    Criterion("gap_mm", "Depth behind the shell (mm)", 3.0),
-    Criterion("holes", "Share of the shell with holes", 0.005),
+    Criterion("gap_mm", "Behind the shell (mm)", 3.0),
+    Criterion("holes", "Share with holes", 0.005),
 )
 DOUBLES = 0.01
 """Share of the Gaussians near a cut that may lie on one of another block."""
