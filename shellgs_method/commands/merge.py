@@ -50,12 +50,13 @@ def report_seams(config: Path, coarse: Path) -> None:
     found = merged | {"doubles": double, "coarse": without, "lost": {seam.criterion.key: seam.lost for seam in seams}}
     with atomic_write(path) as file:
         file.write((json.dumps(found, indent=1) + "\n").encode())
-    table = Table("", f"Within {NEAR:g} m of a cut", "Elsewhere", "Lost at the cuts", "")
+    # Its headings are short, to fit a terminal of 80 columns.
+    table = Table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: within {NEAR:g} m of one)")
     for criterion, *values, lost in seams:
         good = "good" if lost <= criterion.most else f"[bold]more than {criterion.most:g}"
         table.add_row(criterion.title, *(f"{value:.3f}" for value in (*values, lost)), good)
     good = "good" if double["share"] <= DOUBLES else f"[bold]more than {DOUBLES:.0%}"
-    table.add_row("Gaussians on one of another block", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
+    table.add_row("Doubled Gaussians", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
     console.print(table)
     console.print("What to do if more is lost: docs/street.md, Along the cuts.", highlight=False)
     if not seams:

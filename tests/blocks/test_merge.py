@@ -119,7 +119,7 @@ def test_other_commands_take_a_merged_run(configs, tmp_path, shellgs, in_process
 
 def test_the_seams_are_reported_beside_the_run(configs, tmp_path, shellgs):
     printed = shellgs("merge", *configs, "--output", tmp_path / "merged")
-    assert "Within 1 m of a cut" in printed
+    assert "Lost at the cuts (near: within 1 m of one)" in printed
     report = json.loads((tmp_path / "merged" / "seams.json").read_text())
     for of in (report, report["coarse"]):
         for part in ("near", "elsewhere"):
