@@ -13,7 +13,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +44,17 @@ class Cost(NamedTuple):
     cpu_seconds: float
     gigabytes: float
     """Peak of its resident memory, or of a child's if that is more."""
+
+
+# In a small process of its own: a command's ru_maxrss is at least what its parent had when it started it.
+MEASURING = """
+import json, resource, subprocess, sys, time
+start = time.perf_counter()
+status = subprocess.run(sys.argv[1:], stdout=sys.stderr).returncode
+seconds, used = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps([seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e9]))
+sys.exit(status)
+"""
 
 
 def main(
@@ -133,13 +143,12 @@ def _commands(scene: Path) -> Mapping[Stage, Sequence[object]]:
 
 def _run(words: Sequence[object], log: Path) -> Cost:
     """Run a command, and return what it took."""
+    command = list(map(str, words))
     with log.open("w") as file:
-        start = time.perf_counter()
-        process = subprocess.Popen(list(map(str, words)), stdout=file, stderr=file)
-        _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        sys.exit(f"{' '.join(map(str, words))} failed:\n{log.read_text()[-2000:]}")
-    return Cost(time.perf_counter() - start, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e6)
+        done = subprocess.run([sys.executable, "-c", MEASURING, *command], stdout=subprocess.PIPE, stderr=file)
+    if done.returncode:
+        sys.exit(f"{' '.join(command)} failed:\n{log.read_text()[-2000:]}")
+    return Cost(*json.loads(done.stdout))
 
 
 if __name__ == "__main__":

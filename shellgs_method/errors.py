@@ -60,7 +60,7 @@ def check_output(path: Path) -> None:
             raise SceneError(
                 f"{each} is a link to {os.readlink(each)}, which does not exist: remove it, or name another"
             )
-    above = next(parent for parent in path.absolute().parents if parent.exists())
+    above = _existing(path.absolute().parent)
     if not above.is_dir():
         raise SceneError(f"{path} cannot be written: {above} is a file, not a folder")
     if not os.access(above, os.W_OK | os.X_OK):
@@ -73,9 +73,14 @@ def check_output_folder(path: Path) -> None:
     Raises:
         SceneError: names the file.
     """
-    there = next(each for each in (path, *path.absolute().parents) if each.exists())
+    there = _existing(path)
     if not there.is_dir():
         raise SceneError(f"{there} is a file: name a folder to write to")
+
+
+def _existing(path: Path) -> Path:
+    """A path if it exists, or the nearest folder or file above it that does."""
+    return next(each for each in (path, *path.absolute().parents) if each.exists())
 
 
 def _stdout_is_closed() -> bool:

@@ -7,9 +7,9 @@ import shlex
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -77,17 +77,15 @@ def finish(
         follow(commands, announce, tell_of_run, run.folder / "log.txt", device)
 
 
-@contextmanager
-def following(count: int) -> Iterator[ThreadPoolExecutor]:
+def following(count: int) -> AbstractContextManager[ThreadPoolExecutor]:
     """Threads that :func:`follow` commands, which end if the context ends by an exception, such as that of Ctrl-C."""
-    with stoppable(count) as pool:
-        try:
-            yield pool
-        except BaseException:
-            # A terminal's Ctrl-C reaches them too, but nerfstudio does not end at it, nor do some imports.
-            for process in [*_RUNNING]:
-                process.terminate()
-            raise
+    return stoppable(count, _end_commands)
+
+
+def _end_commands() -> None:
+    """End the commands that run: a terminal's Ctrl-C reaches them, but nerfstudio and some imports do not end at it."""
+    for process in [*_RUNNING]:
+        process.terminate()
 
 
 def follow(

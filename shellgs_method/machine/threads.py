@@ -97,13 +97,19 @@ def ahead(make: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 
 
 @contextmanager
-def stoppable(count: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads that begin nothing more once the context ends by an exception, such as that of Ctrl-C."""
+def stoppable(count: int, stop: Callable[[], None] = lambda: None) -> Iterator[ThreadPoolExecutor]:
+    """Threads that begin nothing more once the context ends by an exception, such as that of Ctrl-C.
+
+    Args:
+        count: number of threads.
+        stop: ends what they work on then.
+    """
     with ThreadPoolExecutor(count) as pool:
         try:
             yield pool
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)  # first, or a thread that is free would begin the next
+            stop()
             raise
 
 

@@ -76,14 +76,20 @@ class Sightings(NamedTuple):
 
     def mean_of_views(self, values: Float64[ndarray, "V 3"], num_points: int) -> Float64[ndarray, "N 3"]:
         """Mean of values of the views that each point is seen in, 0 where it is seen in none."""
-        count = np.bincount(self.point, minlength=num_points).clip(1)
-        sums = [np.bincount(self.point, channel[self.view], num_points) for channel in values.T]
-        return np.stack(sums, axis=1) / count[:, None]
+        return np.nan_to_num(self.means(values[self.view], num_points))
+
+    def means(self, values: Float64[ndarray, "S 3"], num_points: int) -> Float64[ndarray, "N 3"]:
+        """Mean of values of the sightings of each point, NaN where there is none."""
+        count = np.bincount(self.point, minlength=num_points)
+        sums = [np.bincount(self.point, channel, num_points) for channel in values.T]
+        with np.errstate(invalid="ignore"):
+            return np.stack(sums, axis=1) / count[:, None]
 
     def plain(self) -> Sightings:
         """Those that say what a gain is, by :data:`UNCLIPPED`."""
         low, high = UNCLIPPED
-        return Sightings(*(each[((self.colour > low) & (self.colour < high)).all(axis=1)] for each in self))
+        plain = ((self.colour > low) & (self.colour < high)).all(axis=1)
+        return Sightings(*(each[plain] for each in self))
 
     @property
     def logs(self) -> Float64[ndarray, "S 3"]:
@@ -156,10 +162,7 @@ class SurfaceColours(NamedTuple):
     def of(cls, sightings: Sightings, gains: Float64[ndarray, "V 3"], points: Float[Tensor, "N 3"]) -> SurfaceColours:
         """Means over the photographs that show each point, given the logarithms of their gains."""
         seen = sightings.plain()
-        count = np.bincount(seen.point, minlength=len(points))
-        logs = (seen.logs - gains[seen.view]).T
-        with np.errstate(invalid="ignore"):
-            return cls(points, np.stack([np.bincount(seen.point, each, len(points)) / count for each in logs], axis=1))
+        return cls(points, seen.means(seen.logs - gains[seen.view], len(points)))
 
     def log_gain(self, view: Exposed) -> Float64[ndarray, " 3"]:
         """Logarithm of a view's gain by most of the points that it shows; 0 where it shows none."""
