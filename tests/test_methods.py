@@ -273,7 +273,7 @@ def rendered(trainer) -> tuple:
 
 
 def terms(geometry, cue, progress: float = 0.5, paper: GeometryLossConfig = OFF, metres: float | None = 2.0, **extra):
-    return CueLosses(cue, paper, ExtraLossConfig(**extra), metres)(geometry, progress)
+    return CueLosses(cue, cue.mask.to(cue.depth), paper, ExtraLossConfig(**extra), metres)(geometry, progress)
 
 
 def test_all_switches_are_off_in_the_papers_setting(untrained):

@@ -22,6 +22,7 @@ FINDINGS = (
     ("background", "y", 0.7),
     ("shell confirmed", "g", 0.25),
     ("behind the shell", "m", 0.5),
+    ("shell doubted", "c", 0.4),
 )
 """Name, colour and opacity of each of :class:`~shellgs_method.files.map_files.Findings` in a panel."""
 
@@ -97,7 +98,7 @@ def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap
             shown[mask] = (1 - alpha) * shown[mask] + alpha * np.array(to_rgb(colour))
         ax.imshow(shown)
         shares = (f"{name} {mask.mean():.1%}" for mask, (name, *_) in zip(found, FINDINGS, strict=True))
-        ax.set_title(", ".join(shares), fontsize=10)
+        ax.set_title(", ".join(shares), fontsize=9)
     handles = [Patch(color=colour, label=name) for name, colour, _ in FINDINGS]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure

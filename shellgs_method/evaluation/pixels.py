@@ -14,6 +14,9 @@ from shellgs_method.geometry.reference import Reference
 
 MARGIN = 2
 """Pixels around what stands in front of the shell that its splats also cover."""
+DOUBTED = 0.2
+"""Weight of the shell where photographs doubt it: enough on plain walls, where nothing else pulls, and too little where
+they show something else."""
 
 
 def kept_pixels(batch: dict, image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"]:
@@ -43,6 +46,19 @@ def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: boo
     if "mask" in batch:
         mask = mask & batch["mask"].to(device)
     return Reference(depth, normal.float(), mask)
+
+
+def shell_trust(batch: dict, device: torch.device) -> Float[Tensor, "H W 1"]:
+    """Weight of the shell in a training view, from 0 to 1.
+
+    It is 0 where photographs show something else, and :data:`DOUBTED` in a margin around that and where they may.
+    """
+    hidden = occluded(batch, device) | beyond(batch, device)
+    doubtful = _with_margin(hidden)
+    if "doubtful" in batch:
+        doubtful |= batch["doubtful"].to(device)
+    there = reference_maps(batch, "shell", device, everywhere=True).mask & ~hidden
+    return torch.where(doubtful, DOUBTED, 1.0).where(there, 0.0)
 
 
 def occluded(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:

@@ -127,6 +127,8 @@ class Findings(NamedTuple):
     """The shell."""
     behind: Bool[np.ndarray, "H W"]
     """Something behind the shell, which a window reflects or lets through."""
+    doubtful: Bool[np.ndarray, "H W"]
+    """Perhaps something in front of the shell: photographs agree there somewhat better than on it."""
 
     @classmethod
     def of(cls, checked: CueMap, shell: CueMap) -> Findings:
@@ -134,12 +136,14 @@ class Findings(NamedTuple):
 
         Its mask is set where the view does not show the shell. There, its depth is the occluder's, which is at least
         1.2 % less than the shell's; the shell's if it moved; and more for the background. Elsewhere it is 0, or the
-        shell's where confirmed, or at least 1.2 % more, the depth of what a window shows.
+        shell's where confirmed, or at least 1.2 % more, the depth of what a window shows, or that much less where
+        doubtful, the depth of what may be there.
         """
         nearer, farther = checked.depth < 0.995 * shell.depth, checked.depth > 1.005 * shell.depth
         hidden = checked.mask
         shown = ~hidden & (checked.depth > 0)
-        return cls(hidden & nearer, hidden & ~nearer & ~farther, hidden & farther, shown & ~farther, shown & farther)
+        same = ~nearer & ~farther
+        return cls(hidden & nearer, hidden & same, hidden & farther, shown & same, shown & farther, shown & nearer)
 
 
 def resampled(cue: CueMap, camera: Camera) -> CueMap:

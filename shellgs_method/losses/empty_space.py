@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from shellgs_method.losses.normal import unit
@@ -31,7 +31,7 @@ class EmptySpaceLoss:
         target_depth: the cue's z-depth.
         target_normal: the cue's normals.
         rays: ray through each pixel, z = 1.
-        mask: true where the target is valid.
+        trust: weight of each pixel, 0 where the target is not valid.
         metres_per_unit: metres per unit of the depths.
         tolerance: distance in metres without cost, for errors of the shell's alignment.
     """
@@ -41,13 +41,13 @@ class EmptySpaceLoss:
         target_depth: Float[Tensor, "H W 1"],
         target_normal: Float[Tensor, "H W 3"],
         rays: Float[Tensor, "H W 3"],
-        mask: Bool[Tensor, "H W 1"],
+        trust: Float[Tensor, "H W 1"],
         metres_per_unit: float = 1.0,
         tolerance: float = 0.0,
     ):
         slope = (unit(target_normal) * rays).sum(dim=-1, keepdim=True).abs()
-        self._slope = (metres_per_unit * slope).where(mask, 0.0)
-        self._weights = mean_weights(mask, like=target_depth)
+        self._slope = (metres_per_unit * slope).where(trust > 0, 0.0)
+        self._weights = trust * mean_weights(trust > 0, like=target_depth)
         self._tolerance = target_depth.new_tensor([tolerance])
 
     def __call__(self, squares: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:

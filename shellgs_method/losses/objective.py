@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from shellgs_method.bounds import Bounds, Count, Weight
-from shellgs_method.evaluation.pixels import kept_pixels, photometric_pixels, reference_maps
+from shellgs_method.evaluation.pixels import kept_pixels, photometric_pixels, reference_maps, shell_trust
 from shellgs_method.files.cue_maps import tolerated
 from shellgs_method.geometry.reference import Reference
 from shellgs_method.losses import (
@@ -136,8 +136,10 @@ class Objective:
         cue = with_cue = None
         if f"{self.cues}_depth" in batch:
             with_cue = batch[f"{self.cues}_mask"].to(target.device)
-            maps = reference_maps(batch, self.cues, target.device, everywhere=self.trust == "shell")
-            cue = CueLosses(maps, self.paper, self.extra, self.metres_per_unit, self.shell_error)
+            maps = reference_maps(batch, self.cues, target.device, everywhere=True)
+            doubted = self.cues == "shell" and self.trust == "photographs"
+            trust = shell_trust(batch, target.device) if doubted else maps.mask.to(target)
+            cue = CueLosses(maps, trust, self.paper, self.extra, self.metres_per_unit, self.shell_error)
         view = ViewLosses(PhotometricLoss(target, kept), cue, with_cue)
         if keep and self._has_room(target):
             self._views[index] = view
@@ -183,17 +185,27 @@ class CueLosses:
     """Weighted terms that compare renders of one view with a cue's maps; what depends on these alone is computed once.
 
     If metres are unknown, lengths are in units of nerfstudio's rescaled world.
+
+    Args:
+        cue: the maps.
+        trust: weight of each pixel in E, 0 where there is no cue; the other terms are of pixels with a weight of 1.
+        paper: terms against the cue.
+        extra: terms beyond the paper.
+        metres_per_unit: metres per unit of the world; None if unknown.
+        shell_error: error of the shell's alignment in metres; None if unknown.
     """
 
     def __init__(
         self,
         cue: Reference,
+        trust: Float[Tensor, "H W 1"],
         paper: GeometryLossConfig,
         extra: ExtraLossConfig,
         metres_per_unit: float | None,
         shell_error: float | None = None,
     ):
-        self.cue, self.paper, self.extra, self.metres = cue, paper, extra, metres_per_unit or 1.0
+        self.cue, self.trust = cue._replace(mask=trust == 1), trust
+        self.paper, self.extra, self.metres = paper, extra, metres_per_unit or 1.0
         self.tolerance = extra.tolerance_for(shell_error)
         self._splats: EmptySpaceLoss | None = None
 
@@ -230,8 +242,9 @@ class CueLosses:
 
     def _empty_space(self, geometry: Geometry) -> Tensor:
         if self._splats is None:
-            depth, normal, mask = self.cue
-            self._splats = EmptySpaceLoss(depth, normal, geometry.camera.rays(), mask, self.metres, self.tolerance)
+            depth, normal, _ = self.cue
+            rays = geometry.camera.rays()
+            self._splats = EmptySpaceLoss(depth, normal, rays, self.trust, self.metres, self.tolerance)
         assert geometry.moments is not None
         return self._splats(geometry.moments.about(self.cue.depth, geometry.solid), _opacity(geometry))
 

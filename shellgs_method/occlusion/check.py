@@ -27,6 +27,7 @@ from shellgs_method.occlusion.contradiction import (
     ALONE,
     CONFIRMED,
     CONTRADICTED,
+    DOUBTFUL,
     REFLECTED,
     ShellView,
     Sweep,
@@ -48,7 +49,7 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 12
+VERSION = 13
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way
@@ -196,8 +197,9 @@ class _TrainingViews:
         behind = score_behind > REFLECTED
         if cue.classes is not None and self.windows:
             behind &= cue.classes == SurfaceClass.WINDOW
-        kinds = [static, beyond, moved, behind, confirmed]
-        depth = cue.depth * np.select(kinds, [_relative_depth(found, size), 2.0, 1.0, farther, 1.0], 0.0)
+        nearer = _relative_depth(found, size)
+        kinds = [static, beyond, moved, behind, confirmed, score > DOUBTFUL]
+        depth = cue.depth * np.select(kinds, [nearer, 2.0, 1.0, farther, 1.0, nearer], 0.0)
         return CueMap(np.where(hit, depth, 0).astype(np.float32), np.zeros_like(cue.normal), hidden & hit)
 
     def _behind(

@@ -43,6 +43,9 @@ CONTRADICTED = 0.14
 """Score above which a pixel is contradicted, if its colour counts neither way. With 0.08 more are found, and renders of
 what is in front of the shell improve, but mirrors contradict the shell too, and surfaces left to the photographs alone
 are less accurate."""
+DOUBTFUL = 0.01
+"""Score above which a pixel that is not contradicted is doubtful. Of what stands before the shell and is not found,
+a quarter to two thirds is, and a tenth of what is not."""
 ALONE = 0.12
 """Difference from the colours that other photographs agree on above which a pixel shows something that moved."""
 CONFIRMED = -0.03

@@ -308,7 +308,7 @@ def slanted_wall(depth: float, yaw: float) -> tuple[torch.Tensor, torch.Tensor, 
 def empty_space(metres_per_unit: float = 1.0, yaw: float = 0.5) -> tuple[EmptySpaceLoss, torch.Tensor]:
     """E of a wall, with a tolerance of 5 cm, and the cosine of each pixel's ray, of z = 1, with its normal."""
     target, normal, rays = slanted_wall(8.0, yaw)
-    loss = EmptySpaceLoss(target, normal, rays, torch.ones_like(target).bool(), metres_per_unit, tolerance=0.05)
+    loss = EmptySpaceLoss(target, normal, rays, torch.ones_like(target), metres_per_unit, tolerance=0.05)
     return loss, (rays * normal).sum(-1, keepdim=True).abs()
 
 
@@ -340,9 +340,25 @@ def test_empty_space_is_positive_even_if_the_mean_depth_is_right():
     assert float(loss(0 * slope, alpha / 2)) == pytest.approx(0.2 * math.log(1 + (0.5**0.5 - 0.05) / 0.2))
 
 
+def test_empty_space_is_a_mean_of_the_pixels_with_a_target_each_times_its_trust(random):
+    target, normal, rays = slanted_wall(8.0, 0.5)
+    squares, alpha = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    trust = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64) * some_mask(random)
+
+    def of(weights: torch.Tensor) -> float:
+        return float(EmptySpaceLoss(target, normal, rays, weights, tolerance=0.05)(squares, alpha))
+
+    pixels = [(float(trust[v, u]), (v, u)) for v in range(HEIGHT) for u in range(WIDTH) if trust[v, u] > 0]
+    alone = torch.zeros_like(trust)
+    terms = []
+    for weight, place in pixels:
+        terms.append(weight * of(alone.index_put(tuple(map(torch.tensor, place)), torch.ones((), dtype=torch.float64))))
+    assert of(trust) == pytest.approx(np.mean(terms))
+
+
 def test_the_gradient_of_empty_space_is_right_and_finite_on_the_wall(random):
     target, normal, rays = slanted_wall(8.0, 0.5)
-    loss = EmptySpaceLoss(target, normal, rays, some_mask(random), tolerance=0.05)
+    loss = EmptySpaceLoss(target, normal, rays, some_mask(random).double(), tolerance=0.05)
     squares, alpha = torch.rand(2, HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
     assert gradcheck(loss, (squares.requires_grad_(), alpha.requires_grad_()))
     zero = torch.zeros_like(target, requires_grad=True)
@@ -390,7 +406,7 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
         "ncc": (NccLoss(x, mask), y),
         "normal": (NormalLoss(target, mask), normal),
         "smoothness": (SmoothnessLoss(x, mask), normal),
-        "empty space": (partial(EmptySpaceLoss(x, target, rays, mask), alpha=b[..., :1] + 0.5), y),
+        "empty space": (partial(EmptySpaceLoss(x, target, rays, mask.float()), alpha=b[..., :1] + 0.5), y),
         "normals of depth": (lambda depth: (target * normals(depth)).sum(), y),
         "normal consistency": (lambda normal: normal_consistency_loss(normal, target, x, mask), normal),
     }

@@ -61,7 +61,7 @@ def calls(device: str) -> dict[str, tuple[Callable, list[Tensor]]]:
     def colours(means: Tensor, first: Tensor, rest: Tensor) -> Tensor:
         return spherical_harmonics(2, means, first, rest)
 
-    empty_space = EmptySpaceLoss(x, target, rays, mask)
+    empty_space = EmptySpaceLoss(x, target, rays, mask.float())
     return {
         "photometric": (lambda x: PhotometricLoss(b + 0.5, mask)(x), [a + 0.5]),
         "ncc": (lambda x: NccLoss(x.new_tensor(y.tolist()), mask)(x), [x]),

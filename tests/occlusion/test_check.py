@@ -19,13 +19,14 @@ from training_runs import data_of, model_of, small_disk, trainer_of
 from viser import SceneApi
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
-from shellgs_method.evaluation import Rendering
-from shellgs_method.evaluation.pixels import reference_maps
+from shellgs_method.evaluation import Rendering, pixels
+from shellgs_method.evaluation.pixels import DOUBTED, reference_maps, shell_trust
 from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.losses.objective import ExtraLossConfig, GeometryLossConfig, Objective, Trust
 from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
 from shellgs_method.occlusion import check as checking
 from shellgs_method.occlusion.check import _at_mean_exposure, _error, _exposed, _gains, _told_apart
@@ -418,11 +419,11 @@ def test_where_the_model_has_windows_only_they_show_what_is_behind(tmp_path: Pat
 
 
 def test_a_checked_map_says_what_a_pixel_shows():
-    shell = np.full((1, 6), 8, np.float32)
-    depth, hidden = np.array([[5, 8, 16, 8, 16, 0]], np.float32), np.array([[True] * 3 + [False] * 3])
-    normal = np.zeros((1, 6, 3), np.float16)
+    shell = np.full((1, 7), 8, np.float32)
+    depth, hidden = np.array([[5, 8, 16, 8, 16, 5, 0]], np.float32), np.array([[True] * 3 + [False] * 4])
+    normal = np.zeros((1, 7, 3), np.float16)
     found = Findings.of(CueMap(depth, normal, hidden), CueMap(shell, normal, shell > 0))
-    assert [mask[0].tolist() for mask in found] == np.eye(5, 6, dtype=bool).tolist()
+    assert [mask[0].tolist() for mask in found] == np.eye(6, 7, dtype=bool).tolist()
 
 
 def test_a_full_disk_raises_an_error_that_says_so(scene: Path):
@@ -464,6 +465,29 @@ def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request(
     parts = {name: part.view(-1).tolist() for name, part in regions(batch | beyond, 1.0, cpu).items()}
     assert parts["on_shell"] == [True, False] + [True] * 4 + [False, False]
     assert parts["off_shell"] == [False] * 6 + [True, True]
+
+
+def test_the_shell_counts_less_near_what_hides_it_and_where_it_is_doubted_and_not_at_all_where_it_is_hidden():
+    there = torch.tensor([True] * 11 + [False]).view(1, 12, 1)
+    batch = {"shell_depth": torch.full((1, 12, 1), 2.0), "shell_normal": torch.zeros(1, 12, 3), "shell_mask": there}
+    cpu, pixel = torch.device("cpu"), torch.arange(12).view(1, 12, 1)
+    assert shell_trust(batch, cpu).view(-1).tolist() == [1] * 11 + [0]
+    batch |= {"other_depth": torch.where(pixel == 0, 1.5, 0.0), "beyond": pixel == 10, "doubtful": pixel == 5}
+    trust = [0, *[DOUBTED] * 2, 1, 1, DOUBTED, 1, 1, *[DOUBTED] * 2, 0, 0]
+    assert shell_trust(batch, cpu).view(-1).tolist() == pytest.approx(trust)
+
+
+@pytest.mark.parametrize(("trust", "weights"), [("photographs", {0.0, 0.5, 1.0}), ("shell", {1.0})])
+def test_only_empty_space_learns_from_a_doubted_shell(monkeypatch, trust: Trust, weights: set[float]):
+    monkeypatch.setattr(pixels, "DOUBTED", 0.5)
+    shape, pixel = (8, 8, 1), torch.arange(64).view(8, 8, 1)
+    batch = {"shell_depth": torch.full(shape, 2.0), "shell_normal": torch.zeros(8, 8, 3), "image_idx": 0}
+    batch |= {"shell_mask": torch.ones(shape, dtype=torch.bool), "beyond": pixel < 8, "doubtful": pixel == 63}
+    objective = Objective("shell", trust, GeometryLossConfig(), ExtraLossConfig(), metres_per_unit=1.0)
+    cue = objective.view(batch, lambda: torch.rand(8, 8, 3), keep=False).cue
+    assert cue is not None
+    assert {*cue.trust.unique().tolist()} == weights
+    assert (cue.cue.mask == (cue.trust == 1)).all()
 
 
 def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(shellgs, scene: Path, tmp_path: Path):
