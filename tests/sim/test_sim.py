@@ -36,6 +36,7 @@ from shellgs_method.sim.collision.outside import from_outside
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.deviations import find_deviations
 from shellgs_method.sim.frame import SimFrame, sim_frame
+from shellgs_method.sim.look import texture
 from shellgs_method.sim.look.texture import Photo, bake
 from shellgs_method.sim.settings import SimSettings
 from shellgs_method.sim.simulate import _name
@@ -529,6 +530,13 @@ def test_a_texture_keeps_no_photographs_in_memory(wall):
     photos = Loading([frontal(x) for x in np.linspace(-1, 1, 6)])
     bake(wall, np.zeros((len(wall.vertices), 3)), photos)
     assert photos.most <= 2  # one is loaded while the last one is still known
+
+
+def test_a_texture_is_the_same_if_it_is_computed_in_parts(monkeypatch, wall):
+    photos, colours = [photo_of(frontal(x)) for x in (-0.8, 0.8)], np.full((len(wall.vertices), 3), 99.0)
+    whole = bake(wall, colours, photos)
+    monkeypatch.setattr(texture, "CHUNK", 500)
+    assert (np.asarray(bake(wall, colours, photos).image) == np.asarray(whole.image)).all()
 
 
 def test_views_blend_into_each_other(wall):

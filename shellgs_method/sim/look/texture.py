@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64, UInt8
+from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 from PIL import Image
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.sparse import coo_matrix, csc_array, hstack
@@ -26,6 +26,8 @@ FINER = 0.6
 """Size of a texel in pixels of the photographs, which together resolve more than one does."""
 GUTTER = 4
 """Padding between the charts of an atlas, in pixels."""
+CHUNK = 2_000_000
+"""Texels that are computed together: arrays of all would take gigabytes."""
 
 
 class Photo(NamedTuple):
@@ -76,26 +78,35 @@ def bake(
     if texel is None:  # a weight is pixels per square metre
         texel = float(FINER / np.sqrt(np.median(best[best > 0]))) if (best > 0).any() else 0.02
     vertex, uv, faces, size = _atlas(surface, texel)
-    pixels, corners, barycentric = _texels(uv, faces, size)
-    at = vertex[faces[corners]]  # the mesh's vertices around each texel
-    points = np.einsum("nk,nkc->nc", barycentric, surface.vertices[at])
+    corners = vertex[faces]  # the mesh's vertices around each triangle
+    texels = _Texels.of(uv, faces, size)
     own = 1e-3  # what no photograph sees keeps its own colour, and what hardly any sees blends into it
-    total = np.full(len(points), own)
-    blend = own * np.einsum("nk,nkc->nc", barycentric, colours[at])
+    total, blend = np.full(len(texels.place), own, np.float32), np.empty((len(texels.place), 3), np.float32)
+    for chunk in _chunks(len(blend)):
+        blend[chunk] = own * texels.mean(colours[corners], chunk)
     for number, photo in enumerate(photos):
         sharp = (weights[:, [number]].toarray().ravel() / np.maximum(best, 1e-12)) ** SHARPNESS
-        weight = np.einsum("nk,nk->n", barycentric, sharp[at])
-        seeing = np.flatnonzero(weight > 1e-4)
-        total[seeing] += weight[seeing]
-        blend[seeing] += weight[seeing, None] * _sample(photo, points[seeing])
-    texture, known = np.zeros((*size, 3)), np.zeros(size, bool)
-    rows, columns = pixels.T
-    texture[rows, columns], known[rows, columns] = blend / total[:, None], True
+        of_corners = sharp[corners]
+        there = np.flatnonzero((of_corners > 0).any(axis=1)[texels.triangle])
+        for chunk in _chunks(len(there)):
+            weight = texels.mean(of_corners, there[chunk])
+            seeing, weight = there[chunk][weight > 1e-4], weight[weight > 1e-4]
+            total[seeing] += weight
+            blend[seeing] += weight[:, None] * _sample(photo, texels.mean(surface.vertices[corners], seeing))
+    blend /= total[:, None]
+    texture, known = np.zeros((size[0] * size[1], 3), np.uint8), np.zeros(size, bool)
+    texture[texels.place] = blend.round(out=blend).clip(0, 255, out=blend)
+    known.ravel()[texels.place] = True
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     assert isinstance(nearest, np.ndarray)
-    filled = texture[nearest[0], nearest[1]].round().clip(0, 255).astype(np.uint8)
+    filled = texture.reshape(*size, 3)[nearest[0], nearest[1]]
     image = Image.fromarray(filled[::-1])  # its first row is at the top, and v points up
     return TexturedMesh(surface.vertices[vertex], faces, uv, image, float((best > 0).mean()))
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    """Parts of :data:`CHUNK`, in order."""
+    return (slice(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK))
 
 
 def _weights(surface: Triangles, photo: Photo) -> Float64[np.ndarray, " V"]:
@@ -157,32 +168,47 @@ def _atlas(
     return vertex.astype(np.int64), uv.astype(np.float64), faces.astype(np.int64), (atlas.height, atlas.width)
 
 
-def _texels(
-    uv: Float[np.ndarray, "M 2"], faces: Int64[np.ndarray, "F 3"], size: tuple[int, int]
-) -> tuple[Int64[np.ndarray, "N 2"], Int64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
-    """Row and column of each texel in a triangle, that triangle, and the texel's centre in barycentric coordinates."""
-    found = list(_texels_of(uv * [size[1], size[0]], faces, size))
-    return tuple(np.concatenate(part) for part in zip(*found, strict=True))  # pyright: ignore[reportReturnType]
+class _Texels(NamedTuple):
+    """Texels of an atlas whose centres are in a triangle; of the largest there are 50 million."""
+
+    place: Int32[np.ndarray, " N"]
+    """Index into the flattened texture."""
+    triangle: Int32[np.ndarray, " N"]
+    barycentric: Float32[np.ndarray, "N 3"]
+    """The texel's centre in the triangle."""
+
+    @classmethod
+    def of(cls, uv: Float[np.ndarray, "M 2"], faces: Int64[np.ndarray, "F 3"], size: tuple[int, int]) -> _Texels:
+        """Find the texels of an atlas' faces, of a texture of a height and width."""
+        return cls(*map(np.concatenate, zip(*_texels_of(uv * [size[1], size[0]], faces, size), strict=True)))
+
+    def mean(
+        self, of_corners: Float64[np.ndarray, "F 3 *C"], some: Int64[np.ndarray, " M"] | slice
+    ) -> Float64[np.ndarray, "M *C"]:
+        """Values of the triangles' corners, interpolated at some texels."""
+        return np.einsum("nk,nk...->n...", self.barycentric[some], of_corners[self.triangle[some]])
 
 
-def _texels_of(places: np.ndarray, faces: np.ndarray, size: tuple[int, int], chunk: int = 20_000) -> Iterator[tuple]:
-    for first in range(0, len(faces), chunk):
-        corners = places[faces[first : first + chunk]]
-        low = np.floor(corners.min(axis=1) - 0.5).astype(int).clip(0)
-        high = (np.ceil(corners.max(axis=1) + 0.5).astype(int)).clip(max=[size[1], size[0]])
-        extent = (high - low).clip(0)
-        counts = extent.prod(axis=1)
-        triangle = np.repeat(np.arange(len(corners)), counts)
-        place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        column = low[triangle, 0] + place % extent[triangle, 0].clip(1)
-        row = low[triangle, 1] + place // extent[triangle, 0].clip(1)
-        a, b, c = (corners[:, k] for k in range(3))
-        doubled = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+def _texels_of(places: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> Iterator[tuple]:
+    corners = places[faces]
+    low = np.floor(corners.min(axis=1) - 0.5).astype(int).clip(0)
+    high = (np.ceil(corners.max(axis=1) + 0.5).astype(int)).clip(max=[size[1], size[0]])
+    extent = (high - low).clip(0)
+    ends = np.cumsum(extent.prod(axis=1))
+    a = corners[:, 0]
+    first_edge, second_edge = corners[:, 1] - a, corners[:, 2] - a
+    doubled = first_edge[:, 0] * second_edge[:, 1] - first_edge[:, 1] * second_edge[:, 0]
+    area = np.where(np.abs(doubled) > 1e-12, doubled, 1e-12)
+    for chunk in _chunks(int(ends[-1])):
+        number = np.arange(chunk.start, chunk.stop)
+        triangle = np.searchsorted(ends, number, side="right")
+        within = number - (ends - extent.prod(axis=1))[triangle]
+        column = low[triangle, 0] + within % extent[triangle, 0]
+        row = low[triangle, 1] + within // extent[triangle, 0]
         x, y = column + 0.5 - a[triangle, 0], row + 0.5 - a[triangle, 1]
-        area = np.where(np.abs(doubled) > 1e-12, doubled, 1e-12)[triangle]
-        first_edge, second_edge = (b - a)[triangle], (c - a)[triangle]
-        v = (x * second_edge[:, 1] - y * second_edge[:, 0]) / area
-        w = (first_edge[:, 0] * y - first_edge[:, 1] * x) / area
+        v = (x * second_edge[triangle, 1] - y * second_edge[triangle, 0]) / area[triangle]
+        w = (first_edge[triangle, 0] * y - first_edge[triangle, 1] * x) / area[triangle]
         weights = np.stack([1 - v - w, v, w], axis=1)
         inside = (weights > -1e-6).all(axis=1)
-        yield np.stack([row, column], axis=1)[inside], triangle[inside] + first, weights[inside]
+        place = row * size[1] + column
+        yield place[inside].astype(np.int32), triangle[inside].astype(np.int32), weights[inside].astype(np.float32)
