@@ -37,7 +37,7 @@ Trust = Literal["shell", "photographs"]
 MAX_KEPT_SHARE = 0.1
 """Share of the device's free memory that losses of training views may take, which are made in their first step."""
 KEPT_BYTES = 110
-"""Bytes that the losses of a pixel take, of all terms: 105 of `shellgs-metric`."""
+"""Bytes that the losses of a pixel take, of all terms: 109 of `shellgs-metric`."""
 SOLID = 0.5
 """Opacity that the shell must have where what is behind it may be seen through it."""
 DISTORTION_FROM = 3000
