@@ -42,23 +42,27 @@ def reference_maps(batch: dict, kind: str, device: torch.device, everywhere: boo
     """
     depth, normal, mask = (batch[f"{kind}_{name}"].to(device) for name in ("depth", "normal", "mask"))
     if kind == "shell" and not everywhere:
-        mask = mask & ~_with_margin(occluded(batch, device) | beyond(batch, device))
+        mask = mask & ~_with_margin(_hidden(batch, device))
     if "mask" in batch:
         mask = mask & batch["mask"].to(device)
     return Reference(depth, normal.float(), mask)
 
 
-def shell_trust(batch: dict, device: torch.device) -> Float[Tensor, "H W 1"]:
-    """Weight of the shell in a training view, from 0 to 1.
+def shell_trust(batch: dict, mask: Bool[Tensor, "H W 1"]) -> Float[Tensor, "H W 1"]:
+    """Weight of the shell in a training view, from 0 to 1, by the mask of its :func:`reference_maps` everywhere.
 
     It is 0 where photographs show something else, and :data:`DOUBTED` in a margin around that and where they may.
     """
-    hidden = occluded(batch, device) | beyond(batch, device)
+    hidden = _hidden(batch, mask.device)
     doubtful = _with_margin(hidden)
     if "doubtful" in batch:
-        doubtful |= batch["doubtful"].to(device)
-    there = reference_maps(batch, "shell", device, everywhere=True).mask & ~hidden
-    return torch.where(doubtful, DOUBTED, 1.0).where(there, 0.0)
+        doubtful |= batch["doubtful"].to(mask.device)
+    return torch.where(doubtful, DOUBTED, 1.0).where(mask & ~hidden, 0.0)
+
+
+def _hidden(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:
+    """Pixels where photographs show something in front of the shell, or the background."""
+    return occluded(batch, device) | beyond(batch, device)
 
 
 def occluded(batch: dict, device: torch.device) -> Bool[Tensor, "H W 1"]:

@@ -45,9 +45,10 @@ class EmptySpaceLoss:
         metres_per_unit: float = 1.0,
         tolerance: float = 0.0,
     ):
+        mask = trust > 0
         slope = (unit(target_normal) * rays).sum(dim=-1, keepdim=True).abs()
-        self._slope = (metres_per_unit * slope).where(trust > 0, 0.0)
-        self._weights = trust * mean_weights(trust > 0, like=target_depth)
+        self._slope = (metres_per_unit * slope).where(mask, 0.0)
+        self._weights = trust * mean_weights(mask, like=target_depth)
         self._tolerance = target_depth.new_tensor([tolerance])
 
     def __call__(self, squares: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, ""]:

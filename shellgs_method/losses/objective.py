@@ -138,7 +138,7 @@ class Objective:
             with_cue = batch[f"{self.cues}_mask"].to(target.device)
             maps = reference_maps(batch, self.cues, target.device, everywhere=True)
             doubted = self.cues == "shell" and self.trust == "photographs"
-            trust = shell_trust(batch, target.device) if doubted else maps.mask.to(target)
+            trust = shell_trust(batch, maps.mask) if doubted else maps.mask.to(target)
             cue = CueLosses(maps, trust, self.paper, self.extra, self.metres_per_unit, self.shell_error)
         view = ViewLosses(PhotometricLoss(target, kept), cue, with_cue)
         if keep and self._has_room(target):

@@ -470,11 +470,11 @@ def test_a_contradicted_shell_is_not_a_reference_and_supervises_only_on_request(
 def test_the_shell_counts_less_near_what_hides_it_and_where_it_is_doubted_and_not_at_all_where_it_is_hidden():
     there = torch.tensor([True] * 11 + [False]).view(1, 12, 1)
     batch = {"shell_depth": torch.full((1, 12, 1), 2.0), "shell_normal": torch.zeros(1, 12, 3), "shell_mask": there}
-    cpu, pixel = torch.device("cpu"), torch.arange(12).view(1, 12, 1)
-    assert shell_trust(batch, cpu).view(-1).tolist() == [1] * 11 + [0]
+    pixel = torch.arange(12).view(1, 12, 1)
+    assert shell_trust(batch, there).view(-1).tolist() == [1] * 11 + [0]
     batch |= {"other_depth": torch.where(pixel == 0, 1.5, 0.0), "beyond": pixel == 10, "doubtful": pixel == 5}
     trust = [0, *[DOUBTED] * 2, 1, 1, DOUBTED, 1, 1, *[DOUBTED] * 2, 0, 0]
-    assert shell_trust(batch, cpu).view(-1).tolist() == pytest.approx(trust)
+    assert shell_trust(batch, there).view(-1).tolist() == pytest.approx(trust)
 
 
 @pytest.mark.parametrize(("trust", "weights"), [("photographs", {0.0, 0.5, 1.0}), ("shell", {1.0})])

@@ -79,11 +79,12 @@ def bake(
         texel = float(FINER / np.sqrt(np.median(best[best > 0]))) if (best > 0).any() else 0.02
     vertex, uv, faces, size = _atlas(surface, texel)
     corners = vertex[faces]  # the mesh's vertices around each triangle
+    places, colours = surface.vertices[corners], colours[corners]
     texels = _Texels.of(uv, faces, size)
     own = 1e-3  # what no photograph sees keeps its own colour, and what hardly any sees blends into it
     total, blend = np.full(len(texels.place), own, np.float32), np.empty((len(texels.place), 3), np.float32)
     for chunk in _chunks(len(blend)):
-        blend[chunk] = own * texels.mean(colours[corners], chunk)
+        blend[chunk] = own * texels.mean(colours, chunk)
     for number, photo in enumerate(photos):
         sharp = (weights[:, [number]].toarray().ravel() / np.maximum(best, 1e-12)) ** SHARPNESS
         of_corners = sharp[corners]
@@ -92,7 +93,7 @@ def bake(
             weight = texels.mean(of_corners, there[chunk])
             seeing, weight = there[chunk][weight > 1e-4], weight[weight > 1e-4]
             total[seeing] += weight
-            blend[seeing] += weight[:, None] * _sample(photo, texels.mean(surface.vertices[corners], seeing))
+            blend[seeing] += weight[:, None] * _sample(photo, texels.mean(places, seeing))
     blend /= total[:, None]
     texture, known = np.zeros((size[0] * size[1], 3), np.uint8), np.zeros(size, bool)
     texture[texels.place] = blend.round(out=blend).clip(0, 255, out=blend)
@@ -194,7 +195,9 @@ def _texels_of(places: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> 
     low = np.floor(corners.min(axis=1) - 0.5).astype(int).clip(0)
     high = (np.ceil(corners.max(axis=1) + 0.5).astype(int)).clip(max=[size[1], size[0]])
     extent = (high - low).clip(0)
-    ends = np.cumsum(extent.prod(axis=1))
+    counts = extent.prod(axis=1)
+    ends = np.cumsum(counts)
+    starts = ends - counts
     a = corners[:, 0]
     first_edge, second_edge = corners[:, 1] - a, corners[:, 2] - a
     doubled = first_edge[:, 0] * second_edge[:, 1] - first_edge[:, 1] * second_edge[:, 0]
@@ -202,7 +205,7 @@ def _texels_of(places: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> 
     for chunk in _chunks(int(ends[-1])):
         number = np.arange(chunk.start, chunk.stop)
         triangle = np.searchsorted(ends, number, side="right")
-        within = number - (ends - extent.prod(axis=1))[triangle]
+        within = number - starts[triangle]
         column = low[triangle, 0] + within % extent[triangle, 0]
         row = low[triangle, 1] + within // extent[triangle, 0]
         x, y = column + 0.5 - a[triangle, 0], row + 0.5 - a[triangle, 1]
