@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,6 +17,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.open3d import import_open3d
+from shellgs_method.machine.progress import track
 
 if TYPE_CHECKING:
     import trimesh
@@ -32,7 +33,7 @@ SPECK = 100.0
 
 
 _BLOCK = 8  # voxels along a side of a block, which is stored if a surface is near
-_TILE = 160  # blocks along a tile
+_MOST = 150_000  # blocks of a tile: 1.5 GB, and two or three times that while Open3D makes room for more
 
 
 class DepthView(NamedTuple):
@@ -48,8 +49,8 @@ class DepthView(NamedTuple):
 def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> trimesh.Trimesh:
     """Fuse views into a coloured mesh of the surface inside a box.
 
-    A long box is fused in tiles of one lattice, whose meshes meet without a seam, so that memory is that of a tile; the
-    views are kept on disk meanwhile.
+    Where a surface is too large for memory, the box is fused in tiles of one lattice, whose meshes meet without a seam;
+    the views are kept on disk meanwhile.
 
     Open3D's ``VoxelBlockGrid`` has float32 coordinates, so the box must be near the frame's origin. (The older
     ``ScalableTSDFVolume`` of Open3D 0.20 silently returns nothing.)
@@ -71,22 +72,22 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
     if voxel is None:
         pixel = (first.depth[first.depth > 0].median() / first.camera.K[0, 0]).item()
         voxel = max(pixel, least_voxel(box))
-    axis, bounds = _tiles(box, voxel)
+    axis, low, parts = _longest(box), -np.inf, []
     with tempfile.TemporaryDirectory() as folder:
-        kept = _Kept(Path(folder)) if len(bounds) > 2 else None
-        parts, taken = [], chain([first], shown)
-        for low, high in pairwise(bounds):
-            grid, seen = _voxel_grid(voxel), 0
+        kept = _Kept(Path(folder))
+        taken = kept.keeping(chain([first], shown))
+        while low < np.inf:
+            grid, high, seen = _voxel_grid(voxel), np.inf, 0
             for view in taken:
                 _integrate(grid, view, axis, low, high)
                 seen += 1
-                if kept and low == bounds[0]:
-                    kept.add(view)
+                if grid.hashmap().size() > _MOST:
+                    high = _shortened(grid, axis)
             if grid.hashmap().size():
                 mesh = _extract(grid, min(MIN_VIEWS, seen))
                 middle = mesh.triangles_center[:, axis] / (_BLOCK * voxel) if len(mesh.faces) else np.empty(0)
                 parts.append((mesh, (middle >= low) & (middle < high)))
-            taken = kept or ()
+            low, taken = high, track(kept, "Fusing the next part, view", len(kept))
     mesh = _joined(parts)
     mesh.update_faces(_without_specks(mesh, SPECK * voxel**2))
     mesh.remove_unreferenced_vertices()
@@ -115,14 +116,26 @@ def _inside(views: Iterable[DepthView], box: Box) -> Iterator[DepthView]:
             yield view._replace(depth=view.depth.where(inside[..., None], 0.0))
 
 
-def _tiles(box: Box, voxel: float) -> tuple[int, list[float]]:
-    """The axis of the lattice along which the box is cut, and the blocks at which tiles begin and end."""
+def _longest(box: Box) -> int:
+    """The axis of the lattice along which the box is longest."""
     corners = np.stack(np.meshgrid(*zip(box.low, box.high, strict=True)), axis=-1).reshape(-1, 3) @ box.axes
-    low, high = corners.min(axis=0) / (_BLOCK * voxel), corners.max(axis=0) / (_BLOCK * voxel)
-    axis = int((high - low).argmax())
-    count = max(1, round(float(high[axis] - low[axis]) / _TILE))
-    cuts = np.floor(np.linspace(low[axis], high[axis], count + 1)[1:-1]).tolist()
-    return axis, [-np.inf, *cuts, np.inf]
+    return int(np.ptp(corners, axis=0).argmax())
+
+
+def _shortened(grid, axis: int) -> float:
+    """End a tile at its median block, if there is one after its first, and remove what is beyond; the new end."""
+    o3d = import_open3d()
+    blocks = grid.hashmap()
+    taken = blocks.active_buf_indices().numpy()
+    places = blocks.key_tensor().numpy()[taken]
+    along = places[:, axis]
+    end = max(int(np.median(along)), int(along.min()) + 1)
+    beyond = along > end  # what is at the end stays, as the last triangles reach into it
+    for name in ("tsdf", "weight", "color"):
+        grid.attribute(name).numpy()[taken[beyond]] = 0  # Open3D does not when it uses their places again
+    if beyond.any():
+        blocks.erase(o3d.core.Tensor(places[beyond]))
+    return float(end)
 
 
 class _Kept:
@@ -131,14 +144,21 @@ class _Kept:
     def __init__(self, folder: Path) -> None:
         self.folder, self.cameras = folder, []
 
-    def add(self, view: DepthView) -> None:
-        np.save(self.folder / f"{len(self.cameras)}.npy", torch.cat([view.depth, view.rgb], dim=-1).float().numpy())
-        self.cameras.append(view.camera)
+    def keeping(self, views: Iterable[DepthView]) -> Iterator[DepthView]:
+        """The views, kept one after another as they are taken."""
+        for view in views:
+            rgb = (255 * view.rgb).round().clamp(0, 255).byte()
+            np.savez(self.folder / f"{len(self)}.npz", depth=view.depth.float().numpy(), rgb=rgb.numpy())
+            self.cameras.append(view.camera)
+            yield view
+
+    def __len__(self) -> int:
+        return len(self.cameras)
 
     def __iter__(self) -> Iterator[DepthView]:
         for number, camera in enumerate(self.cameras):
-            pixels = torch.from_numpy(np.load(self.folder / f"{number}.npy"))
-            yield DepthView(pixels[..., :1], pixels[..., 1:], camera)
+            with np.load(self.folder / f"{number}.npz") as images:
+                yield DepthView(torch.from_numpy(images["depth"]), torch.from_numpy(images["rgb"]) / 255, camera)
 
 
 def _voxel_grid(voxel: float):
