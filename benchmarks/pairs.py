@@ -121,8 +121,8 @@ def pairs(
     if not scenes and not (folder / "facade").exists():
         write_scene(folder / "facade", facade)
     for scene in scenes or (folder / "facade",):
-        print(f"\n{scene.name}\n\n| | pairs | models | mean, worst error | pixels | CPU s: matching, mapping | MB |")
-        print("|---|---:|---|---:|---:|---:|---:|")
+        print(f"\n{scene.name}\n\n| | pairs | models | mean, worst error | pixels | CPU s: matching, mapping |")
+        print("|---|---:|---|---:|---:|---:|")
         for name in contenders:
             config, replaced = CONTENDERS[name]
             row = _row(scene, folder / "captures" / scene.name, replace(config, frames=frames), replaced)
@@ -164,11 +164,10 @@ def _row(truth: Path, scene: Path, config: CaptureConfig, replaced: Steps) -> st
     finally:
         stages.run_step = run_step
     matching = cpu["match"] + cpu["find_loops"] + cpu["settle"] + cpu["find_bridges"] + cpu["join"]
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024
     folded = ", **folded**" if errors[2] > FOLDED else ""
     return (
         f"{count} | {', '.join(map(str, models))} | {errors[0]:.3f}, {errors[1]:.3f}{folded} | {pixels[0]:.2f} | "
-        f"{matching:.0f}, {cpu['reconstruct']:.0f} | {memory}"
+        f"{matching:.0f}, {cpu['reconstruct']:.0f}"
     )
 
 

@@ -27,6 +27,7 @@ from shellgs_method.geometry.box import Box
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.tsdf import DepthView, fuse, least_voxel
+from shellgs_method.machine.memory import return_freed
 from shellgs_method.machine.progress import tell, track
 from shellgs_method.model import FacadeModel
 from shellgs_method.occlusion.exposure import Sightings, log_gains
@@ -199,6 +200,7 @@ class TrainedRun:
             if kept is not None:
                 depth = depth.where(torch.from_numpy(kept)[..., None], 0.0)
             yield DepthView(depth, outputs["rgb"].cpu(), self.frame.camera(dataset.views[index].camera))
+            return_freed()  # what a caller keeps of a view would else hold the memory around it
 
     @torch.no_grad()
     def log_gains(self) -> Float64[np.ndarray, "V 3"]:

@@ -141,10 +141,13 @@ def neighbours(
 def sides(view: Camera, others: Sequence[Camera]) -> Sides:
     """Distances and indices of the cameras left and right of a view that look in about the same direction."""
     found: Sides = ([], [])
-    for index, other in enumerate(others):
-        step = other.position - view.position
-        if float(view.viewmat[2, :3] @ other.viewmat[2, :3]) > 0.5:
-            found[int(view.viewmat[0, :3] @ step > 0)].append((float(step.norm()), index))
+    if others:
+        viewmats = torch.stack([other.viewmat for other in others])
+        steps = -(viewmats[:, :3, 3:].mT @ viewmats[:, :3, :3])[:, 0] - view.position
+        alike = viewmats[:, 2, :3] @ view.viewmat[2, :3] > 0.5
+        is_right, baselines = (steps @ view.viewmat[0, :3] > 0).tolist(), steps.norm(dim=-1).tolist()
+        for index in alike.nonzero()[:, 0].tolist():
+            found[is_right[index]].append((baselines[index], index))
     return found
 
 
