@@ -303,13 +303,15 @@ class FacadeModel(SplatfactoModel):
         self.surface = torch.empty_like(dict["surface"], device=self.device) if "surface" in dict else None
         around = Surroundings.shaped(dict, "surroundings.")
         self.surroundings = around and around.to(self.device)
+        if self.surface_weights is not None:
+            self.surface_weights.weighed = self.means  # as the stored weights are of these, wherever they were then
         self.step = self.num_iterations
         return nn.Module.load_state_dict(self, dict, **kwargs)
 
     def update_surface(self) -> None:
         """Find the Gaussians behind the shell, if any was added, removed or relocated since."""
         weights = self.surface_weights
-        if weights is not None and (self.surface is None or not weights.hold_for(self.means)):
+        if weights is not None and (self.surface is None or weights.weighed is not self.means):
             self.surface = weights(self.means)
 
     @property

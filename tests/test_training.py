@@ -324,6 +324,21 @@ def test_a_resumed_run_ends_as_one_that_was_never_stopped(pristine_scene, tmp_pa
     )
 
 
+def test_a_resumed_run_keeps_which_gaussians_are_behind_the_shell(pristine_scene, tmp_path):
+    """As the run did that was stopped: those that passed the shell since are told at the next densification."""
+    first = trainer_of(pristine_scene, tmp_path / "first", "shellgs_metric", iterations=4)
+    first.train()
+    (checkpoint,) = first.checkpoint_dir.glob("*.ckpt")
+    stored = torch.load(checkpoint)
+    surface = stored["pipeline"]["_model.surface"]
+    surface[0] = 0.5  # neither behind nor before
+    torch.save(stored, checkpoint)
+    model = model_of(trainer_of(pristine_scene, tmp_path / "r", "shellgs_metric", 20, first.checkpoint_dir))
+    model.update_surface()
+    assert model.surface is not None
+    assert torch.equal(model.surface, surface)
+
+
 def test_a_resumed_run_loads_another_number_of_gaussians(pristine_scene, tmp_path):
     first = trainer_of(pristine_scene, tmp_path / "first", iterations=1)
     state = first.pipeline.state_dict()

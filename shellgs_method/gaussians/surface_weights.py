@@ -20,17 +20,22 @@ the time. On a facade with niches this changed the weights of 0.04 % of the Gaus
 
 
 class SurfaceWeights:
-    """Weights of Gaussians in depth and normals, by the shell as points with normals."""
+    """Weights of Gaussians in depth and normals, by the shell as points with normals.
+
+    Attributes:
+        weighed: the centres that were weighed last. Their weights hold wherever these have moved since: an optimizer
+            moves Gaussians within their tensor; whoever adds, removes or relocates some replaces the tensor.
+    """
 
     def __init__(self, shell: Seeds, metres_per_unit: float | None):
         self._points, self._normals = shell.points, shell.normals
         self._tree = point_tree(shell.points) if len(shell.points) else None
         self._thickness = THICKNESS / (metres_per_unit or 1.0)
-        self._weighed: Tensor | None = None
+        self.weighed: Tensor | None = None
 
     def __call__(self, means: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1"]:
         """1, or :data:`WEIGHT_BEHIND` for centres behind the tangent plane of the nearest point."""
-        self._weighed = means
+        self.weighed = means
         if self._tree is None:
             return means.new_ones(len(means), 1)
         positions = means.detach().double().cpu().numpy()
@@ -38,10 +43,3 @@ class SurfaceWeights:
         along = np.einsum("ij,ij->i", self._points[nearest] - positions, self._normals[nearest])
         weights = np.where(along > self._thickness, WEIGHT_BEHIND, 1.0)
         return torch.from_numpy(weights[:, None]).to(means)
-
-    def hold_for(self, means: Float[Tensor, "N 3"]) -> bool:
-        """Whether the weights found last are those of the same Gaussians, wherever these have moved since.
-
-        An optimizer moves Gaussians within their tensor; whoever adds, removes or relocates some replaces the tensor.
-        """
-        return self._weighed is means
