@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import unicodedata
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
@@ -121,18 +120,19 @@ class NamedFiles:
 
 
 def _alike(one: str, other: str) -> bool:
-    return one == other or _folded(one) == _folded(other)
+    return one == other or folded(one) == folded(other)
 
 
-def _folded(name: str) -> str:
+def folded(name: str) -> str:
+    """A name without what systems spell differently: case, and the composition of letters."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 def captured_name(photograph: PurePath) -> str:
     """Name in the scene of a photograph that is captured, by its path below the folder of photographs."""
     kept = photograph if photograph.suffix.lower() in CAPTURED else photograph.with_suffix(".png")
-    # COLMAP's lists of pairs are split at blanks, and # starts a comment.
-    return re.sub(r"[\s#]", "_", kept.as_posix())
+    # COLMAP's lists of pairs are split at blanks, # starts a comment, and bytes that are no UTF-8 are no text.
+    return "".join("_" if each in " #" or not each.isprintable() else each for each in kept.as_posix())
 
 
 def mask_names(photograph: PurePath) -> list[PurePath]:

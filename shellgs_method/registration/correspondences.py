@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.paths import captured_name
+from shellgs_method.files.paths import captured_name, folded
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.similarity import centred, fit_similarity, transformed
 from shellgs_method.shell.alignment import Alignment
@@ -129,7 +129,8 @@ def worst_first(points: Sequence[Point]) -> list[Point]:
 def view_named(name: str, views: Sequence[View], where: str) -> View | None:
     """Find a view by its image's path in the scene or the end of it; None if there is none.
 
-    If no image is called so, the name may be the one before `shellgs capture`, or differ in upper and lower case.
+    If no image is called so, the name may be the one before `shellgs capture`, or differ in upper and lower case, or in
+    how its letters are composed.
 
     Raises:
         SceneError: several images have this name.
@@ -150,7 +151,7 @@ def _captured(name: str) -> str:
     return captured_name(PureWindowsPath(name))
 
 
-_SPELLINGS = (str, _captured, lambda name: _captured(name).casefold())  # the strictest first
+_SPELLINGS = (str, _captured, lambda name: folded(_captured(name)))  # the strictest first
 
 
 def _consensus(scene: np.ndarray, shell: np.ndarray, candidates: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:

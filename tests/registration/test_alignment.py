@@ -747,6 +747,7 @@ USERS_NAMES = {
     "west wing/IMG_0002.HEIC": "'west wing\\IMG_0002.heic'",
     "IMG_0003.JPG": "img_0003.jpg",
     "east/IMG_0004.jpg": "east/IMG_0004.jpg",
+    "Gru\u0308n.jpg": "gr\u00fcn.jpg",
 }
 """Photographs before `shellgs capture`, and how a user's file may call them."""
 
