@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -49,10 +50,11 @@ def photograph(width: int = 64, height: int = 48, seed: int = 0) -> Image.Image:
     return Image.fromarray(pixels)
 
 
-def write_video(path: Path, frames: list[Image.Image], rate: int = 10) -> None:
+def write_video(path: Path, frames: list[Image.Image], rate: int = 10, pixel_aspect: Fraction = Fraction(1)) -> None:
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=rate)
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = *frames[0].size, "yuv420p", 8_000_000
+        stream.codec_context.sample_aspect_ratio = pixel_aspect
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_image(frame)))
         container.mux(stream.encode())

@@ -32,11 +32,13 @@ _PICTURES = Disposition.attached_pic | Disposition.timed_thumbnails | Dispositio
 _NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
 _SMALL = 128  # pixels, the width at which motion is measured
 _PACE = 0.2  # seconds between the frames that motion is measured between: pixels, not fractions of one
+_SQUARE = 0.01  # by which a pixel's sides may differ: programs round them
 _BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
 
 def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> None:
-    """Write the sharpest frame of each of at most ``count`` stretches of equal motion of a video, upright, as JPEG.
+    """Write the sharpest frame of each of at most ``count`` stretches of equal motion of a video, upright and with
+    square pixels, as JPEG.
 
     Files are numbered by their frames in the video. Of several videos in a file, the largest is used, and told.
 
@@ -44,7 +46,8 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         SceneError: the file cannot be read as a video, or holds no frame.
     """
     with _opened(video) as (container, stream):
-        transfer, is_around = _hdr(video, stream), stream.width == 2 * stream.height
+        transfer, aspect = _hdr(video, stream), _pixel_aspect(stream)
+        is_around = round(stream.width * aspect) == 2 * stream.height
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         sharpnesses, times, marks, shifts, before = [], [], [], [], None
         for frame in container.decode(stream):
@@ -69,7 +72,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     with _opened(video) as (container, stream):
         for number, frame in enumerate(container.decode(stream)):
             if number in chosen:
-                image = _upright(frame, transfer)
+                image = _upright(frame, transfer, aspect)
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
                 progress.advance(task)
 
@@ -181,9 +184,17 @@ def _hdr(video: Path, stream: VideoStream) -> Transfer | None:
     return transfer
 
 
-def _upright(frame: av.VideoFrame, transfer: Transfer | None) -> Image.Image:
+def _pixel_aspect(stream: VideoStream) -> float:
+    """Width of a pixel by its height: 4/3 in HDV and some AVCHD, whose 1440 columns are shown as 1920."""
+    aspect = float(stream.sample_aspect_ratio or 1)
+    return aspect if 0.25 < aspect < 4 and abs(aspect - 1) > _SQUARE else 1.0
+
+
+def _upright(frame: av.VideoFrame, transfer: Transfer | None, aspect: float) -> Image.Image:
     if transfer is None:
         image = frame.to_image()
     else:
         image = Image.fromarray(tone_mapped(frame.to_ndarray(format="rgb48le"), transfer))
+    if aspect != 1:
+        image = image.resize((round(image.width * aspect), image.height), Image.Resampling.BICUBIC)
     return image.rotate(frame.rotation, expand=True)

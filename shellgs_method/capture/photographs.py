@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import shutil
 import zlib
@@ -29,6 +30,7 @@ from shellgs_method.files.paths import (
     tell_of_masks,
 )
 
+_EXCERPT = 4096  # bytes
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
 """Suffixes of videos, in lower case."""
 _LENS_TAGS = (
@@ -43,7 +45,7 @@ _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Ba
 
 
 def find_photographs(folder: Path) -> dict[str, Path]:
-    """The photographs in a folder and its sub-folders, by their names in the scene; other files are told.
+    """The photographs in a folder and its sub-folders, by their names in the scene; other files and copies are told.
 
     Raises:
         SceneError: there are none, some are raw without a developed one beside, or two would get the same name.
@@ -51,7 +53,7 @@ def find_photographs(folder: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
     photographs = photographs_in(folder, deep=True)
     _tell_what_is_left_out(folder, photographs)
-    for path in photographs:
+    for path in _without_copies(folder, photographs):
         name = captured_name(path.relative_to(folder))
         if name in found:
             raise SceneError(f"{found[name]} and {path} would both become {name} in the scene: rename one of them")
@@ -74,6 +76,43 @@ def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
         raise SceneError(f"there are no photographs in {folder} ({', '.join(sorted(PHOTOGRAPHS))}){there}{videos}")
     if counted:
         notice(f"{others.total()} files of {folder} are no photographs, and are left out ({counted}).")
+
+
+def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
+    """Photographs without those that are copies of another's file, which is told, as are two formats of one name.
+
+    A view would be trained on whose copy is held out.
+    """
+    originals: dict[tuple[int, bytes], Path] = {}
+    copies: dict[Path, Path] = {}
+    for path in sorted(photographs, key=lambda path: (len(path.name), path)):  # "a copy.jpg" is the copy of "a.jpg"
+        if not path.is_file() or not (size := path.stat().st_size):
+            continue
+        original = originals.setdefault((size, _excerpt(path, size)), path)
+        if original != path and filecmp.cmp(original, path, shallow=False):
+            copies[path] = original
+    if copies:
+        copy, original = min(copies.items())
+        notice(
+            f"{len(copies)} photographs of {folder} are copies of others, and are left out "
+            f"({copy.relative_to(folder)} is {original.relative_to(folder)}, for example)."
+        )
+    kept = [path for path in photographs if path not in copies]
+    stems = Counter(path.with_suffix("") for path in kept)
+    if twins := [path.name for path in kept if stems[path.with_suffix("")] > 1]:
+        notice(
+            f"{len(twins)} photographs of {folder} differ from another's name in their suffix alone ({twins[0]} and "
+            f"{twins[1]}, for example): if they are one photograph in two formats, move one of the two away, or "
+            "metrics of held-out photographs are too good."
+        )
+    return kept
+
+
+def _excerpt(path: Path, size: int) -> bytes:
+    """Some bytes of the middle of a file, by which few differ that are not the same."""
+    with path.open("rb") as file:
+        file.seek(size // 2)
+        return file.read(_EXCERPT)
 
 
 def add_photograph(source: Path, target: Path) -> None:
@@ -229,7 +268,7 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
         with Image.open(folder / name) as image:
             size, tags = image.size, tags_of(image)
         key = {
-            "auto": (size, *(str(tags.get(tag)) for tag in _LENS_TAGS)),
+            "auto": (size, *(str(tags.get(tag)) for tag in _LENS_TAGS), _digital_zoom(tags)),
             "single": (),
             "folder": (name.rpartition("/")[0],),
             "rig": (name.partition("/")[0],),
@@ -243,3 +282,12 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
             )
         lens.names.append(name)
     return list(groups.values())
+
+
+def _digital_zoom(tags: Mapping[int, Any]) -> float:
+    """How much a photograph is enlarged after it was taken, by its EXIF data; 1 where they say nothing."""
+    try:
+        ratio = float(tags.get(ExifTags.Base.DigitalZoomRatio, 1))
+    except (TypeError, ValueError, ZeroDivisionError):  # anything may be written there
+        return 1.0
+    return round(ratio, 2) if 1 < ratio < np.inf else 1.0

@@ -14,10 +14,11 @@ import shutil
 import sqlite3
 import sys
 import threading
+from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from functools import cache, partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
@@ -55,12 +56,15 @@ def extract(
         lenses: size and names of the photographs that share a camera, and its focal length in pixels, if it is known.
         rigs: cameras that move together: the prefix of their photographs' names, whose rest is the same for those that
             are taken at once, and the rotation from the first camera.
-        masks: folder of masks, ``<name>.png``, black where no features are wanted.
+        masks: folder of masks, ``<name>.png``, black where no features are wanted; white ones are added for photographs
+            without one, which COLMAP would leave out.
         sift: maximum image size, number of features, and first octave for photographs of 1000 pixels and more: 0 skips
             the doubled image, which smaller photographs need.
         camera_model: COLMAP's name of the model of lenses with enough photographs to calibrate it.
     """
     for lens in lenses:
+        if masks:
+            _add_white(Path(masks), lens["names"], lens["size"])
         options = pycolmap.FeatureExtractionOptions(max_image_size=sift["max_image_size"])
         options.sift.max_num_features = sift["max_num_features"]
         options.sift.first_octave = sift["first_octave"] if max(lens["size"]) >= 1000 else -1
@@ -89,8 +93,19 @@ def extract(
             extraction_options=options,
         )
     with pycolmap.Database.open(database) as opened:
+        read = {image.name for image in opened.read_all_images()}
+        if unread := [name for lens in lenses for name in lens["names"] if name not in read]:
+            raise OSError(f"COLMAP cannot read {unread[0]}: save it again as an ordinary JPEG or PNG, or leave it out")
         if rigs and not _has_rigs(opened):
             pycolmap.apply_rig_config([_rig(cameras) for cameras in rigs], opened)
+
+
+def _add_white(masks: Path, names: list[str], size: list[int]) -> None:
+    """Write white masks for the photographs of a size that have none."""
+    for target in (masks / f"{name}.png" for name in names):
+        if not target.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _write(np.full(size[::-1], 255, np.uint8), target)
 
 
 def _has_rigs(database: pycolmap.Database) -> bool:
@@ -437,29 +452,30 @@ def _consensus(X: np.ndarray, Y: np.ndarray, tolerance: np.ndarray) -> tuple[pyc
 def undistort(model: str, photographs: str, masks: str | None, output: str) -> None:
     """Write undistorted photographs and masks and the model of their pinhole cameras.
 
-    Masks are named as nerfstudio's COLMAP dataparser expects, and every photograph gets one.
+    Masks are named as nerfstudio's COLMAP dataparser expects, but for photographs whose names differ in their suffixes
+    alone, and every photograph gets one.
     """
     pycolmap.undistort_images(output, model, photographs, jpeg_quality=95)
     if masks is None:
         return
     reconstruction = pycolmap.Reconstruction(model)
-    for image in (reconstruction.image(i) for i in reconstruction.reg_image_ids()):
-        camera, path = reconstruction.camera(image.camera_id), Path(masks) / f"{image.name}.png"
-        bitmap, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), _mask(path, camera), camera)
-        target = (Path(output) / "masks" / image.name).with_suffix(".png")
+    images = [reconstruction.image(i) for i in reconstruction.reg_image_ids()]
+    stems = Counter(PurePath(image.name).with_suffix("") for image in images)
+    for image in images:
+        camera = reconstruction.camera(image.camera_id)
+        mask = pycolmap.Bitmap.read(Path(masks) / f"{image.name}.png", as_rgb=False)
+        if mask is None:
+            raise OSError(f"the mask of {image.name} in {masks} cannot be read")
+        bitmap, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), mask, camera)
+        stem = PurePath(image.name).with_suffix("")
+        target = Path(output) / "masks" / (f"{stem}.png" if stems[stem] == 1 else f"{image.name}.png")
         target.parent.mkdir(parents=True, exist_ok=True)
-        kept = np.where(bitmap.to_array().squeeze() > 127, 255, 0).astype(np.uint8)
-        if not pycolmap.Bitmap.from_array(kept).write(target):
-            raise OSError(f"{target} cannot be written")
+        _write(np.where(bitmap.to_array().squeeze() > 127, 255, 0).astype(np.uint8), target)
 
 
-def _mask(path: Path, camera: pycolmap.Camera) -> pycolmap.Bitmap:
-    """A mask; white where there is no file."""
-    if not path.is_file():
-        return pycolmap.Bitmap.from_array(np.full((camera.height, camera.width), 255, np.uint8))
-    if (mask := pycolmap.Bitmap.read(path, as_rgb=False)) is None:
-        raise OSError(f"{path} cannot be read")
-    return mask
+def _write(pixels: np.ndarray, target: Path) -> None:
+    if not pycolmap.Bitmap.from_array(pixels).write(target):
+        raise OSError(f"{target} cannot be written")
 
 
 def main() -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import sqlite3
 import subprocess
 import sys
 from contextlib import closing, nullcontext
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -245,6 +247,17 @@ def test_the_curve_of_srgb_and_its_inverse_agree():
     assert linear_of(np.array([0.5]))[0] == pytest.approx(0.21404114, abs=1e-7)  # IEC 61966-2-1
 
 
+def test_frames_of_a_video_whose_pixels_are_not_square_are_as_wide_as_they_are_shown(tmp_path):
+    write_video(tmp_path / "hdv.mp4", [photograph(96, 72)] * 8, pixel_aspect=Fraction(4, 3))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "hdv.mp4", tmp_path / "frames", 3, QUIET)
+    sizes = set()
+    for path in (tmp_path / "frames").iterdir():
+        with Image.open(path) as image:
+            sizes.add(image.size)
+    assert sizes == {(128, 72)}
+
+
 @pytest.mark.parametrize("content", [b"", b"this is no video" * 100])
 def test_a_file_that_is_no_video_is_refused_by_name(tmp_path, content):
     (tmp_path / "walk.mp4").write_bytes(content)
@@ -273,9 +286,38 @@ def test_photographs_that_would_share_a_name_are_refused(tmp_path):
         find_photographs(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "captured"),
+    [(os.fsdecode(b"caf\xe9.jpg"), "caf_.jpg"), ("a\nb.jpg", "a_b.jpg"), ("a\u200b\u00a0\x07#.jpg", "a____.jpg")],
+)
+def test_letters_that_are_not_printed_become_underscores(tmp_path, name, captured):
+    """Bytes that are no UTF-8 too, as of names in archives: COLMAP takes neither."""
+    (tmp_path / name).touch()
+    assert list(find_photographs(tmp_path)) == [captured]
+
+
+def test_copies_of_a_photograph_are_left_out_and_told(tmp_path, caplog):
+    for k, name in enumerate(("IMG_1.jpg", "IMG_2.jpg")):
+        photograph(seed=k).save(tmp_path / name)
+    (tmp_path / "again").mkdir()
+    for copy in ("IMG_1 copy.jpg", "IMG_1(1).JPG", "again/IMG_10.jpg"):
+        shutil.copy(tmp_path / "IMG_1.jpg", tmp_path / copy)
+    assert list(find_photographs(tmp_path)) == ["IMG_1.jpg", "IMG_2.jpg"]
+    assert "3 photographs of" in caplog.text
+    assert "IMG_1 copy.jpg is IMG_1.jpg" in caplog.text
+
+
+def test_two_formats_of_one_name_are_kept_and_told(tmp_path, caplog):
+    for k, name in enumerate(("IMG_1.jpg", "IMG_1.PNG", "IMG_2.jpg")):
+        photograph(seed=k).save(tmp_path / name)
+    assert len(find_photographs(tmp_path)) == 3
+    assert "2 photographs of" in caplog.text
+    assert "if they are one photograph in two formats" in caplog.text
+
+
 def test_photographs_of_a_phone_are_read_in_any_case_of_their_suffix(tmp_path):
-    for name in ("IMG_1.HEIC", "img_2.heif", "IMG_3.hif"):
-        shutil.copy(PHONE, tmp_path / name)
+    for k, name in enumerate(("IMG_1.HEIC", "img_2.heif", "IMG_3.hif")):
+        (tmp_path / name).write_bytes(PHONE.read_bytes() + bytes(k))  # no copies
     found = find_photographs(tmp_path)
     assert list(found) == ["IMG_1.png", "IMG_3.png", "img_2.png"]
     add_photograph(found["IMG_1.png"], tmp_path / "work" / "IMG_1.png")
@@ -365,6 +407,18 @@ def test_two_phones_and_a_zoom_in_one_folder_are_three_cameras(tmp_path):
         photograph().save(tmp_path / f"{k}.jpg", exif=exif)
     groups = group_by_lens(tmp_path, [f"{k}.jpg" for k in range(6)], "auto")
     assert [lens.names for lens in groups] == [["0.jpg", "3.jpg"], ["1.jpg", "4.jpg"], ["2.jpg", "5.jpg"]]
+
+
+def test_a_digital_zoom_is_another_camera(tmp_path):
+    """Of which some phones write the same focal length."""
+    for k, ratio in enumerate((None, 0.0, 1.0, 1.5, 1.5)):
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = 4.2
+        if ratio is not None:
+            exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DigitalZoomRatio] = ratio
+        photograph().save(tmp_path / f"{k}.jpg", exif=exif)
+    lenses = group_by_lens(tmp_path, [f"{k}.jpg" for k in range(5)], "auto")
+    assert [lens.names for lens in lenses] == [["0.jpg", "1.jpg", "2.jpg"], ["3.jpg", "4.jpg"]]
 
 
 @pytest.mark.parametrize(("cameras", "count"), [("single", 1), ("folder", 2), ("image", 3)])
@@ -523,7 +577,10 @@ def test_a_growing_product_is_kept_only_for_the_same_key(tmp_path):
     ("prepare", "message"),
     [
         (lambda folder: None, "there are no photographs in"),
-        (lambda folder: [photograph().save(folder / f"{k}.jpg") for k in range(2)], "at least 3 photographs, not 2"),
+        (
+            lambda folder: [photograph(seed=k).save(folder / f"{k}.jpg") for k in range(2)],
+            "at least 3 photographs, not 2",
+        ),
     ],
 )
 def test_too_few_photographs_are_refused(tmp_path, prepare, message):
@@ -786,6 +843,52 @@ def test_features_that_were_stopped_before_the_first_photograph_are_found_as_if_
         extract(stopped, 2)
         for query in ("SELECT * FROM cameras", "SELECT * FROM rigs", "SELECT name, camera_id FROM images"):
             assert rows(stopped, query) == rows(whole, query)
+
+
+def test_photographs_without_a_mask_have_features_all_over_where_others_have_masks(tmp_path):
+    """COLMAP leaves out photographs without a mask."""
+    (tmp_path / "photographs").mkdir()
+    (tmp_path / "masks").mkdir()
+    for name in ("0.png", "1.png"):
+        photograph(200, 150, seed=int(name[0])).save(tmp_path / "photographs" / name)
+    Image.new("L", (200, 150)).save(tmp_path / "masks" / "0.png.png")
+    job: dict[str, Any] = {"photographs": str(tmp_path / "photographs"), "masks": str(tmp_path / "masks"), "rigs": []}
+    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}, "camera_model": "OPENCV"}
+    job |= {"database": str(tmp_path / "database.db")}
+    job |= {"lenses": [{"size": [200, 150], "names": ["0.png", "1.png"], "focal": None}]}
+    run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
+    counts = rows(tmp_path / "database.db", "SELECT name, rows > 0 FROM images JOIN keypoints USING (image_id)")
+    assert counts == [("0.png", 0), ("1.png", 1)]
+
+
+def test_photographs_of_one_name_in_two_formats_keep_their_own_masks(tmp_path):
+    names = ("a.jpg", "a.png", "b.jpg")
+    for folder in ("photographs", "masks", "model", "scene"):
+        (tmp_path / folder).mkdir()
+    for k, name in enumerate(names):
+        photograph().save(tmp_path / "photographs" / name)
+        Image.new("L", (64, 48), 0 if k == 0 else 255).save(tmp_path / "masks" / f"{name}.png")
+    (tmp_path / "model" / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    poses = [f"{k} 1 0 0 0 {k} 0 0 1 {name}\n0 0 -1\n" for k, name in enumerate(names, start=1)]
+    (tmp_path / "model" / "images.txt").write_text("".join(poses))
+    (tmp_path / "model" / "points3D.txt").write_text("")
+    job = {"model": tmp_path / "model", "output": tmp_path / "scene"}
+    job |= {"photographs": tmp_path / "photographs", "masks": tmp_path / "masks"}
+    arguments = {key: str(path) for key, path in job.items()}
+    run_step("undistort", arguments, log=tmp_path / "log", progress=QUIET, description="", total=1)
+    kept = {path.name: np.asarray(Image.open(path)).any() for path in (tmp_path / "scene" / "masks").iterdir()}
+    assert kept == {"a.jpg.png": False, "a.png.png": True, "b.png": True}
+
+
+def test_a_photograph_that_colmap_cannot_read_is_named(tmp_path):
+    photograph(200, 150).save(tmp_path / "0.png")
+    (tmp_path / "1.png").write_bytes(b"what Pillow reads, and COLMAP does not")
+    job: dict[str, Any] = {"photographs": str(tmp_path), "masks": None, "rigs": [], "camera_model": "OPENCV"}
+    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}}
+    job |= {"database": str(tmp_path / "database.db")}
+    job |= {"lenses": [{"size": [200, 150], "names": ["0.png", "1.png"], "focal": None}]}
+    with pytest.raises(SceneError, match=r"COLMAP cannot read 1\.png: save it again"):
+        run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
 
 
 @pytest.mark.parametrize("deleted", [["images"], ["colmap"], ["images", "colmap"], ["images", "capture/model"]])

@@ -49,9 +49,9 @@ def test_photographs_named_as_those_of_a_rig_are_told(caplog):
     ],
 )
 def test_cameras_that_are_not_mounted_together_are_refused(tmp_path, monkeypatch, loose, message):
-    for name in NAMES:
+    for k, name in enumerate(NAMES):
         (tmp_path / "photographs" / name).parent.mkdir(exist_ok=True, parents=True)
-        photograph().save(tmp_path / "photographs" / name)
+        photograph(seed=k).save(tmp_path / "photographs" / name)
     steps = {"extract": None, "match": None, "reconstruct": [{"names": NAMES}], "mount": {"loose": loose}}
     monkeypatch.setattr(stages, "run_step", lambda step, *_, **__: steps[step])
     with pytest.raises(SceneError, match=rf"cameras of left/ and right/ are not mounted together.* {message}"):
