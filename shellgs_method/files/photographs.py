@@ -183,7 +183,7 @@ def _exif_log_gain(path: Path) -> float:
     try:
         seconds, aperture = float(tags[ExifTags.Base.ExposureTime]), float(tags[ExifTags.Base.FNumber])
         gain = seconds * float(np.ravel(tags[ExifTags.Base.ISOSpeedRatings])[0]) / aperture**2
-    except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError):  # anything may be written there
+    except (KeyError, TypeError, ValueError, IndexError, ArithmeticError):  # anything may be written there
         return np.nan
     return float(np.log(gain)) if 0 < gain < np.inf else np.nan
 

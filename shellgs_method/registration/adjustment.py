@@ -178,7 +178,7 @@ def adjusted(
     Raises:
         SceneError: the model has no tracks, its cameras cannot be adjusted, or too few points are on the shell.
     """
-    model = _with_distortion(model)
+    model = _with_distortion(_with_finite_points(model))
     start, seen = bundle_of(model, survey_from_scene)
     start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
     share = min(max(HELD_OUT, ENOUGH / len(start.points)), 0.3)
@@ -447,11 +447,21 @@ def _gain(surface: ShellSurface, whole: Objective, before: Bundle, after: Bundle
     return float(gains.mean() / (gains.std(ddof=1) / np.sqrt(len(gains)) + 1e-12)) if len(gains) > 1 else 0.0
 
 
+def _with_finite_points(model: Model) -> Model:
+    """The model with points in the midst of the others where they are NaN or infinite: they are triangulated anew."""
+    positions = model.points.positions
+    finite = np.isfinite(positions).all(axis=1)
+    amidst = np.median(positions[finite], axis=0) if finite.any() else np.zeros(3)
+    return replace(model, points=replace(model.points, positions=np.where(finite[:, None], positions, amidst)))
+
+
 def _with_distortion(model: Model) -> Model:
-    """The model with lenses of many photographs that may distort."""
+    """The model with lenses of many photographs that may distort, and without lenses of none."""
     shared = Counter(image.camera for image in model.images.values())
     cameras = {}
     for number, camera in model.cameras.items():
+        if not shared[number]:
+            continue
         if camera.model in ("SIMPLE_PINHOLE", "PINHOLE") and shared[number] >= _SHARED:
             fx, fy, cx, cy = (_columns(camera) @ np.array(camera.params))[:4].tolist()
             camera = camera._replace(model="OPENCV", params=(fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0))

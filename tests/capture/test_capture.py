@@ -801,10 +801,12 @@ def test_exposures_survive_capture(tmp_path, without_colmap, monkeypatch):
 
 def test_the_light_of_a_photograph_is_that_of_its_exif_data(tmp_path):
     cases = {"a": exposure_of(1 / 100), "b": exposure_of(1 / 100, iso=800), "none": Image.Exif(), "0": exposure_of(0.0)}
+    cases["absurd"] = exposure_of(1 / 100)
+    cases["absurd"].get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FNumber] = 1e200
     for name, exif in cases.items():
         photograph().save(tmp_path / f"{name}.jpg", exif=exif)
     gains = exif_log_gains([tmp_path / f"{name}.jpg" for name in cases])
-    np.testing.assert_allclose(gains / np.log(2), [-1, 1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(gains / np.log(2), [-1, 1, 0, 0, 0], atol=1e-6)
     np.testing.assert_array_equal(exif_log_gains([tmp_path / "none.jpg"]), [0])
 
 

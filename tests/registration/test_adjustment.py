@@ -269,6 +269,17 @@ def test_picks_say_where_along_a_bare_wall_it_is(surface: ShellSurface, model: M
     assert with_picks.mean() < 0.02
 
 
+def test_points_that_are_nan_and_lenses_without_photographs_change_nothing(surface: ShellSurface, bent: Model):
+    positions = bent.points.positions.copy()
+    positions[::50] = np.nan
+    unused = ColmapCamera("FULL_OPENCV", WIDTH, HEIGHT, (500.0, 500.0, 320.0, 240.0) + 8 * (0.0,))
+    damaged = replace(bent, cameras={7: unused, **bent.cameras}, points=replace(bent.points, positions=positions))
+    found = adjusted(surface, damaged, surface.survey_from_shell, NAMES)
+    assert np.isfinite(found.model.points.positions).all()
+    assert list(found.model.cameras) == [1]
+    assert error(surface, found).mean() < 0.02
+
+
 def test_a_model_without_tracks_is_refused(surface: ShellSurface, model: Model):
     none = [np.empty(0, np.int64)] * len(model.points.ids)
     with pytest.raises(SceneError, match="have no tracks"):
