@@ -44,14 +44,25 @@ _LENS_TAGS = (
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
 
 
-def find_photographs(folder: Path) -> dict[str, Path]:
+def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]:
     """The photographs in a folder and its sub-folders, by their names in the scene; other files and copies are told.
 
+    Args:
+        folder: the folder.
+        masks: folder of masks, which may be one of the sub-folders.
+
     Raises:
-        SceneError: there are none, some are raw without a developed one beside, or two would get the same name.
+        SceneError: there are none, some are raw without a developed one beside, two would get the same name, or masks
+            lie among them.
     """
+    if masks and masks.resolve() == folder.resolve():
+        raise SceneError(f"the masks lie among the photographs in {folder}: move them into a folder of their own")
     found: dict[str, Path] = {}
-    photographs = photographs_in(folder, deep=True)
+    photographs = [
+        path
+        for path in photographs_in(folder, deep=True)
+        if not (masks and (folder.resolve() / path.relative_to(folder)).is_relative_to(masks.resolve()))
+    ]
     _tell_what_is_left_out(folder, photographs)
     for path in _without_copies(folder, photographs):
         name = captured_name(path.relative_to(folder))

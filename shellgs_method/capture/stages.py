@@ -128,7 +128,7 @@ class _Capture:
 
         self.source, self.scene, self.config, self.progress = source, scene, config, progress
         self.is_video = source.is_file()
-        self.photographs = {source.name: source} if self.is_video else find_photographs(source)
+        self.photographs = {source.name: source} if self.is_video else find_photographs(source, config.masks)
         self.masks: dict[str, Path] = {}
         if config.masks and self.is_video:
             raise SceneError(

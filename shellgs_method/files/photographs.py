@@ -208,16 +208,21 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
     """Open an image file, decoded unless ``whole`` is false.
 
     Raises:
-        SceneError: the image cannot be read, is raw, or holds floating-point numbers.
+        SceneError: the image cannot be read, is raw, has too many pixels, or holds floating-point numbers.
     """
     if path.suffix.lower() in RAW:
         raise SceneError(f"{path} is raw, of which only a thumbnail can be read: {DEVELOP}")
     try:
         image = Image.open(path)
         if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
-            raise ValueError(f"it claims {image.width}x{image.height} pixels")
+            raise Image.DecompressionBombError(f"it claims {image.width}x{image.height} pixels")
         if whole:
             image.load()
+    except Image.DecompressionBombError as error:
+        raise SceneError(
+            f"{path} has more than {MAX_PIXELS / 1e6:.0f} megapixels, by its header, and is not read: scale all "
+            "photographs down, or put the whole file back if it is damaged"
+        ) from error
     except Exception as error:  # each decoder raises its own errors for a damaged file
         reason = " ".join(str(error).split())
         raise SceneError(f"{path} cannot be read as an image ({reason}): put the whole file back") from error

@@ -389,6 +389,13 @@ def test_an_unreadable_photograph_is_refused_by_name(tmp_path):
     assert not (tmp_path / "scene" / "images").exists()
 
 
+def test_a_photograph_of_200_megapixels_is_refused_with_what_to_do(tmp_path, monkeypatch):
+    photograph().save(tmp_path / "a.jpg")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    with pytest.raises(SceneError, match=r"a\.jpg has more than 179 megapixels.*: scale all photographs down"):
+        read_image(tmp_path / "a.jpg")
+
+
 def test_photographs_of_one_size_and_lens_share_a_camera(tmp_path):
     exif = Image.Exif()
     exif[ExifTags.Base.Model] = "another phone"
@@ -499,6 +506,17 @@ def test_a_mask_is_rotated_with_its_photograph(tmp_path, as_stored):
 def test_a_mask_of_another_size_is_refused(tmp_path):
     with pytest.raises(SceneError, match=r"a\.jpg\.png is 32x32 pixels, its photograph 64x48"):
         masked(tmp_path, Image.new("L", (32, 32)))
+
+
+def test_masks_below_the_folder_of_photographs_are_no_photographs(tmp_path):
+    photograph().save(tmp_path / "1.jpg")
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (64, 48), 255).save(tmp_path / "masks" / "1.jpg.png")
+    found = find_photographs(tmp_path, tmp_path / "masks")
+    assert list(found) == ["1.jpg"]
+    assert find_masks(found, tmp_path, tmp_path / "masks") == {"1.jpg": tmp_path / "masks" / "1.jpg.png"}
+    with pytest.raises(SceneError, match="move them into a folder of their own"):
+        find_photographs(tmp_path, tmp_path)
 
 
 def test_masks_that_belong_to_no_photograph_are_refused(tmp_path):
