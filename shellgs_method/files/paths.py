@@ -153,7 +153,14 @@ def tell_of_masks(masks: Mapping[str, Path | None], there: Collection[Path], fol
 
 
 def photographs_in(folder: Path, *, deep: bool) -> list[Path]:
-    """Photographs in a folder, by their suffixes, or also in its sub-folders; hidden ones are left out."""
+    """Photographs in a folder, by their suffixes, or also in its sub-folders.
+
+    Hidden ones are left out, and thumbnails of network drives (Synology's @eaDir).
+    """
     found = sorted(folder.rglob("*") if deep else folder.glob("*"))
-    below = ((path, path.relative_to(folder).parts) for path in found if path.suffix.lower() in PHOTOGRAPHS)
-    return [path for path, parts in below if not any(part.startswith(".") for part in parts)]
+    below = (
+        (path, path.relative_to(folder).parts)
+        for path in found
+        if path.suffix.lower() in PHOTOGRAPHS and not path.is_dir()
+    )
+    return [path for path, parts in below if not any(part.startswith(".") or part == "@eaDir" for part in parts)]

@@ -225,7 +225,9 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
         ) from error
     except Exception as error:  # each decoder raises its own errors for a damaged file
         reason = " ".join(str(error).split())
-        raise SceneError(f"{path} cannot be read as an image ({reason}): put the whole file back") from error
+        raise SceneError(
+            f"{path} cannot be read as an image ({reason}): put the whole file back, or leave it out"
+        ) from error
     with image:
         if whole and image.mode == "F":
             broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""

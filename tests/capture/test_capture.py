@@ -279,6 +279,15 @@ def test_photographs_are_found_below_a_folder_and_named_without_blanks(tmp_path)
     }
 
 
+def test_thumbnails_of_a_network_drive_are_no_photographs(tmp_path):
+    """Synology's lie in folders that are called as the photographs."""
+    (tmp_path / "@eaDir" / "a.jpg").mkdir(parents=True)
+    (tmp_path / "@eaDir" / "a.jpg" / "SYNOPHOTO_THUMB_XL.jpg").touch()
+    (tmp_path / "album.jpg").mkdir()
+    (tmp_path / "a.jpg").touch()
+    assert list(find_photographs(tmp_path)) == ["a.jpg"]
+
+
 def test_photographs_that_would_share_a_name_are_refused(tmp_path):
     (tmp_path / "a b.jpg").touch()
     (tmp_path / "a_b.jpg").touch()
