@@ -295,6 +295,21 @@ def group_by_lens(folder: Path, names: Sequence[str], cameras: Cameras) -> list[
     return list(groups.values())
 
 
+def tell_of_unknown_lenses(folder: Path, names: Sequence[str]) -> None:
+    """Tell the user which photographs share a camera only because nothing says that they do not."""
+    unknown = []
+    for name in names:
+        with Image.open(folder / name) as image:
+            if not tags_of(image).keys() & {*_LENS_TAGS}:
+                unknown.append(name)
+    if len(unknown) > 1:
+        notice(
+            f"{len(unknown)} of {len(names)} photographs, {unknown[0]} for example, do not say in EXIF with which lens "
+            "they were taken, as those sent by messengers: those of one size share a camera. If several phones took "
+            "them, or the zoom changed, capture the original files, or use --cameras folder or image."
+        )
+
+
 def _digital_zoom(tags: Mapping[int, Any]) -> float:
     """How much a photograph is enlarged after it was taken, by its EXIF data; 1 where they say nothing."""
     try:

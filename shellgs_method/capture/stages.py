@@ -40,6 +40,7 @@ from shellgs_method.capture.photographs import (
     find_photographs,
     group_by_lens,
     keep_exposure,
+    tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
@@ -230,6 +231,8 @@ class _Capture:
             )
         if self.config.cameras == "auto":
             tell_of_a_rig(ordinary)
+        if self.config.cameras == "auto" and not self.is_video:
+            tell_of_unknown_lenses(self.folder, ordinary)
         self.rig = folders(ordinary) if self.config.cameras == "rig" else []
         lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
         self._step(

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import unicodedata
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 
 from pi_heif import register_heif_opener
+from PIL import Image
 
 from shellgs_method.errors import SceneError, notice
 
 register_heif_opener()  # Pillow reads those of phones (.heic) from here on
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # of phones too: 108 megapixels
 
 PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".hif", ".avif"))
 """Suffixes of photographs, in lower case."""

@@ -37,6 +37,7 @@ from shellgs_method.capture.photographs import (
     find_photographs,
     group_by_lens,
     keep_exposure,
+    tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.work import Work
@@ -396,6 +397,26 @@ def test_an_unreadable_photograph_is_refused_by_name(tmp_path):
     with pytest.raises(SceneError, match=r"b\.jpg cannot be read as an image"):
         capture(photographs, tmp_path / "scene")
     assert not (tmp_path / "scene" / "images").exists()
+
+
+def test_a_photograph_of_108_megapixels_is_read_without_a_warning(tmp_path):
+    photograph().save(tmp_path / "a.jpg")
+    read = (
+        "import shellgs_method.files.paths; from PIL import Image; Image.MAX_IMAGE_PIXELS = 2000; Image.open('a.jpg')"
+    )
+    found = subprocess.run([sys.executable, "-c", read], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "DecompressionBomb" not in found.stderr
+
+
+def test_photographs_that_do_not_say_their_lens_are_told(tmp_path, caplog):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "phone"
+    for k in range(5):
+        photograph().save(tmp_path / f"{k}.jpg", exif=exif if k < 2 else Image.Exif())
+    tell_of_unknown_lenses(tmp_path, ["0.jpg", "1.jpg", "2.jpg"])
+    assert caplog.text == ""
+    tell_of_unknown_lenses(tmp_path, [f"{k}.jpg" for k in range(5)])
+    assert "3 of 5 photographs, 2.jpg for example, do not say" in caplog.text
 
 
 def test_a_photograph_of_200_megapixels_is_refused_with_what_to_do(tmp_path, monkeypatch):
