@@ -35,6 +35,10 @@ _MIN_JOINING = 30  # matches of points that join two models
 _RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
 _PLANAR = 8.0  # pixels, within which a step's matches are of one plane
 _FOCAL = 0.8  # widths, as of phones: calibration finds less from COLMAP's 1.2
+_CREDIBLE = (
+    0.3,
+    10.0,
+)  # widths that EXIF may say: from 11 to 360 mm on 35 mm film; up to 4 times a true one does no harm
 _NEAR = 10  # photographs, within which they are neighbours along a walk
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 
@@ -96,8 +100,20 @@ def extract(
         read = {image.name for image in opened.read_all_images()}
         if unread := [name for lens in lenses for name in lens["names"] if name not in read]:
             raise OSError(f"COLMAP cannot read {unread[0]}: save it again as an ordinary JPEG or PNG, or leave it out")
+        for camera in opened.read_all_cameras():
+            _forget_absurd_focal(opened, camera)
         if rigs and not _has_rigs(opened):
             pycolmap.apply_rig_config([_rig(cameras) for cameras in rigs], opened)
+
+
+def _forget_absurd_focal(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
+    """Let a camera's focal length be found where EXIF says what no camera has; some write millimetres of the sensor."""
+    width, (low, high) = max(camera.width, camera.height), _CREDIBLE
+    if camera.has_prior_focal_length and not low < camera.mean_focal_length() / width < high:
+        for k in camera.focal_length_idxs():
+            camera.params[k] = _FOCAL * width
+        camera.has_prior_focal_length = False
+        database.update_camera(camera)
 
 
 def _add_white(masks: Path, names: list[str], size: list[int]) -> None:

@@ -911,6 +911,23 @@ def test_photographs_without_a_mask_have_features_all_over_where_others_have_mas
     assert counts == [("0.png", 0), ("1.png", 1)]
 
 
+@pytest.mark.parametrize(("said", "known"), [(3, 0), (26, 1), (500, 0)])
+def test_an_absurd_focal_length_of_exif_is_forgotten(tmp_path, said, known):
+    """Some phones write that of the lens, 3 mm, as that on 35 mm film."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "phone"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = said
+    photograph(200, 150).save(tmp_path / "0.jpg", exif=exif)
+    job: dict[str, Any] = {"photographs": str(tmp_path), "masks": None, "rigs": [], "camera_model": "OPENCV"}
+    job |= {"sift": {"max_image_size": 1600, "max_num_features": 100, "first_octave": -1}}
+    job |= {"database": str(tmp_path / "database.db")}
+    job |= {"lenses": [{"size": [200, 150], "names": ["0.jpg"], "focal": None}]}
+    run_step("extract", job, log=tmp_path / "log", progress=QUIET, description="", total=1)
+    ((params, prior),) = rows(tmp_path / "database.db", "SELECT params, prior_focal_length FROM cameras")
+    assert prior == known
+    assert 0.5 < np.frombuffer(params)[0] / 200 < 1.0
+
+
 def test_photographs_of_one_name_in_two_formats_keep_their_own_masks(tmp_path):
     names = ("a.jpg", "a.png", "b.jpg")
     for folder in ("photographs", "masks", "model", "scene"):
