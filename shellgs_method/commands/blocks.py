@@ -50,10 +50,10 @@ def blocks(
     from shellgs_method.geometry.camera import positions
 
     layout, file = FacadeDataParserConfig(**vars(paths), data=scene), scene / BLOCKS
-    before = Blocks.read(file) if file.exists() and not again else None
+    before = Blocks.read(file, moved=True) if file.exists() and not again else None
     views, held_out = read_views(layout), held_out_names(layout)
     seen = _seen(layout, views)
-    if before is None:
+    if before is None or len(before.cells) == 1:
         found = cut(seen, length, overlap, photographs, held_out)
     else:
         found = assigned(before, seen, held_out, least=0)
@@ -72,7 +72,7 @@ def blocks(
     found.write(file)
     draw(file.with_suffix(".png"), found, seen, positions(view.camera for view in views))
     for cell in found.cells:
-        console.print(f"{cell.block.name}: {len(cell.block.photographs)} photographs", highlight=False)
+        console.print(f"{cell.block.name}: {len(cell.block.photographs)} of {len(views)} photographs", highlight=False)
     if len(found.cells) == 1:
         console.print("The scene is one block: train it as it is, with ns-train.")
     elif sum(len(cell.block.photographs) for cell in found.cells) > SAME * len(views) * len(found.cells):

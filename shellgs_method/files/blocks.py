@@ -5,7 +5,10 @@ In ``blocks.json`` the tree is as it is cut, in the scene's own frame and units,
     {"overlap": 5.0,
      "tree": {"cut": {"normal": [1, 0, 0], "offset": 30.2},
               "below": {"name": "block-1", "photographs": ["images/frame_00001.png", ...]},
-              "above": {"name": "block-2", "photographs": [...]}}}
+              "above": {"name": "block-2", "photographs": [...]}},
+     "photographs_of": "0f3a..."}
+
+The last is a hash of the cuts and the overlap that the photographs were found with.
 """
 
 from __future__ import annotations
@@ -127,6 +130,12 @@ class Blocks:
         """The region of each block, in the order of the tree."""
         return tuple(Cell(block, sides, self.overlap) for block, sides in _leaves(self.tree))
 
+    @property
+    def cuts(self) -> str:
+        """Hash of all cuts and the overlap, on which it depends what photographs show of each block."""
+        sides = [[(*cut.normal, cut.offset, above) for cut, above in cell.sides] for cell in self.cells]
+        return fingerprint(self.overlap, sides)
+
     def cell(self, name: str) -> Cell:
         """The region of a block.
 
@@ -142,14 +151,19 @@ class Blocks:
         """Write the file, whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as file:
-            file.write((json.dumps({"overlap": self.overlap, "tree": _written(self.tree)}, indent=1) + "\n").encode())
+            contents = {"overlap": self.overlap, "tree": _written(self.tree), "photographs_of": self.cuts}
+            file.write((json.dumps(contents, indent=1) + "\n").encode())
 
     @classmethod
-    def read(cls, path: Path) -> Blocks:
+    def read(cls, path: Path, moved: bool = False) -> Blocks:
         """Read a file, which a person may have edited.
 
+        Args:
+            path: the file.
+            moved: whether its cuts may have been moved since its photographs were found.
+
         Raises:
-            SceneError: it is not there, damaged, or names two blocks alike.
+            SceneError: it is not there, damaged, names two blocks alike, or its cuts were moved.
         """
         if not path.is_file():
             raise SceneError(f"{path} is not there: run `shellgs blocks {path.parent}` first")
@@ -163,6 +177,11 @@ class Blocks:
         names = [cell.block.name for cell in blocks.cells]
         if twice := {name for name in names if names.count(name) > 1}:
             raise SceneError(f"{path} has two blocks named {min(twice)}: give each its own name")
+        if not moved and contents.get("photographs_of", blocks.cuts) != blocks.cuts:
+            raise SceneError(
+                f"{path} was edited: its cuts or its overlap are not those that its photographs were found with; run "
+                f"`shellgs blocks {path.parent}` again"
+            )
         return blocks
 
 

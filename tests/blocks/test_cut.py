@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -215,11 +216,12 @@ def test_the_command_draws_the_plan_and_keeps_a_cut_that_was_moved(scene: Path, 
     found = Blocks.read(scene / BLOCKS)
     assert isinstance(found.tree, Fork)
     assert (scene / "blocks.png").read_bytes().startswith(b"\x89PNG")
-    assert f"block-1: {len(found.cells[0].block.photographs)} photographs" in capsys.readouterr().out
+    assert f"block-1: {len(found.cells[0].block.photographs)} of 10 photographs" in capsys.readouterr().out
     names = {path.relative_to(scene).as_posix() for path in (scene / "images").iterdir()}
     assert {name for cell in found.cells for name in cell.block.photographs} == names
-    moved = replace(found, tree=replace(found.tree, cut=replace(found.tree.cut, offset=found.tree.cut.offset + 0.1)))
-    moved.write(scene / BLOCKS)
+    by_hand = json.loads((scene / BLOCKS).read_text())
+    by_hand["tree"]["cut"]["offset"] += 0.1
+    (scene / BLOCKS).write_text(json.dumps(by_hand))
     command(scene, length=6.0, overlap=1.0)
     kept = Blocks.read(scene / BLOCKS)
     assert isinstance(kept.tree, Fork)
@@ -240,6 +242,13 @@ def test_the_command_says_where_cuts_save_nothing(scene: Path, capsys: pytest.Ca
     assert "as many photographs as the whole scene, 10, so cuts save nothing" in " ".join(
         capsys.readouterr().out.split()
     )
+
+
+def test_the_command_cuts_a_scene_anew_that_was_one_block(scene: Path):
+    command(scene, length=1000.0)
+    assert len(Blocks.read(scene / BLOCKS).cells) == 1
+    command(scene, length=6.0, overlap=1.0)
+    assert len(Blocks.read(scene / BLOCKS).cells) > 1
 
 
 def test_without_maps_and_tracks_nothing_tells_what_photographs_show(scene: Path):

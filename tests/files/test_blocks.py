@@ -45,6 +45,24 @@ def test_a_file_is_read_as_it_was_written(tmp_path: Path):
     assert Blocks.read(tmp_path / BLOCKS) == PLAN
 
 
+@pytest.mark.parametrize("words", [('"offset": 10.0', '"offset": 9.0'), ('"overlap": 2.0', '"overlap": 3.0')])
+def test_a_file_whose_photographs_are_those_of_other_cuts_is_refused(tmp_path: Path, words: tuple[str, str]):
+    path = tmp_path / BLOCKS
+    PLAN.write(path)
+    path.write_text(path.read_text().replace(*words))
+    with pytest.raises(SceneError, match=r"its cuts or its overlap .* run `shellgs blocks"):
+        Blocks.read(path)
+    Blocks.read(path, moved=True).write(path)
+    Blocks.read(path)
+
+
+def test_a_file_of_an_earlier_version_is_read(tmp_path: Path):
+    path = tmp_path / BLOCKS
+    PLAN.write(path)
+    path.write_text(path.read_text().replace("photographs_of", "unknown"))
+    assert Blocks.read(path) == PLAN
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
