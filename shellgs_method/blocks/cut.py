@@ -29,35 +29,38 @@ THROUGH = 0.25
 
 @dataclass(frozen=True)
 class Sights:
-    """What photographs show of a scene, upright and in metres.
+    """What photographs show of a scene, upright and in metres, or in scene units where metres are unknown.
 
     Attributes:
         points: points that photographs show, z upwards.
         views: the photograph of each.
         names: names of the photographs.
         to_scene: the similarity to the scene's frame.
+        unit: what they are in, for labels.
     """
 
     points: Float64[np.ndarray, "N 3"]
     views: Int64[np.ndarray, " N"]
     names: Sequence[str]
     to_scene: Float64[np.ndarray, "4 4"]
+    unit: str = "m"
 
     @classmethod
     def of(
         cls,
         points: Mapping[str, Float64[np.ndarray, "K 3"]],
         up: Float64[np.ndarray, " 3"],
-        metres_per_unit: float,
+        metres_per_unit: float | None,
     ) -> Sights:
         """What photographs show, by their names, in the scene's frame and units, with its upward direction."""
         x = across(up)
         turn = np.stack([x, np.cross(up, x), up])  # rows: the axes of the upright frame
         to_scene = np.eye(4)
-        to_scene[:3, :3] = turn.T / metres_per_unit
+        to_scene[:3, :3] = turn.T / (metres_per_unit or 1)
         views = np.repeat(np.arange(len(points)), [len(of) for of in points.values()])
         seen = np.concatenate([*points.values(), np.empty((0, 3))])
-        return cls(transformed(seen, np.linalg.inv(to_scene)), views, [*points], to_scene)
+        unit = "m" if metres_per_unit else "scene units"
+        return cls(transformed(seen, np.linalg.inv(to_scene)), views, [*points], to_scene, unit)
 
     @cached_property
     def in_scene(self) -> Float64[np.ndarray, "N 3"]:
@@ -112,7 +115,8 @@ def cut(
         return Fork(plane.moved(seen.to_scene), split(of[~above]), split(of[above]))
 
     tree = _numbered(split(np.arange(len(seen.points))))
-    return assigned(Blocks(tree, overlap * scale_of(seen.to_scene)), seen, held_out)
+    found = assigned(Blocks(tree, overlap * scale_of(seen.to_scene)), seen, held_out)
+    return replace(found, tree=_numbered(found.tree))  # without the numbers of those that were joined
 
 
 def assigned(blocks: Blocks, seen: Sights, held_out: Collection[str] = (), least: int = WEAK) -> Blocks:

@@ -28,7 +28,7 @@ def draw(path: Path, blocks: Blocks, seen: Sights, cameras: Float64[np.ndarray, 
     upright = np.linalg.inv(seen.to_scene)
     points, centres = seen.in_scene, transformed(cameras, upright)
     figure = Figure(figsize=(10, 6), layout="constrained")
-    axes = figure.add_subplot(aspect="equal", xlabel="m", ylabel="m")
+    axes = figure.add_subplot(aspect="equal", xlabel=seen.unit, ylabel=seen.unit)
     axes.plot(centres[:, 0], centres[:, 1], ".", color="black", markersize=3, label="cameras")
     for number, cell in enumerate(blocks.cells):
         x, y, _ = seen.points[cell.core(points)].T

@@ -118,4 +118,4 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
     up = likely_up(view.camera for view in views)
     if metres and (scene / ALIGNMENT).is_file() and (known := Alignment.load(scene / ALIGNMENT)).up is not None:
         up = known.rotation @ known.up  # exactly
-    return Sights.of(shown, up, metres or 1.0)
+    return Sights.of(shown, up, metres)

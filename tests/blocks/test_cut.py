@@ -205,6 +205,16 @@ def test_a_block_with_few_photographs_is_joined_with_its_neighbour(street: np.nd
     assert found.cells[1].core(np.array([[65.0, 0, 0]])).all()
 
 
+def test_blocks_are_numbered_after_those_with_few_photographs_are_joined(street: np.ndarray):
+    few = {name: points for k, (name, points) in enumerate(walk(street).items()) if k > 20 or k % 10 == 0}
+    found = cut(Sights.of(few, UP, 1.0), length=12.0, overlap=0.0)
+    assert [cell.block.name for cell in found.cells] == [f"block-{k + 1}" for k in range(len(found.cells))]
+
+
+def test_points_are_in_scene_units_where_metres_are_unknown():
+    assert Sights.of({"a": np.zeros((1, 3))}, UP, None).unit == "scene units"
+
+
 def test_points_are_upright_and_in_metres():
     seen = Sights.of({"a": np.array([[0.0, 2.0, 0.0]])}, np.array([0.0, 1.0, 0.0]), 0.5)
     assert seen.points[0, 2] == pytest.approx(1.0)
