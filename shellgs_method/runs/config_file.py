@@ -68,7 +68,8 @@ def load_config(path: Path) -> TrainerConfig:
         SceneError: it is not a complete config of a registered method.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: name the config.yml of a trained run")
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise FileNotFoundError(f"{path} {what}: name the config.yml of a trained run")
     try:
         if path.stat().st_size > MAX_BYTES:
             raise SceneError(f"it has more than {MAX_BYTES} bytes")

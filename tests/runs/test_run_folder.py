@@ -90,6 +90,11 @@ def test_the_config_of_a_run_is_written_without_its_folder(tmp_path, monkeypatch
     assert load_config(tmp_path / NAMES / "config.yml") == config
 
 
+def test_a_folder_in_place_of_a_config_is_called_one(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match=r"is a folder: name the config\.yml"):
+        load_config(tmp_path)
+
+
 # Its scene
 
 
