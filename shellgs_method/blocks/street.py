@@ -189,8 +189,10 @@ def script(street: Street) -> list[str]:
     Raises:
         SceneError: a folder holds another run.
     """
-    runs = [street.coarse] if not street.coarse.finished else street.blocks
-    return [" && ".join(map(shlex.join, run.commands())) for run in settled(runs) if not run.finished]
+    for runs in ([street.coarse], street.blocks):
+        if unfinished := [run for run in settled(runs) if not run.finished]:
+            return [" && ".join(map(shlex.join, run.commands())) for run in unfinished]
+    return []
 
 
 def _link(file: Path, to: Path) -> None:

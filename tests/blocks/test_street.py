@@ -31,6 +31,7 @@ def planned(scene: Path, output: Path, method: str = "shellgs-metric") -> Street
 
 def finish_coarse(street: Street, folder: Path) -> None:
     """Put a finished coarse run where the street has it."""
+    street.coarse.settle()
     trained = coarse_run(street.coarse.scene, folder, iterations=4).base_dir
     shutil.copytree(trained, street.coarse.folder, dirs_exist_ok=True)
     street.coarse.metrics().write_text("{}")
@@ -53,6 +54,13 @@ def test_blocks_can_be_started_once_the_coarse_run_is_finished_each_with_a_copy_
         assert ours.read_bytes() == theirs.read_bytes()
         moved = run.moved(Path("/node/scene"), Path("/node/runs"))
         assert f"--pipeline.model.coarse /node/runs/runs/scene/{name}" in shlex.join(moved.commands()[0])
+
+
+def test_a_finished_coarse_run_with_other_settings_is_not_gone_on_from(cut, tmp_path):
+    finish_coarse(planned(cut, tmp_path / "street"), tmp_path / "coarse")
+    other = Street.plan(cut, "shellgs-metric", 6, 4, 0.25, 0, tmp_path / "street", ScenePaths())
+    with pytest.raises(SceneError, match=r"other settings .*res_scale_factor: 0\.5, now 0\.25"):
+        script(other)
 
 
 def test_the_coarse_run_comes_first_and_a_failure_ends_the_street_in_a_sentence(cut, tmp_path):
