@@ -51,7 +51,8 @@ def report_seams(config: Path, coarse: Path) -> None:
     with atomic_write(path) as file:
         file.write((json.dumps(found, indent=1) + "\n").encode())
     # Its headings are short, to fit a terminal of 80 columns.
-    table = Table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: within {NEAR:g} m of one)")
+    near = f"within {NEAR:g} {'m' if run.model.metres_per_unit else 'scene unit'} of one"
+    table = Table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: {near})")
     for criterion, *values, lost in seams:
         good = "good" if lost <= criterion.most else f"[bold]more than {criterion.most:g}"
         table.add_row(criterion.title, *(f"{value:.3f}" for value in (*values, lost)), good)
