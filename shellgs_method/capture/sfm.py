@@ -35,10 +35,7 @@ _MIN_JOINING = 30  # matches of points that join two models
 _RIVAL = 0.5  # share of the matches at which a second way to join two models leaves the first in doubt
 _PLANAR = 8.0  # pixels, within which a step's matches are of one plane
 _FOCAL = 0.8  # widths, as of phones: calibration finds less from COLMAP's 1.2
-_CREDIBLE = (
-    0.3,
-    10.0,
-)  # widths that EXIF may say: from 11 to 360 mm on 35 mm film; up to 4 times a true one does no harm
+_CREDIBLE = 0.3, 10.0  # widths that EXIF may say, 11 to 360 mm on 35 mm film; 4 times the true one does no harm
 _NEAR = 10  # photographs, within which they are neighbours along a walk
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
 
