@@ -50,7 +50,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         is_around = round(stream.width * aspect) == 2 * stream.height
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         sharpnesses, times, marks, shifts, before = [], [], [], [], None
-        for frame in container.decode(stream):
+        for frame in _frames(container, stream):
             half = frame.reformat(frame.width // 2, frame.height // 2, format="gray")
             sharpnesses.append(sharpness(half.to_ndarray()))
             times.append(frame.time if frame.time is not None else len(times) / float(stream.average_rate or 30))
@@ -70,7 +70,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     chosen = sharpest(np.array(sharpnesses), *stretches(moved, since, count))
     task = progress.add_task("keeping the sharpest", total=len(chosen))
     with _opened(video) as (container, stream):
-        for number, frame in enumerate(container.decode(stream)):
+        for number, frame in enumerate(_frames(container, stream)):
             if number in chosen:
                 image = _upright(frame, transfer, aspect)
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
@@ -80,7 +80,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
 def first_frame(video: Path) -> av.VideoFrame | None:
     """The first frame of a video, if it has one."""
     with _opened(video) as (container, stream):
-        return next(container.decode(stream), None)
+        return next(_frames(container, stream), None)
 
 
 def sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
@@ -156,6 +156,22 @@ def _opened(video: Path) -> Iterator[tuple[av.container.InputContainer, VideoStr
             f"{video} cannot be read as a video ({error.strerror}): copy it again if it is cut off or damaged, or "
             "convert it to mp4"
         ) from error
+
+
+def _frames(container: av.container.InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
+    """Frames of a video, without packets that are damaged, as players show it; their share is told."""
+    packets = damaged = 0
+    for packet in container.demux(stream):
+        packets += 1
+        try:
+            yield from packet.decode()
+        except av.error.InvalidDataError:
+            damaged += 1
+    if damaged:
+        notice(
+            f"{damaged / packets:.1%} of the video {container.name} is damaged, and is left out: copy it again if you "
+            "have it whole."
+        )
 
 
 def _main_stream(video: Path, streams: Sequence[VideoStream]) -> VideoStream:

@@ -104,6 +104,21 @@ def test_sharpness_is_relative_to_the_neighbourhood():
     assert sharpest(sharpnesses, np.linspace(0, 1, 100), 2) == {20, 70}
 
 
+def test_a_damaged_packet_of_a_video_is_left_out_and_this_is_told(tmp_path, caplog):
+    path = tmp_path / "walk.mp4"
+    wide = photograph(480, 96)
+    write_video(path, [wide.crop((8 * k, 0, 8 * k + 160, 96)) for k in range(20)])
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    with path.open("r+b") as file:
+        file.seek(packets[10][0])
+        file.write(bytes(packets[10][1]))
+    (tmp_path / "frames").mkdir()
+    extract_frames(path, tmp_path / "frames", 4, QUIET)
+    assert len(numbers(tmp_path / "frames")) == 4
+    assert "walk.mp4 is damaged, and is left out" in caplog.text
+
+
 def test_a_video_gives_between_one_and_five_frames_a_second():
     since = np.arange(60) / 30
     assert stretches(np.linspace(0, 9, 60), since, 200)[1] == 10
