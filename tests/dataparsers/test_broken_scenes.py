@@ -292,7 +292,7 @@ def float_tiff(path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda path: with_header(path, 64_000, 48_000), r"frame_00002.png cannot be read.*pixels"),
+        (lambda path: with_header(path, 64_000, 48_000), r"frame_00002.png has more than .* megapixels"),
         (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"\xff" * 99), "frame_00002.png cannot be read"),
         (lambda path: path.write_bytes(b""), "frame_00002.png cannot be read"),
         (float_tiff, "frame_00002.png holds floating-point numbers and NaN or infinite ones"),
@@ -310,7 +310,7 @@ def test_a_photograph_with_a_huge_header_is_refused_by_capture(tmp_path, shellgs
     for k in range(3):
         photograph(seed=k).save(tmp_path / "photographs" / f"{k}.png")
     with_header(tmp_path / "photographs" / "1.png", 64_000, 48_000)
-    assert "1.png cannot be read" in shellgs("capture", tmp_path / "photographs", tmp_path / "scene")
+    assert "1.png has more than" in shellgs("capture", tmp_path / "photographs", tmp_path / "scene")
     assert not (tmp_path / "scene" / "images").exists()
 
 
