@@ -33,7 +33,8 @@ SPECK = 100.0
 
 
 _BLOCK = 8  # voxels along a side of a block, which is stored if a surface is near
-_MOST = 150_000  # blocks of a tile: 1.5 GB, and two or three times that while Open3D makes room for more
+_MOST = 150_000  # blocks of a tile: 1.5 GB
+_AT_ONCE = 10_000  # blocks that are added at once: Open3D makes room for all of them, there already or not
 
 
 class DepthView(NamedTuple):
@@ -77,16 +78,8 @@ def fuse(views: Iterable[DepthView], box: Box, voxel: float | None = None) -> tr
         kept = _Kept(Path(folder))
         taken = kept.keeping(chain([first], shown))
         while low < np.inf:
-            grid, high, seen = _voxel_grid(voxel), np.inf, 0
-            for view in taken:
-                _integrate(grid, view, axis, low, high)
-                seen += 1
-                if grid.hashmap().size() > _MOST:
-                    high = _shortened(grid, axis)
-            if grid.hashmap().size():
-                mesh = _extract(grid, min(MIN_VIEWS, seen))
-                middle = mesh.triangles_center[:, axis] / (_BLOCK * voxel) if len(mesh.faces) else np.empty(0)
-                parts.append((mesh, (middle >= low) & (middle < high)))
+            part, high = _tile(taken, voxel, axis, low)
+            parts.append(part)
             low, taken = high, track(kept, "Fusing the next part, view", len(kept))
     mesh = _joined(parts)
     mesh.update_faces(_without_specks(mesh, SPECK * voxel**2))
@@ -114,6 +107,21 @@ def _inside(views: Iterable[DepthView], box: Box) -> Iterator[DepthView]:
         inside = (view.depth[..., 0] > 0) & torch.from_numpy(box.contains(points.numpy()))
         if inside.any():
             yield view._replace(depth=view.depth.where(inside[..., None], 0.0))
+
+
+def _tile(
+    views: Iterable[DepthView], voxel: float, axis: int, low: float
+) -> tuple[tuple[trimesh.Trimesh, Bool[np.ndarray, " F"]], float]:
+    """Fuse a tile that begins at block ``low`` along an axis: its mesh, which faces are its own, and where it ends."""
+    grid, high, seen = _voxel_grid(voxel), np.inf, 0
+    for view in views:
+        _integrate(grid, view, axis, low, high)
+        seen += 1
+        if grid.hashmap().size() > _MOST:
+            high = _shortened(grid, axis)
+    mesh = _extract(grid, min(MIN_VIEWS, seen))
+    middle = mesh.triangles_center[:, axis] / (_BLOCK * voxel) if len(mesh.faces) else np.empty(0)
+    return (mesh, (middle >= low) & (middle < high)), high
 
 
 def _longest(box: Box) -> int:
@@ -169,7 +177,7 @@ def _voxel_grid(voxel: float):
         attr_channels=((1,), (1,), (3,)),
         voxel_size=voxel,
         block_resolution=_BLOCK,
-        block_count=10_000,
+        block_count=_AT_ONCE,
     )
 
 
@@ -192,14 +200,17 @@ def _integrate(grid, view: DepthView, axis: int, low: float, high: float) -> Non
             raise
         return  # the view has hardly any depth
     blocks = blocks[(blocks[:, axis] >= low) & (blocks[:, axis] <= high)]
-    if len(blocks):
-        grid.integrate(o3d.core.Tensor(blocks), depth, colour, K, K, viewmat, unit, far, TRUNCATION)
+    for start in range(0, len(blocks), _AT_ONCE):
+        some = o3d.core.Tensor(blocks[start : start + _AT_ONCE])
+        grid.integrate(some, depth, colour, K, K, viewmat, unit, far, TRUNCATION)
 
 
 def _extract(grid, views: int) -> trimesh.Trimesh:
     """The zero crossing between voxels that at least ``views`` views saw; without faces if there is none."""
     import trimesh
 
+    if grid.hashmap().size() == 0:
+        return trimesh.Trimesh()
     try:
         surface = grid.extract_triangle_mesh(weight_threshold=views - 0.5)
     except RuntimeError as error:

@@ -89,6 +89,14 @@ def test_a_view_with_hardly_any_depth_adds_nothing(sphere):
     assert len(fuse(views, ROOM, 0.05).faces) == len(sphere.faces)
 
 
+def test_views_with_hardly_any_depth_alone_are_refused():
+    view = view_of_sphere(camera_at(0.0))
+    depth = torch.zeros_like(view.depth)
+    depth[33, 49] = view.depth[33, 49]
+    with pytest.raises(SceneError, match="there is no mesh"):
+        fuse([view._replace(depth=depth)], ROOM, 0.05)
+
+
 def view_of_street(x: float) -> DepthView:
     """Depth of the wall z = 0.1 sin(x), from 5 before it, by fixed-point iteration along the rays."""
     viewmat = torch.eye(4, dtype=torch.float64)
