@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -162,25 +162,13 @@ def train(street: Street, launch: Launch) -> None:
     Raises:
         SceneError: a folder holds another run, or one failed.
     """
-    for runs in ([street.coarse], street.blocks):
-        unfinished = [run for run in settled(runs) if not run.finished]
-        if unfinished and (failures := launch(unfinished)):
+    for unfinished in _unfinished(street):
+        if failures := launch(unfinished):
             run, why = next(iter(failures.items()))
             raise SceneError(
                 f"{len(failures)} of {len(unfinished)} runs failed, the first is {run.label}; all of its output is in "
                 f"{run.folder / 'log.txt'}, and the same command goes on where it stopped:\n{why}"
             )
-
-
-def settled(runs: Sequence[Run]) -> Sequence[Run]:
-    """The runs, with their settings in their folders.
-
-    Raises:
-        SceneError: a folder holds a run with other settings.
-    """
-    for run in runs:
-        run.settle()
-    return runs
 
 
 def script(street: Street) -> list[str]:
@@ -189,10 +177,20 @@ def script(street: Street) -> list[str]:
     Raises:
         SceneError: a folder holds another run.
     """
+    return [" && ".join(map(shlex.join, run.commands())) for run in next(_unfinished(street), [])]
+
+
+def _unfinished(street: Street) -> Iterator[list[Run]]:
+    """The coarse run if it is not finished, and then such blocks, which need it; with their settings in their folders.
+
+    Raises:
+        SceneError: a folder holds a run with other settings.
+    """
     for runs in ([street.coarse], street.blocks):
-        if unfinished := [run for run in settled(runs) if not run.finished]:
-            return [" && ".join(map(shlex.join, run.commands())) for run in unfinished]
-    return []
+        for run in runs:
+            run.settle()
+        if unfinished := [run for run in runs if not run.finished]:
+            yield unfinished
 
 
 def _link(file: Path, to: Path) -> None:

@@ -55,14 +55,13 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
         SceneError: there are none, some are raw without a developed one beside, two would get the same name, or masks
             lie among them.
     """
-    if masks and masks.resolve() == folder.resolve():
-        raise SceneError(f"the masks lie among the photographs in {folder}: move them into a folder of their own")
+    photographs = photographs_in(folder, deep=True)
+    if masks:
+        root, among = folder.resolve(), masks.resolve()
+        if root == among:
+            raise SceneError(f"the masks lie among the photographs in {folder}: move them into a folder of their own")
+        photographs = [path for path in photographs if not (root / path.relative_to(folder)).is_relative_to(among)]
     found: dict[str, Path] = {}
-    photographs = [
-        path
-        for path in photographs_in(folder, deep=True)
-        if not (masks and (folder.resolve() / path.relative_to(folder)).is_relative_to(masks.resolve()))
-    ]
     _tell_what_is_left_out(folder, photographs)
     for path in _without_copies(folder, photographs):
         name = captured_name(path.relative_to(folder))

@@ -231,8 +231,8 @@ class _Capture:
             )
         if self.config.cameras == "auto":
             tell_of_a_rig(ordinary)
-        if self.config.cameras == "auto" and not self.is_video:
-            tell_of_unknown_lenses(self.folder, ordinary)
+            if not self.is_video:
+                tell_of_unknown_lenses(self.folder, ordinary)
         self.rig = folders(ordinary) if self.config.cameras == "rig" else []
         lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
         self._step(
