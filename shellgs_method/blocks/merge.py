@@ -144,14 +144,16 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
 
 
 def check_free(output: Path) -> None:
-    """Refuse to write a merged run where another run is.
+    """Refuse to write a merged run where a scene or another run is.
 
     Raises:
-        SceneError: the folder is a file, or holds a run that was not merged, which has no blocks.json.
+        SceneError: the folder is a file, or holds a run that was not merged, which has no blocks.json, or a scene.
     """
     check_output_folder(output)
-    if (output / "config.yml").exists() and not (output / BLOCKS).exists():
-        raise SceneError(f"{output} is the folder of a run that was trained: name another one for the merged run")
+    run, blocks = ((output / name).exists() for name in ("config.yml", BLOCKS))
+    if run != blocks:
+        what = "run that was trained" if run else "scene"
+        raise SceneError(f"{output} is the folder of a {what}: name another one for the merged run")
 
 
 def _check_settings(first: BlockRun, run: BlockRun) -> None:

@@ -22,6 +22,7 @@ COARSE = "coarse"
 """Name of the coarse run, and of its copy in the folder of a block's run."""
 _PARSER = "facade-data"
 _SCALE = "camera-res-scale-factor"
+_AVERAGE = "iterations of a block on average"
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class BlockJob(Run):
     """Folder of the coarse run."""
     region: str = ""
     """Fingerprint of the block's cell and photographs when the street began."""
-    usual_iterations: int = 0
+    average_iterations: int = 0
     """Iterations of a block with as many photographs as blocks have on average."""
 
     def _train(self) -> list[str]:
@@ -47,14 +48,14 @@ class BlockJob(Run):
             SceneError: the flags set what the street sets, or there is no coarse run.
         """
         coarse = content_hash(find_checkpoint(self.coarse / "nerfstudio_models"))
-        of_street = {"block": self.region, "coarse": coarse, "usual_iterations": self.usual_iterations}
+        of_street = {"block": self.region, "coarse": coarse, _AVERAGE: self.average_iterations}
         return {**super().settings, **of_street}
 
     @property
     def as_begun(self) -> BlockJob:
         """The same run, as long as when it was begun: other blocks may have been cut anew since."""
         before = recorded_settings(self.recorded) if self.begun else {}
-        same = before.get("block") == self.region and before.get("usual_iterations") == self.usual_iterations
+        same = before.get("block") == self.region and before.get(_AVERAGE) == self.average_iterations
         return replace(self, iterations=before["iterations"]) if same else self
 
     def settle(self) -> None:
@@ -145,7 +146,7 @@ class Street:
                 paths=paths,
                 coarse=coarse.folder,
                 region=cell.fingerprint,
-                usual_iterations=iterations,
+                average_iterations=iterations,
             ).as_begun
             for cell in cells
         ]

@@ -264,12 +264,15 @@ class Run:
             raise SceneError(f"{self.folder} is a run that `shellgs compare` did not make: give another --output")
 
     def settle(self) -> None:
-        """Write the settings into the run's folder, for later comparisons to check.
+        """Write the settings into the run's folder, for later comparisons to check, and delete metrics of another run.
 
         Raises:
             SceneError: as :meth:`check`.
         """
         self.check()
+        if not self.trained:  # its last checkpoint may have been deleted
+            for half in (None, *self.halves):
+                self.metrics(half).unlink(missing_ok=True)
         if not self.begun:
             self.folder.mkdir(parents=True, exist_ok=True)
             with atomic_write(self.recorded) as file:

@@ -192,7 +192,8 @@ def test_gaussians_of_two_blocks_in_one_place_are_doubles_and_those_of_one_block
         ("cut anew", "was cut anew"),
         ("another coarse run", "another coarse run"),
         ("other settings", "has other settings than .*sh_degree"),
-        ("itself", "name another one"),
+        ("into a run", "folder of a run that was trained: name another one"),
+        ("into the scene", "folder of a scene: name another one"),
     ],
 )
 def test_what_cannot_be_merged_is_refused_in_a_sentence(configs, coarse, street, tmp_path, broken, said):
@@ -203,8 +204,8 @@ def test_what_cannot_be_merged_is_refused_in_a_sentence(configs, coarse, street,
         given.append(given[0])
     elif broken == "of the whole scene":
         given.append(coarse.base_dir / "config.yml")
-    elif broken == "itself":
-        output = given[0].parent
+    elif broken.startswith("into"):
+        output = street if broken == "into the scene" else given[0].parent
     else:
         folder = Path(shutil.copytree(given[1].parent, tmp_path / "east"))
         given[1] = folder / "config.yml"

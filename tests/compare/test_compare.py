@@ -316,6 +316,17 @@ def test_a_finished_run_is_not_changed_again(pristine_scene, tmp_path):
 
 
 @pytest.mark.usefixtures("fake_commands")
+def test_a_run_without_its_last_checkpoint_is_trained_and_measured_again(pristine_scene, tmp_path):
+    (run,) = fake_grid([pristine_scene], ["shellgs"], tmp_path / "out")
+    finish_all([run])
+    shutil.rmtree(run.checkpoints)
+    run.metrics().write_text("of the run before")
+    finish_all([run])
+    assert run.finished
+    assert run.metrics().read_text() != "of the run before"
+
+
+@pytest.mark.usefixtures("fake_commands")
 def test_a_killed_run_resumes_from_its_checkpoint(pristine_scene, tmp_path):
     runs = fake_grid([pristine_scene], ["photo-gs"], tmp_path / "out")
     assert list(finish_all(runs)) == runs
