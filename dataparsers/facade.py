@@ -84,7 +84,6 @@ class FacadeDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         config = self.config
         recording = config.read()
-        views = _views(recording.frames, config)
         poses, transform, scale = _rescaled(recording, config)
         cues = {kind: CueMaps.open(config.data, kind) for kind in find_cues(config.data)}
         shell = cues["shell"].manifest if "shell" in cues else None
@@ -92,6 +91,9 @@ class FacadeDataParser(DataParser):
         max_image_size = _image_size(config, sized.max_image_size if sized else None)
         whole = _of_split(recording, split, config)
         chosen, cell = _of_block(recording, whole, split, config)
+        used = chosen if config.block else range(len(recording.frames))
+        _refuse_missing_images([recording.frames[k] for k in used], config.data)
+        views = _views(recording.frames, config)
         views = [replace(views[k], camera=views[k].camera.shrunk(max_image_size)) for k in chosen]
         points = find_sparse_points(config)
         if split == "train":
@@ -125,7 +127,9 @@ class FacadeDataParser(DataParser):
 
 def read_views(layout: SceneLayout) -> list[View]:
     """All views of a scene at full size, training and held-out, sorted by name."""
-    return _views(layout.read().frames, layout)
+    frames = layout.read().frames
+    _refuse_missing_images(frames, layout.data)
+    return _views(frames, layout)
 
 
 def held_out_names(config: FacadeDataParserConfig) -> set[str]:
@@ -136,7 +140,6 @@ def held_out_names(config: FacadeDataParserConfig) -> set[str]:
 
 
 def _views(frames: Sequence[Frame], layout: SceneLayout) -> list[View]:
-    _refuse_missing_images(frames, layout.data)
     cameras = [frame.camera for frame in frames]
     warn_of_coarse(camera_step(cameras), positions(cameras), f"the cameras of {layout.data}")
     masks = layout.masks(frames)

@@ -39,12 +39,14 @@ def oriented(views: Sequence[View], layout: SceneLayout) -> list[View]:
     One program found all cameras, so that they are judged together: by the colours of the SfM points, else by the up
     axes of the cameras of photographs that are stored upright. What is found is told.
     """
-    marked = [view for view in views if _is_unclear(view.image)]
+    # A block is sent to another machine without the photographs of others.
+    there = [view for view in views if view.image.is_file()]
+    marked = [view for view in there if _is_unclear(view.image)]
     if not marked:
         return list(views)
     applied, by = _by_colours(marked, find_sparse_points(layout)), "the colours of the SfM points"
     if applied is None:
-        applied, by = _by_axes(marked, [v for v in views if _orientation(v.image) == 1]), "the cameras' up axes"
+        applied, by = _by_axes(marked, [v for v in there if _orientation(v.image) == 1]), "the cameras' up axes"
     shown = (
         f"{len(marked)} photographs of {layout.data} are stored turned, by their EXIF ({marked[0].name}, for example)"
     )

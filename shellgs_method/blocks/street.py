@@ -8,13 +8,15 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from itertools import chain
+from pathlib import Path, PurePosixPath
 
 from dataparsers.facade import FacadeDataParserConfig, trainable_cells
 from shellgs_method.compare.runs import Run, Variant, recorded_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_contents, content_hash
 from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.files.cue_maps import find_cues, map_path
 from shellgs_method.files.scene import ScenePaths
 from shellgs_method.runs.checkpoints import find_checkpoint
 
@@ -35,6 +37,14 @@ class BlockJob(Run):
     """Fingerprint of the block's cell and photographs when the street began."""
     average_iterations: int = 0
     """Iterations of a block with as many photographs as blocks have on average."""
+
+    @cached_property
+    def spared(self) -> frozenset[PurePosixPath]:
+        """Also the photographs of other blocks, and their maps."""
+        photographs = {cell.fingerprint: cell.block.photographs for cell in Blocks.read(self.scene / BLOCKS).cells}
+        others = set(chain(*photographs.values())).difference(photographs[self.region])
+        maps = [map_path(kind, name) for kind in find_cues(self.scene) for name in others]
+        return super().spared.union(map(PurePosixPath, others), maps)
 
     def _train(self) -> list[str]:
         script, method, *flags = super()._train()

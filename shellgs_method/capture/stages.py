@@ -47,9 +47,7 @@ from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
 from shellgs_method.capture.work import Work, listing
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
-
-WORK = Path("capture")
-"""Work folder in the scene folder."""
+from shellgs_method.files.scene import CAPTURE
 
 SUSPICIOUS_ERROR = 1.0
 """Mean reprojection error in pixels: right models of real and synthetic facades had 0.4 to 0.8. Folded ones may have no
@@ -134,7 +132,7 @@ class _Capture:
         if config.masks and self.is_video:
             raise SceneError(
                 "a video cannot have --masks: capture it without, then capture the frames in "
-                f"{scene / WORK}/photographs with masks into another scene folder"
+                f"{scene / CAPTURE}/photographs with masks into another scene folder"
             )
         if config.masks:
             self.masks = find_masks(self.photographs, source, config.masks)
@@ -151,7 +149,7 @@ class _Capture:
 
     def run(self) -> Summary:
         self._refuse_to_overwrite()
-        self.work = Work(self.scene / WORK)
+        self.work = Work(self.scene / CAPTURE)
         if not self.work.has("undistorted", self.model_key) or self._missing_parts():
             self._photographs()
             database = self._features()
@@ -162,7 +160,7 @@ class _Capture:
 
     def _refuse_to_overwrite(self) -> None:
         """Refuse a scene whose photographs or cameras are not those of this capture."""
-        if (self.scene / WORK).is_dir() and Work(self.scene / WORK).has("undistorted", self.model_key):
+        if (self.scene / CAPTURE).is_dir() and Work(self.scene / CAPTURE).has("undistorted", self.model_key):
             return
         for name in ("transforms.json", "colmap", "sparse", "images", *(["masks"] if self.masked else [])):
             if (self.scene / name).exists():

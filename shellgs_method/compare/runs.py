@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -19,11 +19,13 @@ from shellgs_method.compare.settings import config_settings, default_settings, p
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.holdout import Half
 from shellgs_method.files.atomic import atomic_write, fingerprint
-from shellgs_method.files.cue_maps import CueMaps, find_cues
-from shellgs_method.files.scene import SceneLayout, ScenePaths
+from shellgs_method.files.cue_maps import CueMaps, find_cues, relative_path
+from shellgs_method.files.scene import ALIGNMENT, CAPTURE, TRUTH, SceneLayout, ScenePaths
 from shellgs_method.runs.ablations import ABLATIONS
 from shellgs_method.runs.config_file import renamed
 from shellgs_method.runs.folders import recover_folder
+from shellgs_method.shell import Alignment
+from shellgs_method.shell.cast import MASKS
 from shellgs_method.trainer import FacadeTrainerConfig
 
 METHODS = ("photo-gs", "mono-gs", "2dgs", "shellgs")
@@ -126,6 +128,15 @@ class Run:
     """Number of evaluations on all held-out views during training."""
     paths: ScenePaths = field(default_factory=ScenePaths)
     """Paths of the scene's files."""
+
+    @cached_property
+    def spared(self) -> frozenset[PurePosixPath]:
+        """What a capture leaves, and the shell, of which runs read the maps."""
+        kept = {ALIGNMENT.name, TRUTH.name, MASKS.name}
+        shell = [path for path in (self.scene / ALIGNMENT.parent).glob("*") if path.name not in kept]
+        if (self.scene / ALIGNMENT).is_file():
+            shell += Alignment.load(self.scene / ALIGNMENT).files(self.scene)
+        return frozenset(PurePosixPath(relative_path(path, self.scene)) for path in [self.scene / CAPTURE, *shell])
 
     @property
     def label(self) -> str:

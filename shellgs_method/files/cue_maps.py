@@ -45,6 +45,7 @@ __all__ = [
     "Manifest",
     "MapRecord",
     "find_cues",
+    "map_path",
     "relative_path",
     "source_hash",
     "tolerated",
@@ -260,7 +261,7 @@ class CueMaps:
         parts = PurePosixPath(name)
         if not parts.parts or parts.is_absolute() or ".." in parts.parts:
             raise SceneError(f"view {name!r} is not named by a path inside the scene")
-        return self.folder / f"{parts}.npz"
+        return self.scene / map_path(self.kind, name)
 
     def _path_of(self, name: str) -> Path | None:
         path = self._path(name)
@@ -337,6 +338,11 @@ class CueMaps:
             f"the {self.kind} map of view {name!r} ({self._path(name)}) cannot be used: {problem}; "
             f"run `{command}` to make it again"
         )
+
+
+def map_path(kind: str, name: str) -> PurePosixPath:
+    """Path of a view's map, relative to its scene."""
+    return PurePosixPath("cues", kind, f"{name}.npz")
 
 
 def find_cues(scene: Path) -> list[str]:

@@ -16,6 +16,8 @@ from shellgs_method.files.paths import mask_names, photographs_in, tell_of_masks
 if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line needs only the paths
     from shellgs_method.files.frames import Frame, Recording
 
+CAPTURE = Path("capture")
+"""Folder of what `shellgs capture` works with, in the scene."""
 MASKS = Path("masks")
 """Default folder of masks, in the scene."""
 ALIGNMENT = Path("shell/alignment.json")

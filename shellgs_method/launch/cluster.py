@@ -4,9 +4,9 @@ Where all nodes see the folders of the scenes and of the runs, as on a shared fi
 trained there: nothing is sent, and a task whose worker or node is killed is retried and resumes from the run's last
 checkpoint.
 
-Elsewhere a scene is packed and put into Ray's object store; a node unpacks it once, into its own temporary folder,
-which is removed at the end, and a task returns the run's folder. A task that is retried on the same node resumes from
-its last checkpoint, on another from what the run's folder held at the start.
+Elsewhere what a run needs of its scene is packed and put into Ray's object store; a node unpacks it once, into its own
+temporary folder, which is removed at the end, and a task returns the run's folder. A task that is retried on the same
+node resumes from its last checkpoint, on another from what the run's folder held at the start.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ import stat
 import subprocess
 import tarfile
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import contextmanager, suppress
-from hashlib import sha256
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 from uuid import uuid4
 
@@ -31,7 +30,7 @@ from jaxtyping import UInt8
 from rich.console import Console
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, content_hash
+from shellgs_method.files.atomic import atomic_write, fingerprint
 from shellgs_method.launch.display import Display
 from shellgs_method.launch.job import Job, JobT
 from shellgs_method.launch.local import BIN, CommandError, finish
@@ -108,11 +107,12 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
                 while waiting and len(pending) < most:
                     run, packed = waiting.pop(0), None
                     if not in_place:
-                        if run.scene not in scenes:
-                            scenes[run.scene] = content_hash(run.scene), _packed(run.scene, ray.put)
-                        packed = *scenes[run.scene], _packed(run.folder, ray.put)
-                        if run.scene not in {later.scene for later in waiting}:
-                            del scenes[run.scene]
+                        part = _part(run)
+                        if part not in scenes:
+                            scenes[part] = _packed(run.scene, ray.put, run.spared)
+                        packed = part, scenes[part], _packed(run.folder, ray.put)
+                        if part not in map(_part, waiting):
+                            del scenes[part]
                     pending[task.remote(run, launch, run.key, packed or marks, stages)] = run
                     tell[run.key] = display.begin(run.label)
                     tell[run.key](Stage("Waiting for a node"))
@@ -203,13 +203,18 @@ def _on_each_node(function: Callable[[Any], Any], argument: object) -> list[Any]
     return answers
 
 
+def _part(run: Job) -> str:
+    """Key of what a run needs of its scene."""
+    return fingerprint(str(run.scene), sorted(map(str, run.spared)))
+
+
 def _remove_copies(launch: str) -> None:
     """Remove what a launch unpacked on this node."""
     shutil.rmtree(_own_folder() / launch, ignore_errors=True)
 
 
 Packed = tuple[str, Pieces, Pieces]
-"""A key of a scene's content, and the folders of the scene and the run, packed."""
+"""A key of what a run needs of its scene, and that and the run's folder, packed."""
 
 
 def _finish_on_node(
@@ -247,9 +252,8 @@ def _finish_copy(
     """Finish a run in a folder of this node, and pack it."""
     import ray
 
-    scene_key, scene, folder = packed
-    scenes = root / "scenes" / sha256(scene_key.encode()).hexdigest()
-    local = run.moved(scenes / run.scene.name, root / "runs" / key)
+    part, scene, folder = packed
+    local = run.moved(root / "scenes" / part / run.scene.name, root / "runs" / key)
     if not local.scene.exists():
         _unpack(map(ray.get, scene), local.scene)
     if not local.folder.exists():
@@ -345,10 +349,14 @@ class _Joined(io.RawIOBase):
         return count
 
 
-def _packed(folder: Path, store: Callable[[Archive], Any]) -> Pieces:
-    """Pack a folder into a tar file; return the result of ``store`` for each of its pieces."""
+def _packed(folder: Path, store: Callable[[Archive], Any], spared: Set[PurePosixPath] = frozenset()) -> Pieces:
+    """Pack a folder, without what is ``spared``, into a tar file; return what ``store`` makes of each of its pieces."""
+
+    def kept(member: tarfile.TarInfo) -> tarfile.TarInfo | None:
+        return None if PurePosixPath(member.name) in spared else member
+
     with _Pieces(store) as file, tarfile.open(fileobj=file, mode="w|", dereference=True) as archive:  # pyright: ignore
-        archive.add(folder, arcname=".")
+        archive.add(folder, arcname=".", filter=kept)
     return file.stored
 
 

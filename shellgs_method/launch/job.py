@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Protocol, TypeVar
 
 from typing_extensions import Self
@@ -19,6 +19,11 @@ class Job(Protocol):
     @property
     def scene(self) -> Path:
         """Folder of its scene."""
+        ...
+
+    @property
+    def spared(self) -> frozenset[PurePosixPath]:
+        """Files and folders of the scene, relative to it, that it does without on another machine."""
         ...
 
     @property

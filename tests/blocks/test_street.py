@@ -9,13 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from two_blocks import HALVES, coarse_run, cut_in_two
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+from two_blocks import HALVES, block_run, coarse_run, copied, cut_in_two
 
 from shellgs_method.blocks.street import Street, script, train
 from shellgs_method.compare.settings import parsed
 from shellgs_method.errors import SceneError
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Fork
+from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.scene import ScenePaths
+from shellgs_method.launch import cluster
 from shellgs_method.runs.checkpoints import find_checkpoint
 
 
@@ -136,6 +140,31 @@ def test_a_block_that_was_begun_stays_as_long_when_another_is_cut_anew(cut, tmp_
     west_now, east_now = planned(cut, tmp_path / "street").blocks
     assert west_now.iterations < street.blocks[0].iterations
     assert east_now == east
+
+
+def test_a_block_is_sent_without_photographs_of_others_and_the_shell_and_trains_the_same(cut, tmp_path):
+    (cut / "capture").mkdir()
+    (cut / "capture" / "database.db").touch()
+    west, sent = planned(cut, tmp_path / "street").blocks[0], tmp_path / "node" / "scene"
+    cluster._unpack(cluster._packed(cut, lambda piece: piece, west.spared), sent)
+    names = [frame.name for frame in west.paths.of(cut).read().frames]
+    ours = {*Blocks.read(cut / BLOCKS).cell("west").block.photographs}
+    assert {name for name in names if (sent / name).exists()} == ours
+    assert CueMaps.open(sent, "shell").names == sorted(ours)
+    assert {path.name for path in (sent / "shell").iterdir() if path.is_file()} == {"alignment.json"}
+    assert not (sent / "capture").exists()
+
+    coarse, trained = coarse_run(cut, tmp_path / "coarse", iterations=4), []
+    for scene in (cut, sent):
+
+        def of_scene(config: TrainerConfig, scene: Path = scene) -> None:
+            config.data = config.pipeline.datamanager.data = scene
+
+        trainer = block_run(coarse, "west", tmp_path / scene.parent.name, 4, change=of_scene)
+        trainer.train()
+        trained.append(copied(trainer.pipeline.model.gauss_params.items()))
+    for name, values in trained[0].items():
+        assert torch.equal(values, trained[1][name]), name
 
 
 def test_a_method_of_nerfstudio_trains_no_blocks(cut, tmp_path):
