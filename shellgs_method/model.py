@@ -136,6 +136,25 @@ class FacadeModelConfig(SplatfactoModelConfig):
     prompt: Suppress[Optional[str]] = None
 
     @property
+    def training_cues(self) -> set[str]:
+        """Kinds of maps that the training views need."""
+        points_of_shell = self.init == "shell" or self.trust == "photographs"
+        return {self.cues, "shell" if points_of_shell else "none"} - {"none"}
+
+    def check_cues(self, cues: Iterable[str]) -> None:
+        """Refuse a scene that lacks maps, given the kinds of those that it has.
+
+        Raises:
+            SceneError: it lacks those of a kind that is trained on.
+        """
+        for kind in sorted(self.training_cues.difference(cues)):
+            command = {"shell": "cast", "mono": "mono"}[kind]
+            raise SceneError(
+                f"this method needs the {kind} maps of the scene, and there are none: "
+                f"run `shellgs {command} SCENE` first, or train photo-gs"
+            )
+
+    @property
     def sdf_field(self) -> NoReturn:
         """Refuse what ns-export marching-cubes looks for."""
         refuse(NO_FIELD)
@@ -188,13 +207,6 @@ class FacadeModel(SplatfactoModel):
         self.step, self.log_every = 0, 1
         self.plan(PAPER_ITERATIONS)
 
-    @property
-    def training_cues(self) -> set[str]:
-        """Kinds of maps that the training views need."""
-        config = self.config
-        points_of_shell = config.init == "shell" or config.trust == "photographs"
-        return {config.cues, "shell" if points_of_shell else "none"} - {"none"}
-
     def _check_settings(self) -> None:
         config = self.config
         if config.primitive == "3d" and (config.depth == "median" or config.extra.distortion > 0):
@@ -205,12 +217,7 @@ class FacadeModel(SplatfactoModel):
             )
         if config.coarse is not None and self.kwargs["metadata"]["cell"] is None:
             raise SceneError(f"a block starts from the coarse run {config.coarse}: name it, by facade-data --block")
-        for kind in sorted(self.training_cues - set(self.kwargs["metadata"]["cues"])):
-            command = {"shell": "cast", "mono": "mono"}[kind]
-            raise SceneError(
-                f"this method needs the {kind} maps of the scene, and there are none: "
-                f"run `shellgs {command} SCENE` first, or train photo-gs"
-            )
+        config.check_cues(self.kwargs["metadata"]["cues"])
 
     def start_exposures(self, log_gains: Float64[np.ndarray, "V 3"], of_points: Float64[np.ndarray, "N 3"]) -> None:
         """Start from exposures of the training photographs, and bring the SfM points' colours to the mean exposure.

@@ -80,7 +80,7 @@ class FacadePipeline(VanillaPipeline):
             scene = Path(datamanager.config.dataparser.data)
             self.contradicted_shell = ContradictedShell(scene, datamanager.scene_to_world)
             if self.test_mode == "val":  # a trained run loads all its Gaussians
-                datamanager.train_on(model.training_cues)
+                datamanager.train_on(model.config.training_cues)
                 self._start()
 
     def _start(self) -> None:

@@ -128,7 +128,8 @@ class Street:
             paths: paths of the scene's files.
 
         Raises:
-            SceneError: the scene has no blocks or one that cannot be trained, or the method is none of ShellGS.
+            SceneError: the scene has no blocks or one that cannot be trained, or not the maps that the method needs, or
+                the method is none of ShellGS.
         """
         variant = Variant.parse(method)
         if not variant.ours:
@@ -137,6 +138,7 @@ class Street:
             raise SceneError(
                 f"{method} sets {_SCALE}: leave it out; `shellgs cast --max-image-size` sets the size of photographs"
             )
+        variant.config.pipeline.model.check_cues(find_cues(scene))  # pyright: ignore[reportAttributeAccessIssue]
         scene, output = scene.resolve(), output.resolve()
         scale = (f"--pipeline.datamanager.{_SCALE}", f"{coarse_scale:g}")
         of_whole = replace(variant, name=COARSE, flags=(*scale, *variant.flags))

@@ -172,6 +172,13 @@ def test_a_method_of_nerfstudio_trains_no_blocks(cut, tmp_path):
         planned(cut, tmp_path, "splatfacto")
 
 
+def test_a_scene_without_the_maps_of_the_method_is_refused_before_the_coarse_run(cut, tmp_path):
+    shutil.rmtree(cut / "cues")
+    with pytest.raises(SceneError, match=r"needs the shell maps .* or train photo-gs"):
+        planned(cut, tmp_path)
+    assert planned(cut, tmp_path, "photo-gs")
+
+
 @pytest.mark.slow
 def test_a_street_is_trained_and_merged_by_one_command(cut, tmp_path, shellgs):
     words = (cut, "--iterations", 6, "--coarse-iterations", 4, "--output", tmp_path / "street")
