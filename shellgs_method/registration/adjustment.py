@@ -6,18 +6,15 @@ observations and a wrong distortion. The shell's walls are where they are.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.colmap import ColmapCamera, ColmapImage, Model, parameters_of
+from shellgs_method.files.colmap import Model
 from shellgs_method.geometry.axes import facade_axes
-from shellgs_method.geometry.distortion import PARAMETERS
 from shellgs_method.geometry.similarity import fit_similarity, scale_of, transformed
 from shellgs_method.machine.progress import track
 from shellgs_method.registration.bundle import (
@@ -32,6 +29,7 @@ from shellgs_method.registration.bundle import (
     intersected,
     reprojection_errors,
 )
+from shellgs_method.registration.bundle_model import adjusted_model, bundle_of, with_distortion, with_finite_points
 from shellgs_method.registration.picks import PickedPoint
 from shellgs_method.registration.refinement import motions, similarity_by
 from shellgs_method.shell.surface import ShellSurface
@@ -56,8 +54,6 @@ _PATCH = 1.0
 _PICKED = 0.005
 """Metres: standard deviation of a pick on the shell. Picks are worse than that, and yet tell more: what points on the
 shell say together has a bias, since many are of frames and sills a centimetre or two off it."""
-_RANGE = 0.05
-"""Largest change of focal lengths, relative, and of distortion coefficients."""
 _OUTLYING = 4.0
 """Standard deviations of a keypoint's coordinate from which an observation is wrong. A tenth of a video's are: of edges
 that slide along others, and of repeated windows. Structure from motion without a robust loss is bent by them."""
@@ -67,7 +63,6 @@ _LOOSE = 0.3  # metres: a prior that keeps what nothing determines, such as wher
 _STILL = 5e-4  # metres that cameras move by in a round, from which they stand still
 _WEAK = 0.01  # singular value, relative to the largest, below which a motion of all stays: noise would determine it
 _EXPECTATIONS = 50
-_SHARED = 10  # photographs of a lens from which on its distortion is found
 
 
 @dataclass(frozen=True)
@@ -178,7 +173,7 @@ def adjusted(
     Raises:
         SceneError: the model has no tracks, its cameras cannot be adjusted, or too few points are on the shell.
     """
-    model = _with_distortion(_with_finite_points(model))
+    model = with_distortion(with_finite_points(model))
     start, seen = bundle_of(model, survey_from_scene)
     start = intersected(Objective(seen, _noise_of_pixels(start, seen)), start)
     share = min(max(HELD_OUT, ENOUGH / len(start.points)), 0.3)
@@ -445,122 +440,3 @@ def _gain(surface: ShellSurface, whole: Objective, before: Bundle, after: Bundle
         patches = _patches(closest.point, facing)
     gains = np.bincount(patches, logarithms[1] - logarithms[0])
     return float(gains.mean() / (gains.std(ddof=1) / np.sqrt(len(gains)) + 1e-12)) if len(gains) > 1 else 0.0
-
-
-def _with_finite_points(model: Model) -> Model:
-    """The model with points in the midst of the others where they are NaN or infinite: they are triangulated anew."""
-    positions = model.points.positions
-    finite = np.isfinite(positions).all(axis=1)
-    amidst = np.median(positions[finite], axis=0) if finite.any() else np.zeros(3)
-    return replace(model, points=replace(model.points, positions=np.where(finite[:, None], positions, amidst)))
-
-
-def _with_distortion(model: Model) -> Model:
-    """The model with lenses of many photographs that may distort, and without lenses of none."""
-    shared = Counter(image.camera for image in model.images.values())
-    cameras = {}
-    for number, camera in model.cameras.items():
-        if not shared[number]:
-            continue
-        if camera.model in ("SIMPLE_PINHOLE", "PINHOLE") and shared[number] >= _SHARED:
-            fx, fy, cx, cy = (_columns(camera) @ np.array(camera.params))[:4].tolist()
-            camera = camera._replace(model="OPENCV", params=(fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0))
-        cameras[number] = camera
-    return replace(model, cameras=cameras)
-
-
-def bundle_of(model: Model, placed: Float64[np.ndarray, "4 4"]) -> tuple[Bundle, Observations]:
-    """Cameras, lenses, points and tracks of a model, moved by a similarity.
-
-    Focal lengths and distortion are free within a range, principal points stay, as in COLMAP.
-
-    Raises:
-        SceneError: the model has no tracks, or a lens of a model that cannot be adjusted.
-    """
-    numbers = {number: k for k, number in enumerate(model.images)}
-    scale = scale_of(placed)
-    poses = [_pose(image) for image in model.images.values()]
-    rotations = np.stack([rotation for rotation, _ in poses])
-    centres = np.stack([-rotation.T @ translation for rotation, translation in poses])
-    lenses, free, margins = zip(*map(_lens, model.cameras.values()), strict=True)
-    width = max(columns.shape[1] for columns in free)
-    lens, margin = np.stack(lenses), np.stack(margins)
-    views, points, pixels = _tracks(model, numbers)
-    order = {number: k for k, number in enumerate(model.cameras)}
-    bundle = Bundle(
-        rotations @ (placed[:3, :3] / scale).T,
-        transformed(centres, placed),
-        lens,
-        transformed(model.points.positions, placed),
-    )
-    seen = Observations(
-        views,
-        points,
-        pixels,
-        np.ones(len(views)),
-        np.array([order[image.camera] for image in model.images.values()]),
-        np.array(["FISHEYE" in camera.model for camera in model.cameras.values()]),
-        np.stack([np.pad(columns, ((0, 0), (0, width - columns.shape[1]))) for columns in free]),
-        (lens - margin, lens + margin),
-    )
-    return bundle, seen
-
-
-def _tracks(model: Model, numbers: dict[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """View, point and pixel of each observation."""
-    observers, keypoints = model.points.observers, model.points.keypoints
-    counts = [len(track) for track in observers]
-    if sum(counts) == 0:
-        raise SceneError("the SfM points have no tracks, without which cameras cannot be adjusted")
-    images, index = np.concatenate(observers), np.concatenate(keypoints)
-    points = np.repeat(np.arange(len(counts)), counts)
-    views = np.array([numbers.get(number, -1) for number in images.tolist()])
-    pixels = np.full((len(views), 2), np.nan)
-    for number, image in model.images.items():
-        of = np.flatnonzero(views == numbers[number])
-        xy = image.features["xy"]
-        there = index[of] < len(xy)
-        pixels[of[there]] = xy[index[of[there]]]
-    kept = np.isfinite(pixels).all(axis=1)
-    if not kept.any():
-        raise SceneError("the photographs have no keypoints, without which cameras cannot be adjusted")
-    return views[kept], points[kept], pixels[kept]
-
-
-def _pose(image: ColmapImage) -> tuple[np.ndarray, np.ndarray]:
-    quaternion = np.array(image.quaternion)
-    return Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix(), np.array(image.translation)
-
-
-def _lens(camera: ColmapCamera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All parameters of a lens, the ones that are adjusted as columns, and how far they may move."""
-    columns = _columns(camera)
-    lens = columns @ np.array(camera.params)
-    margins = np.full(len(PARAMETERS), _RANGE)
-    margins[:4] *= lens[[0, 1, 0, 1]]
-    return lens, columns[:, [k for k, name in enumerate(parameters_of(camera)) if name not in ("cx", "cy")]], margins
-
-
-def _columns(camera: ColmapCamera) -> np.ndarray:
-    """The linear map from the parameters of COLMAP's model to :data:`PARAMETERS`."""
-    names = parameters_of(camera)
-    columns = np.zeros((len(PARAMETERS), len(names)))
-    for k, name in enumerate(names):
-        for of in ("fx", "fy") if name == "f" else (name,):
-            columns[PARAMETERS.index(of), k] = 1.0
-    return columns
-
-
-def adjusted_model(model: Model, bundle: Bundle, placed: Float64[np.ndarray, "4 4"]) -> Model:
-    """The model with the cameras, lenses and points of a bundle, moved back by a similarity."""
-    back, turn = np.linalg.inv(placed), placed[:3, :3] / scale_of(placed)
-    centres = transformed(bundle.centres, back)
-    images = {}
-    for (number, image), rotation, centre in zip(model.images.items(), bundle.rotations @ turn, centres, strict=True):
-        x, y, z, w = map(float, Rotation.from_matrix(rotation).as_quat())
-        images[number] = image._replace(quaternion=(w, x, y, z), translation=tuple(map(float, -rotation @ centre)))
-    cameras = {
-        number: camera._replace(params=tuple(map(float, np.linalg.pinv(_columns(camera)) @ lens)))
-        for (number, camera), lens in zip(model.cameras.items(), bundle.lenses, strict=True)
-    }
-    return Model(cameras, images, replace(model.points, positions=transformed(bundle.points, back)))

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from shellgs_method.files.colmap import KEYPOINT, ColmapCamera, ColmapImage, Model, Points, read_model, write_model
 from shellgs_method.geometry.distortion import PARAMETERS, to_pixels
 from shellgs_method.geometry.similarity import fit_similarity, transformed
-from shellgs_method.registration.adjustment import adjusted_model, bundle_of
 from shellgs_method.registration.bundle import (
     Bundle,
     Objective,
@@ -27,6 +26,7 @@ from shellgs_method.registration.bundle import (
     intersected,
     reprojection_errors,
 )
+from shellgs_method.registration.bundle_model import adjusted_model, bundle_of
 
 LENS = np.array([500.0, 510, 320, 240, 0.02, -0.01, 0.001, -0.002, 0.003, 0.001])
 
