@@ -21,6 +21,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 from uuid import uuid4
@@ -69,26 +70,14 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
             not what a run takes.
     """
     ray = import_extra("ray", "ray", "ray", "the ray launcher")
-    from ray.exceptions import RayError
-
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    address = cluster.address
-    if address:
-        _check_cluster(address)
-    try:
-        ray.init(address or "local", include_dashboard=None if address else False, log_to_driver=False)
-    except Exception as error:  # which Ray itself raises where a node does not start in time
-        if not address:
-            raise SceneError(f"Ray cannot start on this machine ({error})") from error
-        raise SceneError(f"there is no Ray cluster at {address}: start one with `ray start --head`") from error
+    _connect(cluster.address)
     from ray.util.queue import Queue
 
-    failures: dict[JobT, str] = {}
     launch = uuid4().hex  # another launch must not resume what this one leaves on a node
     try:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         takes = cluster.per_run(nodes)
-        if (lacking := takes.lacking(nodes)) and not address:
+        if (lacking := takes.lacking(nodes)) and not cluster.address:
             raise SceneError(
                 f"a run takes {lacking}, which this machine has not: give less, or the --address of a cluster"
             )
@@ -97,49 +86,114 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
         task = ray.remote(max_retries=RETRIES, **takes.options)(_finish_on_node)
         # On any node, which may be lost.
         stages = Queue(actor_options={"num_cpus": 0, "max_restarts": -1})
-        waiting, pending, scenes = list(runs), {}, {}
-        tell: dict[str, Callable[[Stage], None]] = {}  # by the run's key
         with _marked(runs, launch) as marks, Display(console) as display:
             in_place = marks and all(_on_each_node(_sees, marks))
+            tasks = _Tasks(launch, task, stages, marks if in_place else None, console, display, list(runs))
             # What must be sent is packed late, to save memory; one run waits for a node that may join.
-            most = len(runs) if in_place else takes.room(nodes) + 1
-            while waiting or pending:
-                while waiting and len(pending) < most:
-                    run, packed = waiting.pop(0), None
-                    if not in_place:
-                        part = _part(run)
-                        if part not in scenes:
-                            scenes[part] = _packed(run.scene, ray.put, run.spared)
-                        packed = part, scenes[part], _packed(run.folder, ray.put)
-                        if part not in map(_part, waiting):
-                            del scenes[part]
-                    pending[task.remote(run, launch, run.key, packed or marks, stages)] = run
-                    tell[run.key] = display.begin(run.label)
-                    tell[run.key](Stage("Waiting for a node"))
-                ended, _ = ray.wait(list(pending), timeout=LOOK_EVERY)
-                with suppress(RayError):  # the runs count, not what is told of them
-                    for key, stage in stages.get_nowait_batch(stages.qsize()):
-                        tell[key](stage)
-                if not ended:
-                    continue
-                run = pending.pop(done := ended[0])
-                display.end(run.label)
-                tell[run.key] = lambda _: None  # what it told before it ended may come later
-                try:
-                    folder, error = ray.get(done)
-                    if folder is not None:
-                        _store_result(folder, run)
-                except (RayError, tarfile.TarError, OSError) as failure:
-                    failures[run] = str(failure)
-                    continue
-                if error is not None:
-                    failures[run] = error
-                left = len(pending) + len(waiting)
-                console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
+            failures = tasks.finish(len(runs) if in_place else takes.room(nodes) + 1)
     finally:
         _on_each_node(_remove_copies, launch)
         ray.shutdown()
     return {run: failures[run] for run in runs if run in failures}
+
+
+def _connect(address: str | None) -> None:
+    """Connect to a cluster, or start one of this machine alone.
+
+    Raises:
+        SceneError: there is no cluster at the address, or Ray does not start.
+    """
+    import ray
+
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address:
+        _check_cluster(address)
+    try:
+        ray.init(address or "local", include_dashboard=None if address else False, log_to_driver=False)
+    except Exception as error:  # which Ray itself raises where a node does not start in time
+        if not address:
+            raise SceneError(f"Ray cannot start on this machine ({error})") from error
+        raise SceneError(f"there is no Ray cluster at {address}: start one with `ray start --head`") from error
+
+
+@dataclass
+class _Tasks:
+    """The tasks of a launch, as the machine that submits them sees them."""
+
+    launch: str
+    task: Any
+    """Ray's remote function."""
+    stages: Any
+    """Ray's queue of what the runs are doing."""
+    marks: list[Path] | None
+    """Files by which nodes see that all folders are there; None if these are sent."""
+    console: Console
+    display: Display
+    waiting: list[Job]
+    """Runs to begin."""
+    pending: dict[Any, Job] = field(default_factory=dict)
+    """Runs that were begun, by Ray's reference to what they return."""
+    scenes: dict[str, Pieces] = field(default_factory=dict)
+    """What is sent of scenes, packed, by :func:`_part`."""
+    tell: dict[str, Callable[[Stage], None]] = field(default_factory=dict)
+    """Shows what a run is doing, by its key."""
+    failures: dict[Job, str] = field(default_factory=dict)
+
+    def finish(self, most: int) -> dict[Job, str]:
+        """Finish all runs, so many at once; return those that failed, with the end of their output."""
+        import ray
+
+        while self.waiting or self.pending:
+            while self.waiting and len(self.pending) < most:
+                self._begin(self.waiting.pop(0))
+            ended, _ = ray.wait(list(self.pending), timeout=LOOK_EVERY)
+            self._listen()
+            for done in ended:
+                self._end(done)
+        return self.failures
+
+    def _begin(self, run: Job) -> None:
+        given = self._packed(run) if self.marks is None else self.marks
+        self.pending[self.task.remote(run, self.launch, run.key, given, self.stages)] = run
+        self.tell[run.key] = self.display.begin(run.label)
+        self.tell[run.key](Stage("Waiting for a node"))
+
+    def _packed(self, run: Job) -> Packed:
+        import ray
+
+        part = _part(run)
+        if part not in self.scenes:
+            self.scenes[part] = _packed(run.scene, ray.put, run.spared)
+        packed = part, self.scenes[part], _packed(run.folder, ray.put)
+        if part not in map(_part, self.waiting):
+            del self.scenes[part]
+        return packed
+
+    def _listen(self) -> None:
+        from ray.exceptions import RayError
+
+        with suppress(RayError):  # the runs count, not what is told of them
+            for key, stage in self.stages.get_nowait_batch(self.stages.qsize()):
+                self.tell[key](stage)
+
+    def _end(self, done: Any) -> None:
+        import ray
+        from ray.exceptions import RayError
+
+        run = self.pending.pop(done)
+        self.display.end(run.label)
+        self.tell[run.key] = lambda _: None  # what it told before it ended may come later
+        try:
+            folder, error = ray.get(done)
+            if folder is not None:
+                _store_result(folder, run)
+        except (RayError, tarfile.TarError, OSError) as failure:
+            self.failures[run] = str(failure)
+            return
+        if error is not None:
+            self.failures[run] = error
+        left = len(self.pending) + len(self.waiting)
+        self.console.print(f"{run.label} {'failed' if error else 'finished'}; {left} left.", highlight=False)
 
 
 @contextmanager
