@@ -153,8 +153,8 @@ def _opened(video: Path) -> Iterator[tuple[av.container.InputContainer, VideoStr
             yield container, stream
     except av.error.FFmpegError as error:
         raise SceneError(
-            f"{video} cannot be read as a video ({error.strerror}): copy it again if it is cut off or damaged, or "
-            "convert it to mp4"
+            f"{video} cannot be read as a video ({error.strerror}): give a video or a folder of photographs; if it is "
+            "a video, copy it again, or convert it to mp4"
         ) from error
 
 

@@ -106,7 +106,10 @@ def video_says_panorama(video: Path) -> bool:
             "(equirectangular, mp4) with the camera's program"
         )
     frame = first_frame(video)
-    data: Any = frame.side_data if frame else ()
+    try:
+        data: Any = frame.side_data if frame else ()
+    except ValueError:  # PyAV does not know all that FFmpeg attaches, as to spatial video; pixels tell then
+        return False
     # The structures of both begin with an enum.
     kinds = {each.type.name: int.from_bytes(bytes(each)[:4], sys.byteorder) for each in data}
     if "SPHERICAL" not in kinds:

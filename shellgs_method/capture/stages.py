@@ -47,6 +47,7 @@ from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
 from shellgs_method.capture.work import Work, listing
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
+from shellgs_method.files.paths import PHOTOGRAPHS, RAW
 from shellgs_method.files.scene import CAPTURE
 
 SUSPICIOUS_ERROR = 1.0
@@ -107,6 +108,8 @@ def capture(
     config = config or CaptureConfig()
     if not source.exists():
         raise FileNotFoundError(f"{source} does not exist; give a folder of photographs or a video.")
+    if source.is_file() and source.suffix.lower() in PHOTOGRAPHS | RAW:
+        raise SceneError(f"{source} is one photograph: give a folder of them, or a video")
     if scene.resolve().is_relative_to(source.resolve()):
         raise SceneError(f"{scene} lies in the folder of the photographs, {source}: give a scene folder outside of it")
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()

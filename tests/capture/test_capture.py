@@ -282,6 +282,13 @@ def test_a_file_that_is_no_video_is_refused_by_name(tmp_path, content):
     assert not (tmp_path / "scene" / "images").exists()
 
 
+def test_one_photograph_in_place_of_a_folder_is_refused(tmp_path):
+    photograph(96, 72).save(tmp_path / "a.JPG")
+    with pytest.raises(SceneError, match=r"a\.JPG is one photograph: give a folder"):
+        capture(tmp_path / "a.JPG", tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
 # Photographs
 
 

@@ -198,6 +198,14 @@ def test_an_ordinary_video_does_not_say_so(tmp_path):
     assert not video_says_panorama(tmp_path / "walk.mp4")
 
 
+def test_data_of_frames_that_pyav_does_not_know_say_nothing(tmp_path):
+    """FFmpeg 8 attaches the EXIF data of a JPEG, and the number of the view to frames of spatial video."""
+    exif = Image.Exif()
+    exif[271] = "Phone"
+    panorama(128).save(tmp_path / "frame.jpg", exif=exif)
+    assert not video_says_panorama(tmp_path / "frame.jpg")
+
+
 @pytest.mark.parametrize(
     ("added", "message"),
     [(version_2(b"cbmp"), "not equirectangular"), (version_2(b"equi", 1), "for two eyes")],
