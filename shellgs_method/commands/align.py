@@ -183,10 +183,10 @@ def align(
         shutil.rmtree(candidate, ignore_errors=True)
     _show_alignment(scene, target, placement, validation)
     if validation.verdict == "refused":
+        kept = f"{target} is unchanged" if target.exists() else "nothing is written"
         why = f"{misplacement}; " if misplacement else ""
-        raise SceneError(
-            f"the alignment is refused and {target} is unchanged: {why}see {scene / REPORT / 'index.html'}"
-        )
+        advice = "; pick points with `shellgs pick`, and give them with --picks" if placement.proposed else ""
+        raise SceneError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}{advice}")
 
 
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:

@@ -963,9 +963,13 @@ def test_a_refused_alignment_does_not_replace_the_saved_one(scene, shellgs):
     true = Alignment.load(scene / ALIGNMENT)
     (scene / "off.json").write_text(json.dumps((true.shell_to_scene @ np.diag([1e3, 1e3, 1e3, 1])).tolist()))
     output = shellgs("align", scene, scene / true.shells[0], "--matrix", scene / "off.json")
-    assert "the alignment is refused" in output
+    assert f"the alignment is refused, and {scene / ALIGNMENT} is unchanged" in " ".join(output.split())
     assert (scene / ALIGNMENT).read_bytes() == before
     assert "Verdict: <b>refused</b>" in (scene / REPORT / "index.html").read_text()
+    (scene / ALIGNMENT).unlink()
+    output = shellgs("align", scene, scene / true.shells[0], "--matrix", scene / "off.json")
+    assert "the alignment is refused, and nothing is written: " in output
+    assert not (scene / ALIGNMENT).exists()
 
 
 def test_a_proposal_becomes_the_alignment_with_accept(scene, shellgs):
