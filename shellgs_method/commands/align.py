@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -15,8 +16,13 @@ from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
 from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
+    from shellgs_method.files.photographs import View
+    from shellgs_method.files.scene import SceneLayout
+    from shellgs_method.files.sparse_points import SparsePoints
     from shellgs_method.registration.align import Placement
+    from shellgs_method.registration.frames import ShellPlace
     from shellgs_method.registration.validation import Validation
+    from shellgs_method.shell import ShellMesh
 
 
 @bounded
@@ -71,92 +77,146 @@ def align(
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import read_views
-    from shellgs_method.files.atomic import replace_folder, unfinished
-    from shellgs_method.files.colmap import write_model
-    from shellgs_method.files.crs import crs_of, given_crs
-    from shellgs_method.files.cue_maps import relative_path
     from shellgs_method.files.scene import ADJUSTED
     from shellgs_method.files.sparse_points import read_sparse_points
-    from shellgs_method.registration.align import (
-        PROPOSAL,
-        REPORT,
-        Placement,
-        misplaced,
-        place_as_before,
-        place_as_it_is,
-        place_as_proposed,
-        place_by_guess,
-        place_by_picks,
-        place_by_positions,
-        refined,
-        seen_again,
-        unbent,
-        up_in_words,
-    )
-    from shellgs_method.registration.frames import ShellPlace
-    from shellgs_method.registration.report import write_report
+    from shellgs_method.registration.align import PROPOSAL, REPORT, misplaced, refined
     from shellgs_method.registration.sfm_frame import check_points
-    from shellgs_method.registration.units import unit_doubted
-    from shellgs_method.registration.validation import validate
-    from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
-    from shellgs_method.shell.cast import renew_error
+    from shellgs_method.shell import ALIGNMENT
 
-    starts = [start for start in (matrix, picks, positions, same_frame) if start]
-    if len(starts) > 1 or (starts and not shell) or (accept and (shell or starts)):
-        raise SceneError(
-            "give a shell, alone or with one of --matrix, --picks, --positions and --same-frame, or none to validate "
-            "what is there"
-        )
-    if any(global_shift) and matrix is None:
-        raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")
-    if metres_per_shell_unit != 1 and not shell:
-        raise SceneError("--metres-per-shell-unit belongs to a shell: give the shell and a start, to align it again")
+    start = _Start(
+        shell, matrix, picks, positions, same_frame, accept, global_shift, metres_per_shell_unit, crs, mesher, spacing
+    )
+    start.check()
     layout = paths.of(scene)
     if shell or accept or bundle_adjust:
         layout = layout.unadjusted()
     views, points = read_views(layout), read_sparse_points(layout)
     check_points(points, views)
-    names = tuple(relative_path(path, scene) for path in shell)
-    system = given_crs(crs) if crs else crs_of(*shell)
-    place = ShellPlace(*shell) if shell and (picks or positions) else None
-    if accept:
-        placement = place_as_proposed(scene / PROPOSAL, scene, views)
-    elif not shell:
-        placement = place_as_before(scene / ALIGNMENT, scene, views)
-    elif matrix:
-        placement = Placement(Alignment.from_matrix_file(matrix, names, metres_per_shell_unit, global_shift))
-    elif same_frame:
-        placement = place_as_it_is(names, metres_per_shell_unit)
-    elif picks and place:
-        placement = place_by_picks(picks, views, place, names, metres_per_shell_unit, system)
-    elif positions and place:
-        placement = place_by_positions(positions, views, place, names, metres_per_shell_unit, system)
-    else:
-        method, unit = mesher or "planes", metres_per_shell_unit
-        unaligned = load_shell(*shell, cache=scene / "shell", mesher=method, metres_per_unit=unit)
-        placement = place_by_guess(unaligned, views, points, names, metres_per_shell_unit, system)
-    aligned = placement.alignment.meshed_by(mesher, spacing)
-    placement = replace(placement, alignment=replace(aligned, crs=system or aligned.crs))
-    mesh = placement.alignment.load_shell(scene, views, place.surfaces if place else ())
+    placement, mesh = start.place(scene, views, points)
     misplacement = misplaced(placement, mesh, views, points)
     is_adjusted = layout.colmap_folder() == ADJUSTED
-    if refine is not None and is_adjusted:
-        raise SceneError(
-            "--refine would move the shell from where the cameras were adjusted to it onto frames and sills that it "
-            "lacks: give it with --bundle-adjust, which begins with the cameras as they were"
-        )
-    if refine is not None and misplacement:
-        raise SceneError(f"the alignment cannot be refined: {misplacement}")
     if refine is not None:
+        _check_refinement(is_adjusted, misplacement)
         placement = refined(placement, mesh, views, points, refine)
-    placement = replace(
-        placement, alignment=replace(placement.alignment, model=ADJUSTED.as_posix() if is_adjusted else "")
-    )
     if placement.proposed and bundle_adjust:
         raise SceneError(
             "cameras are not adjusted to a proposal: look at it first, then --accept it with --bundle-adjust"
         )
+    model = ADJUSTED.as_posix() if is_adjusted else ""
+    placement = replace(placement, alignment=replace(placement.alignment, model=model))
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
+    placement, validation = _written(target, layout, placement, mesh, picks, bundle_adjust)
+    _show_alignment(scene, target, placement, validation)
+    if validation.verdict == "refused":
+        kept = f"{target} is unchanged" if target.exists() else "nothing is written"
+        why = f"{misplacement}; " if misplacement else ""
+        advice = "; pick points with `shellgs pick`, and give them with --picks" if placement.proposed else ""
+        raise SceneError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}{advice}")
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What the command says of where the shell is."""
+
+    shell: tuple[Path, ...]
+    matrix: Path | None
+    picks: Path | None
+    positions: Path | None
+    same_frame: bool
+    accept: bool
+    global_shift: tuple[float, float, float]
+    metres_per_shell_unit: float
+    crs: str | None
+    mesher: Mesher | None
+    spacing: float | None
+
+    def check(self) -> None:
+        """Refuse what contradicts itself.
+
+        Raises:
+            SceneError: says what to give.
+        """
+        starts = [start for start in (self.matrix, self.picks, self.positions, self.same_frame) if start]
+        if len(starts) > 1 or (starts and not self.shell) or (self.accept and (self.shell or starts)):
+            raise SceneError(
+                "give a shell, alone or with one of --matrix, --picks, --positions and --same-frame, or none to "
+                "validate what is there"
+            )
+        if any(self.global_shift) and self.matrix is None:
+            raise SceneError("--global-shift is the one that CloudCompare used for the --matrix: give both or neither")
+        if self.metres_per_shell_unit != 1 and not self.shell:
+            raise SceneError(
+                "--metres-per-shell-unit belongs to a shell: give the shell and a start, to align it again"
+            )
+
+    def place(self, scene: Path, views: Sequence[View], points: SparsePoints) -> tuple[Placement, ShellMesh]:
+        """Place the shell, and mesh it.
+
+        Raises:
+            FileNotFoundError: a file is missing.
+            SceneError: the shell or a file cannot be used, or it fits nowhere.
+        """
+        from shellgs_method.files.crs import crs_of, given_crs
+        from shellgs_method.registration.frames import ShellPlace
+
+        crs = given_crs(self.crs) if self.crs else crs_of(*self.shell)
+        place = ShellPlace(*self.shell) if self.shell and (self.picks or self.positions) else None
+        placement = self._placed(scene, views, points, place, crs)
+        alignment = placement.alignment.meshed_by(self.mesher, self.spacing)
+        alignment = replace(alignment, crs=crs or alignment.crs)
+        mesh = alignment.load_shell(scene, views, place.surfaces if place else ())
+        return replace(placement, alignment=alignment), mesh
+
+    def _placed(
+        self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str
+    ) -> Placement:
+        from shellgs_method.files.cue_maps import relative_path
+        from shellgs_method.registration import align as by
+        from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
+
+        names, unit = tuple(relative_path(path, scene) for path in self.shell), self.metres_per_shell_unit
+        if self.accept:
+            return by.place_as_proposed(scene / by.PROPOSAL, scene, views)
+        if not self.shell:
+            return by.place_as_before(scene / ALIGNMENT, scene, views)
+        if self.matrix:
+            return by.Placement(Alignment.from_matrix_file(self.matrix, names, unit, self.global_shift))
+        if self.same_frame:
+            return by.place_as_it_is(names, unit)
+        if self.picks and place:
+            return by.place_by_picks(self.picks, views, place, names, unit, crs)
+        if self.positions and place:
+            return by.place_by_positions(self.positions, views, place, names, unit, crs)
+        mesh = load_shell(*self.shell, cache=scene / "shell", mesher=self.mesher or "planes", metres_per_unit=unit)
+        return by.place_by_guess(mesh, views, points, names, unit, crs)
+
+
+def _check_refinement(is_adjusted: bool, misplacement: str | None) -> None:
+    if is_adjusted:
+        raise SceneError(
+            "--refine would move the shell from where the cameras were adjusted to it onto frames and sills that it "
+            "lacks: give it with --bundle-adjust, which begins with the cameras as they were"
+        )
+    if misplacement:
+        raise SceneError(f"the alignment cannot be refined: {misplacement}")
+
+
+def _written(
+    target: Path, layout: SceneLayout, placement: Placement, mesh: ShellMesh, picks: Path | None, bundle_adjust: bool
+) -> tuple[Placement, Validation]:
+    """Validate a placement, with cameras adjusted to it if they shall be, and write both unless it is refused."""
+    from dataparsers.facade import read_views
+    from shellgs_method.files.atomic import replace_folder, unfinished
+    from shellgs_method.files.colmap import write_model
+    from shellgs_method.files.scene import ADJUSTED
+    from shellgs_method.files.sparse_points import read_sparse_points
+    from shellgs_method.registration.align import REPORT, seen_again, unbent, up_in_words
+    from shellgs_method.registration.report import write_report
+    from shellgs_method.registration.units import unit_doubted
+    from shellgs_method.registration.validation import validate
+    from shellgs_method.shell.cast import renew_error
+
+    scene, views, points = layout.data, read_views(layout), read_sparse_points(layout)
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
     validation = validation.with_checks(placement.checks)
     candidate = unfinished(scene / ADJUSTED)
@@ -181,12 +241,7 @@ def align(
             renew_error(scene)
     finally:
         shutil.rmtree(candidate, ignore_errors=True)
-    _show_alignment(scene, target, placement, validation)
-    if validation.verdict == "refused":
-        kept = f"{target} is unchanged" if target.exists() else "nothing is written"
-        why = f"{misplacement}; " if misplacement else ""
-        advice = "; pick points with `shellgs pick`, and give them with --picks" if placement.proposed else ""
-        raise SceneError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}{advice}")
+    return placement, validation
 
 
 def _show_alignment(scene: Path, target: Path, placement: Placement, validation: Validation) -> None:
