@@ -38,7 +38,7 @@ class BlockJob(Run):
     average_iterations: int = 0
     """Iterations of a block with as many photographs as blocks have on average."""
 
-    @cached_property
+    @property
     def spared(self) -> frozenset[PurePosixPath]:
         """Also the photographs of other blocks, and their maps."""
         photographs = {cell.fingerprint: cell.block.photographs for cell in Blocks.read(self.scene / BLOCKS).cells}

@@ -129,7 +129,7 @@ class Run:
     paths: ScenePaths = field(default_factory=ScenePaths)
     """Paths of the scene's files."""
 
-    @cached_property
+    @property
     def spared(self) -> frozenset[PurePosixPath]:
         """What a capture leaves, and the shell, of which runs read the maps."""
         kept = {ALIGNMENT.name, TRUTH.name, MASKS.name}

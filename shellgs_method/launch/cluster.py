@@ -134,10 +134,17 @@ class _Tasks:
     pending: dict[Any, Job] = field(default_factory=dict)
     """Runs that were begun, by Ray's reference to what they return."""
     scenes: dict[str, Pieces] = field(default_factory=dict)
-    """What is sent of scenes, packed, by :func:`_part`."""
+    """What is sent of scenes, packed, by :attr:`parts`."""
+    parts: dict[Job, str] = field(default_factory=dict)
+    """Keys of what runs need of their scenes."""
     tell: dict[str, Callable[[Stage], None]] = field(default_factory=dict)
     """Shows what a run is doing, by its key."""
     failures: dict[Job, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Find what runs need of their scenes."""
+        for run in self.waiting if self.marks is None else ():
+            self.parts[run] = fingerprint(str(run.scene), sorted(map(str, run.spared)))
 
     def finish(self, most: int) -> dict[Job, str]:
         """Finish all runs, so many at once; return those that failed, with the end of their output."""
@@ -161,11 +168,11 @@ class _Tasks:
     def _packed(self, run: Job) -> Packed:
         import ray
 
-        part = _part(run)
+        part = self.parts[run]
         if part not in self.scenes:
             self.scenes[part] = _packed(run.scene, ray.put, run.spared)
         packed = part, self.scenes[part], _packed(run.folder, ray.put)
-        if part not in map(_part, self.waiting):
+        if part not in map(self.parts.get, self.waiting):
             del self.scenes[part]
         return packed
 
@@ -255,11 +262,6 @@ def _on_each_node(function: Callable[[Any], Any], argument: object) -> list[Any]
         with suppress(RayError):
             answers.append(ray.get(call))
     return answers
-
-
-def _part(run: Job) -> str:
-    """Key of what a run needs of its scene."""
-    return fingerprint(str(run.scene), sorted(map(str, run.spared)))
 
 
 def _remove_copies(launch: str) -> None:
