@@ -200,7 +200,7 @@ def _save_check_panel(scene: Path, views: Sequence[View]) -> Path:
     checked, shell = CueMaps.open(scene, "checked"), CueMaps.open(scene, "shell")
     panel = checked.folder / "panel.png"
     some = [
-        (load_photograph(view), check, cue)
+        (view.name, load_photograph(view), check, cue)
         for view, check in views_with_maps(checked, views, 4)
         if (cue := shell.read(view.name, view.camera))
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import matplotlib
@@ -25,6 +26,7 @@ FINDINGS = (
     ("shell doubted", "c", 0.4),
 )
 """Name, colour and opacity of each of :class:`~shellgs_method.files.map_files.Findings` in a panel."""
+_TITLE = 80  # letters in a line of the title of a view
 
 
 def supervision_panel(
@@ -76,29 +78,29 @@ def _show_classes(ax: Axes, classes: UInt8[np.ndarray, "H W"]) -> None:
     ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.01), ncols=6, frameon=False, fontsize=8)
 
 
-def check_panel(views: Sequence[tuple[UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:
+def check_panel(views: Sequence[tuple[str, UInt8[np.ndarray, "H W 3"], CueMap, CueMap]]) -> Figure:
     """Plot what photographs show at the shell, in the colours of :data:`FINDINGS`.
 
     Args:
-        views: photograph, map by :func:`~shellgs_method.occlusion.check_views` and shell map of each.
+        views: name, photograph, map by :func:`~shellgs_method.occlusion.check_views` and shell map of each.
 
     Returns:
         The figure; save it with ``.savefig(path)``.
     """
-    height, width = views[0][1].mask.shape
+    height, width = views[0][2].mask.shape
     columns = 2
     rows = -(-len(views) // columns)
-    figure = Figure(figsize=(16, (8 * height / width + 0.3) * rows + 0.5), dpi=100, layout="constrained")
+    figure = Figure(figsize=(16, (8 * height / width + 0.75) * rows + 0.5), dpi=100, layout="constrained")
     for ax in figure.subplots(rows, columns, squeeze=False).flat:
         ax.set_axis_off()
-    for ax, (image, cue, shell) in zip(figure.axes, views, strict=False):
+    for ax, (view, image, cue, shell) in zip(figure.axes, views, strict=False):
         shown = image / 255
         found = Findings.of(cue, shell)
         for mask, (_, colour, alpha) in zip(found, FINDINGS, strict=True):
             shown[mask] = (1 - alpha) * shown[mask] + alpha * np.array(to_rgb(colour))
         ax.imshow(shown)
         shares = (f"{name} {mask.mean():.1%}" for mask, (name, *_) in zip(found, FINDINGS, strict=True))
-        ax.set_title(", ".join(shares), fontsize=9)
+        ax.set_title(f"{view}\n" + textwrap.fill(", ".join(shares), _TITLE), fontsize=9)
     handles = [Patch(color=colour, label=name) for name, colour, _ in FINDINGS]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure

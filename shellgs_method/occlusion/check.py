@@ -162,7 +162,7 @@ class _TrainingViews:
 
         unfinished.mkdir(exist_ok=True)
         with workers() as pool:
-            looks = track(pool.map(look, missing), "Looking before the shell", len(missing))
+            looks = track(pool.map(look, missing), "Looking in front of the shell", len(missing))
             for name, found in zip(missing, looks, strict=True):
                 content = io.BytesIO()  # on a full disk, numpy's own writing raises an error that does not say so
                 np.save(content, torch.stack(found).numpy(), allow_pickle=False)

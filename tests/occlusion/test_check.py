@@ -20,6 +20,7 @@ from viser import SceneApi
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from shellgs_method.evaluation import Rendering, pixels
+from shellgs_method.evaluation.panels import check_panel
 from shellgs_method.evaluation.pixels import DOUBTED, reference_maps, shell_trust
 from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
@@ -592,3 +593,13 @@ def test_surfaces_are_measured_on_the_shell_and_in_front_of_it():
     assert list(metrics)[-2:] == ["truth_f_score_5cm_on_shell", "truth_f_score_5cm_before_shell"]  # in every process
     assert 0.4 < metrics["truth_f_score_5cm"] < 0.6
     assert not [name for name in metrics if name.startswith("f_score") and name.endswith("shell")]
+
+
+def test_the_panel_names_photographs_and_titles_do_not_reach_into_each_other():
+    shape = (36, 64)
+    cue = CueMap(np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float16), np.zeros(shape, bool))
+    figure = check_panel([(f"images/{k}.jpg", np.zeros((*shape, 3), np.uint8), cue, cue) for k in range(2)])
+    figure.canvas.draw()
+    assert [ax.get_title().splitlines()[0] for ax in figure.axes] == ["images/0.jpg", "images/1.jpg"]
+    left, right = (ax.title.get_window_extent() for ax in figure.axes)
+    assert 0 < left.x0 < left.x1 < right.x0 < right.x1 < figure.bbox.width
