@@ -16,13 +16,24 @@ from shellgs_method.errors import SceneError, notice
 if TYPE_CHECKING:  # training needs no PROJ
     from pyproj import CRS
 
-_NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
+_NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+(\+\w+)?$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
 """How a system is named; PROJ would find one for nearly any word."""
 _INTRODUCED = re.compile(
     r"^(the |coordinate(s(?!ystem))?\s*|reference\s*|(projection|system|[CS]RS)\b\s*)+([:=]\s*|is\s+)?(?![\d:=])",
     re.IGNORECASE,  # CRS:84 is a code
 )
-_UTM = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
+_SPELT: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = tuple(
+    (re.compile(pattern, re.IGNORECASE), code)
+    for pattern, code in (
+        (r"WGS84 UTM (\d{1,2})([NS])", lambda m: f"EPSG:{326 if m[2].upper() == 'N' else 327}{int(m[1]):02d}"),
+        (r"(urn:adv:crs:)?ETRS89_UTM(\d\d)(\*.*)?", lambda m: f"EPSG:258{m[2]}"),
+        (r"(urn:adv:crs:)?DE_DHDN_3GK([2-5])(_\w+)?(\*.*)?", lambda m: f"EPSG:{31464 + int(m[2])}"),
+        (r"https?://www\.opengis\.net/gml/srs/epsg\.xml#(\d+)", lambda m: f"EPSG:{m[1]}"),
+        (r"EPSG[:\s]*(\d{4,}(\+\d{4,})?)", lambda m: f"EPSG:{m[1]}"),
+    )
+)
+"""Names that PROJ does not know, and their codes: OpenDroneMap's, those of German surveys (their heights are left out),
+GML 2's, and EPSG's without a colon or with a blank."""
 _IN_FILES = {
     **dict.fromkeys((".ifc",), re.compile(rb"IFCPROJECTEDCRS\s*\(\s*'([^']+)'", re.IGNORECASE)),
     **dict.fromkeys((".gml", ".xml", ".citygml"), re.compile(rb"srsName\s*=\s*[\"']([^\"']+)")),
@@ -33,15 +44,14 @@ _IN_FILES = {
 def known_crs(text: str) -> CRS | None:
     """The system that a text names, also after ``CRS:`` or ``coordinate system``.
 
-    It may be a code (EPSG:25832), urn, PROJ string, WKT, PROJ's full name (ETRS89 / UTM zone 32N), or OpenDroneMap's
-    ``WGS84 UTM 32N``.
+    It may be a code (EPSG:25832), urn, PROJ string, WKT, PROJ's full name (ETRS89 / UTM zone 32N), OpenDroneMap's
+    ``WGS84 UTM 32N``, or that of a German survey (``urn:adv:crs:ETRS89_UTM32*DE_DHHN2016_NH``).
     """
     from pyproj import CRS
     from pyproj.exceptions import ProjError
 
     text = _INTRODUCED.sub("", text.strip())
-    if utm := _UTM.fullmatch(text):
-        text = f"EPSG:{326 if utm[2].upper() == 'N' else 327}{int(utm[1]):02d}"
+    text = next((code(match) for pattern, code in _SPELT if (match := pattern.fullmatch(text))), text)
     try:
         crs = CRS.from_user_input(text)
     except ProjError:
@@ -73,37 +83,42 @@ def _crs_of(path: Path) -> str:
     beside = path.with_suffix(".prj")
     source = beside if beside.is_file() else path
     try:
-        crs = known_crs(beside.read_text("utf-8-sig")) if source is beside else _written_in(path)
+        named = beside.read_text("utf-8-sig") if source is beside else _written_in(path)
+        crs = known_crs(named)
     except Exception:  # each format's reader raises errors of its own; a damaged file is refused where it is read
-        crs = None
-    if crs is None and source is beside:
-        notice(f"{beside} names no coordinate reference system that PROJ knows: give the shell's with --crs.")
+        named, crs = "", None
+    if crs is None and (named.strip() or source is beside):
+        shown = f" ({named.strip()[:60]})" if named.strip() else ""
+        notice(f"{source} names no coordinate reference system that PROJ knows{shown}: give the shell's with --crs.")
     if crs is not None and crs.is_geographic:
         notice(f"{source} names {crs.name}, which is in degrees and so not the shell's: give the shell's with --crs.")
         return ""
     return name_of(crs) if crs else ""
 
 
-def _written_in(path: Path) -> CRS | None:
+def _written_in(path: Path) -> str:
+    """What a file calls its system; empty if it names none."""
     suffix = path.suffix.lower()
     if suffix in (".las", ".laz"):
         import laspy
 
         with laspy.open(path) as file:
-            return file.header.parse_crs()
+            crs = file.header.parse_crs()
+            return crs.to_wkt() if crs else ""
     if suffix == ".e57":
         from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
         file = libe57.ImageFile(str(path), "r")
         try:
-            return known_crs(file.root()["coordinateMetadata"].value())
+            root = file.root()
+            return root["coordinateMetadata"].value() if root.isDefined("coordinateMetadata") else ""
         finally:
             file.close()
     if (pattern := _IN_FILES.get(suffix)) is None:
-        return None
+        return ""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
         found = pattern.search(contents)
-        return known_crs(found[1].decode().replace("\\/", "/")) if found else None
+        return found[1].decode().replace("\\/", "/") if found else ""
 
 
 def given_crs(text: str) -> str:

@@ -55,6 +55,12 @@ def test_the_system_of_a_file_is_read_where_it_has_one(tmp_path, name, write, sy
     assert crs_of(tmp_path / name) == system
 
 
+def test_a_system_that_a_file_names_and_proj_does_not_know_is_told(tmp_path, caplog):
+    (tmp_path / "a.gml").write_text('<gml:Envelope srsName="my own">')
+    crs_of(tmp_path / "a.gml")
+    assert "a.gml names no coordinate reference system that PROJ knows (my own)" in caplog.text
+
+
 def test_a_prj_beside_a_file_is_that_of_the_file(tmp_path):
     (tmp_path / "scan.ply").write_text("ply")
     (tmp_path / "scan.prj").write_text(pyproj.CRS("EPSG:2056").to_wkt("WKT1_ESRI"))
@@ -93,6 +99,13 @@ def test_a_prj_that_is_not_the_shells_system_is_told_and_not_kept(tmp_path, capl
         ("name", None),
         ("X Y Z", None),
         ("height", None),
+        ("urn:adv:crs:ETRS89_UTM32*DE_DHHN2016_NH", UTM),
+        ("urn:adv:crs:ETRS89_UTM33", "EPSG:25833"),
+        ("urn:adv:crs:DE_DHDN_3GK3*DE_DHHN92_NH", "EPSG:31467"),
+        ("http://www.opengis.net/gml/srs/epsg.xml#25832", UTM),
+        ("EPSG: 25832", UTM),
+        ("EPSG25832", UTM),
+        ("EPSG:25832+5783", "EPSG:5555"),
     ],
 )
 def test_a_system_is_known_by_its_code_and_no_word_is_taken_for_one(text, system):
