@@ -142,6 +142,9 @@ def check_las(path: Path) -> None:
     extended_start = extended = 0
     if minor >= 4 and len(header) == 375:
         extended_start, extended, points = struct.unpack_from("<QIQ", header, 235)
+    scales = struct.unpack_from("<3d", header, 131)
+    if not all(0 < abs(scale) < 1e9 for scale in scales):
+        raise ValueError(f"its header scales the coordinates by {' '.join(f'{scale:g}' for scale in scales)}")
     if not 227 <= length <= start <= size or (each == 0 and points):
         raise ValueError(f"its header claims that points begin at byte {start} of {size}")
     if length + _LAS_RECORD * records > start:

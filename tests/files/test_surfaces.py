@@ -924,6 +924,36 @@ def test_withheld_points_and_noise_of_a_las_are_left_out_and_counted(tmp_path: P
     assert "left out 25 of 300 points, which are classified as noise" in caplog.text
 
 
+def las_of(path: Path, integers: np.ndarray, scale: float = 1e-3) -> Path:
+    """A LAS without an offset, whose points have these integers."""
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [scale] * 3
+    las = laspy.LasData(header)
+    las.X, las.Y, las.Z = integers.astype(np.int32).T
+    las.write(str(path))
+    return path
+
+
+def test_points_of_a_las_beyond_its_integers_are_left_out_and_counted(tmp_path: Path, caplog):
+    """CloudCompare wrote northings of 5 413 000 m in millimetres as the least integer: a wall without depth."""
+    integers = np.round(POINTS * 1000).astype(np.int64)
+    integers[:40, 1] = -(2**31)
+    integers[40:50, 0] = 2**31 - 1
+    read = read_geometry(las_of(tmp_path / "a.las", integers))
+    np.testing.assert_allclose(read.vertices, POINTS[50:], atol=1e-3)
+    assert "left out 50 of 300 points, whose coordinates are beyond the file's integers" in caplog.text
+
+
+def test_a_las_that_holds_no_coordinates_is_refused(tmp_path: Path):
+    integers = np.round(POINTS * 1000).astype(np.int64)
+    integers[:, 1] = -(2**31)
+    with pytest.raises(SceneError, match="beyond its integers: write it again with an offset near the coordinates"):
+        read_geometry(las_of(tmp_path / "a.las", integers))
+    with pytest.raises(SceneError, match="scales the coordinates by 0 0 0"):
+        read_geometry(las_of(tmp_path / "b.las", integers, scale=0.0))
+
+
 @pytest.mark.parametrize(("end", "words"), [("os.abort()", "SIGABRT"), ("sys.exit('out of order')", "out of order")])
 def test_a_file_that_ends_its_reader_is_refused(tmp_path: Path, monkeypatch, end: str, words: str):
     pytest.importorskip("pye57")

@@ -18,6 +18,8 @@ import numpy as np
 PIECE = 1_000_000
 NOISE = (7, 18)
 """Classes of LAS: low and high noise."""
+LIMITS = (-(2**31), 2**31 - 1)
+"""Least and largest integer of LAS, which programs write where a coordinate less the file's offset is beyond them."""
 NO_POINTS, NO_COLOURS = np.empty((0, 3)), np.empty((0, 3))
 Piece = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Points, scanner positions, and colours of the points, if they have any that are wanted."""
@@ -25,16 +27,17 @@ BANDS = "colorRed", "colorGreen", "colorBlue"
 
 
 def read_las(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piece]:
-    """Read the points that are neither withheld nor classified as noise."""
+    """Read the points that are neither withheld nor noise, and whose coordinates are within the file's integers."""
     import laspy
 
-    read = 0
+    read = beyond = 0
     with laspy.open(path) as file:  # in chunks: points that a damaged file only claims to hold take no memory
         for piece in file.chunk_iterator(PIECE):
             withheld = np.array(piece.withheld).astype(bool)
             noisy = np.isin(np.array(piece.classification), NOISE) & ~withheld
             points = np.stack([np.array(piece[axis]) for axis in "xyz"], axis=1)
-            kept = ~(withheld | noisy)
+            limited = np.any([np.isin(np.array(piece[axis]), LIMITS) for axis in "XYZ"], axis=0) & ~(withheld | noisy)
+            kept = ~(withheld | noisy | limited)
             colours = NO_COLOURS
             if coloured and {"red", "green", "blue"} <= {*file.header.point_format.dimension_names}:
                 colours = np.stack([np.array(piece[band])[kept] for band in ("red", "green", "blue")], axis=1)
@@ -42,9 +45,13 @@ def read_las(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piec
             read += len(points)
             left_out["points, which are withheld"] += int(withheld.sum())
             left_out["points, which are classified as noise"] += int(noisy.sum())
+            beyond += int(limited.sum())
         claimed = file.header.point_count
     if read != claimed:
         raise ValueError(f"it holds {read} of {claimed} points")
+    if read and beyond == read:
+        raise ValueError("its coordinates are beyond its integers: write it again with an offset near the coordinates")
+    left_out["points, whose coordinates are beyond the file's integers"] += beyond
 
 
 def read_e57(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piece]:
