@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,15 @@ class SceneError(ValueError):
 def notice(sentence: str) -> None:
     """Tell the user, once in a process, what is done with an input that can be used: a command reads it repeatedly."""
     log.warning("%s", sentence)
+
+
+_DECIMAL_COMMA = re.compile(r"'([-+]?\d*,\d+([eE][-+]?\d+)?)'")
+
+
+def decimal_comma(error: Exception) -> str | None:
+    """The number with a decimal comma that an error of a reader quotes, if it does."""
+    found = _DECIMAL_COMMA.search(str(error))
+    return found[1] if found else None
 
 
 _DISK = {

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, decimal_comma
 from shellgs_method.files.readers.contents import left_out
 from shellgs_method.files.readers.points import NO_POINTS, Points
 from shellgs_method.geometry.voxels import Cells, VoxelMeans
@@ -163,6 +163,8 @@ class Cloud:
 
 def damaged(path: Path, error: Exception) -> SceneError:
     """The refusal of a file that a reader failed on."""
+    if number := decimal_comma(error):
+        return SceneError(f"the shell {path} has decimal commas ({number!r}): export it with decimal points")
     return SceneError(f"the shell {path} cannot be read, it may be cut off or damaged ({reason(error)})")
 
 

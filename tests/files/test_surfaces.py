@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -510,6 +511,41 @@ def test_a_binary_stl_may_begin_like_one_of_text(tmp_path: Path):
     (tmp_path / "a.stl").write_bytes(data[:-1])
     with pytest.raises(SceneError, match="claims 12 triangles"):
         read_geometry(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("count", [0, 0xFFFFFFFF])
+def test_a_binary_stl_whose_header_does_not_count_is_read_whole(tmp_path: Path, caplog, count: int):
+    BOX.export(tmp_path / "a.stl")
+    data = bytearray((tmp_path / "a.stl").read_bytes())
+    data[80:84] = struct.pack("<I", count)
+    (tmp_path / "a.stl").write_bytes(data)
+    assert_same_surface(read_geometry(tmp_path / "a.stl"))
+    assert "does not count its triangles: the 12 that follow are read" in caplog.text
+    (tmp_path / "a.stl").write_bytes(data[:-1])
+    with pytest.raises(SceneError, match=r"a\.stl cannot be read"):
+        read_geometry(tmp_path / "a.stl")
+
+
+def test_only_blanks_may_follow_the_triangles_of_a_binary_stl(tmp_path: Path):
+    """Two files in one, or triangles with attributes, would be read by half, or as noise."""
+    BOX.export(tmp_path / "a.stl")
+    data = (tmp_path / "a.stl").read_bytes()
+    (tmp_path / "a.stl").write_bytes(data + b"\r\n" + bytes(100))
+    assert_same_surface(read_geometry(tmp_path / "a.stl"))
+    for more in (data, b"ab"):
+        (tmp_path / "a.stl").write_bytes(data + more)
+        with pytest.raises(SceneError, match=r"goes on for \d+ bytes after the 12 triangles"):
+            read_geometry(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "ply", "off"])
+def test_decimal_commas_of_a_mesh_are_named(tmp_path: Path, suffix: str):
+    kind = {"stl": "stl_ascii"}.get(suffix, suffix)
+    path = tmp_path / f"a.{suffix}"
+    BOX.export(path, file_type=kind, **({"encoding": "ascii"} if suffix == "ply" else {}))
+    path.write_text(re.sub(r"(?<=\d)\.(?=\d)", ",", path.read_text()))
+    with pytest.raises(SceneError, match=r"has decimal commas \('-?[01],\d+.*'\): export it with decimal points"):
+        read_geometry(path)
 
 
 @pytest.mark.parametrize(("form", "more"), [("OFF", ""), ("COFF", " 9 9 9 255"), ("NOFF", " 0 0 1")])

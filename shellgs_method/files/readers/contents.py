@@ -72,11 +72,16 @@ def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
     """The numbers of a text that holds nothing else.
 
     Raises:
-        DeprecationWarning: it holds something else.
+        ValueError: it holds something else, which is named.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy stops there, and warns
-        return np.fromstring(text, kind, sep=" ")
+        try:
+            return np.fromstring(text, kind, sep=" ")
+        except DeprecationWarning as error:
+            for word in text.split():
+                kind(word)
+            raise ValueError("it holds something other than numbers") from error
 
 
 def polygon_triangles(

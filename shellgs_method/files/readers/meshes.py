@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.readers.contents import NO_POINTS, Geometry, drawing, left_out, numbers_in, polygon_triangles
 
 _CURVED = ("curv", "surf", "bsp", "bzp", "cdc", "cdp", "res ")
@@ -51,27 +51,44 @@ def read_obj(path: Path) -> Geometry:
 
 
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_STL_START = 84
+_STL_START, _STL_PROBE = 84, 1 << 12  # bytes: the header's; in which a binary STL has a zero
+_UNCOUNTED = (0, 0xFFFFFFFF)
+_BOM = "ï»¿"  # UTF-8's, as Latin-1
 
 
 def read_stl(path: Path) -> Geometry:
     """Read the triangles of a binary or an ASCII STL, of all its solids.
 
+    A binary one whose header does not count its triangles, as of programs that write them as they come, is read whole.
+
     Raises:
         ValueError: it is cut off or damaged.
     """
     data = path.read_bytes()
-    count = int.from_bytes(data[80:84], "little")
-    if len(data) >= _STL_START and len(data) == _STL_START + count * _STL.itemsize:
-        return _soup(np.frombuffer(data, _STL, count, _STL_START)["corners"].astype(np.float64))
-    words = [line.split() for line in data.decode("latin-1").lower().splitlines()]
+    if b"\0" in data[:_STL_PROBE]:  # text has none
+        return _binary_stl(path, data)
+    words = [line.split() for line in data.decode("latin-1").removeprefix(_BOM).lower().splitlines()]
     solids, ends, facets = (sum(line[:1] == [word] for line in words) for word in ("solid", "endsolid", "facet"))
-    if not solids or b"\0" in data:
-        raise ValueError(f"its header claims {count} triangles, but it has {len(data)} bytes")
+    if not solids:
+        raise ValueError("it is neither a binary STL nor one of text")
     corners = np.array([line[1:4] for line in words if line[:1] == ["vertex"]], np.float64).reshape(-1, 3)
     if solids != ends or len(corners) != 3 * facets:
         raise ValueError(f"it holds {len(corners)} corners of {facets} triangles, and {ends} ends of {solids} solids")
     return _soup(corners.reshape(-1, 3, 3))
+
+
+def _binary_stl(path: Path, data: bytes) -> Geometry:
+    claimed = int.from_bytes(data[80:_STL_START], "little")
+    there, rest = divmod(max(0, len(data) - _STL_START), _STL.itemsize)
+    if claimed in _UNCOUNTED and there and not rest:
+        notice(f"{path}: its header does not count its triangles: the {there} that follow are read.")
+        claimed = there
+    end = _STL_START + claimed * _STL.itemsize
+    if end > len(data):
+        raise ValueError(f"its header claims {claimed} triangles, but it has {len(data)} bytes")
+    if data[end:].strip(b"\0 \r\n"):
+        raise ValueError(f"it goes on for {len(data) - end} bytes after the {claimed} triangles that its header claims")
+    return _soup(np.frombuffer(data, _STL, claimed, _STL_START)["corners"].astype(np.float64))
 
 
 def _soup(corners: Float64[np.ndarray, "F 3 3"]) -> Geometry:
