@@ -245,7 +245,7 @@ def _refuse_missing_images(frames: Sequence[Frame], scene: Path) -> None:
         shown = ", ".join(missing[:3]) + (", …" if len(missing) > 3 else "")
         raise FileNotFoundError(
             f"{len(missing)} of {len(frames)} images of the cameras in {scene} are not on disk ({shown}); "
-            "put them back or take them out of the model."
+            "put them back, take them out of the model, or name their folder with --images-path."
         )
 
 

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.errors import SceneError, notice
+from shellgs_method.errors import SceneError, decimal_comma, notice
 from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order
 from shellgs_method.files.paths import NamedFiles
 
 PLACES = (Path("colmap/sparse"), Path("sparse"))
-"""Folders of numbered models, or of one."""
+"""Folders of numbered models, or of one; it may also be in the scene itself, as RealityScan exports it."""
 # From COLMAP's axes (-y is up) to nerfstudio's.
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 _MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, or their number if it is only named
@@ -125,7 +125,7 @@ def find_folder(scene: Path, chosen: Path | None) -> Path | None:
         SceneError: there are several models, and one is damaged.
     """
     numbered = (_numbered(scene, place) for place in PLACES)
-    ordered = [[chosen], _numbered(scene, chosen)] if chosen else [*numbered, *([place] for place in PLACES)]
+    ordered = [[chosen], _numbered(scene, chosen)] if chosen else [*numbered, *([place] for place in (*PLACES, Path()))]
     models = next(filter(None, ([f for f in folders if _is_model(scene / f)] for folders in ordered)), [])
     if len(models) < 2:
         return models[0] if models else None
@@ -199,7 +199,12 @@ def write_model(folder: Path, model: Model, errors: Float64[np.ndarray, " N"]) -
         for number, image in model.images.items():
             file.write(struct.pack("<i7di", number, *image.quaternion, *image.translation, image.camera))
             features = image.features
-            file.write(image.name.encode() + b"\0" + struct.pack("<Q", len(features)) + features.tobytes())
+            file.write(
+                image.name.encode(errors="surrogateescape")
+                + b"\0"
+                + struct.pack("<Q", len(features))
+                + features.tobytes()
+            )
     points = model.points
     with (folder / "points3D.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(points.ids)))
@@ -300,11 +305,16 @@ def _read(folder: Path, name: str, binary: Callable[[_Bytes], T], text: Callable
             if file.at != len(file.data):
                 raise ValueError(f"it goes on for {len(file.data) - file.at} bytes after its last entry")
             return read
-        lines = map(str.strip, path.read_text("utf-8-sig").splitlines())
+        lines = map(str.strip, path.read_text("utf-8-sig", errors="surrogateescape").splitlines())
         return text(line for line in lines if line and not line.startswith("#"))
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     except (ValueError, IndexError, OverflowError, struct.error, StopIteration) as error:
+        if number := decimal_comma(error):
+            raise SceneError(
+                f"{path} has decimal commas ({number!r}): export it with decimal points, as COLMAP does with "
+                "LC_NUMERIC=C, or in binary"
+            ) from error
         raise SceneError(
             f"{path} is damaged ({str(error) or 'it ends too early'}): copy it again, or run COLMAP again"
         ) from error
@@ -323,7 +333,7 @@ class _Bytes:
 
     def text(self) -> str:
         end = self.data.index(b"\0", self.at)
-        text = self.data[self.at : end].decode("utf-8")
+        text = self.data[self.at : end].decode("utf-8", "surrogateescape")
         self.at = end + 1
         return text
 
@@ -361,8 +371,16 @@ def _text_cameras(lines: Iterator[str]) -> dict[int, ColmapCamera]:
         params = tuple(map(float, words[4:]))
         if len(params) != _PARAMETERS.get(words[1], len(params)):
             raise ValueError(f"{words[1]} has {_PARAMETERS[words[1]]} parameters, not {len(params)}")
-        cameras[int(words[0])] = ColmapCamera(words[1], int(words[2]), int(words[3]), params)
+        cameras[int(words[0])] = ColmapCamera(words[1], _whole(words[2]), _whole(words[3]), params)
     return cameras
+
+
+def _whole(word: str) -> int:
+    """A whole number, which programs also write with decimals."""
+    value = float(word)
+    if not value.is_integer():
+        raise ValueError(f"{word} is not a whole number")
+    return int(value)
 
 
 def _binary_images(file: _Bytes) -> dict[int, ColmapImage]:
@@ -423,7 +441,7 @@ def _text_points(lines: Iterator[str]) -> Points:
     positions, colours, tracks, ids = [], [], [], []
     for words in map(str.split, lines):
         position = [float(word) for word in words[1:4]]
-        colour = [int(word) for word in words[4:7]]
+        colour = [_whole(word) for word in words[4:7]]
         if len(position) != 3 or len(colour) != 3 or not all(0 <= value <= 255 for value in colour):
             raise ValueError(f"a line of points is ID X Y Z R G B ERROR TRACK, not {' '.join(words)[:40]!r}")
         ids.append(int(words[0]))

@@ -27,6 +27,8 @@ RAW = frozenset(
     )
 )
 """Suffixes of what sensors recorded, in lower case: Pillow reads a thumbnail of some, and nothing of others."""
+_CODE_PAGES = ("cp1252", "cp1250", "cp1251", "gbk", "cp932", "cp949", "big5")
+"""Encodings of names that programs on Windows wrote in the language of the machine."""
 DEVELOP = "export it as JPEG, or as PNG or TIFF of 8 or 16 bits, with the program that develops it"
 
 
@@ -47,9 +49,9 @@ def inside(scene: Path, name: str, where: str) -> Path:
 class NamedFiles:
     """The files of a scene that one of its files names, whatever the system, machine and folder it was written on.
 
-    A path is taken as it is written if a file is there. Else Windows' separators, other cases and compositions of
-    letters and a missing suffix are understood, and leading folders that the scene does not have are dropped, until
-    exactly one file fits.
+    A path is taken as it is written if a file is there. Else Windows' separators, other cases, compositions and
+    encodings of letters and a missing or another suffix are understood, and leading folders that the scene does not
+    have are dropped, until exactly one file fits. Names that are no UTF-8 have surrogates for what is none.
     """
 
     def __init__(self, scene: Path, images_path: Path, where: Path):
@@ -77,6 +79,7 @@ class NamedFiles:
         """Tell the user which files were found under other paths than those written."""
         if self._elsewhere:
             name, found = next(iter(self._elsewhere.items()))
+            name = name.encode(errors="backslashreplace").decode()
             notice(
                 f"{len(self._elsewhere)} of the files that {self.where} names have other paths in the scene: "
                 f"{name} is {found.relative_to(self.scene).as_posix()}, for example."
@@ -86,12 +89,15 @@ class NamedFiles:
         try:
             written = inside(self.scene, name, where)
         except SceneError:
-            if ".." in PureWindowsPath(name).parts or not name.isprintable():
+            if not _without_bytes(name).isprintable():
                 raise
             written = None
         if written and written.exists():
             return written
         parts = [part for part in PureWindowsPath(name).parts if part.rstrip("\\/") and not part.endswith(":\\")]
+        if ".." in parts:  # of another working folder
+            parts = parts[len(parts) - parts[::-1].index("..") :]
+            parts = parts if len(parts) > 1 else []
         in_scene = written is not None and len(parts) > 1 and (self.scene / Path(*parts[:-1])).is_dir()
         for dropped in range(1 if in_scene else len(parts)):
             found = {path for root in roots for path in self._spelt(root, parts[dropped:])}
@@ -103,6 +109,11 @@ class NamedFiles:
                 if path != self.scene / Path(*parts):
                     self._elsewhere[name] = path
                 return path
+        if name != _without_bytes(name):
+            raise SceneError(
+                f"{where} names the file {name!r}, whose letters are not UTF-8, and none here fits: use plain letters "
+                "in the photographs' names, and find the cameras again"
+            )
         return written or inside(self.scene, name, where)
 
     def _spelt(self, folder: Path, parts: Sequence[str]) -> list[Path]:
@@ -111,9 +122,11 @@ class NamedFiles:
             return [folder] if folder.is_file() else []
         exact = [folder / parts[0]] if (folder / parts[0]).exists() else []
         entries = exact or [entry for entry in self._in(folder) if _alike(entry.name, parts[0])]
-        if len(parts) == 1 and not entries and PurePosixPath(parts[0]).suffix.lower() not in PHOTOGRAPHS:
+        if len(parts) == 1 and not entries:
+            last = PurePosixPath(parts[0])
+            stem = last.stem if last.suffix.lower() in PHOTOGRAPHS | RAW else last.name
             photographs = (entry for entry in self._in(folder) if entry.suffix.lower() in PHOTOGRAPHS)
-            entries = [entry for entry in photographs if _alike(entry.stem, parts[0])]
+            entries = [entry for entry in photographs if _alike(entry.stem, stem)]
         return [path for entry in entries for path in self._spelt(entry, parts[1:])]
 
     def _in(self, folder: Path) -> list[Path]:
@@ -122,8 +135,21 @@ class NamedFiles:
         return self._entries[folder]
 
 
-def _alike(one: str, other: str) -> bool:
-    return one == other or folded(one) == folded(other)
+def _alike(name: str, written: str) -> bool:
+    return name == written or folded(name) == folded(written) or _in_code_page(name, written)
+
+
+def _in_code_page(name: str, written: str) -> bool:
+    """Whether what is written is a name in one of the code pages."""
+    if written == _without_bytes(written):
+        return False
+    stored = written.encode(errors="surrogateescape")
+    return any(name.encode(page, "ignore") == stored for page in _CODE_PAGES)
+
+
+def _without_bytes(name: str) -> str:
+    """A name without what is no UTF-8."""
+    return name.encode(errors="ignore").decode()
 
 
 def folded(name: str) -> str:

@@ -36,7 +36,8 @@ class ScenePaths:
     """Folder of the photographs in a COLMAP scene, relative to the scene folder."""
     colmap_path: Optional[Path] = None
     """COLMAP model, relative to the scene folder. If not set: the one that the shell was aligned to with
-    --bundle-adjust, else the largest of those numbered in colmap/sparse or sparse, else the one there."""
+    --bundle-adjust, else the largest of those numbered in colmap/sparse or sparse, else the one there or in the scene
+    folder itself."""
     masks_path: Optional[Path] = None
     """Folder of masks (white is kept, black is ignored), relative to the scene folder. If not set: masks, if there."""
 
@@ -78,7 +79,7 @@ class SceneLayout(ScenePaths):
             recording, cameras = transforms.read_recording(self.data, self.images_path), transforms.NAME
         else:
             recording = colmap.read_recording(self.data, folder, self.images_path)
-            cameras = folder.as_posix()
+            cameras = folder.as_posix() if folder.parts else "its COLMAP model"
         self._tell_what_is_left_out(recording, cameras)
         return recording
 
@@ -151,7 +152,7 @@ class SceneLayout(ScenePaths):
             return None
         folder = colmap.find_folder(self.data, self.colmap_path)
         if folder is None:
-            looked_in = [self.colmap_path] if self.colmap_path else colmap.PLACES
+            looked_in = [self.colmap_path] if self.colmap_path else ["the folder itself", *colmap.PLACES]
             raise FileNotFoundError(
                 f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "
                 f"{', '.join(map(str, looked_in))}, or in numbered folders there."

@@ -233,6 +233,11 @@ BAD_MODELS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a name without an end": (binary("images", struct.pack("<Qi7di", 1, 1, 1, *[0] * 6, 1) + b"a"), "is damaged"),
     "many points": (binary("points3D", MANY), "points3D.bin is damaged"),
     "a point of words": (edit("points3D.txt", "1 1 1 1 9", "1 a 1 1 9"), "points3D.txt is damaged"),
+    "decimal commas": (
+        edit("cameras.txt", "1 PINHOLE 48 32 ", "1 PINHOLE 48 32 1,5 "),
+        "cameras.txt has decimal commas ('1,5'): export it with decimal points",
+    ),
+    "half a colour": (edit("points3D.txt", " 9 9 9 ", " 9.5 9 9 "), "9.5 is not a whole number"),
     "a colour of 999": (edit("points3D.txt", " 9 9 9 ", " 999 9 9 "), "points3D.txt is damaged"),
 }
 

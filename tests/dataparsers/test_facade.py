@@ -23,6 +23,7 @@ from scenes import parse, write_colmap
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.datamanager import FacadeDataset
 from shellgs_method.errors import SceneError
+from shellgs_method.files import colmap
 from shellgs_method.files.photographs import load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.geometry.camera import Camera, image_up
@@ -412,6 +413,25 @@ def test_of_several_colmap_models_the_largest_is_read_and_named(scene, caplog, p
     assert FacadeDataParserConfig(data=scene, colmap_path=Path(place)).colmap_folder() == Path(place, largest)
 
 
+def test_a_colmap_model_may_be_in_the_scene_folder_itself(scene):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    for path in (scene / "sparse" / "0").iterdir():
+        path.rename(scene / path.name)
+    assert len(read_views(FacadeDataParserConfig(data=scene))) == 10
+    shutil.copytree(scene / "images", scene, dirs_exist_ok=True)
+    shutil.rmtree(scene / "images")
+    assert read_views(FacadeDataParserConfig(data=scene))[0].name == "frame_00001.png"
+
+
+def test_whole_numbers_of_a_text_model_may_have_decimals(scene):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    for name, old, new in (("cameras", " 48 32 ", " 48.0 32.0 "), ("points3D", " 9 9 9 ", " 9.0 9.0 9.0 ")):
+        path = scene / "sparse" / "0" / f"{name}.txt"
+        path.write_text(path.read_text().replace(old, new))
+    assert read_views(FacadeDataParserConfig(data=scene))[0].camera.width == 48
+    assert len(read_sparse_points(FacadeDataParserConfig(data=scene)).positions) == 39
+
+
 def test_a_chosen_colmap_model_is_read_though_another_is_larger(scene):
     split_model(scene, "sparse", {"0": 2, "1": 7})
     assert len(read_views(FacadeDataParserConfig(data=scene, colmap_path=Path("sparse/0")))) == 2
@@ -464,6 +484,8 @@ SPELLINGS: dict[str, Callable[[str], str]] = {
     "other folder": lambda path: path.replace("images/", "input/"),
     "no suffix": lambda path: path.removesuffix(".png"),
     "only the name": lambda path: path.removeprefix("images/"),
+    "other working folder": lambda path: f"../shoot/{path}",
+    "another suffix": lambda path: path.replace(".png", ".HEIC"),
     "case": lambda path: path.replace("images", "Images").replace(".png", ".PNG"),
     "all": lambda path: "c:\\" + path.upper().replace("/", "\\").removesuffix(".PNG"),
 }
@@ -482,6 +504,25 @@ def test_paths_of_which_letters_are_composed_otherwise_are_found(scene):
     (scene / "images" / "frame_00001.png").rename(scene / "images" / name)
     respell(scene, lambda path: path.replace("frame_00001", "façade"))
     assert read_views(FacadeDataParserConfig(data=scene))[0].image.name == name
+
+
+@pytest.mark.parametrize(("name", "page"), [("Südfassade", "cp1252"), ("照片", "gbk"), ("фасад", "cp1251")])
+@pytest.mark.parametrize("suffix", ["txt", "bin"])
+def test_names_in_the_code_page_of_the_machine_are_found(scene, caplog, name, page, suffix):
+    write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+    folder = scene / "sparse" / "0"
+    path = folder / "images.txt"
+    path.write_bytes(path.read_bytes().replace(b"frame_00001", name.encode(page)))
+    if suffix == "bin":
+        read = colmap.read_model(folder)
+        colmap.write_model(scene / "colmap" / "sparse" / "0", read, np.zeros(len(read.points.ids)))
+    (scene / "images" / "frame_00001.png").rename(scene / "images" / f"{name}.png")
+    views = read_views(FacadeDataParserConfig(data=scene))
+    assert [view.name for view in views].count(f"images/{name}.png") == 1
+    assert f"is images/{name}.png, for example" in caplog.text
+    (scene / "images" / f"{name}.png").unlink()
+    with pytest.raises(SceneError, match="whose letters are not UTF-8, and none here fits: use plain letters"):
+        read_views(FacadeDataParserConfig(data=scene))
 
 
 def test_photographs_found_elsewhere_are_told(scene, caplog):
