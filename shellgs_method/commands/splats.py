@@ -41,7 +41,9 @@ def splats(
     check_splats_format(output, discs=getattr(open_run(config).pipeline.model, "primitive", None) == "2d")
     run = TrainedRun.load(config)
     gaussians, frame, facts = run.splats(), run.frame, {}
+    where = place(frame)
     if output.suffix.lower() in Y_UP:
+        where += " Turned, so that y is up."
         frame, motion = frame.turned(Y)
         gaussians, facts = moved(gaussians, motion), {"turned": motion[:3, :3].tolist()}
     comments = [f"{name}: {value}" for name, value in frame.properties.items()]
@@ -53,7 +55,7 @@ def splats(
     if levels == 1 and (megabytes is None or size(gaussians.finite) <= 1e6 * megabytes):
         count = write_splats(output, gaussians, comments, views)
         frame.describe(Path(f"{output}.json"), {"splats": count, **facts})
-        console.print(f"{output}: {count} Gaussians. {place(frame)}")
+        console.print(f"{output}: {count} Gaussians. {where}")
         return
     level = Level.whole(run, gaussians)
     all_of_them, whole = len(level.splats), psnr_of(run, level.splats, frame)
@@ -68,4 +70,4 @@ def splats(
         frame.describe(Path(f"{path}.json"), {"splats": count, "psnr_loss": round(loss, 3), **facts})
         taken = path.stat().st_size / 1e6
         console.print(f"{path}: {count} Gaussians, {taken:.1f} MB, {loss:.2f} dB of PSNR lost.", highlight=False)
-    console.print(place(frame))
+    console.print(where)

@@ -115,7 +115,7 @@ def test_splats_in_the_shells_frame_look_the_same_from_the_same_place(trainer, t
 
 @pytest.mark.parametrize(("suffix", "read", "least"), [("glb", of_glb, 45), ("spz", unpacked, 38)])
 def test_y_points_up_in_gltf_and_spz_and_what_they_show_is_the_same(
-    trainer, tmp_path, monkeypatch, suffix, read, least
+    trainer, tmp_path, monkeypatch, capsys, suffix, read, least
 ):
     path, primitive = tmp_path / f"splats.{suffix}", model_of(trainer).config.primitive
     if (suffix, primitive) == ("spz", "2d"):
@@ -126,7 +126,10 @@ def test_y_points_up_in_gltf_and_spz_and_what_they_show_is_the_same(
     cli.splats(trainer.base_dir / "config.yml", path)
     record = json.loads(Path(f"{path}.json").read_text())
     assert record["up"] == "y"
-    frame, motion = TrainedRun(model_of(trainer), data_of(trainer)).frame.turned(np.array([0.0, 1.0, 0.0]))
+    shell_frame = TrainedRun(model_of(trainer), data_of(trainer)).frame
+    offset = " ".join(f"{value:.0f}" for value in shell_frame.offset)
+    assert f"less {offset}. Turned, so that y is up." in " ".join(capsys.readouterr().out.split())
+    frame, motion = shell_frame.turned(np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(record["turned"], motion[:3, :3])
     np.testing.assert_allclose(record["to_scene"], frame.to_scene)
     splats = read(path)
