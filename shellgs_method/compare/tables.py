@@ -128,12 +128,12 @@ def tables(
 def _scene_tables(runs: Sequence[Run], shell: Mapping[str, float], prefix: str) -> Iterator[MetricsTable]:
     whole = [run for run in runs if run.variant.held_out is None]
     methods = [run for run in whole if not run.variant.is_ablation]
-    scene = runs[0].scene.name
+    scene, by_region = runs[0].scene.name, _rows(whole)
+    # Not every scene has a truth, or something in front of the shell.
+    regions = [column for column in REGION_COLUMNS if any(column.key in row for row in by_region.values())]
     found = [
         MetricsTable("main", f"{scene}: held-out views, against the shell", MAIN_COLUMNS, _rows(methods)),
-        MetricsTable(
-            "regions", f"{scene}: held-out views, where training views see them", REGION_COLUMNS, _rows(whole)
-        ),
+        MetricsTable("regions", f"{scene}: held-out views, where training views see them", regions, by_region),
         MetricsTable("surface", f"{scene}: visible surface, against the shell", SURFACE_COLUMNS, _rows(methods)),
         MetricsTable("truth", f"{scene}: against the true geometry", TRUTH_COLUMNS, {**_rows(whole), SHELL: shell}),
     ]

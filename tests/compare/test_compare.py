@@ -117,6 +117,13 @@ def test_tables_gather_the_seeds_and_leave_out_the_spread_over_views(pristine_sc
     assert main.rows["shellgs"] == {"psnr": [20.0, 21.0], "normal_deg": [10.0, 10.0]}
 
 
+def test_a_scene_without_a_truth_has_no_columns_for_it(pristine_scene, tmp_path):
+    for run in fake_grid([pristine_scene], ["photo-gs", "shellgs"], tmp_path):
+        fabricate(run, psnr_seen=20.0, psnr_on_shell=20.0)
+    (regions,) = tables(fake_grid([pristine_scene], ["photo-gs", "shellgs"], tmp_path))
+    assert [column.key for column in regions.columns] == ["psnr_seen", "psnr_on_shell"]
+
+
 def test_the_papers_rows_are_beside_scenes_of_the_same_role(pristine_scene, tmp_path):
     other = tmp_path / "copy"
     other.mkdir()
