@@ -116,7 +116,7 @@ def write_results(runs: Sequence[Run], output: Path, failures: Mapping[Run, str]
         suffix = "" if index == 0 else f"-{scene.name}"
         of_scene = [run for run in runs if run.scene == scene]
         shown[scene.name] = _shown(of_scene)
-        figures |= _figures(scene, [run for run in of_scene if not run.variant.is_ablation], output, suffix)
+        figures |= _figures(scene, of_scene, output, suffix)
     reasons = {run.label: why for run, why in failures.items()}
     write_report(output / "report.html", opening, all_tables, figures, shown, reasons)
     return Comparison(all_tables, figures, failures)
@@ -141,14 +141,15 @@ def _shown(runs: Sequence[Run]) -> list[Run]:
 
 
 def _figures(scene: Path, runs: Sequence[Run], output: Path, suffix: str) -> dict[str, Path]:
-    """Draw the figures of one scene's methods, as far as possible; return files by caption."""
+    """Draw the figures of one scene's methods, and exposures of all its runs, as far as possible; files by caption."""
     figures: dict[str, Path] = {}
+    methods = [run for run in runs if not run.variant.is_ablation]
     for kind, name, caption in PANELS:
         panel = output / f"{name}{suffix}.png"
         if (scene / "cues" / kind / "panel.png").exists():
             shutil.copyfile(scene / "cues" / kind / "panel.png", panel)
             figures[f"{scene.name}: {caption}"] = panel
-    shown = _shown(runs)
+    shown = _shown(methods)
     if views := common_views(shown):
         path = output / f"strip{suffix}.png"
         strip(shown, views[0], path)
@@ -157,7 +158,7 @@ def _figures(scene: Path, runs: Sequence[Run], output: Path, suffix: str) -> dic
         surfaces(shown, path)
         figures[f"{scene.name}: visible points from three sides, coloured by distance from the shell's."] = path
     path = output / f"curves{suffix}.png"
-    if curves(runs, path):
+    if curves(methods, path):
         figures[f"{scene.name}: metrics of all held-out views during training."] = path
     path = output / f"exposures{suffix}.png"
     if exposures(runs, path):

@@ -33,6 +33,7 @@ from rich.console import Console
 from training_runs import Method, trainer_of
 
 from shellgs_method import cli
+from shellgs_method.compare import results
 from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_metrics
 from shellgs_method.compare.plots import DOT, dotted, exposures, recorded_metrics
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
@@ -881,3 +882,10 @@ def test_exposures_are_plotted_of_the_runs_that_learned_them(tmp_path):
     assert not (tmp_path / "none.png").exists()
     assert exposures([fixed, learned, older], tmp_path / "stops.png")
     assert Image.open(tmp_path / "stops.png").size[0] == 4 * 130  # one panel
+
+
+def test_exposures_of_ablations_are_plotted_too(tmp_path):
+    (tmp_path / "metrics.json").write_text(json.dumps({"exposure_stops": [[0.1, 0.2, 0.3]] * 5, "results": {}}))
+    variant = SimpleNamespace(name="photo-gs-exposure", is_ablation=True)
+    run = cast(Run, SimpleNamespace(variant=variant, metrics=lambda: tmp_path / "metrics.json"))
+    assert list(results._figures(tmp_path, [run], tmp_path, "").values()) == [tmp_path / "exposures.png"]
