@@ -29,6 +29,7 @@ from shellgs_method.files.paths import (
     photographs_in,
     tell_of_masks,
 )
+from shellgs_method.files.profiles import is_srgb
 
 _EXCERPT = 4096  # bytes
 VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".3gp", ".insv", ".360"}
@@ -126,7 +127,7 @@ def _excerpt(path: Path, size: int) -> bytes:
 
 
 def add_photograph(source: Path, target: Path) -> None:
-    """Put a photograph into the work folder: a link if COLMAP can read it, else a converted copy.
+    """Put a photograph into the work folder: a link if COLMAP can read it and it is in sRGB, else a converted copy.
 
     Raises:
         SceneError: it is not a readable image.
@@ -138,7 +139,7 @@ def add_photograph(source: Path, target: Path) -> None:
     image = read_image(source)
     with Image.open(source) as stored:
         is_plain = stored.mode in ("L", "RGB") and not stored.has_transparency_data
-        is_usable = stored.format == wanted and is_plain and orientation_of(image) == 1
+        is_usable = stored.format == wanted and is_plain and is_srgb(stored) and orientation_of(image) == 1
     if not is_usable:
         upright = ImageOps.exif_transpose(without_hidden(image)).convert("RGB")
         upright.save(target, wanted, quality=95, subsampling=0, exif=exif_of(upright))

@@ -17,6 +17,7 @@ from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
+from shellgs_method.files.profiles import in_srgb
 from shellgs_method.files.transfer import HDR, tone_mapped
 from shellgs_method.files.undistortion import distort_pixels, undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
@@ -124,7 +125,7 @@ def load_upright(view: View) -> Image.Image:
 
 
 def read_image(path: Path) -> Image.Image:
-    """Read an image file as 8-bit RGB or RGBA; EXIF data are kept, the orientation is not applied.
+    """Read an image file as 8-bit RGB or RGBA in sRGB; EXIF data are kept, the orientation is not applied.
 
     Raises:
         SceneError: the image cannot be read, or holds floating-point numbers.
@@ -139,6 +140,7 @@ def read_image(path: Path) -> Image.Image:
             image = Image.fromarray(tone_mapped(_wide(path), transfer))
         if image.mode.startswith("I"):  # 16 bits
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
+        image = in_srgb(image)
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
     image.info["exif"] = exif.tobytes()
     return image

@@ -1,0 +1,89 @@
+"""Colours of photographs in sRGB, whatever their ICC profile or EXIF data say: Display P3 of phones, Adobe RGB."""
+
+from __future__ import annotations
+
+import struct
+from functools import lru_cache
+from io import BytesIO
+
+from PIL import ExifTags, Image, ImageCms
+
+from shellgs_method.files.exif import exif_of
+
+_ADOBE = "R03"  # interoperability index of a camera's file in Adobe RGB (DCF 2.0), which embeds no profile
+_ALIKE = 2  # levels of 8 bits, to which profiles of sRGB differ
+_INTENT = ImageCms.Intent.RELATIVE_COLORIMETRIC
+
+
+def is_srgb(image: Image.Image) -> bool:
+    """Whether the colours of an image are sRGB's, as far as it says."""
+    return _transform_of(image) is None
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """The image in sRGB: RGB or RGBA, or as it is where its colours are sRGB's, or its profile is damaged."""
+    if image.mode == "P":
+        image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+    transform = _transform_of(image)
+    if transform is None:
+        return image
+    converted = ImageCms.applyTransform(image, transform)
+    assert converted is not None
+    converted.info.pop("icc_profile", None)
+    return converted
+
+
+def _transform_of(image: Image.Image) -> ImageCms.ImageCmsTransform | None:
+    profile = image.info.get("icc_profile") or (_adobe_rgb() if _is_adobe_rgb(image) else None)
+    return _to_srgb(profile, image.mode) if profile else None
+
+
+def _is_adobe_rgb(image: Image.Image) -> bool:
+    if image.format != "JPEG":
+        return False
+    return str(exif_of(image).get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)).startswith(_ADOBE)
+
+
+@lru_cache(maxsize=16)
+def _to_srgb(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
+    """The conversion from a profile; None if it changes nothing, or is not one of images of the mode."""
+    target = "RGBA" if mode == "RGBA" else "RGB"
+    try:
+        source = ImageCms.ImageCmsProfile(BytesIO(profile))
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, target, _INTENT)
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return None
+    if mode not in ("RGB", "RGBA"):
+        return transform
+    levels = bytes(range(0, 256, 15))
+    colours = Image.new("RGB", (len(levels) ** 2, len(levels)))
+    colours.putdata([(r, g, b) for r in levels for g in levels for b in levels])
+    before = colours.convert(mode)
+    after = ImageCms.applyTransform(before, transform)
+    assert after is not None
+    changed = max(abs(a - b) for a, b in zip(after.tobytes(), before.tobytes(), strict=True))
+    return transform if changed > _ALIKE else None
+
+
+@lru_cache(maxsize=1)
+def _adobe_rgb() -> bytes:
+    """A profile of Adobe RGB (1998): its primaries relative to D50, and its gamma."""
+    primaries = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
+    colours = {f"{name}XYZ": _xyz(primary) for name, primary in zip("rgb", primaries, strict=True)}
+    curves = {f"{name}TRC": struct.pack(">4sxxxxIH", b"curv", 1, 563) for name in "rgb"}  # 563 / 256
+    tags = {"wtpt": _xyz(_D50), **colours, **curves}
+    start = 128 + 4 + 12 * len(tags)
+    table, data = struct.pack(">I", len(tags)), b""
+    for name, value in tags.items():
+        table += struct.pack(">4sII", name.encode(), start + len(data), len(value))
+        data += value + bytes(-len(value) % 4)
+    header = struct.pack(">I4xI4s4s4s", start + len(data), 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    header += bytes(12) + b"acsp" + bytes(28) + _xyz(_D50)[8:]
+    return header.ljust(128, b"\0") + table + data
+
+
+_D50 = (0.9642, 1.0, 0.8249)
+
+
+def _xyz(values: tuple[float, float, float]) -> bytes:
+    return struct.pack(">4sxxxx3i", b"XYZ ", *(round(value * 65536) for value in values))

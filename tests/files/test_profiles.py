@@ -1,0 +1,55 @@
+"""Colours of photographs are sRGB's, whatever their profile or EXIF data say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageCms
+
+from shellgs_method.capture.photographs import add_photograph
+from shellgs_method.files.photographs import read_image
+
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+# Red is what sRGB calls green, and the other way round.
+SWAPPED = SRGB.replace(b"rXYZ", b"....", 1).replace(b"gXYZ", b"rXYZ", 1).replace(b"....", b"gXYZ", 1)
+ADOBE = {(219, 0, 0): (255, 0, 0), (144, 255, 60): (0, 255, 0), (0, 0, 250): (0, 0, 255), (128, 128, 128): (128,) * 3}
+"""Colours of Adobe RGB, and the same of sRGB."""
+
+
+def save(path: Path, colour: tuple[int, ...], mode: str = "RGB", **more) -> Path:
+    Image.new("RGB", (16, 16), colour).convert(mode).save(path, quality=100, **more)
+    return path
+
+
+def colour(path: Path) -> np.ndarray:
+    return np.asarray(read_image(path))[8, 8].astype(int)
+
+
+@pytest.mark.parametrize(("name", "mode"), [("a.jpg", "RGB"), ("a.png", "RGB"), ("a.png", "RGBA"), ("a.png", "P")])
+def test_a_photograph_of_another_profile_is_converted(tmp_path, name, mode):
+    swapped = colour(save(tmp_path / name, (204, 51, 102), mode, icc_profile=SWAPPED))
+    np.testing.assert_allclose(swapped[:3], (51, 204, 102), atol=5)
+
+
+@pytest.mark.parametrize("profile", [SRGB, SRGB[:200], b"none"])
+def test_a_photograph_in_srgb_or_of_a_damaged_profile_is_taken_as_it_is(tmp_path, profile):
+    path = save(tmp_path / "a.png", (204, 51, 102), icc_profile=profile)
+    np.testing.assert_array_equal(colour(path), (204, 51, 102))
+
+
+@pytest.mark.parametrize("stored", ADOBE)
+def test_adobe_rgb_of_a_camera_is_known_by_its_exif_data(tmp_path, stored):
+    """Cameras embed no profile (DCF)."""
+    exif = Image.Exif()
+    exif[0x8769] = {0xA001: 65535, 0xA005: {1: "R03"}}
+    np.testing.assert_allclose(colour(save(tmp_path / "a.jpg", stored, exif=exif)), ADOBE[stored], atol=3)
+
+
+def test_a_captured_photograph_is_in_srgb(tmp_path):
+    path = save(tmp_path / "a.jpg", (204, 51, 102), icc_profile=SWAPPED)
+    add_photograph(path, tmp_path / "scene" / "a.jpg")
+    with Image.open(tmp_path / "scene" / "a.jpg") as image:
+        assert "icc_profile" not in image.info
+        np.testing.assert_allclose(np.asarray(image)[8, 8].astype(int), (51, 204, 102), atol=5)
