@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8, UInt16
 from pi_heif import open_heif
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
+from PIL.TiffImagePlugin import TiffImageFile
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.exif import exif_of, orientation_of, tags_of
@@ -210,7 +211,8 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
     """Open an image file, decoded unless ``whole`` is false.
 
     Raises:
-        SceneError: the image cannot be read, is raw, has too many pixels, or holds floating-point numbers.
+        SceneError: the image cannot be read, is raw, has too many pixels, holds floating-point numbers, or has bands of
+            16 bits that are not interleaved.
     """
     if path.suffix.lower() in RAW:
         raise SceneError(f"{path} is raw, of which only a thumbnail can be read: {DEVELOP}")
@@ -226,17 +228,34 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
             "photographs down, or put the whole file back if it is damaged"
         ) from error
     except Exception as error:  # each decoder raises its own errors for a damaged file
+        if isinstance(error, UnidentifiedImageError) and path.suffix.lower() in (".tif", ".tiff"):
+            raise SceneError(
+                f"{path} is a TIFF of a kind that is not read, of floating-point numbers for example, or cut off: save "
+                "it in RGB of 8 or 16 bits, or put the whole file back"
+            ) from error
         reason = " ".join(str(error).split())
         raise SceneError(
             f"{path} cannot be read as an image ({reason}): put the whole file back, or leave it out"
         ) from error
     with image:
+        if isinstance(image, TiffImageFile) and _is_misread(image):
+            raise SceneError(
+                f"{path} stores its bands one after another with more than 8 bits, which is not read: save it with "
+                "interleaved bands, or 8 bits"
+            )
         if whole and image.mode == "F":
             broken = " and NaN or infinite ones" if not np.isfinite(np.asarray(image)).all() else ""
             raise SceneError(
                 f"{path} holds floating-point numbers{broken}, whose white is undefined: save it with 8 or 16 bits"
             )
         yield image
+
+
+def _is_misread(image: TiffImageFile) -> bool:
+    """Whether Pillow reads the bands of a TIFF as if they were interleaved, into noise."""
+    bits = image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (1,))
+    apart = image.tag_v2.get(TiffImagePlugin.PLANAR_CONFIGURATION, 1) == 2
+    return apart and len(bits) > 1 and max(bits) > 8
 
 
 def _pixels(view: View) -> UInt8[np.ndarray, "H W C"]:

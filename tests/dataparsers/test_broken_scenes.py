@@ -16,7 +16,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 from scenes import parse, photograph, scan, write_colmap, write_video
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -25,7 +25,7 @@ from shellgs_method.cues.maps import Fits
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import CueMaps
-from shellgs_method.files.photographs import load_photograph
+from shellgs_method.files.photographs import load_photograph, read_image
 from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 from shellgs_method.synthetic import FacadeConfig, write_scene
@@ -292,6 +292,35 @@ def float_tiff(path: Path) -> None:
     pixels = np.full((32, 48), 0.5, np.float32)
     pixels[3, 4] = np.nan
     Image.fromarray(pixels).save(path, format="TIFF")
+
+
+def write_tiff(path: Path, pixels: np.ndarray, planar: int, kind: int) -> Path:
+    """A TIFF of RGB; ``planar`` and ``kind`` are its planar configuration and its sample format."""
+    height, width, bits = *pixels.shape[:2], 8 * pixels.itemsize
+    data = (pixels if planar == 1 else np.moveaxis(pixels, 2, 0)).tobytes()
+    strips = 1 if planar == 1 else 3
+    size = len(data) // strips
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    for tag, value in {256: width, 257: height, 259: 1, 262: 2, 277: 3, 278: height, 284: planar}.items():
+        tags[tag] = value
+    tags[258], tags[339] = (bits,) * 3, (kind,) * 3
+    tags[273], tags[279] = tuple(k * size for k in range(strips)), (size,) * strips
+    with path.open("wb") as file:
+        tags.save(file)
+        file.write(data)
+    return path
+
+
+def test_a_tiff_is_read_in_its_colours_or_refused_as_what_it_is(tmp_path):
+    pixels = np.arange(12 * 16 * 3, dtype=np.uint16).reshape(12, 16, 3) % 256
+    for planar, kind in ((1, np.uint8), (2, np.uint8), (1, np.uint16)):
+        stored = pixels.astype(kind) * kind(257 if kind is np.uint16 else 1)
+        read = read_image(write_tiff(tmp_path / "a.tif", stored, planar, 1))
+        np.testing.assert_array_equal(np.asarray(read), pixels)
+    with pytest.raises(SceneError, match=r"a\.tif stores its bands one after another with more than 8 bits"):
+        read_image(write_tiff(tmp_path / "a.tif", pixels * 257, 2, 1))
+    with pytest.raises(SceneError, match=r"a\.tif is a TIFF of a kind that is not read, of floating-point numbers"):
+        read_image(write_tiff(tmp_path / "a.tif", (pixels / 255).astype(np.float32), 1, 3))
 
 
 @pytest.mark.parametrize(
