@@ -316,6 +316,28 @@ def test_the_map_conversion_of_an_ifc_is_applied(
     assert ("leaves out the scale" in caplog.text) == (unit != 1 and scale == 1)
 
 
+def test_a_map_conversion_in_the_units_of_the_model_is_said(tmp_path: Path, caplog):
+    """Revit wrote millimetres, and the metre of the map as a foot."""
+    file = made.ifc_house(unit=0.001)
+    metre = file.add("IfcSIUnit", UnitType="LENGTHUNIT", Name="METRE")
+    foot = file.add("IfcMeasureWithUnit", file.add("IfcRatioMeasure", 0.3048), metre)
+    length = file.add("IfcDimensionalExponents", 1, 0, 0, 0, 0, 0, 0)
+    crs = file.add("IfcProjectedCRS", "EPSG:25832")
+    crs.MapUnit = file.add("IfcConversionBasedUnit", length, "LENGTHUNIT", "METER", foot)
+    file.add("IfcMapConversion", file.context, crs, *(NATIONAL * 1000).tolist(), 1.0, 0.0, None)
+    assert_cast_as(file.save(tmp_path / "a.ifc"), moved(made.ifc_house_faces()))
+    assert "the METER of its map is 0.3048 m by its definition: it is taken for a metre" in caplog.text
+    assert "its map conversion is in the units of the model, of 0.001 m" in caplog.text
+
+
+def test_a_map_conversion_of_a_model_on_the_map_is_not_applied_again(tmp_path: Path, caplog):
+    file = made.ifc_house(unit=0.001, site=NATIONAL)
+    crs = file.add("IfcProjectedCRS", "EPSG:25832", MapUnit=file.add("IfcSIUnit", UnitType="LENGTHUNIT", Name="METRE"))
+    file.add("IfcMapConversion", file.context, crs, *NATIONAL.tolist(), 1.0, 0.0, 0.001)
+    assert_cast_as(file.save(tmp_path / "a.ifc"), moved(made.ifc_house_faces()))
+    assert "its parts have the coordinates of the map already: its map conversion is not applied again" in caplog.text
+
+
 def test_the_map_conversion_of_an_ifc_2x3_is_in_property_sets(tmp_path: Path):
     file = made.ifc_house(schema="IFC2X3", unit=1.0)
     values = {"Eastings": NATIONAL[0], "Northings": NATIONAL[1], "OrthogonalHeight": NATIONAL[2]}

@@ -50,6 +50,10 @@ _GLASS = 0.3
 _PROJECTION = 0.01
 """Largest difference of a map's scale from 1."""
 _FOOT = 0.3048
+_BEYOND = 1e8
+"""Metres that no easting or northing reaches."""
+_TWICE = 10_000.0
+"""Metres around the place of a map conversion, in which a model has that place already."""
 
 
 def read_ifc(path: Path) -> Geometry:
@@ -184,13 +188,8 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     if known is None:
         return points
     unit = ifcopenshell.util.unit.calculate_unit_scale(model)
-    named = (ifcopenshell.util.geolocation.get_crs(model) or {}).get("MapUnit")
-    if named is None:
-        metres = unit / known.scale
-    elif isinstance(named, str):  # in a property set of IFC 2x3
-        metres = _FOOT if "FOOT" in named.upper() or "FEET" in named.upper() else 1.0
-    else:
-        metres = ifcopenshell.util.unit.get_unit_scale(named)
+    metres = _metres_of_map((ifcopenshell.util.geolocation.get_crs(model) or {}).get("MapUnit"), path)
+    metres = metres or unit / known.scale
     scale = known.scale * metres / unit  # near 1: the scale of the map's projection
     if abs(scale - 1) > _PROJECTION and known.scale == 1:
         notice(
@@ -205,7 +204,34 @@ def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> F
     origin = ifcopenshell.util.geolocation.get_wcs(model)
     if origin is not None:
         points = transformed(points, np.linalg.inv(origin * np.array([[1, 1, 1, unit]] * 3 + [[1, 1, 1, 1]])))
+    place = metres * np.array([known.e, known.n, known.h])
+    if np.abs(place[:2]).max() > _BEYOND and unit < metres:
+        notice(f"{path}: its map conversion is in the units of the model, of {unit:g} m, and not in those of its map.")
+        place *= unit / metres
+    if np.abs(place[:2]).min() > _TWICE and np.abs(np.median(points[:, :2], axis=0) - place[:2]).max() < _TWICE:
+        notice(f"{path}: its parts have the coordinates of the map already: its map conversion is not applied again.")
+        return points
     x, y = np.array([known.xaa, known.xao]) / np.hypot(known.xaa, known.xao)
     turn = np.array([[x, -y, 0], [y, x, 0], [0, 0, 1]])
     factors = scale * np.array([known.factor_x, known.factor_y, known.factor_z])
-    return (points * factors) @ turn.T + metres * np.array([known.e, known.n, known.h])
+    return (points * factors) @ turn.T + place
+
+
+def _metres_of_map(unit: Any, path: Path) -> float | None:
+    """Metres of the unit of a map; None if it names none.
+
+    Args:
+        unit: an IfcNamedUnit, or its name, as in a property set of IFC 2x3.
+        path: the file, for what is said of the unit.
+    """
+    import ifcopenshell.util.unit
+
+    if unit is None:
+        return None
+    if isinstance(unit, str):
+        return _FOOT if "FOOT" in unit.upper() or "FEET" in unit.upper() else 1.0
+    metres = ifcopenshell.util.unit.get_unit_scale(unit)
+    if unit.Name.upper() in ("METER", "METRE") and metres == _FOOT:  # of Revit
+        notice(f"{path}: the {unit.Name} of its map is {metres:g} m by its definition: it is taken for a metre.")
+        return 1.0
+    return metres
