@@ -34,7 +34,7 @@ class PlyProperty:
     """A property of an element of a PLY; types are numpy's, without byte order.
 
     Attributes:
-        name: its name.
+        name: its name, in lower case.
         type: type of its value, or of each of its list.
         counted: type of the length of its list; None if it is no list.
     """
@@ -92,9 +92,9 @@ def read_ply_header(path: Path) -> PlyHeader:
             case ["element", name, count]:
                 elements.append(PlyElement(name, int(count), []))
             case ["property", "list", counted, kind, name]:
-                elements[-1].properties.append(PlyProperty(name, _TYPES[kind], _TYPES[counted]))
+                elements[-1].properties.append(PlyProperty(name.lower(), _TYPES[kind], _TYPES[counted]))
             case ["property", kind, name]:
-                elements[-1].properties.append(PlyProperty(name, _TYPES[kind]))
+                elements[-1].properties.append(PlyProperty(name.lower(), _TYPES[kind]))
     for element in elements:
         for k, prop in enumerate(element.properties):
             if any(other.name == prop.name for other in element.properties[:k]):

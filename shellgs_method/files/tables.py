@@ -17,11 +17,11 @@ from shellgs_method.files.crs import converter, known_crs
 
 LARGEST = 1e12
 """Largest coordinate, in any unit."""
-_LONGITUDE = ("lon", "long", "lng", "longitude", "gpslongitude")
-_LATITUDE = ("lat", "latitude", "gpslatitude")
+LONGITUDE = ("lon", "long", "lng", "longitude", "gpslongitude")
+LATITUDE = ("lat", "latitude", "gpslatitude")
 COORDINATES = {
-    "X": (*_LONGITUDE, "x", "easting", "east", "e", "rechtswert", "ostwert", "ost", "pointx"),
-    "Y": (*_LATITUDE, "y", "northing", "north", "n", "hochwert", "nordwert", "nord", "pointy"),
+    "X": (*LONGITUDE, "x", "easting", "east", "e", "rechtswert", "ostwert", "ost", "pointx"),
+    "Y": (*LATITUDE, "y", "northing", "north", "n", "hochwert", "nordwert", "nord", "pointy"),
     "Z": ("z", "height", "altitude", "alt", "elevation", "elev", "hoehe", "höhe", "h", "pointz", "gpsaltitude"),
 }
 IMAGE = ("image", "photo", "photograph", "picture", "img", "file", "filename", "foto", "bild", "sourcefile")
@@ -246,14 +246,14 @@ class Table:
             for first, second in ("XY", "YX")
             if all(names & {*COORDINATES[axis]} for names, axis in zip(called[k:], (first, second, "Z"), strict=False))
         ]
-        return min(found, key=lambda columns: bool(called[columns["X"]] & {*_LONGITUDE}), default={})
+        return min(found, key=lambda columns: bool(called[columns["X"]] & {*LONGITUDE}), default={})
 
     @cached_property
     def _are_degrees(self) -> bool:
         """Whether the header calls columns latitude and longitude, and no others X Y Z."""
         places = self._position.values() or range(len(self.titles))
         names = {name for k in places for name in _called(self.titles[k])}
-        return bool(names & {*_LATITUDE} and names & {*_LONGITUDE})
+        return bool(names & {*LATITUDE} and names & {*LONGITUDE})
 
 
 def names_system(text: str) -> bool:

@@ -655,6 +655,18 @@ def test_hostile_pcds_are_refused(tmp_path: Path):
             assert "cannot be read" in str(error)  # noqa: PT017
 
 
+def test_names_of_fields_may_be_in_capitals(tmp_path: Path):
+    """PDAL writes X, Y and Z."""
+    save_pcd(tmp_path / "a.pcd", F4, POINTS.tobytes(), FIELDS="X Y Z")
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.pcd").vertices, POINTS.astype(np.float64))
+    BOX.export(tmp_path / "a.ply")
+    data = (tmp_path / "a.ply").read_bytes()
+    for axis in (b"x", b"y", b"z"):
+        data = data.replace(b"float " + axis + b"\n", b"float " + axis.upper() + b"\n", 1)
+    (tmp_path / "a.ply").write_bytes(data)
+    assert_same_surface(read_geometry(tmp_path / "a.ply"))
+
+
 def test_a_viewpoint_of_a_pcd_is_said_not_to_be_applied(tmp_path: Path, caplog):
     read_geometry(save_pcd(tmp_path / "a.pcd", F4, POINTS.tobytes(), VIEWPOINT="1 2 3 1 0 0 0"))
     assert "its VIEWPOINT is not applied" in caplog.text
@@ -686,6 +698,10 @@ def columns(order: list[int], separator: str = " ") -> list[str]:
         [line.replace(" ", ";") for line in LINES],
         [line.replace(" ", "\t") for line in LINES],
         ["r;Z [m];Y(m);x", *columns([3, 2, 1, 0], ";")],
+        ["Northing,Easting,Elevation (m)", *columns([1, 0, 2], ",")],
+        ["Rechtswert;Hochwert;Höhe", *columns([0, 1, 2], ";")],
+        ["# E N H intensity", *columns([0, 1, 2, 3])],
+        ["E N H X Y Z", *columns([3, 4, 5, 0, 1, 2])],
         [f"P{k} {line}" for k, line in enumerate(LINES)],
         [f"{k + 1000} {line}" for k, line in enumerate(LINES)],
         ["id x y z", *(f"{k} {line}" for k, line in enumerate(LINES))],
@@ -802,6 +818,7 @@ def test_a_damaged_ptx_is_refused(tmp_path: Path, change: Callable[[list[str]], 
         ([line.replace(".", ",").replace(" ", ";") for line in LINES], "has decimal commas"),
         ([line.replace(".", ",").replace(" ", "\t") for line in LINES], "has decimal commas"),
         (["East North Up", *columns([0, 1, 2])], "'East North Up', which does not name one column each of X, Y and Z"),
+        (["Latitude,Longitude,Elevation", *columns([1, 0, 2], ",")], "is in degrees .*: convert it to metres"),
         (["x y 3", *columns([0, 1, 2])], "begins with 'x y 3' where X, Y and Z are expected"),
         (columns([0, 1]), "where X, Y and Z are expected"),
         (["name X Y Z", *(f"wall 3 {line}" for line in LINES)], "its header names 4 columns, and a line has 8"),

@@ -42,7 +42,7 @@ def read_pcd(path: Path) -> Iterator[Points]:
 
 
 def _points(file: IO[bytes], fields: dict[str, list[str]], path: Path) -> Iterator[Points]:
-    names = fields.get("FIELDS") or fields["COLUMNS"]
+    names = [name.lower() for name in fields.get("FIELDS") or fields["COLUMNS"]]
     kinds = [_KINDS[kind.upper()] + size for kind, size in zip(fields["TYPE"], fields["SIZE"], strict=True)]
     counts = [int(count) for count in fields.get("COUNT", ["1"] * len(names))]
     if not len(names) == len(kinds) == len(counts) or min(counts) < 1:

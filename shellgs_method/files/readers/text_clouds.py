@@ -15,16 +15,21 @@ import numpy as np
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.readers.contents import left_out
 from shellgs_method.files.readers.points import NO_POINTS, PIECE, Points
+from shellgs_method.files.tables import COORDINATES, LATITUDE, LONGITUDE
 
 _COMMENTS = ("#", "//")
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _SAMPLE = 100  # lines that decide on the layout
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _WHOLE = re.compile(r"[-+]?\d+")
+_XYZ = {axis: (axis.lower(),) for axis in "XYZ"}
+_SURVEYED = {axis: {*names} - {*LATITUDE, *LONGITUDE} for axis, names in COORDINATES.items()}
 
 
 def read_text_cloud(path: Path) -> Iterator[Points]:
     """Read X, Y and Z of each line: the first three columns, or those that a header names so, also in a comment.
+
+    A header may call them easting, northing and height, in any order.
 
     Columns are separated by spaces, tabs, commas or semicolons. A line with one number counts the points after it.
     Where the first column numbers or names the points, X is the second; where two are a scanner's rows and columns, as
@@ -146,16 +151,28 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def _words(header: list[str]) -> list[str]:
+    return [re.split(r"[^a-z]", name.lower().strip("\"' "))[0] for name in header]
+
+
 def _axes(header: list[str]) -> list[int]:
-    """Columns that a header calls X, Y and Z, with a unit or without; none if it does not name each once."""
-    names = [re.split(r"[^a-z]", name.lower().strip("\"' "))[0] for name in header]
-    return [names.index(axis) for axis in "xyz"] if all(names.count(axis) == 1 for axis in "xyz") else []
+    """Columns that a header calls X, Y and Z, or easting, northing and height; none if it does not name each once."""
+    words = _words(header)
+    for names in (_XYZ, _SURVEYED):
+        found = [[k for k, word in enumerate(words) if word in names[axis]] for axis in "XYZ"]
+        if all(len(columns) == 1 for columns in found):
+            return [k for (k,) in found]
+    return []
 
 
 def _named(rows: list[list[str]], line: str, path: Path) -> list[int]:
-    """Columns that the first row calls X, Y and Z."""
+    """Columns that the first row calls X, Y and Z, or easting, northing and height."""
     names, columns = rows[0], _axes(rows[0])
     if not columns:
+        if all({*_words(names)} & {*each} for each in (LATITUDE, LONGITUDE)):
+            raise SceneError(
+                f"the shell {path} is in degrees ({_shown(line)}): convert it to metres, as of UTM or the national grid"
+            )
         raise SceneError(
             f"the shell {path} cannot be read: it begins with {_shown(line)}, which does not name one column each of "
             "X, Y and Z: name them in that line, or delete it if they are the first three columns"
