@@ -24,7 +24,7 @@ from shellgs_method.files.frames import Frame, Recording
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
-from shellgs_method.files.undistortion import undistort
+from shellgs_method.files.undistortion import refuse_folding, undistort
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.precision import camera_step, warn_of_coarse
 from shellgs_method.registration.sfm_frame import check_points
@@ -151,7 +151,9 @@ def _views(frames: Sequence[Frame], layout: SceneLayout) -> list[View]:
             key = (lens.K.numpy().tobytes(), lens.distortion, lens.fisheye, lens.width, lens.height)
             if key not in pinholes:
                 K, image = undistort(lens, np.zeros((lens.height, lens.width, 3), np.uint8))
-                pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K), image.shape[1], image.shape[0])
+                height, width = image.shape[:2]
+                refuse_folding(lens, K, width, height, f"{frame.name} in {layout.data}")
+                pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K), width, height)
             camera = replace(pinholes[key], viewmat=camera.viewmat)
         views.append(View(frame.name, frame.image, camera, lens, masks.get(frame.name)))
     return oriented(views, layout)

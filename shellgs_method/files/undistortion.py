@@ -8,7 +8,11 @@ import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
 
-from shellgs_method.geometry.lens import Lens
+from shellgs_method.errors import SceneError
+from shellgs_method.geometry.lens import COEFFICIENTS, Lens
+
+_GRID = 40  # pixels along each side at which a lens is tested
+_LEAST_SHOWN = 0.05  # of a photograph's area
 
 
 def undistort(lens: Lens, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float64[np.ndarray, "3 3"], np.ndarray]:
@@ -30,6 +34,34 @@ def undistort(lens: Lens, image: UInt8[np.ndarray, "H W C"]) -> tuple[Float64[np
     )[0]
     pinhole, image, _ = _undistort_image(camera, np.array(lens.distortion, np.float32), {}, image, K.numpy().copy())
     return pinhole.astype(np.float64), image
+
+
+def refuse_folding(lens: Lens, K: Float64[np.ndarray, "3 3"], width: int, height: int, called: str) -> None:
+    """Refuse a lens whose undistorted photographs show something twice, or hardly anything.
+
+    Args:
+        lens: the lens.
+        K: intrinsics of its undistorted photographs.
+        width: their width.
+        height: their height.
+        called: the photograph and its scene, for the message.
+
+    Raises:
+        SceneError: it is such a lens, as structure from motion finds where it has too little to go by, or a fisheye
+            lens that sees more than a plane image can show.
+    """
+    x, y = np.meshgrid(np.linspace(0, width, _GRID), np.linspace(0, height, _GRID))
+    shown = distort_pixels(lens, np.stack([x.ravel(), y.ravel()], axis=1), K).reshape(_GRID, _GRID, 2)
+    right, down = np.diff(shown, axis=1)[:-1], np.diff(shown, axis=0)[:, :-1]
+    areas = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
+    if (areas > 0).mean() > 0.99 and areas.sum() > _LEAST_SHOWN * lens.width * lens.height:
+        return
+    named = (f"{name} {value:.3g}" for name, value in zip(COEFFICIENTS, lens.distortion, strict=True) if value)
+    wide = ", sees 180° or more," if lens.fisheye else ""
+    raise SceneError(
+        f"the lens of {called} ({', '.join(named) or 'no distortion'}) folds the photograph{wide} or leaves hardly "
+        "anything of it undistorted: find the cameras again with a simpler lens model, or leave the photograph out"
+    )
 
 
 def undistort_pixels(

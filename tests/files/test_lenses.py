@@ -95,6 +95,20 @@ def test_a_camera_that_cannot_be_undistorted_is_refused(scene: Path, model: str)
         with_lens(scene, model, {})
 
 
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("OPENCV", {"k1": -4.0}),
+        ("OPENCV", {"k1": -44.85, "k2": 1017.4, "p1": 0.62, "p2": 0.94}),
+        ("OPENCV_FISHEYE", {"k1": -6.0}),
+        ("OPENCV_FISHEYE", {"fl_x": 120.0, "fl_y": 120.0}),
+    ],
+)
+def test_a_lens_that_folds_the_photograph_is_refused(scene: Path, model: str, coefficients: dict):
+    with pytest.raises(SceneError, match=r"the lens of images/frame_\d+\.png in .* folds the photograph"):
+        with_lens(scene, model, coefficients)
+
+
 def test_browns_fourth_radial_coefficient_is_refused(scene: Path):
     with pytest.raises(SceneError, match=r"k4, which nerfstudio cannot undistort"):
         with_lens(scene, "OPENCV", BROWN | {"k4": 0.01})
