@@ -16,7 +16,7 @@ from jaxtyping import Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError, decimal_comma, notice
-from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order
+from shellgs_method.files.frames import FISHEYE, UNDISTORT, Frame, Recording, frame, in_order, remedy_for
 from shellgs_method.files.paths import NamedFiles
 
 PLACES = (Path("colmap/sparse"), Path("sparse"))
@@ -46,7 +46,6 @@ _MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, o
 _PARAMETERS = {name: known if isinstance(known, int) else len(known.split()) for name, known in _MODELS.items()}
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 """A keypoint of a photograph, and the id of its point or -1."""
-_PANORAMAS = {"EQUIRECTANGULAR", "SPHERICAL"}  # the same by the name of other programs
 
 T = TypeVar("T")
 
@@ -269,10 +268,9 @@ def _lens(camera: ColmapCamera, scene: Path) -> dict[str, Any]:
     """Intrinsics and distortion by the names of transforms.json."""
     parameters = _MODELS.get(camera.model)
     if not isinstance(parameters, str):
-        panorama = camera.model in _PANORAMAS
-        remedy = "render perspective photographs from these panoramas first" if panorama else UNDISTORT
         raise SceneError(
-            f"the cameras of {scene} are of the model {camera.model}, which cannot be undistorted; {remedy}"
+            f"the cameras of {scene} are of the model {camera.model}, which cannot be undistorted; "
+            f"{remedy_for(camera.model)}"
         )
     values = dict(zip(parameters.split(), camera.params, strict=True))
     fx = values.pop("f", values.pop("fx", None))

@@ -19,6 +19,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import COEFFICIENTS, Lens
 
 UNDISTORT = "undistort the photographs first (`colmap image_undistorter`)"
+_PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")  # the same by the name of other programs
 MAX_PIXELS = 178_956_970
 """Most pixels of a photograph: Pillow's limit for decompression bombs. Larger ones are never allocated."""
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -113,10 +114,15 @@ def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
     return frames
 
 
+def remedy_for(model: object) -> str:
+    """What to do with photographs of a camera model that nerfstudio does not undistort."""
+    return "render perspective photographs from these panoramas first" if model in _PANORAMAS else UNDISTORT
+
+
 def _is_fisheye(lens: Mapping[str, Any], where: str) -> bool:
     model = lens.get("camera_model", "OPENCV")
     if model not in (*PERSPECTIVE, FISHEYE):
-        raise SceneError(f"{where} is {model}, but only perspective and fisheye ones work; {UNDISTORT}")
+        raise SceneError(f"{where} is {model}, but only perspective and fisheye ones work; {remedy_for(model)}")
     return model == FISHEYE
 
 

@@ -89,9 +89,16 @@ def test_a_colmap_fisheye_keeps_its_fourth_coefficient(scene: Path):
     assert lens.distortion == (0.08, -0.03, 0.01, 0.004, 0, 0)
 
 
-@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "ORTHOPHOTO", "FISHEYE624"])
-def test_a_camera_that_cannot_be_undistorted_is_refused(scene: Path, model: str):
-    with pytest.raises(SceneError, match=rf"frame_\d+\.png is {model}.*undistort"):
+@pytest.mark.parametrize(
+    ("model", "remedy"),
+    [
+        ("EQUIRECTANGULAR", "render perspective photographs from these panoramas"),
+        ("ORTHOPHOTO", "undistort"),
+        ("FISHEYE624", "undistort"),
+    ],
+)
+def test_a_camera_that_cannot_be_undistorted_is_refused(scene: Path, model: str, remedy: str):
+    with pytest.raises(SceneError, match=rf"frame_\d+\.png is {model}.*{remedy}"):
         with_lens(scene, model, {})
 
 
