@@ -63,7 +63,8 @@ def align(
             colmap/adjusted, which is used from then on. Without it, or with --colmap-path, the cameras are as before.
         accept: Accept the earlier proposal.
         global_shift: CloudCompare's global shift, with --matrix.
-        metres_per_shell_unit: Length of the shell's unit in metres.
+        metres_per_shell_unit: Length of the shell's unit in metres. If not set: that of its coordinate reference
+            system, else a metre.
         same_frame: The shell is in the frame and unit of the cameras: both are of one project of Metashape, RealityScan
             or OpenDroneMap. Instead of --matrix.
         crs: Coordinate reference system of the shell, such as EPSG:25832. Picks and positions whose first line names
@@ -170,15 +171,17 @@ class _Start:
     def _placed(
         self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str
     ) -> Placement:
+        from shellgs_method.files.crs import metres_of
         from shellgs_method.files.cue_maps import relative_path
         from shellgs_method.registration import align as by
         from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
-        names, unit = tuple(relative_path(path, scene) for path in self.shell), self.metres_per_shell_unit
         if self.accept:
             return by.place_as_proposed(scene / by.PROPOSAL, scene, views)
         if not self.shell:
             return by.place_as_before(scene / ALIGNMENT, scene, views)
+        names = tuple(relative_path(path, scene) for path in self.shell)
+        unit = metres_of(crs, self.metres_per_shell_unit, self.shell)
         if self.matrix:
             return by.Placement(Alignment.from_matrix_file(self.matrix, names, unit, self.global_shift))
         if self.same_frame:

@@ -33,7 +33,8 @@ def pick(
         scene: Scene folder.
         shell: Mesh, model (IFC, CityGML, CityJSON) or point cloud of the shell; or several, in the same coordinates.
         picks: File of picks, written and read back.
-        metres_per_shell_unit: Length of the shell's unit in metres.
+        metres_per_shell_unit: Length of the shell's unit in metres. If not set: that of its coordinate reference
+            system, else a metre.
         crs: Coordinate reference system of the shell, such as EPSG:25832, to which a file of picks in another one is
             converted. If not set: as the shell's file says, or a .prj beside it.
         port: Port of the page.
@@ -49,7 +50,7 @@ def pick(
 
     from dataparsers.facade import read_views
     from shellgs_method.errors import check_output
-    from shellgs_method.files.crs import crs_of, given_crs
+    from shellgs_method.files.crs import crs_of, given_crs, metres_of
     from shellgs_method.picking.scan import Scan
     from shellgs_method.picking.server import PickServer
     from shellgs_method.picking.session import Session
@@ -65,7 +66,8 @@ def pick(
     with PickServer(port) as server:
         tell(f"Reading {', '.join(path.name for path in shell)}")
         place = ShellPlace(*shell)
-        session = Session(picks, views, metres_per_shell_unit, given_crs(crs) if crs else crs_of(*shell))
+        system = given_crs(crs) if crs else crs_of(*shell)
+        session = Session(picks, views, metres_of(system, metres_per_shell_unit, shell), system)
         if session.state.picks:
             place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")
         tell("Preparing it to be drawn and picked")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,8 @@ from shellgs_method.errors import SceneError, notice
 if TYPE_CHECKING:  # training needs no PROJ
     from pyproj import CRS
 
+IN_METRES = (".ifc", ".ifczip")
+"""Suffixes of files that are read in metres, whatever their system."""
 _NAMED = re.compile(r"\+\w+=|urn:|https?://|[A-Za-z]+:\w+(\+\w+)?$|[A-Za-z_]+\[|WGS ?84$", re.IGNORECASE)
 """How a system is named; PROJ would find one for nearly any word."""
 _INTRODUCED = re.compile(
@@ -133,6 +135,30 @@ def given_crs(text: str) -> str:
     if crs.is_geographic:
         raise SceneError(f"--crs {text} is in degrees: give the shell's own system, which must be in metres or feet")
     return name_of(crs)
+
+
+def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
+    """Metres of a shell's unit: those given, or of the unit of its system where that is no metre, which is told.
+
+    Args:
+        system: name of the system; empty if unknown.
+        given: metres of the unit that the user gives, 1 if none.
+        shell: its files.
+
+    Raises:
+        SceneError: the system has heights in another unit than eastings.
+    """
+    crs = known_crs(system)
+    if crs is None or any(path.suffix.lower() in IN_METRES for path in shell):
+        return given
+    units = {axis.unit_name: axis.unit_conversion_factor for axis in crs.axis_info}
+    if max(units.values()) > 1.1 * min(units.values()):
+        raise SceneError(f"{crs.name} has axes in {' and in '.join(units)}: convert the shell to one unit")
+    name, metres = next(iter(units.items()))
+    if given != 1 or abs(metres - 1) < 1e-9:
+        return given
+    notice(f"The shell's system, {crs.name}, is in {name}: its unit is taken for {metres:.9g} m.")
+    return metres
 
 
 def conversion(source: CRS, target: CRS) -> Callable[[np.ndarray], Float64[np.ndarray, "N D"]]:
