@@ -192,7 +192,36 @@ def _png_with_exif(content: bytes, exif: bytes) -> bytes:
     return content[:8] + b"".join([chunks[0], chunk, *chunks[1:]])
 
 
-def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) -> None:
+def masks_as_stored(photographs: Mapping[str, Path], masks: Mapping[str, Path]) -> bool:
+    """Whether masks are of the pixels that are stored, and to be turned with them, not of what photographs show.
+
+    Sizes tell, of photographs on their side. The others are taken to be likewise; that nothing tells is told.
+
+    Raises:
+        SceneError: a mask is not a readable image.
+    """
+    from shellgs_method.files.photographs import read_mask
+
+    told: set[bool] = set()
+    upside_down = []
+    for name, mask in masks.items():
+        with Image.open(photographs[name]) as stored:
+            orientation, size = orientation_of(stored), stored.size
+        if orientation == 1 or orientation_of(drawn := read_mask(mask)) != 1:
+            continue
+        if orientation < 5:
+            upside_down.append(name)
+        elif size[0] != size[1]:
+            told.add(drawn.size == size)
+    if upside_down and len(told) != 1:
+        notice(
+            f"{len(upside_down)} photographs that have masks, {upside_down[0]} for example, are stored upside down or "
+            "mirrored, by their EXIF, and their masks are taken for upright. If they are not, turn the masks."
+        )
+    return told == {True}
+
+
+def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path, as_stored: bool = False) -> None:
     """Put a photograph's mask into the work folder, upright, 255 where the photograph is kept and opaque.
 
     Args:
@@ -200,6 +229,7 @@ def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) ->
         source: the original photograph, possibly with an EXIF orientation.
         photograph: the upright photograph in the work folder.
         target: png to write.
+        as_stored: whether a mask whose size does not tell is of the stored photograph.
 
     Raises:
         SceneError: the mask is not a readable image, or has another size.
@@ -212,7 +242,7 @@ def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) ->
         transparent = stored.has_transparency_data
     kept = np.ones(upright_size[::-1], bool)
     if mask is not None:
-        kept &= np.asarray(_upright_mask(read_mask(mask), mask, stored_size, upright_size, exif)) > 0
+        kept &= np.asarray(_upright_mask(read_mask(mask), mask, stored_size, upright_size, exif, as_stored)) > 0
     if transparent:
         kept &= np.asarray(ImageOps.exif_transpose(read_image(source)).convert("RGBA"))[..., 3] > OPAQUE
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -220,10 +250,16 @@ def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path) ->
 
 
 def _upright_mask(
-    image: Image.Image, mask: Path, stored_size: tuple[int, int], upright_size: tuple[int, int], exif: Image.Exif
+    image: Image.Image,
+    mask: Path,
+    stored_size: tuple[int, int],
+    upright_size: tuple[int, int],
+    exif: Image.Exif,
+    as_stored: bool,
 ) -> Image.Image:
+    as_stored = as_stored and orientation_of(image) == 1  # else it says itself how it is shown
     image = ImageOps.exif_transpose(image)
-    if image.size == stored_size != upright_size:
+    if image.size == stored_size and (as_stored or stored_size != upright_size):
         image.info["exif"] = exif.tobytes()
         image = ImageOps.exif_transpose(image)
     if image.size != upright_size:

@@ -40,6 +40,7 @@ from shellgs_method.capture.photographs import (
     find_photographs,
     group_by_lens,
     keep_exposure,
+    masks_as_stored,
     tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
@@ -189,11 +190,13 @@ class _Capture:
         if len(self.names) < LEAST_REGISTERED:
             raise SceneError(f"a scene needs at least {LEAST_REGISTERED} photographs, not {len(self.names)}")
         if self.masked and not self.work.has("masks", self.masks_key):
+            as_stored = masks_as_stored(self.photographs, self.masks)
             with self.work.making("masks", self.masks_key) as folder:
                 for name in self.progress.track(self.masked, description="reading masks"):
                     source, target = self.photographs[name], folder / f"{name}.png"
                     is_whole = (self.folder / name).exists()
-                    add_mask(self.masks.get(name), source, self.folder / name if is_whole else source, target)
+                    upright = self.folder / name if is_whole else source
+                    add_mask(self.masks.get(name), source, upright, target, as_stored)
                     if not is_whole:
                         add_mask_faces(target, folder, name, self.folder)
 

@@ -37,6 +37,7 @@ from shellgs_method.capture.photographs import (
     find_photographs,
     group_by_lens,
     keep_exposure,
+    masks_as_stored,
     tell_of_unknown_lenses,
 )
 from shellgs_method.capture.process import run_step
@@ -553,6 +554,27 @@ def test_a_mask_is_rotated_with_its_photograph(tmp_path, as_stored):
     mask = Image.fromarray(upright)
     kept = masked(tmp_path, mask.rotate(90, expand=True) if as_stored else mask)
     np.testing.assert_array_equal(np.asarray(kept), upright)
+
+
+def test_masks_of_photographs_on_their_side_tell_how_those_of_others_are_stored(tmp_path, caplog):
+    exif = Image.Exif()
+    for name, orientation in (("side", 6), ("head", 3)):
+        exif[ExifTags.Base.Orientation] = orientation
+        photograph(64, 48).save(tmp_path / f"{name}.jpg", exif=exif)
+    photographs = {name: tmp_path / f"{name}.jpg" for name in ("side", "head")}
+    masks = {name: tmp_path / f"{name}.png" for name in photographs}
+    black = np.full((48, 64), 255, np.uint8)
+    black[:12, :16] = 0
+    for path in masks.values():
+        Image.fromarray(black).save(path)
+    assert masks_as_stored(photographs, masks)
+    add_photograph(photographs["head"], tmp_path / "upright.jpg")
+    add_mask(masks["head"], photographs["head"], tmp_path / "upright.jpg", tmp_path / "kept.png", as_stored=True)
+    with Image.open(tmp_path / "kept.png") as kept:
+        np.testing.assert_array_equal(np.asarray(kept), black[::-1, ::-1])
+    assert not caplog.text
+    assert not masks_as_stored({"head": photographs["head"]}, {"head": masks["head"]})
+    assert "1 photographs that have masks, head for example, are stored upside down" in caplog.text
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path):
