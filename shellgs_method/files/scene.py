@@ -155,7 +155,8 @@ class SceneLayout(ScenePaths):
             looked_in = [self.colmap_path] if self.colmap_path else ["the folder itself", *colmap.PLACES]
             raise FileNotFoundError(
                 f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "
-                f"{', '.join(map(str, looked_in))}, or in numbered folders there."
+                f"{', '.join(map(str, looked_in))}, or in numbered folders there; `shellgs capture` makes a scene of "
+                "photographs"
             )
         return folder
 

@@ -63,7 +63,8 @@ def read_surface(path: Path) -> Geometry | Cloud:
         SceneError: the file is empty, damaged, of an unknown format or holds splats, or its reader is not installed.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"the shell {path} does not exist")
+        problem = "is a folder: give the files in it" if path.is_dir() else "does not exist"
+        raise FileNotFoundError(f"the shell {path} {problem}")
     if path.stat().st_size == 0:
         raise SceneError(f"the shell {path} is an empty file: export it again")
     suffix = path.suffix.lower()

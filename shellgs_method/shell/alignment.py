@@ -325,6 +325,8 @@ def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
             matrix = json.loads(path.read_bytes())
         else:
             matrix = [line.replace(",", " ").split() for line in path.read_text().splitlines() if line.strip()]
+            if len({len(line) for line in matrix}) > 1:
+                raise ValueError("its lines differ in their number of words")
         matrix = np.array(matrix, dtype=np.float64)
     except Exception as error:  # each format's reader raises errors of its own for a damaged file
         raise SceneError(f"this is not a 4x4 matrix ({' '.join(str(error).split())})") from error

@@ -476,7 +476,7 @@ def test_outliers_among_sfm_points_are_left_out_and_counted(scene, caplog):
             "is not a text file of camera positions",
         ),
         (("align", "{scene}", "{scene}/shell/facade.ply", "--matrix", "{scene}/sparse_pc.ply"), "not a 4x4 matrix"),
-        (("align", "{scene}", "{scene}/images"), "does not exist"),
+        (("align", "{scene}", "{scene}/images"), "is a folder: give the files in it"),
         (("cast", "{scene}/transforms.json"), "is not a folder"),
     ],
 )

@@ -209,6 +209,17 @@ def test_an_unusable_shell_is_refused_with_its_file_name(tmp_path: Path, write: 
     assert words in str(caught.value)
 
 
+def test_a_folder_in_place_of_a_shell_is_refused(tmp_path: Path):
+    with pytest.raises(FileNotFoundError, match=r"the shell .* is a folder: give the files in it"):
+        load_shell(tmp_path)
+
+
+def test_picks_in_place_of_a_matrix_are_refused_in_plain_words(tmp_path: Path):
+    (tmp_path / "picks.txt").write_text("# X Y Z x y image name\n1 2 3 4 5 a.jpg top\n")
+    with pytest.raises(SceneError, match=r"picks\.txt: this is not a 4x4 matrix \(its lines differ"):
+        Alignment.from_matrix_file(tmp_path / "picks.txt", ("shell.ply",))
+
+
 def test_a_missing_shell_is_refused_with_its_file_name(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"nowhere\.ply does not exist"):
         load_shell(tmp_path / "nowhere.ply")
