@@ -16,7 +16,7 @@ from jaxtyping import Bool
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write, content_hash
 from shellgs_method.files.clouds import Cloud
-from shellgs_method.files.readers.contents import Geometry
+from shellgs_method.files.readers.contents import Geometry, refuse_degrees
 from shellgs_method.files.readers.points import NO_POINTS
 from shellgs_method.files.surfaces import read_geometry, read_surface
 from shellgs_method.geometry.camera import Camera, positions
@@ -117,10 +117,13 @@ def _load_file(
             usable = _without_outliers(*used, path)
             near = _referenced(used[0], used[1][usable])
             mesh = ShellMesh(*near, classes=surface.classes[usable])
+            refuse_degrees(mesh.vertices, path)
             step = NO_STEP if surface.drawn else mesh_step(mesh.vertices, mesh.faces)
             refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
             return replace(_with_area(mesh, path), step=step)
         whole = surface.whole
+        if len(whole.sample):
+            refuse_degrees(whole.sample, path)
         step = cloud_step(whole.sample)
         refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
         sights = Sights.of(cameras, whole.points) if cameras and len(whole.points) else None

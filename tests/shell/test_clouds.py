@@ -253,6 +253,25 @@ def test_the_mesh_of_a_rounded_cloud_remembers_its_step(cloud: Path):
         np.testing.assert_allclose(load_shell(cloud, cache=cloud.parent).step.lengths, 0.01)
 
 
+@pytest.mark.parametrize("suffix", ["laz", "xyz", "ply"])
+def test_a_shell_in_degrees_is_refused(tmp_path: Path, suffix: str):
+    points = scan(2000)[:, [0, 2, 1]] * (1e-5, 1e-5, 1) + (8.68, 49.41, 110)
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "ply":
+        trimesh.Trimesh(points, np.arange(1998).reshape(-1, 3), process=False).export(path)
+    elif suffix == "xyz":
+        np.savetxt(path, points, fmt="%.9f")
+    else:
+        laspy = pytest.importorskip("laspy")
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.scales, header.offsets = [1e-9, 1e-9, 1e-3], [8, 49, 0]
+        las = laspy.LasData(header)
+        las.x, las.y, las.z = points.T
+        las.write(str(path))
+    with pytest.raises(SceneError, match=rf"a\.{suffix} has its coordinates in degrees \(such as 8\.\d+ 49\.\d+\)"):
+        load_shell(path)
+
+
 def test_a_cloud_of_six_digits_is_refused_before_it_is_meshed(tmp_path: Path):
     np.savetxt(tmp_path / "scan.xyz", scan(3000) + GEOREFERENCE, fmt="%.6g")
     with pytest.raises(SceneError, match=r"scan\.xyz: the coordinates are stored in steps of 1 x 10 x 0\.001 m"):

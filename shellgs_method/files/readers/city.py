@@ -12,7 +12,14 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.readers.contents import NO_POINTS, Geometry, left_out, say_left_out, say_missed
+from shellgs_method.files.readers.contents import (
+    NO_POINTS,
+    Geometry,
+    left_out,
+    refuse_degrees,
+    say_left_out,
+    say_missed,
+)
 from shellgs_method.geometry.polygons import triangulated
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import area_vectors
@@ -143,7 +150,7 @@ def outside(objects: Iterable[CityObject], path: Path, missing: Counter[str]) ->
     levels = (f"LoD {level:g} of {count}" for level, count in sorted(found.levels.items(), reverse=True))
     notice(f"{path}: the highest level of detail of each object is read: {', '.join(levels)}.")
     points = np.concatenate([NO_POINTS, *rings])
-    _refuse_degrees(points, path)
+    refuse_degrees(points, path)
     vertices, corners = np.unique(points, axis=0, return_inverse=True)
     holes = np.array([k > 0 for polygon in found.polygons for k in range(len(polygon))])
     sizes = np.array([len(ring) for ring in rings])
@@ -167,14 +174,4 @@ def _tell_if_mirrored(upwards: Float64[np.ndarray, " F"], classes: UInt8[np.ndar
         notice(
             f"{path}: its roofs face down, so that its polygons are wound inwards, which does not matter, or its "
             "coordinates are northing before easting, which mirrors the building: if it does not align, swap them."
-        )
-
-
-def _refuse_degrees(points: Float64[np.ndarray, "N 3"], path: Path) -> None:
-    """Refuse longitudes and latitudes, which make a building ten thousand times higher than it is wide."""
-    wide, high = np.ptp(points[:, :2], axis=0).max(), np.ptp(points[:, 2])
-    if np.abs(points[:, :2]).max() <= 180 and wide < 0.2 and high > 20 * wide:
-        raise SceneError(
-            f"the shell {path} has its coordinates in degrees (such as {points[0, 0]:.7g} {points[0, 1]:.7g}): convert "
-            "it to metres, in the national grid of its place, for example with citygml-tools or cjio"
         )

@@ -68,6 +68,24 @@ def say_left_out(path: Path, counts: Mapping[str, int]) -> None:
         notice(f"{path}: left out what is no outside of a building: {', '.join(some)}.")
 
 
+def refuse_degrees(points: Float64[np.ndarray, "N 3"], path: Path) -> None:
+    """Refuse longitudes and latitudes, which make a building ten thousand times higher than it is wide.
+
+    Args:
+        points: some of the file's points, finite.
+        path: the file.
+
+    Raises:
+        SceneError: they are such.
+    """
+    wide, high = np.ptp(points[:, :2], axis=0).max(), np.ptp(points[:, 2])
+    if np.abs(points[:, :2]).max() <= 180 and 0 < wide < 0.2 and high > 200 * wide:
+        raise SceneError(
+            f"the shell {path} has its coordinates in degrees (such as {points[0, 0]:.7g} {points[0, 1]:.7g}): convert "
+            "it to metres, in the national grid of its place, for example with citygml-tools, cjio or PDAL"
+        )
+
+
 def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
     """The numbers of a text that holds nothing else.
 
