@@ -446,8 +446,8 @@ def test_a_drawing_of_lines_is_no_cloud_of_their_ends(tmp_path: Path, suffix: st
 
 
 def test_a_ply_without_a_coordinate_names_it(tmp_path: Path):
-    header = ["element vertex 6", *(line.upper().replace("PROPERTY DOUBLE", "property double") for line in XYZ)]
-    with pytest.raises(SceneError, match="its vertices have X, Y, Z, but no x"):
+    header = ["element vertex 6", *XYZ[:2], "property double w"]
+    with pytest.raises(SceneError, match="its vertices have x, y, w, but no z"):
         read_geometry(save_ply(tmp_path / "a.ply", header, rows(HEXAGON), "ascii"))
 
 
