@@ -169,7 +169,9 @@ class TrainedRun:
             )
         if voxel is None and (pixels := self.footprints(box)):
             voxel = max(float(np.median(pixels)), least_voxel(box))
-        return self.facade(fuse(self.views() if views is None else views, box, voxel), margin)
+        surface = self.facade(fuse(self.views() if views is None else views, box, voxel), margin)
+        return_freed()  # its voxels
+        return surface
 
     def facade(self, mesh: trimesh.Trimesh, margin: float) -> trimesh.Trimesh:
         """The part of a mesh within ``margin`` metres of the shell; all of it if there is no shell.
