@@ -20,6 +20,7 @@ from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
 from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.gaussians.initial import BEHIND_SPACING, MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.seeds import (
     SeededView,
@@ -174,13 +175,14 @@ class FacadePipeline(VanillaPipeline):
         return super().get_train_loss_dict(step)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Training state for checkpoints: the densification's sums, remaining views, random number generators."""
+        """State for checkpoints: the cameras, and that of the training, with sums, remaining views and generators."""
         if self.test_mode != "val":
             return {}
         data, sums = self.datamanager, self.model.strategy_state
         order = getattr(data, "random_generator", None)
         return {
             "block": dict(self._block),
+            "cameras": BoundCameras.of(data.train_dataset.views).to_json(),
             "densification": {name: value for name, value in sums.items() if isinstance(value, Tensor)},
             "views": list(data.train_unseen_cameras),
             "order": order and list(map(_listed, order.getstate())),
@@ -189,8 +191,18 @@ class FacadePipeline(VanillaPipeline):
         }
 
     def set_extra_state(self, state: Any) -> None:
-        """Keep the state until :meth:`restore_training`: planning the schedules, which comes later, would clear it."""
+        """Keep the state until :meth:`restore_training`: planning the schedules, which comes later, would clear it.
+
+        Raises:
+            SceneError: the run is trained, and the scene has other cameras now.
+        """
         self._training_state = state
+        trained_with, data = BoundCameras.from_json(state.get("cameras", {})), self.datamanager
+        if self.test_mode != "val" and (changed := trained_with.changed(data.train_dataset.views)):
+            raise SceneError(
+                f"the cameras of {data.config.dataparser.data} are not those that the run was trained with: {changed}; "
+                "name the model of those as colmap_path in its config.yml, or train again"
+            )
 
     def restore_training(self) -> None:
         """Restore the training state of a loaded checkpoint, so that the run continues as if never stopped.

@@ -226,6 +226,19 @@ def test_a_run_is_not_loaded_with_another_scene(trained, tmp_path, load):
         load(tmp_path / "a" / NAMES / "config.yml", "inference")
 
 
+@pytest.mark.parametrize("load", [load_run, lambda path, mode: eval_setup(path, test_mode=mode)])
+def test_a_run_is_not_loaded_with_cameras_that_were_adjusted_since(trained, tmp_path, load):
+    """By centimetres, by which its frame is the same."""
+    shutil.copytree(trained / "a", tmp_path / "a")
+    path = tmp_path / "a/scene/transforms.json"
+    cameras = json.loads(path.read_text())
+    along = [frame["transform_matrix"][0][3] for frame in cameras["frames"]]
+    cameras["frames"][3]["transform_matrix"][0][3] += 2e-3 * (max(along) - min(along))
+    path.write_text(json.dumps(cameras))
+    with pytest.raises((SceneError, SystemExit), match=r"are not those that the run was trained with: .*frame_00004"):
+        load(tmp_path / "a" / NAMES / "config.yml", "inference")
+
+
 def test_a_command_of_nerfstudio_may_give_a_scene_in_place_of_one_that_is_gone(trained, pristine_scene, tmp_path):
     run = Path(shutil.copytree(trained / "a" / NAMES, tmp_path / "best"))
 
