@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
+from PIL import Image
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import read_json
@@ -23,6 +25,7 @@ GREY = 128
 # Applied to COLMAP's frame by old versions of ns-process-data, without being recorded.
 _UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_ANGLES = ("camera_angle_x", "camera_angle_y")
 _LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *COEFFICIENTS)
 
 
@@ -109,11 +112,36 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
         raise SceneError(
             f"{where}: is_fisheye is set, which counts only with the camera_model OPENCV_FISHEYE: set it too"
         )
-    name = files.photograph(entry["file_path"], where).relative_to(files.scene).as_posix()
+    photograph = files.photograph(entry["file_path"], where)
+    name = photograph.relative_to(files.scene).as_posix()
+    if "fl_x" not in lens:
+        angles = {key: source[key] for key in _ANGLES for source in (meta, entry) if key in source}
+        lens = _by_angles(angles, photograph, where) | lens
     found = frame(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
     if entry.get("mask_path") is None:
         return found
     return replace(found, mask=files.other(str(entry["mask_path"]), where))
+
+
+def _by_angles(angles: Mapping[str, Any], photograph: Path, where: str) -> dict[str, Any]:
+    """The lens of NeRF's synthetic scenes and Blender: its angles of view, on pixels of a photograph; {} without any.
+
+    Raises:
+        SceneError: an angle is none between 0 and 180 degrees, in radians, or the photograph cannot be read.
+    """
+    if "camera_angle_x" not in angles:
+        return {}
+    for name, angle in angles.items():
+        if isinstance(angle, bool) or not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
+            raise SceneError(f"{where}: its {name} is {str(angle)[:40]}, not an angle between 0 and pi")
+    try:
+        with Image.open(photograph) as image:
+            width, height = image.size
+    except OSError as error:
+        raise SceneError(f"{where}: {photograph} cannot be read, whose size its camera needs") from error
+    focal = width / 2 / math.tan(angles["camera_angle_x"] / 2)
+    vertical = height / 2 / math.tan(angles["camera_angle_y"] / 2) if "camera_angle_y" in angles else focal
+    return {"fl_x": focal, "fl_y": vertical, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
 
 
 def _has_distortion(meta: Mapping[str, Any]) -> bool:

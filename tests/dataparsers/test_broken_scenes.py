@@ -73,6 +73,11 @@ def remove(scene: Path, *keys: str) -> None:
     path.write_text(json.dumps({key: value for key, value in transforms.items() if key not in keys}))
 
 
+def by_angle(scene: Path, angle: float) -> None:
+    remove(scene, "fl_x")
+    change(scene, None, camera_angle_x=angle)
+
+
 def text(content: str | bytes) -> Callable[[Path], object]:
     data = content.encode() if isinstance(content, str) else content
     return lambda scene: (scene / "transforms.json").write_bytes(data)
@@ -88,6 +93,7 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "frames of words": (lambda scene: change(scene, None, frames=["a"]), "frame 1: there is no file_path"),
     "no photographs": (lambda scene: change(scene, None, frames=[]), "holds no photographs"),
     "no focal length": (lambda scene: remove(scene, "fl_x"), "has no fl_x"),
+    "an angle of view in degrees": (lambda scene: by_angle(scene, 62.0), "camera_angle_x is 62.0, not an angle"),
     "a focal length of 0": (lambda scene: change(scene, None, fl_x=0), "must be positive"),
     "a negative focal length": (lambda scene: change(scene, None, fl_y=-300.0), "must be positive"),
     "a focal length of nan": (lambda scene: change(scene, None, fl_x=float("nan")), "'nan' as its fl_x"),
