@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -13,7 +14,7 @@ from rich.table import Table
 
 from shellgs_method.bounds import Length, bounded
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 
 if TYPE_CHECKING:
     from shellgs_method.files.photographs import View
@@ -69,7 +70,7 @@ def align(
             or OpenDroneMap. Instead of --matrix.
         crs: Coordinate reference system of the shell, such as EPSG:25832. Picks and positions whose first line names
             another one, such as EPSG:4326 for degrees, are converted. If not set: as the shell's file says, or a .prj
-            beside it.
+            beside it, else that in which the same files were aligned before.
         mesher: How a point cloud is meshed, here and wherever the alignment is used: planes (ball pivoting between
             them), bpa (ball pivoting alone) or poisson (for round shapes). If not set: that of the existing alignment,
             else planes.
@@ -160,13 +161,28 @@ class _Start:
         from shellgs_method.files.crs import crs_of, given_crs
         from shellgs_method.registration.frames import ShellPlace
 
-        crs = given_crs(self.crs) if self.crs else crs_of(*self.shell)
+        crs = given_crs(self.crs) if self.crs else crs_of(*self.shell) or self._crs_before(scene)
         place = ShellPlace(*self.shell) if self.shell and (self.picks or self.positions) else None
         placement = self._placed(scene, views, points, place, crs)
         alignment = placement.alignment.meshed_by(self.mesher, self.spacing)
         alignment = replace(alignment, crs=crs or alignment.crs)
         mesh = alignment.load_shell(scene, views, place.surfaces if place else ())
         return replace(placement, alignment=alignment), mesh
+
+    def _crs_before(self, scene: Path) -> str:
+        """The system that the same files were aligned or proposed in before; empty if in none."""
+        from shellgs_method.files.cue_maps import relative_path
+        from shellgs_method.registration.align import PROPOSAL
+        from shellgs_method.shell import ALIGNMENT, Alignment
+
+        names = tuple(relative_path(path, scene) for path in self.shell)
+        for path in (scene / ALIGNMENT, scene / PROPOSAL):
+            with suppress(FileNotFoundError, SceneError):  # a damaged one is replaced
+                before = Alignment.load(path)
+                if names == before.shells and before.crs:
+                    notice(f"The shell is in {before.crs[:60]}, as it was aligned before; --crs names another one.")
+                    return before.crs
+        return ""
 
     def _placed(
         self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str

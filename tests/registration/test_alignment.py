@@ -1387,14 +1387,22 @@ def test_a_shell_in_the_frame_of_the_cameras_needs_no_matrix_and_its_system_is_k
     mesh = load_shell(*alignment.files(scene))
     placed = trimesh.Trimesh(alignment.apply(mesh.vertices), mesh.faces, process=False)
     placed.export(tmp_path / "placed.ply")
-    told = shellgs("align", scene, tmp_path / "placed.ply", "--same-frame", "--crs", "EPSG:25832",
-                   "--metres-per-shell-unit", alignment.metres_per_unit)  # fmt: skip
+    words = (
+        "align",
+        scene,
+        tmp_path / "placed.ply",
+        "--same-frame",
+        "--metres-per-shell-unit",
+        alignment.metres_per_unit,
+    )
+    told = shellgs(*words, "--crs", "EPSG:25832")
     assert "Verdict: doubtful" in told  # its coordinates are in single precision
     found = Alignment.load(scene / ALIGNMENT)
     np.testing.assert_array_equal(found.shell_to_scene, np.eye(4))
     assert found.crs == "EPSG:25832"
-    shellgs("align", scene)  # validated again
-    assert Alignment.load(scene / ALIGNMENT).crs == "EPSG:25832"
+    for again in (("align", scene), words):  # validated, and aligned
+        shellgs(*again)
+        assert Alignment.load(scene / ALIGNMENT).crs == "EPSG:25832"
     elsewhere = trimesh.Trimesh(placed.vertices + 1e5, placed.faces, process=False)
     elsewhere.export(tmp_path / "elsewhere.ply")
     assert "a shift" in shellgs("align", scene, tmp_path / "elsewhere.ply", "--same-frame")
