@@ -107,7 +107,7 @@ def align(
     model = ADJUSTED.as_posix() if is_adjusted else ""
     placement = replace(placement, alignment=replace(placement.alignment, model=model))
     target = scene / (PROPOSAL if placement.proposed else ALIGNMENT)
-    placement, validation = _written(target, layout, placement, mesh, picks, bundle_adjust)
+    placement, validation = _written(target, layout, views, points, placement, mesh, picks, bundle_adjust)
     _show_alignment(scene, target, placement, validation)
     if validation.verdict == "refused":
         kept = f"{target} is unchanged" if target.exists() else "nothing is written"
@@ -171,11 +171,10 @@ class _Start:
 
     def _crs_before(self, scene: Path) -> str:
         """The system that the same files were aligned or proposed in before; empty if in none."""
-        from shellgs_method.files.cue_maps import relative_path
         from shellgs_method.registration.align import PROPOSAL
         from shellgs_method.shell import ALIGNMENT, Alignment
 
-        names = tuple(relative_path(path, scene) for path in self.shell)
+        names = self._names(scene)
         for path in (scene / ALIGNMENT, scene / PROPOSAL):
             with suppress(FileNotFoundError, SceneError):  # a damaged one is replaced
                 before = Alignment.load(path)
@@ -184,11 +183,16 @@ class _Start:
                     return before.crs
         return ""
 
+    def _names(self, scene: Path) -> tuple[str, ...]:
+        """The shell's files as alignments name them."""
+        from shellgs_method.files.cue_maps import relative_path
+
+        return tuple(relative_path(path, scene) for path in self.shell)
+
     def _placed(
         self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str
     ) -> Placement:
         from shellgs_method.files.crs import metres_of
-        from shellgs_method.files.cue_maps import relative_path
         from shellgs_method.registration import align as by
         from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
@@ -196,8 +200,7 @@ class _Start:
             return by.place_as_proposed(scene / by.PROPOSAL, scene, views)
         if not self.shell:
             return by.place_as_before(scene / ALIGNMENT, scene, views)
-        names = tuple(relative_path(path, scene) for path in self.shell)
-        unit = metres_of(crs, self.metres_per_shell_unit, self.shell)
+        names, unit = self._names(scene), metres_of(crs, self.metres_per_shell_unit, self.shell)
         if self.matrix:
             return by.Placement(Alignment.from_matrix_file(self.matrix, names, unit, self.global_shift))
         if self.same_frame:
@@ -221,7 +224,14 @@ def _check_refinement(is_adjusted: bool, misplacement: str | None) -> None:
 
 
 def _written(
-    target: Path, layout: SceneLayout, placement: Placement, mesh: ShellMesh, picks: Path | None, bundle_adjust: bool
+    target: Path,
+    layout: SceneLayout,
+    views: Sequence[View],
+    points: SparsePoints,
+    placement: Placement,
+    mesh: ShellMesh,
+    picks: Path | None,
+    bundle_adjust: bool,
 ) -> tuple[Placement, Validation]:
     """Validate a placement, with cameras adjusted to it if they shall be, and write both unless it is refused."""
     from dataparsers.facade import read_views
@@ -235,7 +245,7 @@ def _written(
     from shellgs_method.registration.validation import validate
     from shellgs_method.shell.cast import renew_error
 
-    scene, views, points = layout.data, read_views(layout), read_sparse_points(layout)
+    scene = layout.data
     validation = validate(mesh, placement.alignment, views, points, placement.correspondences)
     validation = validation.with_checks(placement.checks)
     candidate = unfinished(scene / ADJUSTED)

@@ -197,13 +197,8 @@ def write_model(folder: Path, model: Model, errors: Float64[np.ndarray, " N"]) -
         file.write(struct.pack("<Q", len(model.images)))
         for number, image in model.images.items():
             file.write(struct.pack("<i7di", number, *image.quaternion, *image.translation, image.camera))
-            features = image.features
-            file.write(
-                image.name.encode(errors="surrogateescape")
-                + b"\0"
-                + struct.pack("<Q", len(features))
-                + features.tobytes()
-            )
+            name, features = image.name.encode(errors="surrogateescape"), image.features
+            file.write(name + b"\0" + struct.pack("<Q", len(features)) + features.tobytes())
     points = model.points
     with (folder / "points3D.bin").open("wb") as file:
         file.write(struct.pack("<Q", len(points.ids)))

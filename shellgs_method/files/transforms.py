@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
-from PIL import Image
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import read_json
 from shellgs_method.files.frames import Frame, Recording, frame, in_order
 from shellgs_method.files.headers import read_ply_header
 from shellgs_method.files.paths import NamedFiles
+from shellgs_method.files.photographs import opened
 from shellgs_method.geometry.lens import COEFFICIENTS
 
 NAME = "transforms.json"
@@ -134,11 +134,8 @@ def _by_angles(angles: Mapping[str, Any], photograph: Path, where: str) -> dict[
     for name, angle in angles.items():
         if isinstance(angle, bool) or not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
             raise SceneError(f"{where}: its {name} is {str(angle)[:40]}, not an angle between 0 and pi")
-    try:
-        with Image.open(photograph) as image:
-            width, height = image.size
-    except OSError as error:
-        raise SceneError(f"{where}: {photograph} cannot be read, whose size its camera needs") from error
+    with opened(photograph, whole=False) as image:
+        width, height = image.size
     focal = width / 2 / math.tan(angles["camera_angle_x"] / 2)
     vertical = height / 2 / math.tan(angles["camera_angle_y"] / 2) if "camera_angle_y" in angles else focal
     return {"fl_x": focal, "fl_y": vertical, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
