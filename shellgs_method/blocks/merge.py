@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
-from torch import Tensor
 
 from dataparsers.cameras import scene_to_world
 from dataparsers.facade import FacadeDataParserConfig
@@ -20,6 +19,7 @@ from shellgs_method.compare.settings import config_settings
 from shellgs_method.errors import SceneError, check_output_folder
 from shellgs_method.files.atomic import atomic_contents
 from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.gaussians.surroundings import Region
 from shellgs_method.machine.progress import tell, track
 from shellgs_method.runs.checkpoints import (
@@ -98,7 +98,7 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
     Raises:
         FileNotFoundError: there is no such run.
         SceneError: a block has no run or two, or an unfinished one, or one that was cut otherwise, started from another
-            coarse run, or has other settings.
+            coarse run, has other settings, or was trained with other cameras.
     """
     runs = [BlockRun.open(path) for path in paths]
     if not runs:
@@ -122,7 +122,12 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
     for cell in track(blocks.cells, "Merging block", len(blocks.cells)):
         run = by_name[cell.block.name]
         state = load_checkpoint(run.checkpoint)["pipeline"]
-        trained_as = state.pop("_extra_state", {}).get("block", {})
+        extra = state.pop("_extra_state", {})
+        trained_as = extra.get("block", {})
+        if changed := BoundCameras.from_json(extra.get("cameras", {})).changed(parsed.metadata["views"]):
+            raise SceneError(
+                f"the cameras of {scene} have changed since {run.folder} was trained: {changed}; train again"
+            )
         if trained_as.get("region") != cell.fingerprint:
             raise SceneError(f"{run.name} was cut anew since its run {run.folder} was trained: train it again")
         if trained_as.get("coarse") != coarse.hash:
@@ -139,6 +144,7 @@ def merge(paths: Sequence[Path], output: Path) -> Path:
     for name in parts[0]:
         key = SURFACE if name == "surface" else f"{GAUSSIANS}{name}"
         state[key] = torch.cat([part[name] for part in parts])
+    state["_extra_state"] = {"cameras": BoundCameras.of(parsed.metadata["views"]).to_json()}
     _write(first, state, output)
     return output / "config.yml"
 
@@ -175,7 +181,7 @@ def _check_settings(first: BlockRun, run: BlockRun) -> None:
         )
 
 
-def _write(first: BlockRun, state: Mapping[str, Tensor], output: Path) -> None:
+def _write(first: BlockRun, state: Mapping[str, Any], output: Path) -> None:
     config = copy.deepcopy(first.config)
     data: Any = config.pipeline.datamanager
     model: Any = config.pipeline.model

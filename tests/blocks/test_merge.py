@@ -114,6 +114,8 @@ def test_other_commands_take_a_merged_run(configs, tmp_path, shellgs, in_process
     in_process("ns-eval", "--load-config", config, "--output-path", tmp_path / "eval.json")
     assert np.isfinite(json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"])
     assert "Gaussians" in shellgs("splats", config)
+    extra = load_checkpoint(find_checkpoint(config.parent / "nerfstudio_models"))["pipeline"]["_extra_state"]
+    assert len(extra["cameras"]) > 1
     assert (tmp_path / "merged" / "splats.ply").is_file()
 
 
@@ -191,6 +193,7 @@ def test_gaussians_of_two_blocks_in_one_place_are_doubles_and_those_of_one_block
         ("unfinished", "6 of its 99 iterations"),
         ("cut anew", "was cut anew"),
         ("another coarse run", "another coarse run"),
+        ("moved cameras", "cameras of .* have changed since .*: that of .*stood"),
         ("other settings", "has other settings than .*sh_degree"),
         ("into a run", "folder of a run that was trained: name another one"),
         ("into the scene", "folder of a scene: name another one"),
@@ -217,8 +220,12 @@ def test_what_cannot_be_merged_is_refused_in_a_sentence(configs, coarse, street,
         else:
             (path,) = (folder / "nerfstudio_models").glob("*.ckpt")
             state = torch.load(path, weights_only=True)
-            record = state["pipeline"]["_extra_state"]["block"]
-            record["region" if broken == "cut anew" else "coarse"] = "another"
+            extra = state["pipeline"]["_extra_state"]
+            if broken == "moved cameras":
+                for camera in extra["cameras"].values():
+                    camera[9] += 0.1
+            else:
+                extra["block"]["region" if broken == "cut anew" else "coarse"] = "another"
             torch.save(state, path)
     with pytest.raises(SceneError, match=said):
         merge(given, output)
