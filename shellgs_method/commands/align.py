@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
@@ -14,7 +13,7 @@ from rich.table import Table
 
 from shellgs_method.bounds import Length, bounded
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
-from shellgs_method.errors import SceneError, notice
+from shellgs_method.errors import SceneError
 
 if TYPE_CHECKING:
     from shellgs_method.files.photographs import View
@@ -158,36 +157,16 @@ class _Start:
             FileNotFoundError: a file is missing.
             SceneError: the shell or a file cannot be used, or it fits nowhere.
         """
-        from shellgs_method.files.crs import crs_of, given_crs
+        from shellgs_method.registration.align import system_of
         from shellgs_method.registration.frames import ShellPlace
 
-        crs = given_crs(self.crs) if self.crs else crs_of(*self.shell) or self._crs_before(scene)
+        crs = system_of(self.shell, self.crs, scene)
         place = ShellPlace(*self.shell) if self.shell and (self.picks or self.positions) else None
         placement = self._placed(scene, views, points, place, crs)
         alignment = placement.alignment.meshed_by(self.mesher, self.spacing)
         alignment = replace(alignment, crs=crs or alignment.crs)
         mesh = alignment.load_shell(scene, views, place.surfaces if place else ())
         return replace(placement, alignment=alignment), mesh
-
-    def _crs_before(self, scene: Path) -> str:
-        """The system that the same files were aligned or proposed in before; empty if in none."""
-        from shellgs_method.registration.align import PROPOSAL
-        from shellgs_method.shell import ALIGNMENT, Alignment
-
-        names = self._names(scene)
-        for path in (scene / ALIGNMENT, scene / PROPOSAL):
-            with suppress(FileNotFoundError, SceneError):  # a damaged one is replaced
-                before = Alignment.load(path)
-                if names == before.shells and before.crs:
-                    notice(f"The shell is in {before.crs[:60]}, as it was aligned before; --crs names another one.")
-                    return before.crs
-        return ""
-
-    def _names(self, scene: Path) -> tuple[str, ...]:
-        """The shell's files as alignments name them."""
-        from shellgs_method.files.cue_maps import relative_path
-
-        return tuple(relative_path(path, scene) for path in self.shell)
 
     def _placed(
         self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str
@@ -200,7 +179,7 @@ class _Start:
             return by.place_as_proposed(scene / by.PROPOSAL, scene, views)
         if not self.shell:
             return by.place_as_before(scene / ALIGNMENT, scene, views)
-        names, unit = self._names(scene), metres_of(crs, self.metres_per_shell_unit, self.shell)
+        names, unit = by.names_in(scene, self.shell), metres_of(crs, self.metres_per_shell_unit, self.shell)
         if self.matrix:
             return by.Placement(Alignment.from_matrix_file(self.matrix, names, unit, self.global_shift))
         if self.same_frame:

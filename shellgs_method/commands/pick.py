@@ -50,10 +50,11 @@ def pick(
 
     from dataparsers.facade import read_views
     from shellgs_method.errors import check_output
-    from shellgs_method.files.crs import crs_of, given_crs, metres_of
+    from shellgs_method.files.crs import metres_of
     from shellgs_method.picking.scan import Scan
     from shellgs_method.picking.server import PickServer
     from shellgs_method.picking.session import Session
+    from shellgs_method.registration.align import system_of
     from shellgs_method.registration.frames import ShellPlace
 
     if not shell:
@@ -66,7 +67,7 @@ def pick(
     with PickServer(port) as server:
         tell(f"Reading {', '.join(path.name for path in shell)}")
         place = ShellPlace(*shell)
-        system = given_crs(crs) if crs else crs_of(*shell)
+        system = system_of(shell, crs, scene)
         session = Session(picks, views, metres_of(system, metres_per_shell_unit, shell), system)
         if session.state.picks:
             place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")

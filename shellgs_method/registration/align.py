@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.colmap import read_model, read_points
+from shellgs_method.files.crs import crs_of, given_crs
+from shellgs_method.files.cue_maps import relative_path
 from shellgs_method.files.photographs import View
-from shellgs_method.files.scene import ADJUSTED, SceneLayout
+from shellgs_method.files.scene import ADJUSTED, ALIGNMENT, SceneLayout
 from shellgs_method.files.surfaces import usual_up
 from shellgs_method.geometry.axes import facade_axes, likely_up, name_of
 from shellgs_method.geometry.camera import positions
@@ -48,6 +51,30 @@ REPORT = Path("shell/report")
 _RTK = 0.02  # metres: smallest scatter of surveyed positions along an axis
 _ELSEWHERE = 0.15  # metres by which a shell that is moved as a whole is misaligned
 _MAX_PLAY = 0.1  # degrees, beyond which the report names it: 2 cm on a wall 10 m away
+
+
+def names_in(scene: Path, shell: Sequence[Path]) -> tuple[str, ...]:
+    """The shell's files as alignments name them."""
+    return tuple(relative_path(path, scene) for path in shell)
+
+
+def system_of(shell: Sequence[Path], given: str | None, scene: Path) -> str:
+    """The shell's coordinate reference system: that given, or its files', or that in which they were aligned before.
+
+    Empty if none is known.
+
+    Raises:
+        SceneError: the one given is unknown, or the files name several.
+    """
+    if found := given_crs(given) if given else crs_of(*shell):
+        return found
+    for path in (scene / ALIGNMENT, scene / PROPOSAL):
+        with suppress(FileNotFoundError, SceneError):  # a damaged one is replaced
+            before = Alignment.load(path)
+            if names_in(scene, shell) == before.shells and before.crs:
+                notice(f"The shell is in {before.crs[:60]}, as it was aligned before; --crs names another one.")
+                return before.crs
+    return ""
 
 
 @dataclass(frozen=True)
