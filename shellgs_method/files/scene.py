@@ -152,6 +152,11 @@ class SceneLayout(ScenePaths):
             return None
         folder = colmap.find_folder(self.data, self.colmap_path)
         if folder is None:
+            if parts := sorted(self.data.glob("transforms_*.json")):
+                raise FileNotFoundError(
+                    f"{self.data} has its cameras in {', '.join(part.name for part in parts)}: put the frames of all "
+                    f"into one {transforms.NAME}; its lists train_filenames and test_filenames keep the splits"
+                )
             looked_in = [self.colmap_path] if self.colmap_path else ["the folder itself", *colmap.PLACES]
             raise FileNotFoundError(
                 f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "
