@@ -11,12 +11,12 @@ from shellgs_method.datamanager import FacadeDataManagerConfig
 from shellgs_method.losses.objective import ExtraLossConfig
 from shellgs_method.model import FacadeModelConfig
 from shellgs_method.pipeline import FacadePipelineConfig
-from shellgs_method.trainer import FacadeTrainerConfig, FusedAdamConfig, RunLengthDecayConfig
+from shellgs_method.trainer import FacadeTrainerConfig, FusedAdamConfig, PerViewAdamConfig, RunLengthDecayConfig
 
 
-def _adam(lr: float, lr_final: float | None = None) -> dict:
+def _adam(lr: float, lr_final: float | None = None, of: type[FusedAdamConfig] = FusedAdamConfig) -> dict:
     decay = None if lr_final is None else RunLengthDecayConfig(lr_final=lr_final)
-    return {"optimizer": FusedAdamConfig(lr=lr, eps=1e-15), "scheduler": decay}
+    return {"optimizer": of(lr=lr, eps=1e-15), "scheduler": decay}
 
 
 def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpecification:
@@ -40,7 +40,7 @@ def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpec
             "opacities": _adam(0.05),
             "scales": _adam(0.005),
             "quats": _adam(0.001),
-            "exposures": _adam(0.005, lr_final=0.0005),
+            "exposures": _adam(0.025, lr_final=0.0025, of=PerViewAdamConfig),
         },
         viewer=ViewerConfig(quit_on_train_completion=True, websocket_host="127.0.0.1"),
         vis="viewer",

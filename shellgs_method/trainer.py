@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Iterable
@@ -19,7 +20,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 from tyro.conf import Suppress
 
@@ -59,6 +60,22 @@ class FusedAdamConfig(AdamOptimizerConfig):
     """Adam whose step is one loop over the parameters, on the CPU too."""
 
     fused: Suppress[bool] = True
+
+
+@dataclass
+class PerViewAdamConfig(FusedAdamConfig):
+    """Adam for a parameter of which each row is that of a view, and has a gradient in that view's steps only.
+
+    A row's second moment decays between its steps, so that Adam moves it by about √V learning rates in each, with V
+    rows, of which there are less than 1000. Here ``lr`` is how far a step moves it, however many rows there are.
+    """
+
+    def setup(self, params: list[nn.Parameter]) -> torch.optim.Optimizer:
+        """The optimizer of the parameter."""
+        optimizer = super().setup(params)
+        for group in optimizer.param_groups:
+            group["lr"] = self.lr / math.sqrt(len(params[0]))
+        return optimizer
 
 
 @dataclass

@@ -17,7 +17,7 @@ from shellgs_method.compare.measure import measure
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.gaussians.exposures import Exposures
 from shellgs_method.occlusion.exposure import exposed
-from shellgs_method.trainer import FacadeTrainer
+from shellgs_method.trainer import FacadeTrainer, PerViewAdamConfig
 
 STOPS = np.log(2)
 GAINS = 0.6 * STOPS * np.sin(np.arange(10))[:, None] * [1.0, 0.9, 1.1]
@@ -90,6 +90,20 @@ def test_their_mean_is_zero_whatever_the_optimizer_does():
         (exposures.log_gains[view] ** 2).sum().backward()
         optimizer.step()
     torch.testing.assert_close(exposures.log_gains.double().mean(dim=0), torch.zeros(3).double(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("num_views", [8, 150])
+def test_a_step_moves_a_photographs_gain_by_its_learning_rate_however_many_there_are(num_views):
+    exposures = Exposures(num_views)
+    optimizer = PerViewAdamConfig(lr=0.02, eps=1e-15).setup([exposures.parameter])
+    for _ in range(5):
+        before = exposures.parameter.detach().clone()
+        for view in range(num_views):
+            optimizer.zero_grad()
+            (exposures.parameter[view] * torch.tensor([1.0, 0.1, 3.0])).sum().backward()
+            optimizer.step()
+    moved = (before - exposures.parameter.detach()).mean(dim=0)
+    torch.testing.assert_close(moved, torch.full((3,), 0.02), rtol=0.1, atol=0)
 
 
 def test_a_photograph_is_compared_with_the_render_at_its_exposure(trained):
