@@ -40,7 +40,7 @@ def _method(name: str, description: str, model: FacadeModelConfig) -> MethodSpec
             "opacities": _adam(0.05),
             "scales": _adam(0.005),
             "quats": _adam(0.001),
-            "exposures": _adam(0.025, lr_final=0.0025, of=PerViewAdamConfig),
+            "exposures": _adam(0.01, lr_final=0.001, of=PerViewAdamConfig),
         },
         viewer=ViewerConfig(quit_on_train_completion=True, websocket_host="127.0.0.1"),
         vis="viewer",
