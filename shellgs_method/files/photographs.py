@@ -24,6 +24,9 @@ from shellgs_method.files.undistortion import distort_pixels, undistort, undisto
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
 
+BLACK = 16
+"""Brightest of 256 levels in a photograph that shows nothing: that of 12 bits stored as 16."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -143,6 +146,11 @@ def read_image(path: Path) -> Image.Image:
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
         image = in_srgb(image)
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+    if max(brightest for _, brightest in image.getextrema()[:3]) <= BLACK:
+        notice(
+            f"{path.parent} holds photographs that are black, or nearly so: where a sensor's 12 bits or less are "
+            "stored as 16, scale them to the whole range."
+        )
     image.info["exif"] = exif.tobytes()
     return image
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image, ImageCms
@@ -53,3 +54,12 @@ def test_a_captured_photograph_is_in_srgb(tmp_path):
     with Image.open(tmp_path / "scene" / "a.jpg") as image:
         assert "icc_profile" not in image.info
         np.testing.assert_allclose(np.asarray(image)[8, 8].astype(int), (51, 204, 102), atol=5)
+
+
+@pytest.mark.parametrize("shape", [(24, 32), (24, 32, 3)])
+@pytest.mark.parametrize(("bits", "told"), [(10, True), (12, True), (16, False)])
+def test_a_sensors_bits_that_fill_a_part_of_16_are_told_of(tmp_path, caplog, shape, bits, told):
+    values = np.random.default_rng(0).integers(0, 2**bits, shape, dtype=np.uint16)
+    cv2.imwrite(str(tmp_path / "a.png"), values)
+    read_image(tmp_path / "a.png")
+    assert (f"{tmp_path} holds photographs that are black, or nearly so" in caplog.text) == told
