@@ -212,7 +212,9 @@ def _of_block(
     if config.block is None:
         return of_split, None
     path = config.data / BLOCKS
-    cell = Blocks.read(path).cell(config.block)
+    blocks = Blocks.read(path)
+    blocks.check_cameras(recording.frames, path)
+    cell = blocks.cell(config.block)
     return _of_cell(cell, recording, of_split, split, path), cell
 
 
@@ -230,10 +232,18 @@ def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
     """The blocks of a scene, each of which has photographs to train on and some that are held out.
 
     Raises:
-        SceneError: one has not, or names what is no photograph of the scene.
+        SceneError: one has not, or names what is no photograph of the scene; or photographs were added since, or
+            cameras have changed.
     """
     path, recording = config.data / BLOCKS, config.read()
-    cells = Blocks.read(path).cells
+    blocks = Blocks.read(path)
+    blocks.check_cameras(recording.frames, path)
+    known, cells = blocks.cameras.cameras, blocks.cells
+    if known and (added := [frame.name for frame in recording.frames if frame.name not in known]):
+        raise SceneError(
+            f"{path} knows nothing of {len(added)} of the scene's {len(recording.frames)} photographs, such as "
+            f"{added[0]}: run `shellgs blocks {config.data}` again"
+        )
     for split in ("train", "test"):
         of_split = _of_split(recording, split, config)
         for cell in cells:

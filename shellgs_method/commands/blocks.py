@@ -43,15 +43,20 @@ def blocks(
         again: Cut anew.
         paths: Paths of the scene's files.
     """
+    from dataclasses import replace
+
     from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
     from shellgs_method.blocks.cut import assigned, cut
     from shellgs_method.blocks.plan import draw
     from shellgs_method.files.blocks import BLOCKS, Blocks
+    from shellgs_method.files.bound_cameras import BoundCameras
     from shellgs_method.geometry.camera import positions
 
     layout, file = FacadeDataParserConfig(**vars(paths), data=scene), scene / BLOCKS
     before = Blocks.read(file, moved=True) if file.exists() and not again else None
-    views, held_out = read_views(layout), held_out_names(layout)
+    views, held_out, frames = read_views(layout), held_out_names(layout), layout.read().frames
+    if before is not None:
+        before.check_cameras(frames, file)
     seen = _seen(layout, views)
     if before is None or len(before.cells) == 1:
         found = cut(seen, length, overlap, photographs, held_out)
@@ -69,7 +74,7 @@ def blocks(
                     "cut anew with --again"
                 )
         console.print(f"The cuts and the overlap of {file} are kept; --again cuts anew.", highlight=False)
-    found.write(file)
+    replace(found, cameras=BoundCameras.of(frames)).write(file)
     draw(file.with_suffix(".png"), found, seen, positions(view.camera for view in views))
     for cell in found.cells:
         console.print(f"{cell.block.name}: {len(cell.block.photographs)} of {len(views)} photographs", highlight=False)

@@ -6,17 +6,19 @@ In ``blocks.json`` the tree is as it is cut, in the scene's own frame and units,
      "tree": {"cut": {"normal": [1, 0, 0], "offset": 30.2},
               "below": {"name": "block-1", "photographs": ["images/frame_00001.png", ...]},
               "above": {"name": "block-2", "photographs": [...]}},
-     "photographs_of": "0f3a..."}
+     "photographs_of": "0f3a...",
+     "cameras": {"images/frame_00001.png": [1920, 1080, ...], ...}}
 
-The last is a hash of the cuts and the overlap that the photographs were found with.
+The last two are what the photographs were found with: a hash of the cuts and the overlap, and the cameras of the whole
+scene, without which the cuts lie anywhere.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,10 +28,13 @@ from jaxtyping import Bool, Float, Float64
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, fingerprint, read_json
+from shellgs_method.files.bound_cameras import BoundCameras
+from shellgs_method.files.frames import Frame
 from shellgs_method.geometry.similarity import scale_of
 
 BLOCKS = "blocks.json"
 _NAME = re.compile(r"\w[\w.+-]*")
+_NUMBERS = re.compile(r"\[\n[^][{\"]*\]")
 LARGEST = 1e12
 """Largest number in the file: what is beyond cannot be a place in a scene."""
 
@@ -119,6 +124,8 @@ class Blocks:
     tree: Fork | Block
     overlap: float
     """How far extended regions reach beyond cores, in scene units."""
+    cameras: BoundCameras = field(default_factory=BoundCameras, compare=False)
+    """Those of the scene when its photographs were found; an earlier version did not write them."""
 
     def __post_init__(self) -> None:
         """Refuse extended regions that are smaller than their cores."""
@@ -147,12 +154,30 @@ class Blocks:
                 return cell
         raise SceneError(f"there is no block {name!r}: use {', '.join(cell.block.name for cell in self.cells)}")
 
+    def check_cameras(self, frames: Sequence[Frame], path: Path) -> None:
+        """Refuse the photographs of a scene whose cameras are not those that it was cut with.
+
+        Raises:
+            SceneError: they have changed; ``path`` is the file.
+        """
+        if changed := self.cameras.changed(frames):
+            raise SceneError(
+                f"{path}: the cameras of the scene have changed since it was cut: {changed}; cut it anew with "
+                f"`shellgs blocks {path.parent} --again`"
+            )
+
     def write(self, path: Path) -> None:
         """Write the file, whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
+        contents = {
+            "overlap": self.overlap,
+            "tree": _written(self.tree),
+            "photographs_of": self.cuts,
+            "cameras": self.cameras.to_json(),
+        }
+        text = _NUMBERS.sub(lambda numbers: " ".join(numbers[0].split()), json.dumps(contents, indent=1))
         with atomic_write(path) as file:
-            contents = {"overlap": self.overlap, "tree": _written(self.tree), "photographs_of": self.cuts}
-            file.write((json.dumps(contents, indent=1) + "\n").encode())
+            file.write((text + "\n").encode())
 
     @classmethod
     def read(cls, path: Path, moved: bool = False) -> Blocks:
@@ -170,9 +195,10 @@ class Blocks:
         contents = read_json(path)
         try:
             tree = _node(_item(contents, "tree", "it"), "tree")
-            blocks = cls(tree, _number(_item(contents, "overlap", "it"), "overlap"))
-        except (ValueError, RecursionError) as error:
-            why = error if isinstance(error, ValueError) else "its tree is too deep"
+            cameras = BoundCameras.from_json(contents.get("cameras", {}))
+            blocks = cls(tree, _number(_item(contents, "overlap", "it"), "overlap"), cameras)
+        except (TypeError, ValueError, RecursionError) as error:
+            why = "its tree is too deep" if isinstance(error, RecursionError) else error
             raise SceneError(f"{path} is damaged: {why}; mend it, or remove it and cut anew") from error
         names = [cell.block.name for cell in blocks.cells]
         if twice := {name for name in names if names.count(name) > 1}:

@@ -15,7 +15,7 @@ from pathlib import PurePosixPath
 import numpy as np
 import torch
 
-from shellgs_method.files.frames import MAX_PIXELS
+from shellgs_method.files.frames import MAX_PIXELS, Frame
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera, angle_between, positions
 
@@ -33,7 +33,7 @@ class BoundCameras:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, views: Sequence[View]) -> BoundCameras:
+    def of(cls, views: Sequence[View | Frame]) -> BoundCameras:
         """The cameras of photographs."""
         return cls({view.name: view.camera for view in views})
 
@@ -53,7 +53,7 @@ class BoundCameras:
         """Width, height, fx, fy, cx, cy and the rows of the motion from the world to the camera, of each."""
         return {name: _numbers(camera) for name, camera in self.cameras.items()}
 
-    def changed(self, views: Sequence[View]) -> str | None:
+    def changed(self, views: Sequence[View | Frame]) -> str | None:
         """How the cameras of photographs differ from these, in words; None if they agree.
 
         Two photographs in common show that the frame is the same; one does not tell its scale.
@@ -63,7 +63,7 @@ class BoundCameras:
             return f"of their {len(self.cameras)} photographs, {len(shared)} are in the scene"
         return next((words for name, view in shared.items() if (words := self.camera_changed(name, view.camera))), None)
 
-    def _shared(self, views: Sequence[View]) -> dict[str, View]:
+    def _shared(self, views: Sequence[View | Frame]) -> dict[str, View | Frame]:
         """Photographs in common by the names recorded; if none is, those of another folder (``images_4``) or format."""
         same = {view.name: view for view in views if view.name in self.cameras}
         if same:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import parse
 from scipy.spatial.transform import Rotation
 
+from dataparsers.facade import FacadeDataParserConfig, trainable_cells
 from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, cut
 from shellgs_method.blocks.walls import areas, end_of_walls
 from shellgs_method.commands.blocks import blocks as command
@@ -245,6 +247,37 @@ def test_the_command_draws_the_plan_and_keeps_a_cut_that_was_moved(scene: Path, 
     assert Blocks.read(scene / BLOCKS) == far
     command(scene, length=6.0, overlap=1.0, again=True)
     assert Blocks.read(scene / BLOCKS) == found
+
+
+def test_cuts_of_other_cameras_are_refused(scene: Path):
+    command(scene, length=6.0, overlap=1.0)
+    layout, cameras = FacadeDataParserConfig(data=scene), scene / "transforms.json"
+    assert len(trainable_cells(layout)) > 1
+    transforms = json.loads(cameras.read_text())
+    for frame in transforms["frames"]:
+        x, y, z, last = frame["transform_matrix"]
+        frame["transform_matrix"] = [y, [-number for number in x], z, last]
+    cameras.write_text(json.dumps(transforms))
+    shutil.rmtree(scene / "cues")  # which are refused too
+    refused = r"blocks\.json: the cameras of the scene have changed .* `shellgs blocks .* --again`"
+    for read in (trainable_cells, lambda _: parse(scene, block="block-1"), lambda _: command(scene)):
+        with pytest.raises(SceneError, match=refused):
+            read(layout)
+
+
+def test_photographs_that_were_added_since_a_scene_was_cut_are_not_left_out_of_all_blocks(scene: Path):
+    layout, cameras = FacadeDataParserConfig(data=scene), scene / "transforms.json"
+    whole = cameras.read_text()
+    transforms = json.loads(whole)
+    added = transforms["frames"].pop(4)["file_path"]
+    cameras.write_text(json.dumps(transforms))
+    command(scene, length=6.0, overlap=1.0)
+    assert len(trainable_cells(layout)) > 1
+    cameras.write_text(whole)
+    with pytest.raises(SceneError, match=rf"nothing of 1 of the scene's 10 photographs, such as {added}: run"):
+        trainable_cells(layout)
+    command(scene)
+    assert any(added in cell.block.photographs for cell in trainable_cells(layout))
 
 
 def test_the_command_says_where_cuts_save_nothing(scene: Path, capsys: pytest.CaptureFixture):

@@ -84,6 +84,8 @@ def test_a_file_of_an_earlier_version_is_read(tmp_path: Path):
         ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1' + "0" * 400 + "}}}", "offset is 1000"),
         ('{"overlap": 1, "tree": {"cut": {"normal": [0, 0, 0], "offset": 1}}}', "tree.cut.normal is 0"),
         ('{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}}}', "tree lacks 'below'"),
+        ('{"overlap": 1, "tree": {"name": "a", "photographs": []}, "cameras": []}', "damaged: its cameras are list"),
+        ('{"overlap": 1, "tree": {"name": "a", "photographs": []}, "cameras": {"1.png": [2]}}', "camera of 1.png is"),
         (
             '{"overlap": 1, "tree": {"cut": {"normal": [1, 0, 0], "offset": 1}, '
             '"below": {"name": "a", "photographs": []}, "above": []}}',
