@@ -187,7 +187,9 @@ def _write(first: BlockRun, state: Mapping[str, Any], output: Path) -> None:
     model: Any = config.pipeline.model
     data.dataparser.block = model.coarse = config.load_dir = config.load_checkpoint = None
     data.data = data.data.resolve()
-    config.experiment_name, config.timestamp = output.resolve().parent.name, output.resolve().name
+    # As deep by its names as it is: its scene is looked for relative to where those say that it was.
+    above = output.resolve().parent.parent
+    config.output_dir, config.experiment_name, config.timestamp = above.parent, above.name, output.resolve().name
     step = config.max_num_iterations - 1
     checkpoint = config.relative_model_dir / f"step-{step:09d}.ckpt"
     with atomic_contents(output) as folder:

@@ -19,6 +19,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint
+from shellgs_method.runs.run_folder import open_run, written_config
 from shellgs_method.trainer import FacadeTrainer
 
 
@@ -107,6 +108,21 @@ def test_a_merge_leaves_nothing_of_one_before_it_and_overwrites_no_trained_run(c
     assert not (folder / "seams.json").exists()
     with pytest.raises(SceneError, match="is the folder of a run that was trained"):
         merge(configs, coarse.base_dir)
+
+
+def test_a_merged_run_in_its_scene_finds_it(configs, street, tmp_path):
+    scene = Path(shutil.copytree(street, tmp_path / "scene"))
+    runs = scene / "street" / "blocks" / "runs" / "scene"
+    given = []
+    for config, name in zip(configs, HALVES, strict=True):
+        moved = Path(shutil.copytree(config.parent, runs / name / "shellgs-metric" / "seed-0")) / "config.yml"
+        run = open_run(config)
+        run.output_dir, run.experiment_name, run.timestamp = runs, name, "seed-0"
+        run.data = run.pipeline.datamanager.data = scene  # pyright: ignore[reportAttributeAccessIssue]
+        moved.write_text(written_config(run))
+        given.append(moved)
+    merged = merge(given, scene / "street" / "merged" / "scene" / "shellgs-metric" / "seed-0")
+    assert open_run(merged).pipeline.datamanager.data == scene  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_other_commands_take_a_merged_run(configs, tmp_path, shellgs, in_process):
