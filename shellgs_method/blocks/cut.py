@@ -15,6 +15,9 @@ from shellgs_method.blocks.walls import REACH, areas, end_of_walls, extent, midd
 from shellgs_method.files.blocks import Block, Blocks, Cut, Fork
 from shellgs_method.files.map_files import CueMap
 from shellgs_method.files.photographs import View
+from shellgs_method.files.sparse_points import SparsePoints
+from shellgs_method.gaussians.skybox import skybox_radius
+from shellgs_method.gaussians.surroundings import FAR
 from shellgs_method.geometry.camera import world_rays
 from shellgs_method.geometry.planes import across
 from shellgs_method.geometry.similarity import scale_of, transformed
@@ -79,6 +82,13 @@ def sights(views: Iterable[View], read: Callable[[View], CueMap | None]) -> Iter
         pixels = rows[chosen], columns[chosen]
         position, rays = world_rays(view.camera)
         yield view.name, position + cue.depth[pixels][:, None] * rays[pixels]
+
+
+def tracked(points: SparsePoints, centre: Float64[np.ndarray, " 3"]) -> dict[str, Float64[np.ndarray, "K 3"]]:
+    """SfM points that each photograph observes, without those too far from the cameras' centre to be of any block."""
+    near = np.linalg.norm(points.positions - centre, axis=1) < FAR * skybox_radius(centre, points.positions)
+    found = {name: points.positions[of[near[of]]].astype(np.float64) for name, of in (points.observed or {}).items()}
+    return {name: each for name, each in found.items() if len(each)}
 
 
 def cut(

@@ -92,12 +92,11 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
     """What the photographs of a scene show of the shell, by its maps, or else of the SfM points."""
     from dataclasses import replace
 
-    import numpy as np
-
-    from shellgs_method.blocks.cut import Sights, sights
+    from shellgs_method.blocks.cut import Sights, sights, tracked
     from shellgs_method.files.cue_maps import CueMaps, find_cues
     from shellgs_method.files.sparse_points import find_sparse_points
     from shellgs_method.geometry.axes import likely_up
+    from shellgs_method.geometry.camera import positions
     from shellgs_method.machine.progress import track
     from shellgs_method.shell import ALIGNMENT, Alignment
 
@@ -115,7 +114,7 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
                 f"{scene} has neither maps of a shell nor tracks of its SfM points, which tell what each photograph "
                 f"shows: align a shell, and run `shellgs cast {scene}` first"
             )
-        shown = {name: points.positions[of].astype(np.float64) for name, of in points.observed.items() if len(of)}
+        shown = tracked(points, positions(view.camera for view in views).mean(axis=0))
     if not shown:
         raise SceneError(f"no photograph of {scene} shows the shell: look at it with `shellgs align`")
     if metres is None:

@@ -15,11 +15,12 @@ from scenes import parse
 from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, trainable_cells
-from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, cut
+from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, cut, tracked
 from shellgs_method.blocks.walls import areas, end_of_walls
 from shellgs_method.commands.blocks import blocks as command
 from shellgs_method.errors import SceneError
 from shellgs_method.files.blocks import BLOCKS, Block, Blocks, Cut, Fork
+from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.synthetic import StreetConfig
@@ -221,6 +222,15 @@ def test_points_are_upright_and_in_metres():
     seen = Sights.of({"a": np.array([[0.0, 2.0, 0.0]])}, np.array([0.0, 1.0, 0.0]), 0.5)
     assert seen.points[0, 2] == pytest.approx(1.0)
     np.testing.assert_allclose(transformed(seen.points, seen.to_scene), [[0, 2, 0]], atol=1e-12)
+
+
+def test_sfm_points_that_no_block_has_do_not_count(street: np.ndarray):
+    far = np.array([[1e6, 1e6, 0.0]])
+    indices = np.arange(len(street))
+    points = SparsePoints(np.concatenate([street, far]), {"a": indices, "b": np.append(indices[:5], len(street))})
+    shown = tracked(points, street.mean(axis=0))
+    np.testing.assert_array_equal(shown["a"], street)
+    np.testing.assert_array_equal(shown["b"], street[:5])
 
 
 def test_the_command_draws_the_plan_and_keeps_a_cut_that_was_moved(scene: Path, capsys: pytest.CaptureFixture):
