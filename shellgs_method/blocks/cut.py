@@ -26,20 +26,23 @@ SHARE = 0.05
 """Share of a photograph's points that lie in a block's extended region from which it belongs to the block."""
 PIXELS = 2000
 """Points of the shell that are taken of each photograph."""
+USUAL = 10.0
+"""Metres from photographs of a street to what they show, in the median."""
 THROUGH = 0.25
 """Share of a usual cut's walls through which no cut goes if both sides of the street can be cut apart."""
 
 
 @dataclass(frozen=True)
 class Sights:
-    """What photographs show of a scene, upright and in metres, or in scene units where metres are unknown.
+    """What photographs show of a scene, upright and in metres, which are assumed where they are unknown.
 
     Attributes:
         points: points that photographs show, z upwards.
         views: the photograph of each.
         names: names of the photographs.
         to_scene: the similarity to the scene's frame.
-        unit: what they are in, for labels.
+        unit: of lengths that a user gives and sees: scene units where metres are unknown.
+        metres: in that unit.
     """
 
     points: Float64[np.ndarray, "N 3"]
@@ -47,6 +50,7 @@ class Sights:
     names: Sequence[str]
     to_scene: Float64[np.ndarray, "4 4"]
     unit: str = "m"
+    metres: float = 1.0
 
     @classmethod
     def of(
@@ -54,16 +58,20 @@ class Sights:
         points: Mapping[str, Float64[np.ndarray, "K 3"]],
         up: Float64[np.ndarray, " 3"],
         metres_per_unit: float | None,
+        assumed: float = 1.0,
     ) -> Sights:
-        """What photographs show, by their names, in the scene's frame and units, with its upward direction."""
+        """What photographs show, by their names, in the scene's frame and units, with its upward direction.
+
+        Where ``metres_per_unit`` are unknown, ``assumed`` ones are.
+        """
         x = across(up)
         turn = np.stack([x, np.cross(up, x), up])  # rows: the axes of the upright frame
         to_scene = np.eye(4)
-        to_scene[:3, :3] = turn.T / (metres_per_unit or 1)
+        to_scene[:3, :3] = turn.T / (metres_per_unit or assumed)
         views = np.repeat(np.arange(len(points)), [len(of) for of in points.values()])
         seen = np.concatenate([*points.values(), np.empty((0, 3))])
-        unit = "m" if metres_per_unit else "scene units"
-        return cls(transformed(seen, np.linalg.inv(to_scene)), views, [*points], to_scene, unit)
+        of_lengths = ("m", 1.0) if metres_per_unit else ("scene units", assumed)
+        return cls(transformed(seen, np.linalg.inv(to_scene)), views, [*points], to_scene, *of_lengths)
 
     @cached_property
     def in_scene(self) -> Float64[np.ndarray, "N 3"]:
@@ -91,6 +99,12 @@ def tracked(points: SparsePoints, centre: Float64[np.ndarray, " 3"]) -> dict[str
     return {name: each for name, each in found.items() if len(each)}
 
 
+def assumed_metres(views: Iterable[View], shown: Mapping[str, Float64[np.ndarray, "K 3"]]) -> float:
+    """Metres in a scene unit, if photographs are taken as far from what they show as those of streets usually are."""
+    distances = [np.linalg.norm(shown[view.name] - view.camera.position.numpy(), axis=1) for view in views]
+    return USUAL / float(np.median(np.concatenate(distances)))
+
+
 def cut(
     seen: Sights, length: float, overlap: float, photographs: int | None = None, held_out: Collection[str] = ()
 ) -> Blocks:
@@ -103,11 +117,12 @@ def cut(
 
     Args:
         seen: what the photographs show.
-        length: length of a block in metres.
-        overlap: how far a block reaches beyond its core, in metres.
+        length: length of a block, in the unit of what is seen.
+        overlap: how far a block reaches beyond its core, likewise.
         photographs: number of photographs of a block, which then decides in place of the length.
         held_out: names of the photographs that are held out, of which each block has one.
     """
+    length, overlap = seen.metres * length, seen.metres * overlap
     area, share = areas(seen.points), 1 / np.bincount(seen.views)[seen.views]
 
     def split(of: Int64[np.ndarray, " M"]) -> Fork | Block:

@@ -25,17 +25,17 @@ def draw(path: Path, blocks: Blocks, seen: Sights, cameras: Float64[np.ndarray, 
     """
     from matplotlib.figure import Figure
 
-    upright = np.linalg.inv(seen.to_scene)
-    points, centres = seen.in_scene, transformed(cameras, upright)
+    upright = np.diag([*[1 / seen.metres] * 3, 1]) @ np.linalg.inv(seen.to_scene)
+    points, shown, centres = seen.in_scene, seen.points / seen.metres, transformed(cameras, upright)
     figure = Figure(figsize=(10, 6), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel=seen.unit, ylabel=seen.unit)
     axes.plot(centres[:, 0], centres[:, 1], ".", color="black", markersize=3, label="cameras")
     for number, cell in enumerate(blocks.cells):
-        x, y, _ = seen.points[cell.core(points)].T
+        x, y, _ = shown[cell.core(points)].T
         axes.plot(x, y, ",", color=f"C{number % 10}")
         axes.plot([], [], "s", color=f"C{number % 10}", label=f"{cell.block.name}: {len(cell.block.photographs)}")
     edges = axes.get_xlim(), axes.get_ylim()
-    foot = seen.points.mean(axis=0)
+    foot = shown.mean(axis=0)
     along = np.linspace(-1, 1, 2001) * np.hypot(np.ptp(edges[0]), np.ptp(edges[1]))
     for number, cell in enumerate(cell.moved(upright) for cell in blocks.cells):
         for cut, above in cell.sides:

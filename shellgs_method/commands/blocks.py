@@ -92,7 +92,7 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
     """What the photographs of a scene show of the shell, by its maps, or else of the SfM points."""
     from dataclasses import replace
 
-    from shellgs_method.blocks.cut import Sights, sights, tracked
+    from shellgs_method.blocks.cut import Sights, assumed_metres, sights, tracked
     from shellgs_method.files.cue_maps import CueMaps, find_cues
     from shellgs_method.files.sparse_points import find_sparse_points
     from shellgs_method.geometry.axes import likely_up
@@ -122,4 +122,4 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
     up = likely_up(view.camera for view in views)
     if metres and (scene / ALIGNMENT).is_file() and (known := Alignment.load(scene / ALIGNMENT)).up is not None:
         up = known.rotation @ known.up  # exactly
-    return Sights.of(shown, up, metres)
+    return Sights.of(shown, up, metres, assumed_metres((view for view in views if view.name in shown), shown))

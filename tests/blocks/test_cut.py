@@ -14,8 +14,8 @@ import pytest
 from scenes import parse
 from scipy.spatial.transform import Rotation
 
-from dataparsers.facade import FacadeDataParserConfig, trainable_cells
-from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, cut, tracked
+from dataparsers.facade import FacadeDataParserConfig, read_views, trainable_cells
+from shellgs_method.blocks.cut import SHARE, WEAK, Sights, assigned, assumed_metres, cut, tracked
 from shellgs_method.blocks.walls import areas, end_of_walls
 from shellgs_method.commands.blocks import blocks as command
 from shellgs_method.errors import SceneError
@@ -212,6 +212,24 @@ def test_blocks_are_numbered_after_those_with_few_photographs_are_joined(street:
     few = {name: points for k, (name, points) in enumerate(walk(street).items()) if k > 20 or k % 10 == 0}
     found = cut(Sights.of(few, UP, 1.0), length=12.0, overlap=0.0)
     assert [cell.block.name for cell in found.cells] == [f"block-{k + 1}" for k in range(len(found.cells))]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_cuts_are_the_same_in_any_unit_where_metres_are_unknown(street: np.ndarray, scale: float):
+    usual = cut(Sights.of(walk(street), UP, 1.0), length=35.0, overlap=5.0)
+    scaled = {name: scale * points for name, points in walk(street).items()}
+    found = cut(Sights.of(scaled, UP, None, assumed=1 / scale), length=35.0 * scale, overlap=5.0 * scale)
+    assert isinstance(usual.tree, Fork)
+    assert isinstance(found.tree, Fork)
+    assert found.tree.cut.offset == pytest.approx(scale * usual.tree.cut.offset)
+    assert found.overlap == pytest.approx(5.0 * scale)
+
+
+def test_metres_are_assumed_by_how_far_photographs_are_from_what_they_show(scene: Path):
+    views = read_views(FacadeDataParserConfig(data=scene))
+    around = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 5.0], [-9.0, 0.0, 0.0]])
+    shown = {view.name: view.camera.position.numpy() + around for view in views}
+    assert assumed_metres(views, shown) == pytest.approx(2.0)
 
 
 def test_points_are_in_scene_units_where_metres_are_unknown():
