@@ -175,7 +175,7 @@ class Blocks:
             "photographs_of": self.cuts,
             "cameras": self.cameras.to_json(),
         }
-        text = _NUMBERS.sub(lambda numbers: " ".join(numbers[0].split()), json.dumps(contents, indent=1))
+        text = _NUMBERS.sub(lambda numbers: json.dumps(json.loads(numbers[0])), json.dumps(contents, indent=1))
         with atomic_write(path) as file:
             file.write((text + "\n").encode())
 
