@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -55,11 +55,19 @@ class CoarseRun:
         check_world(path.parent, parsed, f"coarse run, or train {path.parent} again")
         checkpoint = finished_checkpoint(config, path, f"the coarse run {path.parent}")
         state = load_checkpoint(checkpoint)["pipeline"]
-        exposures, count = state.get("_model.exposures.parameter"), parsed.metadata["split"][0]
+        exposures, (count, used) = state.get("_model.exposures.parameter"), parsed.metadata["split"]
         if exposures is not None and len(exposures) != count:
             raise SceneError(
                 f"the coarse run {path.parent} has exposures of {len(exposures)} photographs, and the scene has "
                 f"{count} to train on: train it again"
+            )
+        trained_on = [PurePath(name).stem for name in state.get("_extra_state", {}).get("cameras", {})]
+        views = zip(used, parsed.metadata["views"], strict=True)
+        other = (view.name for k, view in views if trained_on[k : k + 1] != [PurePath(view.name).stem])
+        if trained_on and (name := next(other, None)):
+            raise SceneError(
+                f"the coarse run {path.parent} was trained on other photographs than the scene has to train on, from "
+                f"{name} on: train it again"
             )
         return cls(gaussians_in(state), exposures, content_hash(checkpoint))
 

@@ -193,6 +193,7 @@ def test_the_bound_on_seeds_is_one_on_those_of_the_block_whatever_else_its_photo
         ("nothing held out", "no photograph that is held out"),
         ("unknown photograph", "which is no photograph of the scene"),
         ("another scene", "is not the scene that the run"),
+        ("others held out", "was trained on other photographs than .* from images/frame_0000[0-9]"),
     ],
 )
 def test_what_no_block_can_start_from_is_refused_in_a_sentence(coarse, street, tmp_path, broken, said):
@@ -222,6 +223,11 @@ def test_what_no_block_can_start_from_is_refused_in_a_sentence(coarse, street, t
         east[:] = [name for name in east if "frame_00009" not in name]
     elif broken == "unknown photograph":
         east.append("images/nobody.png")
+    elif broken == "others held out":
+        transforms = json.loads((scene / "transforms.json").read_text())
+        names = sorted(frame["file_path"] for frame in transforms["frames"])
+        transforms |= {"test_filenames": [names[0], names[5]], "train_filenames": [*names[1:5], *names[6:]]}
+        (scene / "transforms.json").write_text(json.dumps(transforms))
     (scene / BLOCKS).write_text(json.dumps(blocks))
     with pytest.raises((SystemExit, SceneError, FileNotFoundError), match=said):
         block_run(coarse, "east", tmp_path, change=change)
