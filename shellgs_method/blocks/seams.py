@@ -139,8 +139,13 @@ def along_cuts(run: TrainedRun) -> dict[str, dict[str, float]]:
 
 @torch.no_grad()
 def doubles(run: TrainedRun) -> dict[str, float]:
-    """Number of Gaussians near a cut that lie on one of another block (:data:`DOUBLE`), and their share of those."""
-    count, of = _doubles(run.model.means.cpu(), run.model.scales.exp().cpu(), run, _cells(run), NEAR / _metres(run))
+    """Number of Gaussians near a cut that lie on one of another block (:data:`DOUBLE`), and their share of those.
+
+    Near is within the blocks' overlap where metres are unknown.
+    """
+    cells, metres = _cells(run), run.model.metres_per_unit
+    within = NEAR / metres if metres else cells[0].overlap
+    count, of = _doubles(run.model.means.cpu(), run.model.scales.exp().cpu(), run, cells, within)
     return {"count": float(count), "share": count / max(of, 1)}
 
 

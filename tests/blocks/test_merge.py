@@ -13,6 +13,7 @@ import torch
 from training_runs import model_of
 from two_blocks import HALVES, block_run, coarse_run, cut_in_two, save_config
 
+from shellgs_method.blocks import seams
 from shellgs_method.blocks.merge import merge
 from shellgs_method.blocks.seams import CRITERIA, from_cuts, judged, on_another
 from shellgs_method.errors import SceneError
@@ -144,6 +145,14 @@ def test_the_seams_are_reported_beside_the_run(configs, tmp_path, shellgs):
             assert {"psnr", "normal_deg", "chamfer_m", "holes"} <= of[part].keys()
     assert report["doubles"]["count"] >= 0
     assert report["lost"].keys() == {criterion.key for criterion in CRITERIA}
+
+
+def test_near_a_cut_is_within_the_overlap_where_metres_are_unknown(configs, street, tmp_path, monkeypatch):
+    run = TrainedRun.load(merge(configs, tmp_path / "merged"))
+    monkeypatch.setattr(run.model, "metres_per_unit", None)
+    monkeypatch.setattr(seams, "_doubles", lambda *given: (given[-1], 1))
+    within = Blocks.read(street / BLOCKS).overlap * run.model_scale
+    assert seams.doubles(run)["count"] == pytest.approx(within)
 
 
 COARSE = {
