@@ -146,7 +146,7 @@ def read_image(path: Path) -> Image.Image:
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
         image = in_srgb(image)
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-    if max(brightest for _, brightest in image.getextrema()[:3]) <= BLACK:
+    if np.max(image.getextrema()[:3]) <= BLACK:
         notice(
             f"{path.parent} holds photographs that are black, or nearly so: where a sensor's 12 bits or less are "
             "stored as 16, scale them to the whole range."
