@@ -212,9 +212,7 @@ def _of_block(
     if config.block is None:
         return of_split, None
     path = config.data / BLOCKS
-    blocks = Blocks.read(path)
-    blocks.check_cameras(recording.frames, path)
-    cell = blocks.cell(config.block)
+    cell = _blocks(path, recording).cell(config.block)
     return _of_cell(cell, recording, of_split, split, path), cell
 
 
@@ -228,6 +226,13 @@ def _of_cell(cell: Cell, recording: Recording, of_split: list[int], split: str, 
     return chosen
 
 
+def _blocks(path: Path, recording: Recording) -> Blocks:
+    """The blocks of a scene, refused if its cameras are not those that it was cut with."""
+    blocks = Blocks.read(path)
+    blocks.check_cameras(recording.frames, path)
+    return blocks
+
+
 def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
     """The blocks of a scene, each of which has photographs to train on and some that are held out.
 
@@ -236,8 +241,7 @@ def trainable_cells(config: FacadeDataParserConfig) -> Sequence[Cell]:
             cameras have changed.
     """
     path, recording = config.data / BLOCKS, config.read()
-    blocks = Blocks.read(path)
-    blocks.check_cameras(recording.frames, path)
+    blocks = _blocks(path, recording)
     known, cells = blocks.cameras.cameras, blocks.cells
     if known and (added := [frame.name for frame in recording.frames if frame.name not in known]):
         raise SceneError(
