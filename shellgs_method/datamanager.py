@@ -90,7 +90,7 @@ class FacadeDataset(InputDataset):
             if min(width, height) < MIN_SIDE:
                 raise SceneError(
                     f"{view.name} is used at {width}x{height} pixels, and SSIM needs {MIN_SIDE}: raise max_image_size "
-                    "or camera_res_scale_factor, or cast larger maps"
+                    "or camera_res_scale_factor (`shellgs street --coarse-scale`), or cast larger maps"
                 )
 
     @property

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path, PurePosixPath
+from typing import Any
 
-from dataparsers.facade import FacadeDataParserConfig, trainable_cells
+from dataparsers.facade import trainable_cells
 from shellgs_method.compare.runs import Run, Variant, recorded_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_contents, content_hash
@@ -134,16 +135,14 @@ class Street:
         variant = Variant.parse(method)
         if not variant.ours:
             raise SceneError(f"{variant.method} trains no blocks: use a method of ShellGS")
-        if any(_SCALE in flag for flag in variant.flags):
-            raise SceneError(
-                f"{method} sets {_SCALE}: leave it out; `shellgs cast --max-image-size` sets the size of photographs"
-            )
+        _refuse_own(variant)
         variant.config.pipeline.model.check_cues(find_cues(scene))  # pyright: ignore[reportAttributeAccessIssue]
         scene, output = scene.resolve(), output.resolve()
         scale = (f"--pipeline.datamanager.{_SCALE}", f"{coarse_scale:g}")
         of_whole = replace(variant, name=COARSE, flags=(*scale, *variant.flags))
         coarse = Run(scene, of_whole, seed, coarse_iterations, output / COARSE, paths=paths)
-        cells = trainable_cells(FacadeDataParserConfig(**vars(paths), data=scene))
+        data: Any = coarse.trainer.pipeline.datamanager
+        cells = trainable_cells(replace(data.dataparser, data=scene))
         if len(cells) == 1:
             raise SceneError(f"{scene / BLOCKS} has one block: train the scene as it is, with ns-train")
         photographs = sum(len(cell.block.photographs) for cell in cells) / len(cells)
@@ -204,6 +203,19 @@ def _unfinished(street: Street) -> Iterator[list[Run]]:
             run.settle()
         if unfinished := [run for run in runs if not run.finished]:
             yield unfinished
+
+
+def _refuse_own(variant: Variant) -> None:
+    """Refuse a method whose flags set what the street sets for each run."""
+    pipeline: Any = variant.config.pipeline
+    data = pipeline.datamanager
+    own = {
+        _SCALE: data.camera_res_scale_factor != 1,
+        "pipeline.model.coarse": pipeline.model.coarse is not None,
+        "block": data.dataparser.block is not None,
+    }
+    if name := next((name for name, there in own.items() if there), None):
+        raise SceneError(f"{variant.name} sets {name}, which `shellgs street` sets for each run: leave it out")
 
 
 def _link(file: Path, to: Path) -> None:

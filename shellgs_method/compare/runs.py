@@ -221,6 +221,15 @@ class Run:
             words += ["facade-data"]
         return _words(*words, *paths)
 
+    @property
+    def trainer(self) -> TrainerConfig:
+        """The config that ns-train makes of its command.
+
+        Raises:
+            SceneError: ns-train refuses the flags.
+        """
+        return parsed(tuple(self._train()[1:]))
+
     @cached_property
     def settings(self) -> dict:
         """All settings that the run's result depends on.
@@ -228,7 +237,7 @@ class Run:
         Raises:
             SceneError: the flags set what the comparison sets.
         """
-        config = parsed(tuple(self._train()[1:]))
+        config = self.trainer
         expected = {
             "data": self.scene,
             "max_num_iterations": self.iterations,

@@ -167,6 +167,24 @@ def test_a_block_is_sent_without_photographs_of_others_and_the_shell_and_trains_
         assert torch.equal(values, trained[1][name]), name
 
 
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        ("--pipeline.datamanager.camera-res-scale-factor .3", "camera-res-scale-factor"),
+        ("--pipeline.model.coarse other", r"pipeline\.model\.coarse"),
+        ("facade-data --block west", "block"),
+    ],
+)
+def test_what_a_street_sets_is_refused_in_a_method_of_ones_own(cut, tmp_path, flags, name):
+    with pytest.raises(SceneError, match=f"mine sets {name}, which .* leave it out"):
+        planned(cut, tmp_path, f"mine=shellgs-metric {flags}")
+
+
+def test_blocks_have_photographs_to_train_on_and_held_out_ones_by_the_methods_own_interval(cut, tmp_path):
+    with pytest.raises(SceneError, match="has no photograph that is held out"):
+        planned(cut, tmp_path, "mine=shellgs-metric facade-data --eval-interval 1000")
+
+
 def test_a_method_of_nerfstudio_trains_no_blocks(cut, tmp_path):
     with pytest.raises(SceneError, match="splatfacto trains no blocks"):
         planned(cut, tmp_path, "splatfacto")
