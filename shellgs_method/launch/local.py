@@ -9,7 +9,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -111,7 +111,7 @@ def follow(
     waiting, iteration = list(commands), 0
     current = waiting[0]
     with (
-        log.open("a", 1, "utf8") if log else nullcontext() as file,  # line by line: a run can take hours
+        log.open("ab", 0) if log else nullcontext() as file,  # as lines come: a run can take hours
         subprocess.Popen(
             command_in_turn(commands, BIN),
             stdout=subprocess.PIPE,
@@ -127,7 +127,8 @@ def follow(
             for line in process.stdout:
                 output.append(line)
                 if file:
-                    file.write(line)
+                    with suppress(OSError):  # of a full disk the command itself tells
+                        file.write(line.encode())
                 if waiting and line == heading(waiting[0]):
                     announce(current := waiting.pop(0))
                     tell(_first_stage(current))

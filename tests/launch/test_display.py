@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from shellgs_method.launch import display, local
 from shellgs_method.launch.display import Display, Work
-from shellgs_method.launch.local import follow
+from shellgs_method.launch.local import CommandError, follow
 from shellgs_method.machine.progress import ITERATION, Stage
+
+FULL = Path("/dev/full")
 
 
 class Clock:
@@ -32,6 +35,14 @@ def test_repeated_lines_of_nerfstudio_do_not_turn_the_count_back(tmp_path, monke
     stages: list[Stage] = []
     follow([["ns-train"]], tell=stages.append)
     assert [stage.item for stage in stages[1:]] == [92, 102, 112]
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="needs a file that is always full")
+def test_a_full_disk_does_not_end_a_command_which_tells_of_it_itself(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "BIN", tmp_path)
+    (tmp_path / "ns-train").write_text("print('step 1'); raise SystemExit('could not write its checkpoint')")
+    with pytest.raises(CommandError, match="could not write its checkpoint"):
+        follow([["ns-train"]], log=FULL)
 
 
 def test_a_log_tells_each_stage_at_once_and_one_that_counts_every_ten_seconds_and_less_often_in_a_long_run():
