@@ -191,7 +191,8 @@ def _of_split(recording: Recording, split: str, config: FacadeDataParserConfig) 
     """Indices of the photographs of a split."""
     names = [frame.name for frame in recording.frames]
     if recording.listed:
-        listed = recording.listed.get(split, recording.listed.get("test" if split == "val" else "val", set()))
+        other = {"val": "test", "test": "val"}.get(split, "")
+        listed = recording.listed.get(split, recording.listed.get(other, set()))
         unknown = sorted(listed - set(names))
         if unknown or not listed:
             what = f"lists {unknown[0]}, which has no camera" if unknown else "lists no photographs"

@@ -107,6 +107,12 @@ class SceneLayout(ScenePaths):
                 f"{len(unlisted)} of {len(names)} photographs of {self.data} are in no list of its splits, and are "
                 f"left out: {min(unlisted)}, for example."
             )
+        held_out = recording.listed.get("val", set()) | recording.listed.get("test", set())
+        if both := held_out & recording.listed.get("train", set()):
+            notice(
+                f"{len(both)} of {len(held_out)} held-out photographs of {self.data} are trained on as well, by its "
+                f"lists: {min(both)}, for example; metrics of these are too good: take them out of train_filenames."
+            )
 
     def colmap_folder(self) -> Path | None:
         """Folder of the COLMAP model, relative to the scene; None where transforms.json holds the cameras.

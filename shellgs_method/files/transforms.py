@@ -46,7 +46,8 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
         raise SceneError(f"{path} has no list of frames: make it again")
     applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
     frames = [_frame(files, each, meta, applied, f"{path}, frame {k}") for k, each in enumerate(listed_frames, start=1)]
-    listed = {s: _names(meta[f"{s}_filenames"], files, path) for s in _SPLITS if f"{s}_filenames" in meta}
+    named = {split: _names(meta.get(f"{split}_filenames", []), files, path) for split in _SPLITS}
+    listed = {split: names for split, names in named.items() if names}  # an empty list says that the split has none
     files.tell_what_is_elsewhere()
     orientation = meta.get("orientation_override")
     if orientation not in (None, "pca", "up", "vertical", "none"):

@@ -267,6 +267,7 @@ def test_a_broken_colmap_model_is_refused_in_a_sentence(scene, shellgs, fault):
         ({"max_image_size": 0}, lambda scene: None, "at least 1 pixel, not 0"),
         ({}, lambda scene: change(scene, None, train_filenames=["images/x.png"]), "lists images/x.png, which has no"),
         ({}, lambda scene: change(scene, None, test_filenames=["images/frame_00001.png"]), "lists no photographs"),
+        ({}, lambda scene: change(scene, None, val_filenames=["images/frame_00001.png"]), "train split .* lists no"),
     ],
 )
 def test_a_split_that_leaves_nothing_is_refused(scene, config, spoil, words):

@@ -478,6 +478,26 @@ def test_photographs_in_no_list_of_the_splits_are_counted(scene, caplog):
     assert "in no list of its splits" in caplog.text
 
 
+def test_photographs_in_the_lists_of_training_and_of_a_held_out_split_are_counted(scene, caplog):
+    transforms = json.loads((scene / "transforms.json").read_text())
+    frames = [frame["file_path"] for frame in transforms["frames"]]
+    transforms |= {"train_filenames": frames, "val_filenames": frames[:1], "test_filenames": frames[:2]}
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    assert len(names(parse(scene))) == 10
+    assert "2 of 2 held-out photographs of" in caplog.text
+    assert "take them out of train_filenames" in caplog.text
+
+
+@pytest.mark.parametrize("empty", ["val", "test"])
+def test_an_empty_list_is_that_of_a_split_that_is_not_used(scene, empty):
+    transforms = json.loads((scene / "transforms.json").read_text())
+    frames = [frame["file_path"] for frame in transforms["frames"]]
+    lists = {"train": frames[2:], "val": frames[:2], "test": frames[:2]} | {empty: []}
+    transforms |= {f"{split}_filenames": listed for split, listed in lists.items()}
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    assert [len(names(parse(scene, split=split))) for split in ("train", "val", "test")] == [8, 2, 2]
+
+
 # Paths as other systems, programs and machines write them
 
 
