@@ -44,6 +44,8 @@ _MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, o
     "EQUIRECTANGULAR": 2,
 }
 _PARAMETERS = {name: known if isinstance(known, int) else len(known.split()) for name, known in _MODELS.items()}
+_BROWN = "fx fy cx cy k1 k2 p1 p2 k3"
+"""Parameters of FULL_OPENCV before those that are 0 in Brown's model, as Metashape and RealityScan have it."""
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 """A keypoint of a photograph, and the id of its point or -1."""
 
@@ -261,13 +263,15 @@ def _frame(scene: Path, path: str, image: ColmapImage, cameras: Mapping[int, Col
 
 def _lens(camera: ColmapCamera, scene: Path) -> dict[str, Any]:
     """Intrinsics and distortion by the names of transforms.json."""
-    parameters = _MODELS.get(camera.model)
+    parameters, given = _MODELS.get(camera.model), camera.params
+    if camera.model == "FULL_OPENCV" and not any(given[9:]):
+        parameters, given = _BROWN, given[:9]
     if not isinstance(parameters, str):
         raise SceneError(
             f"the cameras of {scene} are of the model {camera.model}, which cannot be undistorted; "
             f"{remedy_for(camera.model)}"
         )
-    values = dict(zip(parameters.split(), camera.params, strict=True))
+    values = dict(zip(parameters.split(), given, strict=True))
     fx = values.pop("f", values.pop("fx", None))
     lens = {"fl_x": fx, "fl_y": values.pop("fy", fx), "w": camera.width, "h": camera.height}
     return lens | values | {"camera_model": FISHEYE if "FISHEYE" in camera.model else "OPENCV"}

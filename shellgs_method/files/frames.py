@@ -25,6 +25,10 @@ MAX_PIXELS = 178_956_970
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE = "OPENCV_FISHEYE"
 """Camera models that nerfstudio undistorts."""
+_WIDEST = 170.0
+"""Degrees that no perspective photograph shows."""
+_CORNER = 0.02
+"""Share of the width and height that is a corner of a photograph."""
 _ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
 
 
@@ -90,6 +94,12 @@ def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mappin
     if fx <= 0 or fy <= 0:
         raise SceneError(f"{where} has the focal lengths {fx:g} and {fy:g}, which must be positive: calibrate it again")
     fisheye = _is_fisheye(lens, where)
+    angle = math.degrees(2 * math.atan(max(width / fx, height / fy) / 2))
+    if angle > _WIDEST and not fisheye:
+        raise SceneError(
+            f"{where} has the focal lengths {fx:g} and {fy:g}, with which {width:g}x{height:g} pixels show "
+            f"{angle:.0f}°: give them in pixels, not in millimetres or as a share of the width"
+        )
     distortion = tuple(_number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
     if not fisheye and distortion[3] != 0:
         raise SceneError(f"{where} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
@@ -103,10 +113,16 @@ def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
     """The frames sorted by name.
 
     Raises:
-        SceneError: there are none, or two of the same photograph.
+        SceneError: there are none, or two of the same photograph; or the principal points of all are in their corner.
     """
     if not frames:
         raise SceneError(f"{where} holds no photographs: it is empty")
+    if all(_is_at_corner(frame.camera) for frame in frames):  # that of a tile may be
+        cx, cy = frames[0].camera.K[:2, 2].tolist()
+        raise SceneError(
+            f"{where} has the principal points of all photographs in their upper left corner, at {cx:g} {cy:g} for "
+            "example: give them in pixels from that corner, not from the middle or as shares of the size"
+        )
     frames = sorted(frames, key=lambda frame: frame.name)
     for one, other in pairwise(frames):
         if one.name == other.name:
@@ -114,14 +130,20 @@ def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
     return frames
 
 
-def remedy_for(model: object) -> str:
+def _is_at_corner(camera: Camera) -> bool:
+    """Whether the principal point is in the upper left corner, as one that counts from the middle, or in shares, is."""
+    cx, cy = camera.K[:2, 2].tolist()
+    return abs(cx) < max(1.0, _CORNER * camera.width) and abs(cy) < max(1.0, _CORNER * camera.height)
+
+
+def remedy_for(model: str) -> str:
     """What to do with photographs of a camera model that nerfstudio does not undistort."""
     return "render perspective photographs from these panoramas first" if model in _PANORAMAS else UNDISTORT
 
 
 def _is_fisheye(lens: Mapping[str, Any], where: str) -> bool:
-    model = lens.get("camera_model", "OPENCV")
-    if model not in (*PERSPECTIVE, FISHEYE):
+    model = str(lens.get("camera_model", "OPENCV")).upper()
+    if model not in (*PERSPECTIVE, "PERSPECTIVE", FISHEYE):
         raise SceneError(f"{where} is {model}, but only perspective and fisheye ones work; {remedy_for(model)}")
     return model == FISHEYE
 
@@ -133,11 +155,25 @@ def _rigid(pose: np.ndarray, where: str) -> Float64[np.ndarray, "4 4"]:
     rotation = pose[:3, :3]
     turned = np.abs(rotation.T @ rotation - np.eye(3)).max() <= _ORTHONORMAL and np.linalg.det(rotation) > 0
     if pose.shape != (4, 4) or not turned or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise SceneError(f"{where} has a pose that is not a rotation and translation: it scales, shears or mirrors")
+        raise SceneError(f"{where} has a pose that is not a rotation and translation: {_fault(pose)}")
     u, _, vt = np.linalg.svd(rotation)
     exact = np.eye(4)
     exact[:3, :3], exact[:3, 3] = u @ vt, pose[:3, 3]
     return exact
+
+
+def _fault(pose: np.ndarray) -> str:
+    """What is wrong with a pose, and what to do."""
+    if pose.shape == (4, 4) and np.abs(pose[:, 3] - [0, 0, 0, 1]).max() < 1e-6 < np.abs(pose[3, :3]).max():
+        return "its matrix is written column by column, transpose it"
+    gram = pose[:3, :3].T @ pose[:3, :3]
+    scale = math.sqrt(np.trace(gram) / 3)
+    if scale > 0 and np.abs(gram / scale**2 - np.eye(3)).max() <= _ORTHONORMAL:
+        if np.linalg.det(pose[:3, :3]) < 0:
+            return "it mirrors, as in a left-handed frame, convert all poses to a right-handed one"
+        if abs(scale - 1) > _ORTHONORMAL / 2:
+            return f"it scales by {scale:.4g}, divide its first three columns by that"
+    return "it scales, shears or mirrors"
 
 
 def _number(lens: Mapping[str, Any], key: str, where: str) -> float:

@@ -13,7 +13,7 @@ from jaxtyping import Float64, UInt8
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import read_json
-from shellgs_method.files.frames import Frame, Recording, frame, in_order
+from shellgs_method.files.frames import FISHEYE, Frame, Recording, frame, in_order
 from shellgs_method.files.headers import read_ply_header
 from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
@@ -65,7 +65,7 @@ def find_cloud(scene: Path) -> Path | None:
         SceneError: the path leads out of the scene.
     """
     name, where = read_json(scene / NAME).get("ply_file_path"), scene / NAME
-    return None if name is None else NamedFiles(scene, Path(), where).other(str(name), str(where))
+    return None if not name else NamedFiles(scene, Path(), where).other(str(name), str(where))
 
 
 def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
@@ -109,7 +109,7 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
         lens.pop(key, None)
     lens |= _distortion(meta if _has_distortion(meta) else entry, where)
     fisheye = entry.get("is_fisheye", meta.get("is_fisheye"))
-    if fisheye is True and lens.get("camera_model") != "OPENCV_FISHEYE":  # instant-ngp's
+    if fisheye is True and str(lens.get("camera_model")).upper() != FISHEYE:  # instant-ngp's
         raise SceneError(
             f"{where}: is_fisheye is set, which counts only with the camera_model OPENCV_FISHEYE: set it too"
         )
@@ -119,7 +119,7 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
         angles = {key: source[key] for key in _ANGLES for source in (meta, entry) if key in source}
         lens = _by_angles(angles, photograph, where) | lens
     found = frame(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
-    if entry.get("mask_path") is None:
+    if not entry.get("mask_path"):
         return found
     return replace(found, mask=files.other(str(entry["mask_path"]), where))
 

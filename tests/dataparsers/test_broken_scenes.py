@@ -101,6 +101,15 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "a list as focal length": (lambda scene: change(scene, None, fl_x=[1]), "fl_x, which is not a finite number"),
     "an endless focal length": (lambda scene: change(scene, None, fl_x=10**400), "fl_x, which is not a finite number"),
     "an infinite centre": (lambda scene: change(scene, None, cx=float("inf")), "'inf' as its cx"),
+    "a focal length in millimetres": (
+        lambda scene: change(scene, None, fl_x=1.5, fl_y=1.5),
+        "with which 48x32 pixels show 173°: give them in pixels",
+    ),
+    "a principal point as a share": (
+        lambda scene: change(scene, None, cx=0.5, cy=0.5),
+        "in their upper left corner, at 0.5 0.5 for example: give them in pixels from that corner",
+    ),
+    "a principal point from the middle": (lambda scene: change(scene, None, cx=0, cy=-0.2), "at 0 -0.2 for example"),
     "no width": (lambda scene: change(scene, None, w=0), "has 0x32 pixels"),
     "half a pixel": (lambda scene: change(scene, None, h=31.5), "has 48x31.5 pixels"),
     "a huge image": (lambda scene: change(scene, None, w=64_000, h=48_000), "has 64000x48000 pixels, more than"),
@@ -110,8 +119,18 @@ BAD_TRANSFORMS: dict[str, tuple[Callable[[Path], object], str]] = {
     "distortion of words": (lambda scene: change(scene, None, k1="strong"), "'strong' as its k1"),
     "five coefficients": (lambda scene: change(scene, None, distortion_params=[0] * 5), "distortion_params are k1"),
     "a pose of nan": (lambda scene: pose(scene, 3, lambda m: m.fill(np.nan)), "frame_00004.png has NaN"),
-    "a pose that mirrors": (lambda scene: pose(scene, 3, lambda m: np.negative(m[:3, 0], m[:3, 0])), "not a rotation"),
-    "a pose that scales": (lambda scene: pose(scene, 3, lambda m: np.multiply(m[:3, :3], 2, m[:3, :3])), "it scales"),
+    "a pose that mirrors": (
+        lambda scene: pose(scene, 3, lambda m: np.negative(m[:3, 0], m[:3, 0])),
+        "not a rotation and translation: it mirrors, as in a left-handed frame",
+    ),
+    "a pose that scales": (
+        lambda scene: pose(scene, 3, lambda m: np.multiply(m[:3, :3], 2, m[:3, :3])),
+        "it scales by 2, divide its first three columns by that",
+    ),
+    "a pose by columns": (
+        lambda scene: pose(scene, 3, lambda m: np.copyto(m, m.T.copy())),
+        "is written column by column, transpose it",
+    ),
     "a pose of zeros": (lambda scene: pose(scene, 3, lambda m: m.fill(0)), "frame_00004.png has a pose that is not"),
     "half a pose": (lambda scene: change(scene, 3, transform_matrix=[[1, 0, 0, 0]]), "not a 4x4 matrix of numbers"),
     "a pose of words": (lambda scene: change(scene, 3, transform_matrix="here"), "not a 4x4 matrix of numbers"),

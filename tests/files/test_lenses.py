@@ -89,6 +89,23 @@ def test_a_colmap_fisheye_keeps_its_fourth_coefficient(scene: Path):
     assert lens.distortion == (0.08, -0.03, 0.01, 0.004, 0, 0)
 
 
+def test_a_full_opencv_model_without_a_denominator_is_browns(scene: Path):
+    views = read_views(FacadeDataParserConfig(data=scene))
+    write_colmap(scene, views, list(range(1, 11)), model="FULL_OPENCV", extra="-0.2 0.05 0.004 -0.003 0.02 0 0 0")
+    lens = read_views(FacadeDataParserConfig(data=scene))[0].lens
+    assert lens is not None
+    assert not lens.fisheye
+    assert lens.distortion == (-0.2, 0.05, 0.02, 0, 0.004, -0.003)
+
+
+@pytest.mark.parametrize("model", ["opencv", "pinhole", "PERSPECTIVE"])
+def test_a_perspective_model_may_be_written_otherwise(scene: Path, model: str):
+    lens = with_lens(scene, model, {"k1": -0.2})[0].lens
+    assert lens is not None
+    assert not lens.fisheye
+    assert lens.distortion[0] == -0.2
+
+
 @pytest.mark.parametrize(
     ("model", "remedy"),
     [
@@ -123,7 +140,7 @@ def test_browns_fourth_radial_coefficient_is_refused(scene: Path):
 
 @pytest.mark.parametrize(
     ("model", "extra"),
-    [("FULL_OPENCV", "0.1 0 0 0 0 0 0.1 0"), ("FOV", "0.9"), ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 0 0")],
+    [("FULL_OPENCV", "0.1 0 0 0 0 0.2 0 0"), ("FOV", "0.9"), ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 0 0")],
 )
 def test_a_colmap_model_unknown_to_nerfstudio_is_refused(scene: Path, model: str, extra: str):
     views = read_views(FacadeDataParserConfig(data=scene))
