@@ -146,11 +146,16 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
         shell: its files.
 
     Raises:
-        SceneError: the system has heights in another unit than eastings.
+        SceneError: the system has heights in another unit than eastings, or is a projection of the whole Earth.
     """
     crs = known_crs(system)
     if crs is None or any(path.suffix.lower() in IN_METRES for path in shell):
         return given
+    if _is_of_the_earth(crs):
+        raise SceneError(
+            f"{crs.name} is a projection of the whole Earth, in which lengths are stretched (by a half in Europe) and "
+            "heights are not: convert the shell to a system of its region, such as UTM, or name that with --crs"
+        )
     units = {axis.unit_name: axis.unit_conversion_factor for axis in crs.axis_info}
     if max(units.values()) > 1.1 * min(units.values()):
         raise SceneError(f"{crs.name} has axes in {' and in '.join(units)}: convert the shell to one unit")
@@ -159,6 +164,13 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
         return given
     notice(f"The shell's system, {crs.name}, is in {name}: its unit is taken for {metres:.9g} m.")
     return metres
+
+
+def _is_of_the_earth(crs: CRS) -> bool:
+    """Whether a system projects the whole Earth, as Web Mercator: nowhere but at some latitude has it true lengths."""
+    flat = crs.sub_crs_list[0] if crs.sub_crs_list else crs
+    area = flat.area_of_use
+    return bool(flat.is_projected and area and area.east - area.west >= 360 and area.south < 0 < area.north)
 
 
 def conversion(source: CRS, target: CRS) -> Callable[[np.ndarray], Float64[np.ndarray, "N D"]]:

@@ -124,6 +124,17 @@ def test_the_unit_of_a_system_is_that_of_its_shell_unless_another_is_given(caplo
         metres_of("EPSG:2229+5703", 1.0, scan)
 
 
+@pytest.mark.parametrize("system", ["EPSG:3857", "ESRI:102100", "EPSG:3857+5773", "EPSG:3395"])
+def test_a_projection_of_the_whole_earth_has_no_unit_of_length(system):
+    with pytest.raises(SceneError, match=r"stretched .* convert the shell to a system of its region"):
+        metres_of(system, 1.0, (Path("scan.las"),))
+    assert metres_of(system, 1.0, (Path("a.ifc"),)) == 1  # whose map conversion does not stretch
+
+
+def test_polar_systems_have_lengths():
+    assert metres_of("EPSG:3031", 1.0, (Path("scan.las"),)) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "why"), [("UTM32", "PROJ knows: give a code"), ("EPSG:1", "PROJ knows"), ("EPSG:4326", "is in degrees")]
 )
