@@ -7,11 +7,15 @@ mended in the modules of the commands, in processes that run one of them.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
-from typing import Any, NoReturn
+from types import SimpleNamespace
+from typing import Any, NoReturn, TextIO
+
+import numpy as np
 
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.render.panorama import check_camera_type
@@ -70,14 +74,57 @@ def mend_commands() -> None:
 
 
 def _mend_render(render: Any) -> None:
-    """Ns-render takes an unknown type of camera for perspective, and starts spirals from listed data managers alone."""
+    """Ns-render checks no camera path that it reads, and starts spirals from listed data managers alone."""
     from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
-    render.get_path_from_json = _before(
-        render.get_path_from_json, lambda path: check_camera_type(str(path.get("camera_type") or "perspective"))
-    )
+    render.json = SimpleNamespace(load=_camera_path)  # it reads nothing else by it
     render.VanillaDataManager = (VanillaDataManager, FullImageDatamanager)
+
+
+def _camera_path(file: TextIO) -> dict[str, Any]:
+    """The camera path in a file, as ns-render takes it; one that it cannot follow ends the program with a sentence."""
+    with refusals_end_the_program():
+        try:
+            path = json.load(file)
+        except ValueError as error:
+            raise SceneError(f"{file.name} is no camera path: it is not json") from error
+        if not isinstance(path, dict) or not isinstance(path.get("camera_path"), list):
+            raise SceneError(
+                f"{file.name} is no camera path, as ns-viewer's Render tab generates it; ns-render dataset renders the "
+                "photographs' own views"
+            )
+        cameras = path["camera_path"]
+        if not cameras:
+            raise SceneError(f"{file.name} has a path of no cameras: add a second keyframe, and generate it again")
+        path["camera_type"] = str(path.get("camera_type") or "perspective").lower()
+        check_camera_type(path["camera_type"])
+        angled = path["camera_type"] != "equirectangular"
+        for name in ("render_height", "render_width"):
+            _number_between(path, name, 0, np.inf, file.name)
+        for camera in cameras:
+            if not isinstance(camera, dict) or not _is_pose(camera.get("camera_to_world")):
+                raise SceneError(f"{file.name}: the camera_to_world of each camera must be 16 finite numbers")
+            if angled:
+                _number_between(camera, "fov", 0, 180, file.name)
+        if not path.get("seconds"):  # of a single keyframe, or of other programs
+            path["seconds"] = len(cameras) / (path.get("fps") or 24)
+    return path
+
+
+def _number_between(numbers: dict[str, Any], name: str, low: float, high: float, where: str) -> None:
+    value = numbers.get(name)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low < value < high:
+        most = f" and below {high:g}" if np.isfinite(high) else ""
+        raise SceneError(f"{where}: its {name} must be a number above {low:g}{most}, and is {str(value)[:40]}")
+
+
+def _is_pose(matrix: object) -> bool:
+    try:
+        values = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return values.size == 16 and bool(np.isfinite(values).all())
 
 
 def _mend_exporter(exporter: Any) -> None:

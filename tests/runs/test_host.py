@@ -28,6 +28,7 @@ NOWHERE = {
     "crop_scale": [1.0, 1.0, 1.0],
 }
 CONFIG = Path("config.yml")
+POSE = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1]
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +47,8 @@ def loaded(trainer, monkeypatch) -> None:
 
 
 def camera_path(folder: Path, **changes: Any) -> Path:
-    pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0.5, 0, 0, 0, 1]
     path = {"camera_type": "perspective", "render_height": 16, "render_width": 32, "seconds": 1}
-    path |= {"camera_path": [{"camera_to_world": pose, "fov": 60, "aspect": 2}]}
+    path |= {"camera_path": [{"camera_to_world": POSE, "fov": 60, "aspect": 2}]}
     (folder / "path.json").write_text(json.dumps(path | changes))
     return folder / "path.json"
 
@@ -73,6 +73,33 @@ def test_a_path_of_cameras_that_cannot_be_rendered_is_refused_by_name(loaded, tm
 def test_a_path_of_other_cameras_is_rendered(loaded, tmp_path, kind):
     (image,) = images_along(camera_path(tmp_path, camera_type=kind), tmp_path)
     assert image.shape == (16, 32, 3)
+
+
+PATHS: dict[str, tuple[dict[str, Any], str]] = {
+    "one keyframe": ({"camera_path": []}, "has a path of no cameras: add a second keyframe"),
+    "cameras of a scene": ({"camera_path": None, "frames": []}, "is no camera path.*ns-render dataset"),
+    "no angle": ({"camera_path": [{"camera_to_world": POSE}]}, "fov must be a number above 0 and below 180.*None"),
+    "half around": ({"camera_path": [{"camera_to_world": POSE, "fov": 180}]}, "below 180, and is 180"),
+    "three rows": ({"camera_path": [{"camera_to_world": POSE[:12], "fov": 50}]}, "must be 16 finite numbers"),
+    "a folder": ({"camera_path": ["data/images"]}, "must be 16 finite numbers"),
+    "no width": ({"render_width": None}, "render_width must be a number above 0"),
+}
+
+
+@pytest.mark.parametrize("fault", PATHS)
+def test_a_path_that_cannot_be_followed_is_refused(loaded, tmp_path, fault):
+    changes, sentence = PATHS[fault]
+    with pytest.raises(SystemExit, match=f"^shellgs: .*path.json.*{sentence}"):
+        images_along(camera_path(tmp_path, **changes), tmp_path)
+
+
+@pytest.mark.parametrize("changes", [{"seconds": 0}, {"seconds": None, "fps": 12}, {"camera_type": "Fisheye"}])
+def test_a_path_may_leave_out_its_length_and_write_its_type_otherwise(loaded, tmp_path, changes):
+    (image,) = images_along(camera_path(tmp_path, **changes), tmp_path)
+    (tmp_path / "small").mkdir()
+    lower = {name: str(value).lower() for name, value in changes.items() if name == "camera_type"}
+    (same,) = images_along(camera_path(tmp_path / "small", **lower), tmp_path / "small")
+    np.testing.assert_array_equal(image, same)
 
 
 def test_a_crop_box_around_nothing_shows_the_background(loaded, tmp_path):
