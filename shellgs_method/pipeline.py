@@ -19,7 +19,7 @@ from torch import Tensor
 from shellgs_method.datamanager import FacadeDataManager
 from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.evaluation import mean_over_views
-from shellgs_method.files.blocks import BLOCKS, Blocks
+from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.gaussians.initial import BEHIND_SPACING, MAX_SEEDS, SEED_SPACING, SKYBOX_SEEDS
 from shellgs_method.gaussians.seeds import (
@@ -111,9 +111,14 @@ class FacadePipeline(VanillaPipeline):
         both = (data.train_dataset, data.eval_dataset)
         cameras = [dataset.camera(index) for dataset in both for index in range(len(dataset))]
         self.model.start_in(coarse, track(cameras, "Looking at the coarse run from view", len(cameras)))
-        parser: Any = data.config.dataparser
-        cell = Blocks.read(parser.data / BLOCKS).cell(parser.block)
+        cell = self._cell
         self._block = {"name": cell.block.name, "region": cell.fingerprint, "coarse": coarse.hash}
+
+    @property
+    def _cell(self) -> Cell:
+        """The block's region in the scene, as it is cut now."""
+        parser: Any = self.datamanager.config.dataparser
+        return Blocks.read(parser.data / BLOCKS).cell(parser.block)
 
     def _add_seeds(self, seed_views: Callable[..., tuple[Iterator, int]]) -> None:
         model, data = self.model, self.datamanager
@@ -194,7 +199,7 @@ class FacadePipeline(VanillaPipeline):
         """Keep the state until :meth:`restore_training`: planning the schedules, which comes later, would clear it.
 
         Raises:
-            SceneError: the run is trained, and the scene has other cameras now.
+            SceneError: the run is trained, and the scene has other cameras now, or the block was cut anew.
         """
         self._training_state = state
         trained_with, data = BoundCameras.from_json(state.get("cameras", {})), self.datamanager
@@ -203,6 +208,9 @@ class FacadePipeline(VanillaPipeline):
                 f"the cameras of {data.config.dataparser.data} are not those that the run was trained with: {changed}; "
                 "name the model of those as colmap_path in its config.yml, or train again"
             )
+        block = state.get("block") or {}
+        if self.test_mode != "val" and block and block["region"] != self._cell.fingerprint:
+            raise SceneError(f"{block['name']} was cut anew since the run was trained: train it again")
 
     def restore_training(self) -> None:
         """Restore the training state of a loaded checkpoint, so that the run continues as if never stopped.

@@ -19,12 +19,13 @@ from shellgs_method.evaluation.regions import reference_errors
 from shellgs_method.evaluation.view import OPAQUE
 from shellgs_method.export.frame import Frame, scene_frame, shell_frame
 from shellgs_method.export.splats import moved
-from shellgs_method.files.photographs import load_mask
+from shellgs_method.files.blocks import Cell
+from shellgs_method.files.photographs import View, load_mask
 from shellgs_method.files.splats import Splats
 from shellgs_method.files.surfaces import usual_up
 from shellgs_method.geometry.axes import likely_up
 from shellgs_method.geometry.box import Box
-from shellgs_method.geometry.camera import in_view, positions
+from shellgs_method.geometry.camera import in_view, positions, world_rays
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.tsdf import DepthView, fuse, least_voxel
 from shellgs_method.machine.memory import return_freed
@@ -104,13 +105,23 @@ class TrainedRun:
         alignment, shell = self.shell
         return shell_frame(alignment, shell, usual_up(alignment.shells) if alignment.up is None else alignment.up)
 
-    @property
+    @cached_property
+    def cell(self) -> Cell | None:
+        """The region of a block's run in the frame, of whose core it has the geometry; None of a whole scene's."""
+        cell = self.datamanager.train_dataparser_outputs.metadata["cell"]
+        return cell and cell.moved(np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
+
+    @cached_property
     def shell_in_frame(self) -> ShellMesh:
-        """The shell in the frame; the scene must have one."""
+        """The shell in the frame, or its part in the block's core; the scene must have one.
+
+        Raises:
+            SceneError: the shell has nothing there.
+        """
         assert self.shell is not None
         alignment, shell = self.shell
-        placed = shell.vertices * alignment.metres_per_shell_unit - self.frame.offset
-        return ShellMesh(placed, shell.faces, classes=shell.classes)
+        placed = replace(shell, vertices=shell.vertices * alignment.metres_per_shell_unit - self.frame.offset)
+        return placed if self.cell is None else _in_core(self.cell, placed)
 
     @property
     def model_scale(self) -> float:
@@ -156,6 +167,8 @@ class TrainedRun:
     ) -> trimesh.Trimesh:
         """Fuse the views, or those given, into a mesh of the facade; see :func:`fuse` and :meth:`facade`.
 
+        That of a block's run is of its core, so that the meshes of all blocks are one.
+
         Raises:
             SceneError: nothing is rendered there, or the voxels are finer than half of what the photographs resolve:
                 between their pixels no voxel is seen, and the mesh falls into crumbs.
@@ -181,13 +194,16 @@ class TrainedRun:
         Raises:
             SceneError: no triangle is that near.
         """
-        if self.shell is None:
-            return mesh
         mesh = mesh.copy()
-        mesh.update_faces(_distances(mesh, self.shell_in_frame) < margin)
+        if self.cell is not None:
+            mesh.update_faces(self.cell.core(mesh.triangles_center))
+        if self.shell is not None:
+            mesh.update_faces(_distances(mesh, self.shell_in_frame) < margin)
         mesh.remove_unreferenced_vertices()
         if len(mesh.faces) == 0:
-            raise SceneError(f"there is no mesh: no rendered surface is within {margin:g} m of the shell")
+            near = f" within {margin:g} m of the shell" if self.shell is not None else ""
+            where = f" in {self.cell.block.name}" if self.cell is not None else ""
+            raise SceneError(f"there is no mesh: no rendered surface is{near}{where}")
         return mesh
 
     @torch.no_grad()
@@ -227,7 +243,7 @@ class TrainedRun:
         return np.array(gains)
 
     def splats(self) -> Splats:
-        """The Gaussians in the frame."""
+        """The Gaussians in the frame, of a block's run those of its core."""
         trained = {name: parameter.detach().cpu() for name, parameter in self.model.gauss_params.items()}
         harmonics = torch.cat([trained["features_dc"][:, None], trained["features_rest"]], dim=1)
         splats = Splats(
@@ -238,21 +254,23 @@ class TrainedRun:
             harmonics,
             discs=self.model.config.primitive == "2d",
         )
-        return moved(splats, np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
+        splats = moved(splats, np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
+        return splats if self.cell is None else splats[torch.from_numpy(self.cell.core(splats.means.numpy()))]
 
 
 def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
     """Metrics of :func:`reference_errors` of the mesh, seen from the held-out cameras, averaged over the views.
 
     They can be compared with those of ns-eval: against the shell, and as ``truth_…`` against the true geometry if the
-    scene has it. Surfaces without a reference, such as flaps beside the building, are only measured by
-    ``area_near_shell``, the share of the mesh's area within :data:`NEAR` of the shell.
+    scene has it; of a block's run, where the shell is in its core. Surfaces without a reference, such as flaps beside
+    the building, are only measured by ``area_near_shell``, the share of the mesh's area within :data:`NEAR` of the
+    shell.
     """
     caster = ShellCaster(ShellMesh(mesh.vertices, mesh.faces), run.frame.to_scene)
     held_out, metrics = run.datasets[1], []
     metres_per_unit = 1 / (run.frame.scale * run.model_scale) if run.frame.metric else None
     for index, view in enumerate(held_out.views):
-        batch, cue = held_out.get_data(index), caster.cast(view.camera)
+        batch, cue = _of_block(held_out.get_data(index), view, run), caster.cast(view.camera)
         depth, mask = torch.from_numpy(cue.depth)[..., None] * run.model_scale, torch.from_numpy(cue.mask)[..., None]
         normal = torch.from_numpy(cue.normal).float()
         rendering = Rendering(torch.zeros_like(normal), depth, mask.float(), normal)
@@ -263,6 +281,26 @@ def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:
         near = _distances(mesh, run.shell_in_frame) < NEAR
         errors["area_near_shell"] = float(np.average(near, weights=mesh.area_faces))
     return errors
+
+
+def _in_core(cell: Cell, shell: ShellMesh) -> ShellMesh:
+    """The part of a shell in the core of a block."""
+    for normal, offset in cell.planes:
+        if (shell.vertices[shell.faces] @ normal < offset).all():
+            raise SceneError(f"the shell has nothing in {cell.block.name}, so there is no geometry to export")
+        shell = shell.above(normal, offset)
+    return shell
+
+
+def _of_block(batch: dict, view: View, run: TrainedRun) -> dict:
+    """A view whose mask keeps what shows the core of a block's run; all of it of a whole scene's."""
+    if run.cell is None or "shell_depth" not in batch:
+        return batch
+    eye, rays = world_rays(run.frame.camera(view.camera))
+    depth = batch["shell_depth"].double()
+    shown = eye + rays * depth.numpy() / (run.model_scale * run.frame.scale)
+    inside = torch.from_numpy(run.cell.core(shown.reshape(-1, 3))).view(depth.shape) & (depth > 0)
+    return batch | {"mask": inside & batch["mask"] if "mask" in batch else inside}
 
 
 def _distances(mesh: trimesh.Trimesh, shell: ShellMesh) -> Float32[np.ndarray, " F"]:

@@ -97,6 +97,12 @@ class Cell:
         return replace(self, sides=sides, overlap=scale_of(similarity) * self.overlap)
 
     @property
+    def planes(self) -> list[tuple[Float64[np.ndarray, " 3"], float]]:
+        """Unit normal and offset of each cut that bounds it, so that the core is where ``normal · x >= offset``."""
+        signed = [(cut, 1.0 if above else -1.0) for cut, above in self.sides]
+        return [(sign * np.array(cut.normal), sign * cut.offset) for cut, sign in signed]
+
+    @property
     def fingerprint(self) -> str:
         """Hash of what makes the region, and of its photographs."""
         sides = [(*cut.normal, cut.offset, above) for cut, above in self.sides]

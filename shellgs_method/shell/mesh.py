@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
+from trimesh.intersections import slice_faces_plane
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.geometry.precision import NO_STEP, Step
@@ -67,6 +68,26 @@ class ShellMesh:
     def centre(self) -> Float64[np.ndarray, " 3"]:
         """Median vertex. What is in float32 is relative to it, so that no vertex far away costs the others theirs."""
         return np.median(self.vertices, axis=0)
+
+    def above(self, normal: Float64[np.ndarray, " 3"], offset: float) -> ShellMesh:
+        """The part where ``normal · x >= offset``, of a unit normal; triangles across that plane are cut.
+
+        Raises:
+            SceneError: there is none.
+        """
+        kinds, kind = np.unique(np.stack([self.classes, self.source], axis=1), axis=0, return_inverse=True)
+        parts = []
+        for number in range(len(kinds)):
+            of_kind = self.faces[kind.ravel() == number]
+            vertices, faces, _ = slice_faces_plane(self.vertices, of_kind, normal, offset * normal)
+            parts.append((vertices, faces, np.broadcast_to(kinds[number], (len(faces), 2))))
+        firsts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts[:-1])])
+        vertices, faces, of = (np.concatenate(each) for each in zip(*parts, strict=True))
+        faces = faces + np.repeat(firsts, [len(each) for _, each, _ in parts])[:, None]
+        kept = ~without_area(vertices, faces)
+        return ShellMesh(
+            vertices, faces[kept], self.meshing, self.step, of[kept, 0].astype(np.uint8), of[kept, 1].astype(np.int64)
+        )
 
 
 def sources_of(faces: Int64[np.ndarray, "F 3"], sources: Int64[np.ndarray, " S"]) -> Int64[np.ndarray, " F"]:

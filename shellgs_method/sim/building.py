@@ -56,6 +56,7 @@ class Reconstruction:
 
     Attributes:
         folder: scene folder.
+        block: name of the block whose run it is; empty of a whole scene.
         frame: simulation frame.
         fused: surface fused from the rendered depth, with vertex colours.
         shell: shell of any winding; None if the scene has none.
@@ -71,6 +72,7 @@ class Reconstruction:
     """
 
     folder: Path
+    block: str
     frame: SimFrame
     fused: trimesh.Trimesh
     shell: Triangles | None
@@ -116,11 +118,12 @@ class Reconstruction:
         shell = Triangles(transformed(known, motion), run.shell_in_frame.faces) if run.shell else None
         return cls(
             folder,
+            run.cell.block.name if run.cell else "",
             frame,
             fused.apply_transform(motion),
             shell,
-            run.shell[1].classes if run.shell else NO_CLASSES,
-            run.shell[1].source if run.shell else NO_SOURCES,
+            run.shell_in_frame.classes if run.shell else NO_CLASSES,
+            run.shell_in_frame.source if run.shell else NO_SOURCES,
             run.shell[0].shells if run.shell else (),
             moved(run.splats(), motion),
             views,
@@ -132,8 +135,8 @@ class Reconstruction:
 
     @property
     def scene(self) -> str:
-        """Name of the scene's folder."""
-        return self.folder.name
+        """Name of the scene's folder, and of the block."""
+        return f"{self.folder.name} {self.block}".rstrip()
 
     @property
     def eyes(self) -> Float64[np.ndarray, "V 3"]:
