@@ -7,14 +7,17 @@ are tried one by one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import permutations, product
 
 import numpy as np
+import torch
 from jaxtyping import Float64, Shaped
 from PIL import Image
 
 from shellgs_method.errors import SceneError, notice
+from shellgs_method.files import transforms
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints
 from shellgs_method.geometry.camera import Camera, in_view, positions
@@ -69,6 +72,30 @@ class Slip:
         return points @ self.correction.T
 
 
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+_ROLLED = "cameras are rolled by {}° against their photographs: their x axis points to the right of these as stored"
+_OF_POSES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+    (
+        "transform_matrix has OpenCV's axes of the camera instead of OpenGL's: negate its second and third columns",
+        lambda viewmat: _OPENGL @ viewmat,
+    ),
+    (
+        "transform_matrix is from the world to the camera: invert it",
+        lambda viewmat: _OPENGL @ np.linalg.inv(_OPENGL @ viewmat),
+    ),
+    (
+        "transform_matrix is from the world to the camera, in OpenCV's axes: invert it, and negate the second and "
+        "third columns of that",
+        lambda viewmat: np.linalg.inv(_OPENGL @ viewmat),
+    ),
+    (_ROLLED.format(180), lambda viewmat: np.diag([-1.0, -1.0, 1.0, 1.0]) @ viewmat),
+    (_ROLLED.format(90), lambda viewmat: _QUARTER @ viewmat),
+    (_ROLLED.format(90), lambda viewmat: _QUARTER.T @ viewmat),
+)
+"""Mistakes in the poses of a transforms.json, and what brings the world to the camera without them."""
+
+
 def slips() -> Iterator[Slip]:
     """Usual mistakes, likelier ones first: axes that are usually confused, units, any axes, axes with units."""
     axes = {tuple(s * (k + 1) for s, k in zip(signs, order, strict=True)): _signed(order, signs)
@@ -113,7 +140,7 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
         views: photographs of the scene, of any size.
 
     Raises:
-        SceneError: no camera sees them, or with other axes or in another unit, they would fit.
+        SceneError: no camera sees them, or they would fit with other axes or in another unit, or other poses would.
     """
     if len(points.positions) < _FEW or not views:
         return
@@ -126,6 +153,8 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
     if slip := sight.explanation(seen, away):
         sure = "they" if sight.photographs else "perhaps they"
         raise SceneError(f"{points.called} are not in the frame of the cameras: {sure} {slip.words}; {remedy}")
+    if transforms.NAME in points.called and (words := sight.explanation_by_poses(seen)):
+        raise SceneError(f"the cameras do not see {points.called} where the photographs show them: {words}")
     if seen < _UNSEEN or away > _FAR:
         raise SceneError(
             f"{points.called} are not in the frame of the cameras: {apart}, which neither other axes nor another unit "
@@ -194,8 +223,27 @@ class _Sight:
         likeness, slip = max(found, key=lambda pair: np.nan_to_num(pair[0]))
         return slip if likeness >= _SEEN and self.seen(slip.corrected(self.points)) >= _SEEN else None
 
+    def explanation_by_poses(self, seen: float) -> str | None:
+        """The mistake in the poses without which cameras see the points, in these colours where they have some."""
+        found = [(self._moved(change), words) for words, change in _OF_POSES]
+        if not self.photographs:
+            fitting = (words for sight, words in found if seen < _HARDLY and sight._in_view(self.points))
+            return next(fitting, None)
+        likeness, words = max((np.nan_to_num(sight.alike(self.points)), words) for sight, words in found)
+        return words if likeness >= _SEEN else None
+
+    def _moved(self, change: Callable[[np.ndarray], np.ndarray]) -> _Sight:
+        """The same with other poses."""
+        moved = partial(_with_pose, change=change)
+        photographs = [(moved(camera), image) for camera, image in self.photographs]
+        return replace(self, cameras=[moved(camera) for camera in self.cameras], photographs=photographs)
+
     def _in_view(self, points: np.ndarray) -> bool:
         return self.seen(points) > _WELL and self.away(points) < _FAR / 5
+
+
+def _with_pose(camera: Camera, change: Callable[[np.ndarray], np.ndarray]) -> Camera:
+    return replace(camera, viewmat=torch.from_numpy(change(camera.viewmat.double().cpu().numpy())).to(camera.viewmat))
 
 
 def may_be_of(colours: Shaped[np.ndarray, "N 3"], images: Sequence[Shaped[np.ndarray, "H W 3"]]) -> bool:

@@ -65,6 +65,31 @@ def test_points_with_other_axes_or_in_another_unit_are_refused_with_the_slip(poi
         check_points(other(points, change), views)
 
 
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda matrix: matrix @ OPENGL, "has OpenCV's axes of the camera instead of OpenGL's: negate"),
+        (np.linalg.inv, "is from the world to the camera: invert it"),
+        (lambda matrix: np.linalg.inv(matrix @ OPENGL), "in OpenCV's axes: invert it, and negate"),
+        (lambda matrix: matrix @ np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "rolled by 90°"),
+        (lambda matrix: matrix @ np.diag([-1.0, -1, 1, 1]), "rolled by 180°"),
+    ],
+    ids=["OpenCV", "inverse", "OpenCV inverse", "quarter", "half"],
+)
+def test_poses_of_another_convention_are_refused_with_the_slip(scene, change, words):
+    path = scene / "transforms.json"
+    transforms = json.loads(path.read_text())
+    for frame in transforms["frames"]:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    path.write_text(json.dumps(transforms))
+    layout = FacadeDataParserConfig(data=scene)
+    with pytest.raises(SceneError, match=f"the cameras do not see the SfM points .*: .*{words}"):
+        check_points(find_sparse_points(layout), read_views(layout))
+
+
 def test_points_without_colours_are_refused_if_no_camera_sees_them(points, views):
     grey = replace(other(points, np.diag([1, -1, -1])), colours=None)
     with pytest.raises(SceneError, match="the cameras: perhaps they have OpenGL's axes"):
