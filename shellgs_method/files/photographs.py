@@ -18,8 +18,8 @@ from shellgs_method.files.exif import exif_of, orientation_of, tags_of
 from shellgs_method.files.frames import MAX_PIXELS
 from shellgs_method.files.masks import OPAQUE, kept_pixels
 from shellgs_method.files.paths import DEVELOP, RAW
-from shellgs_method.files.profiles import in_srgb
-from shellgs_method.files.transfer import HDR, tone_mapped
+from shellgs_method.files.profiles import hdr_of, in_srgb
+from shellgs_method.files.transfer import tone_mapped
 from shellgs_method.files.undistortion import distort_pixels, undistort, undistort_pixels
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
@@ -136,12 +136,13 @@ def read_image(path: Path) -> Image.Image:
     """
     with opened(path) as image:
         exif = exif_of(image)
-        if transfer := HDR.get(image.info.get("nclx_profile", {}).get("transfer_characteristics")):
+        if transfer := hdr_of(image, path):
             notice(
                 f"{path.parent} holds HDR photographs ({transfer}), which are tone-mapped: bright walls lose contrast; "
                 "record or export them as SDR if you can."
             )
-            image = Image.fromarray(tone_mapped(_wide(path), transfer))
+            codes = _wide(path) if "nclx_profile" in image.info else np.asarray(image.convert("RGB"), np.uint16) * 257
+            image = Image.fromarray(tone_mapped(codes, transfer))
         if image.mode.startswith("I"):  # 16 bits
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
         image = in_srgb(image)

@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from functools import lru_cache
 from io import BytesIO
+from pathlib import Path
 
 from PIL import ExifTags, Image, ImageCms
 
 from shellgs_method.files.exif import exif_of
+from shellgs_method.files.transfer import HDR, Transfer
 
 _ADOBE = "R03"  # interoperability index of a camera's file in Adobe RGB (DCF 2.0), which embeds no profile
 _ALIKE = 2  # levels of 8 bits, to which profiles of sRGB differ
+_CODES = {  # where files that Pillow says nothing of have the code of their transfer function
+    "AVIF": re.compile(rb"colrnclx..(..)", re.DOTALL),
+    "PNG": re.compile(rb"\0\0\0\x04cICP.(.)", re.DOTALL),
+}
+_HEAD = 1 << 16  # bytes of a file that hold its header
 _INTENT = ImageCms.Intent.RELATIVE_COLORIMETRIC
+
+
+def hdr_of(image: Image.Image, path: Path) -> Transfer | None:
+    """The transfer function of an HDR photograph; None of others.
+
+    Args:
+        image: the photograph.
+        path: its file.
+    """
+    if "nclx_profile" in image.info:
+        return HDR.get((image.info["nclx_profile"] or {}).get("transfer_characteristics", 0))
+    if (pattern := _CODES.get(str(image.format))) is None:
+        return None
+    with path.open("rb") as file:
+        found = pattern.search(file.read(_HEAD).partition(b"IDAT")[0])
+    return HDR.get(int.from_bytes(found[1], "big")) if found else None
 
 
 def is_srgb(image: Image.Image) -> bool:

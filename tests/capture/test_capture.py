@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import zlib
 from contextlib import closing, nullcontext
 from fractions import Fraction
 from pathlib import Path
@@ -256,6 +257,40 @@ def test_8_bits_of_an_hdr_photograph_are_tone_mapped_too(tmp_path):
     plain, mapped = (np.asarray(read_image(path)) for path in (PHONE, tmp_path / "hlg.heic"))
     wide = plain.astype(np.uint16) * 257
     np.testing.assert_allclose(mapped.astype(int), tone_mapped(wide, "HLG").astype(int), atol=1)
+
+
+def _of_pq(path: Path, shown: Image.Image) -> None:
+    """Write a photograph that says, as AVIF and PNG do, that its colours are of PQ."""
+    shown.save(path)
+    content = path.read_bytes()
+    if path.suffix == ".avif":
+        head, mark, rest = content.partition(b"colrnclx")
+        path.write_bytes(head + mark + b"\0\x09\0\x10" + rest[4:])
+        return
+    chunk = b"cICP" + bytes([9, 16, 0, 1])
+    chunk = b"\0\0\0\x04" + chunk + zlib.crc32(chunk).to_bytes(4, "big")
+    path.write_bytes(content[:33] + chunk + content[33:])  # after the header
+
+
+@pytest.mark.parametrize("suffix", [".avif", ".png"])
+def test_an_hdr_photograph_of_any_format_is_tone_mapped(tmp_path, caplog, suffix):
+    shown = Image.new("RGB", (32, 24), (97, 97, 97))  # 38 %: 18 % grey of PQ
+    shown.save(tmp_path / f"sdr{suffix}")
+    assert np.asarray(read_image(tmp_path / f"sdr{suffix}")).mean() == pytest.approx(97, abs=1)
+    assert not caplog.records
+    _of_pq(tmp_path / f"hdr{suffix}", shown)
+    expected = tone_mapped(np.full((1, 1, 3), 97 * 257, np.uint16), "PQ").mean()
+    assert np.asarray(read_image(tmp_path / f"hdr{suffix}")).mean() == pytest.approx(expected, abs=3)
+    assert "holds HDR photographs (PQ), which are tone-mapped" in caplog.text
+
+
+def test_an_hdr_png_is_captured_in_srgb(tmp_path):
+    _of_pq(tmp_path / "hdr.png", Image.new("RGB", (32, 24), (97, 97, 97)))
+    add_photograph(tmp_path / "hdr.png", tmp_path / "captured.png")
+    with Image.open(tmp_path / "captured.png") as captured:
+        mapped = tone_mapped(np.full((1, 1, 3), 97 * 257, np.uint16), "PQ")
+        assert (np.asarray(captured) == mapped).all()
+    assert (np.asarray(read_image(tmp_path / "captured.png")) == mapped).all()
 
 
 def test_the_curve_of_srgb_and_its_inverse_agree():
