@@ -19,13 +19,21 @@ LARGEST = 1e12
 """Largest coordinate, in any unit."""
 LONGITUDE = ("lon", "long", "lng", "longitude", "gpslongitude")
 LATITUDE = ("lat", "latitude", "gpslatitude")
+_ROS = ("position", "pos", "poseposition", "fieldposeposition")
+"""What exports of ROS' topics have before the axis."""
 COORDINATES = {
-    "X": (*LONGITUDE, "x", "easting", "east", "e", "rechtswert", "ostwert", "ost", "pointx"),
-    "Y": (*LATITUDE, "y", "northing", "north", "n", "hochwert", "nordwert", "nord", "pointy"),
-    "Z": ("z", "height", "altitude", "alt", "elevation", "elev", "hoehe", "höhe", "h", "pointz", "gpsaltitude"),
+    "X": (*LONGITUDE, "x", "easting", "east", "e", "rechtswert", "ostwert", "ost", "pointx", *(f"{p}x" for p in _ROS)),
+    "Y": (*LATITUDE, "y", "northing", "north", "n", "hochwert", "nordwert", "nord", "pointy", *(f"{p}y" for p in _ROS)),
+    "Z": (
+        *("z", "height", "altitude", "alt", "elevation", "elev", "hoehe", "höhe", "h", "pointz", "gpsaltitude"),
+        *(f"{prefix}z" for prefix in _ROS),
+    ),
 }
-IMAGE = ("image", "photo", "photograph", "picture", "img", "file", "filename", "foto", "bild", "sourcefile")
-NAME = ("name", "id", "point", "punkt", "nr", "label", "gcp")
+IMAGE = (
+    *("image", "photo", "photograph", "picture", "img", "file", "filename", "foto", "bild", "sourcefile"),
+    *("imagename", "photoname", "imagefile"),
+)
+NAME = ("name", "id", "point", "punkt", "nr", "label", "gcp", "pointname", "pointid", "gcpname")
 PIXELS = {"x": ("u", "px", "col", "column", "imagex", "pixelx"), "y": ("v", "py", "row", "line", "imagey", "pixely")}
 """What headers call the columns; of several, the first counts."""
 _ACCURACY = {"std", "sd", "sigma", "error", "err", "accuracy", "acc"}

@@ -721,6 +721,19 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
 
 
 @pytest.mark.parametrize(
+    "header",
+    [
+        "imageName X Y Z Omega Phi Kappa",  # of Pix4D
+        "filename,pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,a,b",  # of ROS
+        "Image Name,Position X,Position Y,Position Z,a,b,c",
+    ],
+)
+def test_headers_of_other_programs_name_the_columns_of_positions(rigged, tmp_path, header):
+    (tmp_path / "geo.txt").write_text(header + "\nimages/0.png 410000.5 5413000.25 251 9 9 9\n".replace(" ", ","))
+    np.testing.assert_array_equal(read_positions(tmp_path / "geo.txt", rigged[0]).shell, [[410000.5, 5413000.25, 251]])
+
+
+@pytest.mark.parametrize(
     ("line", "sentence"),
     [
         ("EPSG:4326", "is in degrees (EPSG:4326): say with --crs"),
