@@ -17,6 +17,8 @@ from shellgs_method.files.frames import FISHEYE, Frame, Recording, frame, in_ord
 from shellgs_method.files.headers import read_ply_header
 from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
+from shellgs_method.files.readers.ply import ply_points, read_ply
+from shellgs_method.files.readers.points import NO_POINTS, Points
 from shellgs_method.geometry.lens import COEFFICIENTS
 
 NAME = "transforms.json"
@@ -80,19 +82,32 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
         return np.empty((0, 3)), np.empty((0, 3), np.uint8)
     if not path.is_file():
         raise FileNotFoundError(f"{path}, the SfM points that {scene / NAME} names, does not exist")
-    import trimesh
-
     try:
-        read_ply_header(path)
-        cloud = trimesh.load(path, process=False)
-        positions = np.asarray(cloud.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
-        colours = np.asarray(cloud.visual.vertex_colors, np.uint8)  # pyright: ignore[reportAttributeAccessIssue]
-    except Exception as error:  # trimesh raises errors of any kind for a damaged file
+        positions, colours = _points_of(path)
+    except Exception as error:  # readers raise errors of any kind for a damaged file
         reason = " ".join(str(error).split())
         raise SceneError(f"the SfM points {path} cannot be read ({reason}): make them again") from error
     undo = np.linalg.inv(_applied(read_json(scene / NAME), scene))
-    colours = colours[:, :3] if len(colours) == len(positions) else np.full(positions.shape, GREY, np.uint8)
+    colours = np.full(positions.shape, GREY, np.uint8) if colours is None else colours
     return positions @ undo[:3, :3].T + undo[:3, 3], colours
+
+
+def _points_of(path: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
+    """Positions of the vertices of a PLY, which may be a mesh's or splats, and their colours if it has any."""
+    columns = {prop.name for element in read_ply_header(path).elements for prop in element.properties}
+    if {"f_dc_0", "opacity", "scale_0"} <= columns:
+        from shellgs_method.files.splats import DEGREE_0, read_splats  # imports torch, which is slow
+
+        gaussians = read_splats(path)
+        mean = 255 * (0.5 + DEGREE_0 * gaussians.harmonics[:, 0].double().numpy())
+        return gaussians.means.double().numpy(), mean.round().clip(0, 255).astype(np.uint8)
+    pieces = ply_points(path, coloured=True)
+    if pieces is None:
+        mesh = read_ply(path)
+        return mesh.vertices, mesh.colours
+    read = [Points(NO_POINTS), *pieces]
+    colours = [piece.colours for piece in read if piece.colours is not None]
+    return np.concatenate([piece.positions for piece in read]), np.concatenate(colours) if colours else None
 
 
 def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.ndarray, where: str) -> Frame:

@@ -25,7 +25,8 @@ from shellgs_method.datamanager import FacadeDataset
 from shellgs_method.errors import SceneError
 from shellgs_method.files import colmap
 from shellgs_method.files.photographs import load_photograph
-from shellgs_method.files.sparse_points import read_sparse_points
+from shellgs_method.files.sparse_points import find_sparse_points, read_sparse_points
+from shellgs_method.files.splats import Splats, write_splats
 from shellgs_method.geometry.camera import Camera, image_up
 
 
@@ -96,6 +97,43 @@ def test_points_without_colours_are_grey(scene):
     lines = [*header, "end_header", "0 0 0", "1 0 0", "0 1 0", "0 0 1"]
     (scene / "sparse_pc.ply").write_text("\n".join(lines) + "\n")
     assert (parse(scene).metadata["points3D_rgb"] == torch.full((4, 3), 128)).all()
+
+
+COLOURS: dict[str, tuple[tuple[str, ...], str, float]] = {
+    "bytes": (("red", "green", "blue"), "u1", 1.0),
+    "floats to 255": (("red", "green", "blue"), "<f4", 1.0),
+    "floats to 1": (("red", "green", "blue"), "<f4", 1 / 255),
+    "16 bits": (("red", "green", "blue"), "<u2", 257.0),
+    "diffuse": (("diffuse_red", "diffuse_green", "diffuse_blue"), "u1", 1.0),
+    "letters": (("r", "g", "b"), "u1", 1.0),
+}
+
+
+@pytest.mark.parametrize("kind", COLOURS)
+def test_colours_of_points_may_be_of_any_name_and_type(scene, kind):
+    names, stored, factor = COLOURS[kind]
+    colours = np.array([[0, 10, 200], [255, 30, 60], [7, 128, 90], [40, 41, 42]])
+    rows = np.zeros(4, [(axis, "<f4") for axis in "xyz"] + [(name, stored) for name in names])
+    rows["x"] = range(4)
+    for name, values in zip(names, colours.T, strict=True):
+        rows[name] = values * factor
+    word = {"u1": "uchar", "<f4": "float", "<u2": "ushort"}[stored]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 4"]
+    header += [*(f"property float {axis}" for axis in "xyz"), *(f"property {word} {name}" for name in names)]
+    (scene / "sparse_pc.ply").write_bytes("\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
+    found = find_sparse_points(FacadeDataParserConfig(data=scene)).colours
+    assert found is not None
+    np.testing.assert_array_equal(found, colours)
+
+
+def test_splats_are_points_of_their_mean_colours(scene):
+    harmonics = torch.tensor([[[0.0, 1.0, -1.0]], [[9.0, -9.0, 0.1]]])
+    splats = Splats(torch.eye(3)[:2], torch.ones(2, 4), torch.zeros(2, 3), torch.zeros(2, 1), harmonics)
+    write_splats(scene / "sparse_pc.ply", splats)
+    points = find_sparse_points(FacadeDataParserConfig(data=scene))
+    np.testing.assert_array_equal(points.positions, [[1, 0, 0], [0, 1, 0]])
+    assert points.colours is not None
+    np.testing.assert_array_equal(points.colours, [[128, 199, 56], [255, 0, 135]])
 
 
 def test_scene_cameras_undo_nerfstudios_rescaling(pristine_scene):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Protocol
 
@@ -24,7 +24,9 @@ from shellgs_method.files.readers.points import PIECE, Colours, Points
 
 _KNOWN = ("vertex", "face", "tristrips", "edge", "range_grid", "material", "camera")
 _SPLAT = ({"opacity", "scale_0", "rot_0"}, {"packed_position", "packed_rotation"})
-_NORMAL, _COLOUR = ("nx", "ny", "nz"), ("red", "green", "blue")
+_NORMAL = ("nx", "ny", "nz")
+_COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""What programs call colours."""
 _STRIP_END = -1
 _TEXT = 1 << 25  # bytes of text read at once
 
@@ -60,8 +62,8 @@ def read_ply(path: Path) -> Geometry:
     for element in header.elements:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
-    bands = [columns[name] for name in _COLOUR if name in columns]
-    colours = Colours().of(np.stack(bands, axis=1)) if len(bands) == 3 else None
+    bands = [columns[name] for name in _colours_among(columns)]
+    colours = Colours().of(np.stack(bands, axis=1)) if bands else None
     return Geometry(vertices, np.concatenate(faces), colours=colours)
 
 
@@ -88,7 +90,7 @@ def ply_points(path: Path, coloured: bool = False) -> Iterator[Points] | None:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     at = names.index("vertex")
-    roles = "xyz", _NORMAL, _COLOUR if coloured else ()
+    roles = "xyz", _NORMAL, _colours_among(columns) if coloured else ()
     used = [[columns.index(name) for name in names if {*names} <= {*columns}] for names in roles]
     colours = Colours()
     if header.order is None:
@@ -99,6 +101,11 @@ def ply_points(path: Path, coloured: bool = False) -> Iterator[Points] | None:
     before = sum(row.itemsize * element.count for row, element in zip(rows[:at], there, strict=False))
     tables = _binary_tables(path, header.length + before, rows[at], there[at].count)
     return (_of_columns([[table[f"{k}"] for k in part] for part in used], colours) for table in tables)
+
+
+def _colours_among(columns: Container[str]) -> tuple[str, ...]:
+    """Names of red, green and blue; none if there are none."""
+    return next((names for names in _COLOURS if all(name in columns for name in names)), ())
 
 
 def _of_columns(parts: list[list[np.ndarray]], colours: Colours) -> Points:
