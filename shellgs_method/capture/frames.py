@@ -72,6 +72,11 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     with _opened(video) as (container, stream):
         for number, frame in enumerate(_frames(container, stream)):
             if number in chosen:
+                if frame.interlaced_frame:
+                    notice(
+                        f"{video} is interlaced: where it moves, every other line of a frame is interpolated, as it is "
+                        "of another moment; record it progressive (25p, not 50i) if you can."
+                    )
                 image = _upright(frame, transfer, aspect)
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
                 progress.advance(task)
@@ -211,6 +216,23 @@ def _upright(frame: av.VideoFrame, transfer: Transfer | None, aspect: float) -> 
         image = frame.to_image()
     else:
         image = Image.fromarray(tone_mapped(frame.to_ndarray(format="rgb48le"), transfer))
+    if frame.interlaced_frame and _is_combed(pixels := np.asarray(image)):
+        image = Image.fromarray(_first_field(pixels))
     if aspect != 1:
         image = image.resize((round(image.width * aspect), image.height), Image.Resampling.BICUBIC)
     return image.rotate(frame.rotation, expand=True)
+
+
+def _is_combed(pixels: UInt8[np.ndarray, "H W 3"]) -> bool:
+    """Whether every other line is of another moment: lines are less like the next than like the one after it."""
+    lines = pixels.mean(axis=2, dtype=np.float32)
+    return bool(np.abs(lines[2:] - lines[1:-1]).mean() > np.abs(lines[2:] - lines[:-2]).mean())
+
+
+def _first_field(pixels: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """The picture of its even lines, with the others interpolated."""
+    even = pixels[::2].astype(np.uint16)
+    below = np.concatenate([even[1:], even[-1:]])
+    whole = pixels.copy()
+    whole[1::2] = ((even + below + 1) // 2)[: len(whole[1::2])]
+    return whole

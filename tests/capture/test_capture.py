@@ -299,6 +299,25 @@ def test_the_curve_of_srgb_and_its_inverse_agree():
     assert linear_of(np.array([0.5]))[0] == pytest.approx(0.21404114, abs=1e-7)  # IEC 61966-2-1
 
 
+@pytest.mark.parametrize(("flags", "told"), [("interlaced=1:tff=1:", True), ("", False)])
+def test_a_frame_of_an_interlaced_video_is_of_one_moment(tmp_path, caplog, flags, told):
+    wide = np.asarray(photograph().resize((96, 48), Image.Resampling.BICUBIC))
+    first, second = wide[:, :64], wide[:, 12:76]  # the camera moves by 12 pixels within a frame
+    combed = first.copy()
+    combed[1::2] = second[1::2]
+    with av.open(str(tmp_path / "walk.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=25, options={"x264-params": f"{flags}qp=1"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
+        for frame in [*[av.VideoFrame.from_ndarray(np.ascontiguousarray(combed))] * 5, None]:
+            container.mux(stream.encode(frame))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 1, QUIET)
+    with Image.open(next((tmp_path / "frames").iterdir())) as image:
+        off = np.abs(np.asarray(image).astype(int) - first).mean()
+    assert (off < 8) == told
+    assert ("is interlaced: where it moves" in caplog.text) == told
+
+
 def test_frames_of_a_video_whose_pixels_are_not_square_are_as_wide_as_they_are_shown(tmp_path):
     write_video(tmp_path / "hdv.mp4", [photograph(96, 72)] * 8, pixel_aspect=Fraction(4, 3))
     (tmp_path / "frames").mkdir()
