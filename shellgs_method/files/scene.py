@@ -121,8 +121,7 @@ class SceneLayout(ScenePaths):
             FileNotFoundError: the scene has neither.
             SceneError: the shell was aligned to adjusted cameras, which are missing.
         """
-        if not self.data.is_dir():
-            raise FileNotFoundError(f"{self.data} is not a folder: give a scene folder")
+        self._check_folder()
         if self.colmap_path is not None or not self._is_adjusted():
             return self.unadjusted_folder()
         if not (self.data / ADJUSTED).is_dir():
@@ -131,6 +130,11 @@ class SceneLayout(ScenePaths):
                 "align the shell again"
             )
         return ADJUSTED
+
+    def _check_folder(self) -> None:
+        if not self.data.is_dir():
+            which = f"its scene's, {self.data.parent}" if self.data.is_file() else "a scene folder"
+            raise FileNotFoundError(f"{self.data} is not a folder: give {which}")
 
     def _is_adjusted(self) -> bool:
         """Whether the scene's alignment was found with adjusted cameras; a damaged one is reported where it is used."""
@@ -152,8 +156,7 @@ class SceneLayout(ScenePaths):
         """
         from shellgs_method.files import colmap, transforms
 
-        if not self.data.is_dir():
-            raise FileNotFoundError(f"{self.data} is not a folder: give a scene folder")
+        self._check_folder()
         if (self.data / transforms.NAME).is_file() and self.colmap_path is None:
             return None
         folder = colmap.find_folder(self.data, self.colmap_path)

@@ -80,6 +80,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         SceneError: it cannot be read, or holds anything else or invalid Gaussians.
     """
+    if path.is_dir() and path.suffix != ".ckpt":
+        raise SceneError(f"{path} is a folder: --load-dir takes it, and --load-checkpoint a file in it")
+    if not path.exists():
+        raise SceneError(f"{path}, the checkpoint, does not exist")
     remedy = "remove it to resume from an earlier one, or train again"
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)

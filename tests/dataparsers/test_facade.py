@@ -651,6 +651,11 @@ def test_a_folder_without_cameras_is_refused(tmp_path):
         parse(tmp_path)
 
 
+def test_the_file_of_the_cameras_is_no_scene(scene):
+    with pytest.raises(FileNotFoundError, match=rf"transforms.json is not a folder: give its scene's, {scene}$"):
+        parse(scene / "transforms.json")
+
+
 def test_a_users_mask_is_attached_at_the_cameras_size(scene):
     transforms = json.loads((scene / "transforms.json").read_text())
     mask = np.zeros((64, 96), np.uint8)

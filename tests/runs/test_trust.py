@@ -26,6 +26,7 @@ from training_runs import Method, small_disk, trainer_of
 
 from shellgs_method import cli
 from shellgs_method.errors import SceneError
+from shellgs_method.runs.checkpoints import load_checkpoint
 from shellgs_method.runs.config_file import RENAMED, _known, _Loader, load_config, renamed
 
 LAST = "nerfstudio_models/step-000000001.ckpt"
@@ -325,6 +326,14 @@ def test_a_checkpoint_of_another_method_is_not_resumed_by_its_path(run, pristine
 
     with pytest.raises(SystemExit, match=r"is a checkpoint of splatfacto, not of photo-gs: "):
         trainer_of(pristine_scene, tmp_path / "resumed", "photo_gs", change=resume)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"), [("", "is a folder: --load-dir takes it"), ("step-9.ckpt", "the checkpoint, does not exist")]
+)
+def test_a_path_that_is_no_checkpoint_is_not_called_a_damaged_one(tmp_path, name, why):
+    with pytest.raises(SceneError, match=why):
+        load_checkpoint(tmp_path / name)
 
 
 def test_a_missing_config_is_named(tmp_path, monkeypatch):
