@@ -368,11 +368,14 @@ class _Capture:
         missing = sorted(set(names) - set(largest["names"]))
         registered = len(largest["names"])
         is_flat = found.get("flat_pairs", 0) > _NO_PARALLAX
-        if is_flat and registered < LEAST_SHARE * len(names):
+        points, seen_in = largest.get("points", 0), largest.get("track_length", 0.0)
+        sees_little = points * seen_in < LEAST_SEEN * registered
+        if is_flat and (sees_little or registered < LEAST_SHARE * len(names)):
             raise SceneError(
                 f"the photographs of {self.source} show no parallax: almost any two differ by a turn of the camera "
-                f"alone, or show one plane, and the cameras of only {registered} of {len(names)} were found. Walk "
-                "sideways along the building, a step between photographs; neither stand nor turn on the spot"
+                f"alone, or show one plane, and the cameras of {registered} of {len(names)} were found, by {points} "
+                "points. Walk sideways along the building, a step between photographs; neither stand nor turn on the "
+                "spot"
             )
         if is_flat:
             notice(
@@ -392,11 +395,11 @@ class _Capture:
                 f"{LEAST_SHARE:.0%} of them and at least {LEAST_REGISTERED}. Not found: {shown}. {advice} out "
                 "photographs of other things; photograph larger, with more overlap, in sidesteps rather than turns"
             )
-        if largest["points"] * largest["track_length"] < LEAST_SEEN * registered:
+        if sees_little:
             raise SceneError(
-                f"the photographs of {self.source} show too little to find cameras by: only {largest['points']} "
-                f"points, each in {largest['track_length']:.1f} of {registered} photographs. Give larger and sharper "
-                f"photographs of the building, which show at least {LEAST_SEEN} points each"
+                f"the photographs of {self.source} show too little to find cameras by: only {points} points, each in "
+                f"{seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the building, which "
+                f"show at least {LEAST_SEEN} points each"
             )
         if torn := largest.pop("torn", None):
             slower = "more --frames, or a slower walk, help" if self.is_video else "more photographs there help"

@@ -50,7 +50,7 @@ def tell(what: str) -> None:
 
 
 class Lines:
-    """Prints with which item the work is: the first, the last, and one every :data:`EVERY` seconds.
+    """Prints with which item the work is: the first, and one every :data:`EVERY` seconds.
 
     Nothing on a terminal, which has bars.
     """
@@ -62,7 +62,7 @@ class Lines:
     def at(self, item: int) -> None:
         """The work is with this item, counted from 1."""
         now = time.monotonic()
-        if not self._terminal and (now >= self._printed + EVERY or item == self._total):
+        if not self._terminal and now >= self._printed + EVERY:
             print(f"{self._what}: {item} of {self._total}", flush=True)
             self._printed = now
 
