@@ -398,8 +398,8 @@ class _Capture:
         if sees_little:
             raise SceneError(
                 f"the photographs of {self.source} show too little to find cameras by: only {points} points, each in "
-                f"{seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the building, which "
-                f"show at least {LEAST_SEEN} points each"
+                f"{seen_in:.1f} of {registered} photographs. Give larger and sharper photographs of the building, "
+                f"which show at least {LEAST_SEEN} points each"
             )
         if torn := largest.pop("torn", None):
             slower = "more --frames, or a slower walk, help" if self.is_video else "more photographs there help"
