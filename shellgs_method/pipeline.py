@@ -111,11 +111,10 @@ class FacadePipeline(VanillaPipeline):
         both = (data.train_dataset, data.eval_dataset)
         cameras = [dataset.camera(index) for dataset in both for index in range(len(dataset))]
         self.model.start_in(coarse, track(cameras, "Looking at the coarse run from view", len(cameras)))
-        cell = self._cell
+        cell = self._cell()
         self._block = {"name": cell.block.name, "region": cell.fingerprint, "coarse": coarse.hash}
 
-    @property
-    def _cell(self) -> Cell:
+    def _cell(self) -> Cell:  # no property: the viewer reads all of them, of whole scenes too
         """The block's region in the scene, as it is cut now."""
         parser: Any = self.datamanager.config.dataparser
         return Blocks.read(parser.data / BLOCKS).cell(parser.block)
@@ -209,7 +208,7 @@ class FacadePipeline(VanillaPipeline):
                 "name the model of those as colmap_path in its config.yml, or train again"
             )
         block = state.get("block") or {}
-        if self.test_mode != "val" and block and block["region"] != self._cell.fingerprint:
+        if self.test_mode != "val" and block and block["region"] != self._cell().fingerprint:
             raise SceneError(f"{block['name']} was cut anew since the run was trained: train it again")
 
     def restore_training(self) -> None:
