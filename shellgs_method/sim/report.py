@@ -11,6 +11,7 @@ import numpy as np
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.html import captioned, encoded, img, table, write_page
+from shellgs_method.geometry.camera import Camera, world_rays
 from shellgs_method.geometry.spread import spread
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import Reconstruction
@@ -27,6 +28,8 @@ from shellgs_method.sim.trials.trials import throw, walk
 
 IMAGES = 3
 """Number of photographs shown of each building."""
+SAMPLED = 32
+"""Longer side in pixels at which it is looked up what a view shows."""
 REGIONS = 20
 """Number of deviations listed."""
 
@@ -190,7 +193,10 @@ def _section(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Itera
 def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:
     """Photographs, MuJoCo's renders from the same cameras, and photographs with the edges of the collision geometry."""
     held_out = [k for k, view in enumerate(chapter.made.views) if view.name in chapter.made.held_out]
-    chosen = [held_out[k] for k in spread(len(held_out), IMAGES)]
+    cameras = chapter.made.cameras
+    shares = {k: _share(chapter.collider.surface, cameras[k]) for k in held_out}
+    showing = [k for k, share in shares.items() if share >= max(shares.values()) / 2]
+    chosen = [showing[k] for k in spread(len(showing), IMAGES)]
     photos = [shown(chapter.made.photo(k)) for k in chosen]
     try:
         drawn = rendered(world, [photo.camera for photo in photos])
@@ -203,6 +209,11 @@ def _images(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterat
         yield _captioned(photo.image, chapter.made.views[k].name)
         yield "" if image is None else _captioned(image, "MuJoCo")
         yield _captioned(overlaid(photo, surface), "edges of the collision geometry") + "</div>"
+
+
+def _share(surface: Triangles, camera: Camera) -> float:
+    """Share of a view that shows a surface, were nothing else there: views of a block may show hardly any of it."""
+    return float(surface.blocked(*world_rays(camera.shrunk(SAMPLED))).mean())
 
 
 def _captioned(image: np.ndarray, caption: str) -> str:
