@@ -25,7 +25,7 @@ from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
 from shellgs_method.files.undistortion import refuse_folding, undistort
-from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.camera import OPENGL, Camera, positions
 from shellgs_method.geometry.precision import camera_step, warn_of_coarse
 from shellgs_method.registration.sfm_frame import check_points
 
@@ -164,7 +164,7 @@ def _rescaled(
 ) -> tuple[torch.Tensor, Float64[np.ndarray, "4 4"], float]:
     """Poses in nerfstudio's world (OpenGL, float32), and the rigid motion and then scale from the scene to it."""
     poses = np.stack([np.linalg.inv(frame.camera.viewmat.numpy()) for frame in recording.frames])
-    poses = recording.applied @ poses @ np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = recording.applied @ poses @ OPENGL
     to_origin = np.eye(4)
     positions = poses[:, :3, 3]
     if np.spacing(np.abs(positions).max().astype(np.float32)) > ROUNDING * np.linalg.norm(np.ptp(positions, axis=0)):

@@ -71,6 +71,11 @@ class Splats:
         return math.isqrt(self.harmonics.shape[1]) - 1
 
     @property
+    def colours(self) -> Float[Tensor, "N 3"]:
+        """Colours from 0 to 1, means over all directions of view."""
+        return (0.5 + DEGREE_0 * self.harmonics[:, 0].double()).clamp(0, 1)
+
+    @property
     def is_finite(self) -> Bool[Tensor, " N"]:
         """Which Gaussians have no NaN or infinite value: these break viewers."""
         return torch.stack([each.flatten(1).isfinite().all(dim=1) for each in self._tensors]).all(dim=0)
@@ -194,10 +199,9 @@ def _glb(splats: Splats, comments: Sequence[str]) -> bytes:
     A point cloud of the mean colours where the extension is not known.
     """
     opacities = splats.opacities.double().sigmoid()
-    colours = (0.5 + DEGREE_0 * splats.harmonics[:, 0].double()).clamp(0, 1)
     attributes = {
         "POSITION": splats.means,
-        "COLOR_0": (255 * torch.cat([colours, opacities], dim=1)).round().to(torch.uint8),
+        "COLOR_0": (255 * torch.cat([splats.colours, opacities], dim=1)).round().to(torch.uint8),
         f"{_EXTENSION}:ROTATION": _unit_quats(splats)[:, [1, 2, 3, 0]],
         f"{_EXTENSION}:SCALE": splats.scales.double().exp(),
         f"{_EXTENSION}:OPACITY": opacities,

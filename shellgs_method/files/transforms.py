@@ -19,6 +19,8 @@ from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
 from shellgs_method.files.readers.ply import ply_points, read_ply
 from shellgs_method.files.readers.points import NO_POINTS, Points
+from shellgs_method.files.splats import read_splats
+from shellgs_method.geometry.camera import OPENGL
 from shellgs_method.geometry.lens import COEFFICIENTS
 
 NAME = "transforms.json"
@@ -26,7 +28,6 @@ GREY = 128
 """Colour of points whose file has none."""
 # Applied to COLMAP's frame by old versions of ns-process-data, without being recorded.
 _UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _ANGLES = ("camera_angle_x", "camera_angle_y")
 _LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *COEFFICIENTS)
 
@@ -96,11 +97,8 @@ def _points_of(path: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray
     """Positions of the vertices of a PLY, which may be a mesh's or splats, and their colours if it has any."""
     columns = {prop.name for element in read_ply_header(path).elements for prop in element.properties}
     if {"f_dc_0", "opacity", "scale_0"} <= columns:
-        from shellgs_method.files.splats import DEGREE_0, read_splats  # imports torch, which is slow
-
         gaussians = read_splats(path)
-        mean = 255 * (0.5 + DEGREE_0 * gaussians.harmonics[:, 0].double().numpy())
-        return gaussians.means.double().numpy(), mean.round().clip(0, 255).astype(np.uint8)
+        return gaussians.means.double().numpy(), (255 * gaussians.colours).round().numpy().astype(np.uint8)
     pieces = ply_points(path, coloured=True)
     if pieces is None:
         mesh = read_ply(path)
@@ -133,7 +131,7 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
     if "fl_x" not in lens:
         angles = {key: source[key] for key in _ANGLES for source in (meta, entry) if key in source}
         lens = _by_angles(angles, photograph, where) | lens
-    found = frame(files.scene, name, np.linalg.inv(applied) @ pose @ _OPENGL, lens, where)
+    found = frame(files.scene, name, np.linalg.inv(applied) @ pose @ OPENGL, lens, where)
     if not entry.get("mask_path"):
         return found
     return replace(found, mask=files.other(str(entry["mask_path"]), where))

@@ -13,6 +13,9 @@ from torch import Tensor
 
 from shellgs_method.machine.constants import constant
 
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From a camera's axes in OpenGL (y up, z backwards) to ours, and back."""
+
 
 @dataclass(frozen=True)
 class Camera:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -125,6 +126,15 @@ class Triangles:
 def _index(answer) -> Int32[np.ndarray, " *N"]:
     """Triangles of an answer of Open3D's, which marks a miss by 2³² - 1: as signed integers, without a copy, by -1."""
     return answer["primitive_ids"].numpy().view(np.int32)
+
+
+def stacked(
+    meshes: Iterable[tuple[Float64[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]],
+) -> tuple[Float64[np.ndarray, "W 3"], Int[np.ndarray, "G 3"]]:
+    """Vertices and faces of meshes as those of one."""
+    vertices, faces = zip(*meshes, strict=True)
+    starts = np.cumsum([0, *(len(each) for each in vertices[:-1])])
+    return np.concatenate(vertices), np.concatenate([each + start for each, start in zip(faces, starts, strict=True)])
 
 
 def area_vectors(vertices: Float64[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float64[np.ndarray, "F 3"]:

@@ -20,7 +20,7 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import transforms
 from shellgs_method.files.photographs import View, load_photograph
 from shellgs_method.files.sparse_points import SparsePoints
-from shellgs_method.geometry.camera import Camera, in_view, positions
+from shellgs_method.geometry.camera import OPENGL, Camera, in_view, positions
 from shellgs_method.geometry.spread import spread
 
 UNITS = {
@@ -72,22 +72,21 @@ class Slip:
         return points @ self.correction.T
 
 
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _ROLLED = "cameras are rolled by {}° against their photographs: their x axis points to the right of these as stored"
 _OF_POSES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     (
         "transform_matrix has OpenCV's axes of the camera instead of OpenGL's: negate its second and third columns",
-        lambda viewmat: _OPENGL @ viewmat,
+        lambda viewmat: OPENGL @ viewmat,
     ),
     (
         "transform_matrix is from the world to the camera: invert it",
-        lambda viewmat: _OPENGL @ np.linalg.inv(_OPENGL @ viewmat),
+        lambda viewmat: OPENGL @ np.linalg.inv(OPENGL @ viewmat),
     ),
     (
         "transform_matrix is from the world to the camera, in OpenCV's axes: invert it, and negate the second and "
         "third columns of that",
-        lambda viewmat: np.linalg.inv(_OPENGL @ viewmat),
+        lambda viewmat: np.linalg.inv(OPENGL @ viewmat),
     ),
     (_ROLLED.format(180), lambda viewmat: np.diag([-1.0, -1.0, 1.0, 1.0]) @ viewmat),
     (_ROLLED.format(90), lambda viewmat: _QUARTER @ viewmat),

@@ -13,7 +13,7 @@ from trimesh.intersections import slice_faces_plane
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.geometry.precision import NO_STEP, Step
 from shellgs_method.geometry.surface_classes import NO_CLASSES, classes_of
-from shellgs_method.geometry.triangles import area_vectors
+from shellgs_method.geometry.triangles import area_vectors, stacked
 from shellgs_method.shell.clouds import Meshing
 
 NO_SOURCES = np.empty(0, np.int64)
@@ -79,15 +79,11 @@ class ShellMesh:
         parts = []
         for number in range(len(kinds)):
             of_kind = self.faces[kind.ravel() == number]
-            vertices, faces, _ = slice_faces_plane(self.vertices, of_kind, normal, offset * normal)
-            parts.append((vertices, faces, np.broadcast_to(kinds[number], (len(faces), 2))))
-        firsts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts[:-1])])
-        vertices, faces, of = (np.concatenate(each) for each in zip(*parts, strict=True))
-        faces = faces + np.repeat(firsts, [len(each) for _, each, _ in parts])[:, None]
+            parts.append(slice_faces_plane(self.vertices, of_kind, normal, offset * normal)[:2])
+        vertices, faces = stacked(parts)
         kept = ~without_area(vertices, faces)
-        return ShellMesh(
-            vertices, faces[kept], self.meshing, self.step, of[kept, 0].astype(np.uint8), of[kept, 1].astype(np.int64)
-        )
+        classes, source = np.repeat(kinds, [len(each) for _, each in parts], axis=0)[kept].T
+        return ShellMesh(vertices, faces[kept], self.meshing, self.step, classes.astype(np.uint8), source)
 
 
 def sources_of(faces: Int64[np.ndarray, "F 3"], sources: Int64[np.ndarray, " S"]) -> Int64[np.ndarray, " F"]:
@@ -123,10 +119,8 @@ def joined(meshes: Sequence[ShellMesh], paths: Sequence[Path], metres_per_unit: 
     if len(meshes) == 1:
         return meshes[0]
     _check_frame([mesh.bounds for mesh in meshes], paths, metres_per_unit)
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     return ShellMesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)]),
+        *stacked((mesh.vertices, mesh.faces) for mesh in meshes),
         tuple(meshing for mesh in meshes for meshing in mesh.meshing),
         max((mesh.step for mesh in meshes), key=lambda step: (step.rounded * step.coarsest, step.coarsest)),
         np.concatenate([mesh.classes for mesh in meshes]),

@@ -11,6 +11,7 @@ import trimesh
 from jaxtyping import Float, Float64, Int
 
 from shellgs_method.geometry.similarity import transformed
+from shellgs_method.geometry.triangles import stacked
 
 
 class Material(IntEnum):
@@ -51,10 +52,8 @@ class Mesh:
 def merge(meshes: Iterable[Mesh]) -> Mesh:
     """Merge meshes into one."""
     meshes = list(meshes)
-    first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.triangles + offset for mesh, offset in zip(meshes, first, strict=True)]),
+        *stacked((mesh.vertices, mesh.triangles) for mesh in meshes),
         np.concatenate([mesh.material for mesh in meshes]),
     )
 

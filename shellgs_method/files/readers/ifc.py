@@ -17,6 +17,7 @@ from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.readers.contents import Geometry, say_left_out
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
+from shellgs_method.geometry.triangles import stacked
 from shellgs_method.machine.extras import import_extra
 
 _END = b"END-ISO-10303-21"
@@ -93,10 +94,10 @@ def read_ifc(path: Path) -> Geometry:
         notice(f"{path}: {len(faults)} of its lines or shapes are faulty and may be missing, such as: {first}.")
     if not made:
         raise SceneError(f"the shell {path} has no walls, roofs, windows or other outside of a building")
-    starts = np.cumsum([0, *(len(part.vertices) for part in made)])
+    vertices, faces = stacked((part.vertices, part.faces) for part in made)
     return Geometry(
-        _on_the_map(model, np.concatenate([part.vertices for part in made]), path),
-        np.concatenate([part.faces + start for part, start in zip(made, starts, strict=False)]),
+        _on_the_map(model, vertices, path),
+        faces,
         classes=np.concatenate([part.classes for part in made]),
         drawn=True,
     )

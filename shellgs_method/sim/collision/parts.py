@@ -11,6 +11,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
+from shellgs_method.geometry.triangles import stacked
+
 MOST_VERTICES = 64
 """Maximum number of a part's corners: PhysX, in Isaac Sim, cooks no larger hulls."""
 FINEST = 1e-3
@@ -67,11 +69,7 @@ class Part:
 
 def joined(parts: Sequence[Part]) -> tuple[Float64[np.ndarray, "V 3"], Int64[np.ndarray, "F 3"]]:
     """Vertices and faces of all parts as one mesh."""
-    first = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    return (
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + offset for part, offset in zip(parts, first, strict=True)]),
-    )
+    return stacked((part.vertices, part.faces) for part in parts)
 
 
 def pieces(parts: Sequence[Part], gap: float) -> int:
