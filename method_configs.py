@@ -68,6 +68,7 @@ shellgs_metric = _method(
         trust="photographs",
         exposure="learned",
         depth="mode",
+        background_color="white",  # as the sky about is: where the skybox has a gap, black would be seen
         densify_grad_thresh=THRESHOLD_METRIC,
         extra=ExtraLossConfig(
             empty_space=1.0,

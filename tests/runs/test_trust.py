@@ -159,7 +159,8 @@ OLDER = Path(__file__).parent / "shellgs-metric-older.yml"
 
 def test_an_older_config_of_shellgs_metric_means_what_it_meant():
     now = copy.deepcopy(all_methods["shellgs-metric"]).pipeline.model
-    assert load_config(OLDER).pipeline.model == replace(now, exposure="fixed")  # there was nothing else
+    then = replace(now, exposure="fixed", background_color="black")  # there was nothing else
+    assert load_config(OLDER).pipeline.model == then
 
 
 @pytest.mark.parametrize(
