@@ -68,11 +68,9 @@ class BoundCameras:
         same = {view.name: view for view in views if view.name in self.cameras}
         if same:
             return same
-        recorded, present = Counter(map(_stem, self.cameras)), Counter(_stem(view.name) for view in views)
-        there = {_stem(view.name): view for view in views if present[_stem(view.name)] == 1}
-        return {
-            name: there[_stem(name)] for name in self.cameras if _stem(name) in there and recorded[_stem(name)] == 1
-        }
+        recorded, present = Counter(map(stem, self.cameras)), Counter(stem(view.name) for view in views)
+        there = {stem(view.name): view for view in views if present[stem(view.name)] == 1}
+        return {name: there[stem(name)] for name in self.cameras if stem(name) in there and recorded[stem(name)] == 1}
 
     def camera_changed(self, name: str, camera: Camera) -> str | None:
         """How a photograph's camera, of any image size, differs from the one recorded, in words; None if it agrees."""
@@ -95,7 +93,7 @@ class BoundCameras:
         return float(np.linalg.norm(np.ptp(positions(self.cameras.values()), axis=0)))
 
 
-def _stem(name: str) -> PurePosixPath:
+def stem(name: str) -> PurePosixPath:
     """A photograph's path in its folder of the scene, without the suffix of its format."""
     return PurePosixPath(name.partition("/")[2] or name).with_suffix("")
 

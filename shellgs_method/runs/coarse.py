@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import content_hash
+from shellgs_method.files.bound_cameras import stem
 from shellgs_method.runs.checkpoints import finished_checkpoint, gaussians_in, load_checkpoint
 from shellgs_method.runs.run_folder import check_world, open_run
 
@@ -61,9 +62,9 @@ class CoarseRun:
                 f"the coarse run {path.parent} has exposures of {len(exposures)} photographs, and the scene has "
                 f"{count} to train on: train it again"
             )
-        trained_on = [PurePath(name).stem for name in state.get("_extra_state", {}).get("cameras", {})]
+        trained_on = [stem(name) for name in state.get("_extra_state", {}).get("cameras", {})]
         views = zip(used, parsed.metadata["views"], strict=True)
-        other = (view.name for k, view in views if trained_on[k : k + 1] != [PurePath(view.name).stem])
+        other = (view.name for k, view in views if trained_on[k : k + 1] != [stem(view.name)])
         if trained_on and (name := next(other, None)):
             raise SceneError(
                 f"the coarse run {path.parent} was trained on other photographs than the scene has to train on, from "

@@ -194,6 +194,7 @@ def test_the_bound_on_seeds_is_one_on_those_of_the_block_whatever_else_its_photo
         ("unknown photograph", "which is no photograph of the scene"),
         ("another scene", "is not the scene that the run"),
         ("others held out", "was trained on other photographs than .* from images/frame_0000[0-9]"),
+        ("another camera of a rig", "was trained on other photographs than .* from images/frame_0000[0-9]"),
     ],
 )
 def test_what_no_block_can_start_from_is_refused_in_a_sentence(coarse, street, tmp_path, broken, said):
@@ -228,6 +229,14 @@ def test_what_no_block_can_start_from_is_refused_in_a_sentence(coarse, street, t
         names = sorted(frame["file_path"] for frame in transforms["frames"])
         transforms |= {"test_filenames": [names[0], names[5]], "train_filenames": [*names[1:5], *names[6:]]}
         (scene / "transforms.json").write_text(json.dumps(transforms))
+    elif broken == "another camera of a rig":
+        (checkpoint,) = folder.rglob("*.ckpt")
+        state = torch.load(checkpoint, weights_only=False)
+        extra = state["pipeline"]["_extra_state"]
+        extra["cameras"] = {
+            name.replace("images/", "images/left/"): camera for name, camera in extra["cameras"].items()
+        }
+        torch.save(state, checkpoint)
     (scene / BLOCKS).write_text(json.dumps(blocks))
     with pytest.raises((SystemExit, SceneError, FileNotFoundError), match=said):
         block_run(coarse, "east", tmp_path, change=change)
