@@ -49,7 +49,7 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
-VERSION = 13
+VERSION = 14
 """Version of the maps: maps of another version are made again."""
 
 _COLOUR, _NEUTRAL = 0.05, 0.6  # weight of colours in a score; their log-ratio at which they count neither way

@@ -25,16 +25,17 @@ from torch.nn.functional import grid_sample
 
 from shellgs_method.geometry.camera import Camera
 
-_NEAREST, _STEP = 0.0125, 1.4
-OFFSETS = tuple(_NEAREST * _STEP**k for k in range(15))
-"""Tried depths, as the relative excess of their inverse over the shell's: from 10 cm in front of a wall that is 8 m
-away to a third of its depth."""
+_NEAREST, _FARTHEST, _STEP = 0.0125, 1.38, 1.4
+_FINEST = 0.02  # difference of offsets below which none is tried, however far apart the cameras are
 OFFSETS_BEHIND = tuple(-2 * _NEAREST * 2.0**k for k in range(6))
-"""The same behind the shell, from 20 cm behind a wall that is 8 m away to five times its depth: coarser, since what is
-found there need not be accurate."""
+"""Tried depths behind the shell, as the relative excess of their inverse over the shell's: from 20 cm behind a wall
+that is 8 m away to five times its depth. They are few, since what is found there need not be accurate."""
 MOVES = 5.5
-"""Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and much more needs
-finer steps of depth than the offsets have."""
+"""Parallax in pixels for which neighbours are chosen at each offset: much less is not significant, and with much more
+fewer photographs show the same."""
+MOVES_ON = 4.0
+"""Most pixels by which a place moves in the nearest photograph from one tried depth to the next. Where photographs are
+far apart, thin things were between two."""
 PER_SIDE = 4
 """Neighbours on either side of a view: what is occluded on one side is visible from the other."""
 PER_SIDE_BEHIND = 2
@@ -60,6 +61,7 @@ _WINDOW, _EDGES = 13, 1e-3  # guided filter: window side in pixels, regularisati
 # Separable, with coefficients subsampled by 2 (He and Sun 2015), it is 7 times faster; recall and precision stay
 # within 0.01. Before kornia 0.9, it is not separable, and fails to subsample odd sizes.
 _FAST: Any = {"separable": True, "subsample": 2} if "separable" in signature(guided_blur).parameters else {}
+_AT_ONCE = 15  # depths that are compared at once, for memory
 _FEATHERED = 4  # times the silhouette is feathered
 _COLOUR, _GRADIENT = 0.12, 0.06  # truncation of colour and gradient differences, for values in [0, 1]
 _WEIGHTS = (1 / (6 * _COLOUR), 1 / (4 * _GRADIENT))  # of a colour and a gradient: each mean is truncated at a half
@@ -113,6 +115,25 @@ class Sweep(NamedTuple):
         return torch.sigmoid((self.score.float() - threshold * CONTRADICTED) / 0.02)
 
 
+def offsets_before(view: Camera, others: Sides, depth: float) -> list[float]:
+    """Depths to try in front of the shell, as the relative excess of their inverse over the shell's.
+
+    They reach from 10 cm in front of a wall that is 8 m away to two fifths of its depth. Each is 1.4 times the one
+    before; less where the nearest camera would see a place move by more than :data:`MOVES_ON`.
+
+    Args:
+        view: the view's camera.
+        others: the other cameras, by :func:`sides`.
+        depth: typical depth of the shell in the view.
+    """
+    nearest = min((baseline for side in others for baseline, _ in side if baseline > 1e-6 * depth), default=depth)
+    most = max(MOVES_ON * depth / (nearest * float(view.K[0, 0])), _FINEST)
+    offsets = [_NEAREST]
+    while offsets[-1] < _FARTHEST:
+        offsets.append(min(_STEP * offsets[-1], offsets[-1] + most))
+    return offsets
+
+
 def neighbours(
     view: Camera, others: Sides, depth: float, offset: float, per_side: int = PER_SIDE
 ) -> list[tuple[int, int]]:
@@ -122,7 +143,7 @@ def neighbours(
         view: the view's camera.
         others: cameras to choose from, by :func:`sides`.
         depth: typical depth of the shell in the view.
-        offset: one of :data:`OFFSETS` or :data:`OFFSETS_BEHIND`.
+        offset: one of :func:`offsets_before` or :data:`OFFSETS_BEHIND`.
         per_side: number of cameras on either side.
 
     Returns:
@@ -162,9 +183,12 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
     """
     if not (view.depth > 0).any():
         return _nothing(view)
-    pixels = _Pixels(view)
-    on_shell, nearer = _costs(pixels, others, OFFSETS).amin(dim=2)
-    return _best(view, OFFSETS, _smooth(pixels, on_shell - nearer))
+    pixels, near = _Pixels(view), _sides_of(view, others)
+    offsets, scores = offsets_before(view.camera, near, pixels.depth), []
+    for k in range(0, len(offsets), _AT_ONCE):
+        on_shell, nearer = _costs(pixels, others, near, offsets[k : k + _AT_ONCE]).amin(dim=2)
+        scores.append(_smooth(pixels, on_shell - nearer))
+    return _best(view, offsets, torch.cat(scores))
 
 
 def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[Sweep], error: float) -> Sweep:
@@ -183,11 +207,11 @@ def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[
     if not (view.depth > 0).any():
         return _nothing(view)
     pixels = _Pixels(view)
-    reach = math.ceil(float(view.camera.K[0, 0]) * error / float(pixels.surface.median()))
+    reach = math.ceil(float(view.camera.K[0, 0]) * error / pixels.depth)
     window = 2 * min(reach, max(view.depth.shape)) + 1
     near, far = (each(pixels.surface.numpy(), window, mode="nearest") for each in (minimum_filter, maximum_filter))
     surfaces = [pixels.surface / torch.from_numpy(depth) - 1 for depth in (near, far)]
-    *shells, behind = _costs(pixels, others, OFFSETS_BEHIND, surfaces, sweeps).amin(dim=2)
+    *shells, behind = _costs(pixels, others, _sides_of(view, others), OFFSETS_BEHIND, surfaces, sweeps).amin(dim=2)
     on_shell = torch.stack([_smooth(pixels, each) for each in shells]).amin(dim=0)
     inside = torch.from_numpy(minimum_filter((view.depth > 0).numpy(), window, mode="nearest"))
     found = _best(view, OFFSETS_BEHIND, on_shell - _smooth(pixels, behind))
@@ -201,6 +225,10 @@ def _plain(view: ShellView) -> Bool[Tensor, "h w"]:
     return torch.from_numpy(squares - mean**2 < (_PLAIN * mean) ** 2)
 
 
+def _sides_of(view: ShellView, others: Sequence[ShellView]) -> Sides:
+    return sides(view.camera, [other.camera for other in others])
+
+
 def _nothing(view: ShellView) -> Sweep:
     """The sweep of a view that shows no shell."""
     return Sweep(torch.full_like(view.depth, -1).half(), torch.zeros_like(view.depth).half())
@@ -209,6 +237,7 @@ def _nothing(view: ShellView) -> Sweep:
 def _costs(
     pixels: _Pixels,
     others: Sequence[ShellView],
+    near: Sides,
     offsets: Sequence[float],
     surfaces: Sequence[Float[Tensor, "h w"]] = (),
     sweeps: Sequence[Sweep] | None = None,
@@ -220,15 +249,15 @@ def _costs(
     Args:
         pixels: a view's.
         others: all other views.
+        near: their cameras, by :func:`sides`.
         offsets: depths to try.
         surfaces: offsets of other surfaces.
         sweeps: sweeps of the other views: the shell is not visible where they show something in front of it.
     """
-    near, depth = sides(pixels.camera, [other.camera for other in others]), float(pixels.surface.median())
     roles: dict[int, list[tuple[int, int]]] = {}
     for step, offset in enumerate(offsets):
         for index, side in neighbours(
-            pixels.camera, near, depth, offset, PER_SIDE if sweeps is None else PER_SIDE_BEHIND
+            pixels.camera, near, pixels.depth, offset, PER_SIDE if sweeps is None else PER_SIDE_BEHIND
         ):
             roles.setdefault(index, []).append((step, side))
     weights = torch.zeros(len(offsets), 2, *pixels.surface.shape)
@@ -250,7 +279,9 @@ def _costs(
 
 def _best(view: ShellView, offsets: Sequence[float], scores: Float[Tensor, "K h w"]) -> Sweep:
     score, best = scores.max(dim=0)
-    offset = offsets[0] * (offsets[1] / offsets[0]) ** (best + _vertex(scores, best))
+    place = best + _vertex(scores, best)
+    tried, below = torch.tensor(offsets), place.long().clamp_max(len(offsets) - 2)
+    offset = tried[below] * (tried[below + 1] / tried[below]) ** (place - below)
     return Sweep(score.where(view.depth > 0, -1.0).half(), offset.half())
 
 
@@ -333,7 +364,8 @@ class _Pixels:
         hit = view.depth > 0
         self.camera, self.rays = view.camera, view.camera.rays().float()
         self.features = _features(view)
-        self.surface = view.depth.where(hit, view.depth[hit].median() if hit.any() else view.depth.new_tensor(1.0))
+        typical = view.depth[hit].median() if hit.any() else view.depth.new_tensor(1.0)
+        self.depth, self.surface = float(typical), view.depth.where(hit, typical)
 
 
 class _Neighbour:

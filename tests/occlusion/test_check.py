@@ -37,7 +37,7 @@ from shellgs_method.occlusion.contradiction import (
     CONFIRMED,
     CONTRADICTED,
     MOVES,
-    OFFSETS,
+    MOVES_ON,
     REFLECTED,
     Agreement,
     ShellView,
@@ -45,6 +45,7 @@ from shellgs_method.occlusion.contradiction import (
     _better_half,
     agreement,
     neighbours,
+    offsets_before,
     sides,
     sweep,
     sweep_behind,
@@ -129,6 +130,15 @@ def test_a_post_in_front_of_the_wall_is_found_at_its_depth(depth: float):
     assert both / contradicted.sum() > 0.8
     inverse = WALL / np.median(found.numpy()[before & contradicted]) - 1
     assert abs(np.log(inverse / (WALL / depth - 1))) < np.log(1.4)  # one step of the offsets
+
+
+def test_a_post_is_found_by_photographs_that_are_far_apart():
+    """Between two tried depths, where each is 1.4 times the one before, it would move by 10 pixels."""
+    views = street([camera_at(x) for x in np.linspace(-3.6, 3.6, 5)], post=4.3)
+    found, both = agreed([view for view, _ in views], judged=2)
+    before, contradicted = views[2][1], both.score.numpy() > CONTRADICTED
+    assert (before & contradicted).sum() / before.sum() > 0.8  # 0.3 by these
+    assert np.median(found.offset.numpy()[before & contradicted]) == pytest.approx(WALL / 4.3 - 1, rel=0.05)
 
 
 def test_what_photographs_do_not_count_for_is_found_nowhere():
@@ -314,7 +324,21 @@ def test_an_object_either_moved_or_stands():
     assert (stands == ((columns >= 7) & (columns < 10))).all()
 
 
-@pytest.mark.parametrize("offset", [OFFSETS[3], OFFSETS[8]])
+def test_tried_depths_are_as_close_as_what_moves_from_one_to_the_next():
+    """A place moves by at most 4 pixels in the nearest photograph; of near ones, each offset is 1.4 times the last."""
+    view = camera_at(0.0)
+    near, far = (offsets_before(view, sides(view, [camera_at(-x), camera_at(2 * x)]), WALL) for x in (0.3, 2.5))
+    np.testing.assert_allclose(near, 0.0125 * 1.4 ** np.arange(15))
+    assert far[0] == near[0]
+    assert far[-1] >= 1.38
+    position = view.position + WALL * torch.tensor([0.3, 0.2, 1.0]).double() / (1 + torch.tensor(far).double()[:, None])
+    seen = (position - camera_at(-2.5).position) / position[:, 2:]
+    moved = 160 * np.diff(seen[:, 0].numpy())
+    assert moved.max() == pytest.approx(MOVES_ON)
+    assert (np.diff(far) < 0.4001 * np.array(far[:-1])).all()
+
+
+@pytest.mark.parametrize("offset", [0.034, 0.18])
 def test_chosen_neighbours_are_on_both_sides_and_have_the_wanted_parallax(offset: float):
     view, others = camera_at(0.0), [camera_at(x) for x in np.linspace(-12, 12, 200)]
     chosen = neighbours(view, sides(view, others), WALL, offset)
