@@ -38,8 +38,8 @@ _MODELS: dict[str, str | int] = {  # in the order of COLMAP's ids; parameters, o
     "RAD_TAN_THIN_PRISM_FISHEYE": 16,
     "SIMPLE_DIVISION": 4,
     "DIVISION": 5,
-    "SIMPLE_FISHEYE": 3,
-    "FISHEYE": 4,
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
     "EUCM": 6,
     "EQUIRECTANGULAR": 2,
 }

@@ -13,8 +13,9 @@ from itertools import permutations, product
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float64, Int, Shaped
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files import transforms
@@ -74,7 +75,7 @@ class Slip:
 
 _QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _ROLLED = "cameras are rolled by {}° against their photographs: their x axis points to the right of these as stored"
-_OF_POSES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+_OF_TRANSFORMS: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     (
         "transform_matrix has OpenCV's axes of the camera instead of OpenGL's: negate its second and third columns",
         lambda viewmat: OPENGL @ viewmat,
@@ -93,6 +94,28 @@ _OF_POSES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     (_ROLLED.format(90), lambda viewmat: _QUARTER.T @ viewmat),
 )
 """Mistakes in the poses of a transforms.json, and what brings the world to the camera without them."""
+
+
+def _reordered(viewmat: np.ndarray) -> np.ndarray:
+    """The pose whose quaternion was written x y z w and read as w x y z."""
+    reordered = viewmat.copy()
+    reordered[:3, :3] = Rotation.from_quat(np.roll(Rotation.from_matrix(viewmat[:3, :3]).as_quat(), 1)).as_matrix()
+    return reordered
+
+
+_OF_IMAGES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+    (
+        "poses of images.txt are those of the cameras, but COLMAP's are from the world to the camera: invert them",
+        np.linalg.inv,
+    ),
+    ("quaternions of images.txt are in the order x y z w, but COLMAP's is w x y z", _reordered),
+    (
+        "poses of images.txt have OpenGL's axes of the camera instead of OpenCV's: negate the second and third rows of "
+        "their matrices from the world to the camera",
+        lambda viewmat: OPENGL @ viewmat,
+    ),
+)
+"""The same of a COLMAP model."""
 
 
 def slips() -> Iterator[Slip]:
@@ -149,11 +172,13 @@ def check_points(points: SparsePoints, views: Sequence[View]) -> None:
         return
     apart = f"cameras see {seen:.0%} of them, and their centre is {away:.2g} times as far as the cameras are apart"
     remedy = "export cameras and points from one program, in one frame"
-    if slip := sight.explanation(seen, away):
+    of_poses = sight.explanation_by_poses(seen, _OF_TRANSFORMS if transforms.NAME in points.called else _OF_IMAGES)
+    slip = sight.explanation(seen, away)
+    if of_poses and (slip is None or sight.observed is not None):
+        raise SceneError(f"the cameras do not see {points.called} where the photographs show them: {of_poses}")
+    if slip:
         sure = "they" if sight.photographs else "perhaps they"
         raise SceneError(f"{points.called} are not in the frame of the cameras: {sure} {slip.words}; {remedy}")
-    if transforms.NAME in points.called and (words := sight.explanation_by_poses(seen)):
-        raise SceneError(f"the cameras do not see {points.called} where the photographs show them: {words}")
     if seen < _UNSEEN or away > _FAR:
         raise SceneError(
             f"{points.called} are not in the frame of the cameras: {apart}, which neither other axes nor another unit "
@@ -172,6 +197,8 @@ class _Sight:
     colours: Float64[np.ndarray, "N 3"]
     cameras: Sequence[Camera]
     photographs: Sequence[tuple[Camera, Float64[np.ndarray, "H W 3"]]]
+    observed: Sequence[Int[np.ndarray, " M"]] | None = None
+    """Indices of the points that each camera observes, where tracks tell."""
 
     @classmethod
     def of(cls, points: SparsePoints, views: Sequence[View]) -> _Sight:
@@ -183,10 +210,21 @@ class _Sight:
         photographs = [photograph for view in shown for photograph in _small(view)]
         if not may_be_of(colours, [image for _, image in photographs]):
             photographs = []
-        return cls(points.positions[some], colours, [view.camera for view in views], photographs)
+        observed = None
+        if points.observed is not None:
+            of = [points.observed.get(view.name, np.empty(0, int)) for view in views]
+            observed = [np.flatnonzero(np.isin(some, each)) for each in of]
+        return cls(points.positions[some], colours, [view.camera for view in views], photographs, observed)
 
     def seen(self, points: np.ndarray) -> float:
-        """Share of the points that a camera sees; each of many cameras may see a small part of a street."""
+        """Share of the points that a camera sees; each of many cameras may see a small part of a street.
+
+        Where tracks are known, share of the observations of which the camera sees the point.
+        """
+        if self.observed is not None:
+            pairs = zip(self.cameras, self.observed, strict=True)
+            inside = np.concatenate([in_view(camera, points[of])[0] for camera, of in pairs])
+            return float(inside.mean()) if len(inside) else 1.0
         unseen = points
         for camera in self.cameras:
             unseen = unseen[~in_view(camera, unseen)[0]]
@@ -217,16 +255,18 @@ class _Sight:
     def explanation(self, seen: float, away: float) -> Slip | None:
         """The mistake whose correction gives the most likeness; without colours, one that brings them into view."""
         if not self.photographs:
-            return first_slip(self.points, self._in_view) if seen < _HARDLY or away > _FAR else None
+            return first_slip(self.points, self._in_view) if seen < self._few or away > _FAR else None
         found = [(self.alike(slip.corrected(self.points)), slip) for slip in slips()]
         likeness, slip = max(found, key=lambda pair: np.nan_to_num(pair[0]))
         return slip if likeness >= _SEEN and self.seen(slip.corrected(self.points)) >= _SEEN else None
 
-    def explanation_by_poses(self, seen: float) -> str | None:
+    def explanation_by_poses(
+        self, seen: float, mistakes: Sequence[tuple[str, Callable[[np.ndarray], np.ndarray]]]
+    ) -> str | None:
         """The mistake in the poses without which cameras see the points, in these colours where they have some."""
-        found = [(self._moved(change), words) for words, change in _OF_POSES]
+        found = [(self._moved(change), words) for words, change in mistakes]
         if not self.photographs:
-            fitting = (words for sight, words in found if seen < _HARDLY and sight._in_view(self.points))
+            fitting = (words for sight, words in found if seen < self._few and sight._in_view(self.points))
             return next(fitting, None)
         likeness, words = max((np.nan_to_num(sight.alike(self.points)), words) for sight, words in found)
         return words if likeness >= _SEEN else None
@@ -236,6 +276,11 @@ class _Sight:
         moved = partial(_with_pose, change=change)
         photographs = [(moved(camera), image) for camera, image in self.photographs]
         return replace(self, cameras=[moved(camera) for camera in self.cameras], photographs=photographs)
+
+    @property
+    def _few(self) -> float:
+        """Share of seen points below which something is wrong, whatever their colours."""
+        return _HARDLY if self.observed is None else _SEEN
 
     def _in_view(self, points: np.ndarray) -> bool:
         return self.seen(points) > _WELL and self.away(points) < _FAR / 5

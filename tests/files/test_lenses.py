@@ -80,13 +80,17 @@ def test_the_shell_photographed_through_a_lens_matches_its_map(scene: Path, mode
     assert (difference > 8).mean() < 0.6 * (shifted > 8).mean()
 
 
-def test_a_colmap_fisheye_keeps_its_fourth_coefficient(scene: Path):
+@pytest.mark.parametrize(
+    ("model", "coefficients"), [("OPENCV_FISHEYE", (0.08, -0.03, 0.01, 0.004)), ("FISHEYE", (0, 0, 0, 0))]
+)
+def test_a_colmap_fisheye_keeps_its_fourth_coefficient(scene: Path, model: str, coefficients: tuple[float, ...]):
     views = read_views(FacadeDataParserConfig(data=scene))
-    write_colmap(scene, views, list(range(1, 11)), model="OPENCV_FISHEYE", extra="0.08 -0.03 0.01 0.004")
+    extra = " ".join(map(str, coefficients)) if any(coefficients) else ""
+    write_colmap(scene, views, list(range(1, 11)), model=model, extra=extra)
     lens = read_views(FacadeDataParserConfig(data=scene))[0].lens
     assert lens is not None
     assert lens.fisheye
-    assert lens.distortion == (0.08, -0.03, 0.01, 0.004, 0, 0)
+    assert lens.distortion == (*coefficients, 0, 0)
 
 
 def test_a_full_opencv_model_without_a_denominator_is_browns(scene: Path):

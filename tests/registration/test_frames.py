@@ -16,6 +16,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import SceneError
 from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
+from shellgs_method.geometry.camera import in_view
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.sfm_frame import _Sight, check_points, slips
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
@@ -88,6 +89,47 @@ def test_poses_of_another_convention_are_refused_with_the_slip(scene, change, wo
     layout = FacadeDataParserConfig(data=scene)
     with pytest.raises(SceneError, match=f"the cameras do not see the SfM points .*: .*{words}"):
         check_points(find_sparse_points(layout), read_views(layout))
+
+
+@pytest.mark.parametrize("tracks", [True, False], ids=["tracks", "colours"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (np.linalg.inv, "are those of the cameras, .* invert them"),
+        (lambda viewmat: OPENGL @ viewmat, "have OpenGL's axes of the camera instead of OpenCV's"),
+        (lambda viewmat: written_scalar_last(viewmat), "are in the order x y z w"),
+    ],
+    ids=["inverse", "OpenGL", "x y z w"],
+)
+def test_poses_of_another_convention_in_a_colmap_model_are_refused(points, views, change, words, tracks):
+    of_model = replace(
+        points, called="the SfM points of sparse/0", observed=observed(points, views) if tracks else None
+    )
+    wrong = [
+        replace(v, camera=replace(v.camera, viewmat=torch.from_numpy(change(v.camera.viewmat.numpy())))) for v in views
+    ]
+    check_points(of_model, views)
+    with pytest.raises(SceneError, match=f"the cameras do not see the SfM points of sparse/0 .*{words}"):
+        check_points(of_model, wrong)
+
+
+def test_points_of_a_model_with_tracks_in_another_unit_are_refused(points, views):
+    tracked = replace(other(points, np.diag([0.3048] * 3)), observed=observed(points, views))
+    with pytest.raises(SceneError, match="not in the frame of the cameras: perhaps they are in metres instead of feet"):
+        check_points(tracked, views)
+
+
+def written_scalar_last(viewmat: np.ndarray) -> np.ndarray:
+    """The pose that a quaternion x y z w gives when it is read as w x y z."""
+    w, x, y, z = Rotation.from_matrix(viewmat[:3, :3]).as_quat()
+    wrong = viewmat.copy()
+    wrong[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    return wrong
+
+
+def observed(points: SparsePoints, views: list[View]) -> dict[str, np.ndarray]:
+    """The points that each view sees, as its tracks."""
+    return {view.name: np.flatnonzero(in_view(view.camera, points.positions)[0]) for view in views}
 
 
 def test_points_without_colours_are_refused_if_no_camera_sees_them(points, views):
