@@ -72,9 +72,9 @@ class Frame:
         return replace(self, to_scene=to_scene, offset=motion[:3, :3] @ self.offset, up=up), motion
 
     def describe(self, path: Path, facts: dict) -> None:
-        """Write a .json beside ``path`` that describes the coordinates in that file, with ``facts`` added."""
+        """Write a .json that describes the coordinates in this frame, with ``facts`` added."""
         description = self.properties | {"to_scene": self.to_scene.tolist()} | facts
-        with atomic_write(path.with_suffix(".json")) as file:
+        with atomic_write(path) as file:
             file.write((json.dumps(description, indent=1) + "\n").encode())
 
 

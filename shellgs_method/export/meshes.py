@@ -58,7 +58,7 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
             file.write(content.encode() if isinstance(content, str) else content)
     about = {"up_in_file": name_of(up), "faces": len(mesh.faces)}
     about |= {"unit_in_file": "metre"} if format in METRE_FORMATS else {}
-    frame.describe(path, about | mesh.metadata | (facts or {}))
+    frame.describe(Path(f"{path}.json"), about | mesh.metadata | (facts or {}))
 
 
 def _write_usd(path: Path, mesh: trimesh.Trimesh, up: Literal["y", "z"], metric: bool) -> None:

@@ -41,7 +41,7 @@ COMMANDS = {
     "cast": ("shellgs cast scene", ["scene/cues/shell", "scene/cues/checked"]),
     "mono": ("shellgs mono scene from scene/predictions", ["scene/cues/mono"]),
     "train": (TRAIN, [CHECKPOINTS]),
-    "mesh": (f"shellgs mesh {RUN}/config.yml --output mesh.ply --voxel 0.1", ["mesh.ply", "mesh.json"]),
+    "mesh": (f"shellgs mesh {RUN}/config.yml --output mesh.ply --voxel 0.1", ["mesh.ply", "mesh.ply.json"]),
     "sim": (f"shellgs sim {RUN}/config.yml sim --voxel 0.1 --faces 2000 --parts 16 --texel 0.05", ["sim"]),
     "compare": (
         "shellgs compare scene --methods photo-gs --iterations 60 --curve-points 0",

@@ -222,7 +222,7 @@ def test_a_mesh_file_is_read_back_unchanged(sphere, tmp_path, suffix):
     turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) if suffix == ".glb" else np.eye(3)
     np.testing.assert_allclose(read.vertices, sphere.vertices @ turn.T, atol=1e-6)
     np.testing.assert_array_equal(read.faces, sphere.faces)
-    about = json.loads((tmp_path / "mesh.json").read_text())
+    about = json.loads((tmp_path / f"mesh{suffix}.json").read_text())
     assert about["offset"] == [400_000, 5_000_000, 0]
     assert about["crs"] == "EPSG:25832"
     assert (about["unit"], about["up"], about["faces"]) == ("metre", "z", len(sphere.faces))
@@ -251,7 +251,7 @@ def test_usd_is_a_static_collider_of_the_triangles_in_metres(sphere, tmp_path, s
 def test_a_mesh_of_unknown_unit_is_in_metres_where_its_format_states_one_and_says_so(sphere, tmp_path, suffix):
     """USD that states none is read in centimetres; glTF is in metres by its specification."""
     write_mesh(tmp_path / f"mesh{suffix}", sphere, scene_frame())
-    about = json.loads((tmp_path / "mesh.json").read_text())
+    about = json.loads((tmp_path / f"mesh{suffix}.json").read_text())
     assert (about["unit"], about["unit_in_file"]) == ("unknown", "metre")
     if suffix == ".usda":
         header = (tmp_path / "mesh.usda").read_text().split("def Mesh")[0]
@@ -352,7 +352,7 @@ def test_a_trained_run_becomes_a_mesh_with_metrics(pristine_scene, tmp_path):
     trainer.config.save_config()
     config = trainer.base_dir / "config.yml"
     cli.mesh(config, tmp_path / "facade.obj", voxel=0.3, faces=500)
-    about = json.loads((tmp_path / "facade.json").read_text())
+    about = json.loads((tmp_path / "facade.obj.json").read_text())
     assert about["faces"] <= 500
     assert {"chamfer_m", "f_score_5cm", "truth_chamfer_m"} <= about.keys()
     assert len(load_shell(tmp_path / "facade.obj").faces) == about["faces"]
