@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations, product
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -75,7 +76,9 @@ class Slip:
 
 _QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _ROLLED = "cameras are rolled by {}° against their photographs: their x axis points to the right of these as stored"
-_OF_TRANSFORMS: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+_OfPoses: TypeAlias = Sequence[tuple[str, Callable[[np.ndarray], np.ndarray]]]
+"""Mistakes in poses, and what brings the world to the camera without them."""
+_OF_TRANSFORMS: _OfPoses = (
     (
         "transform_matrix has OpenCV's axes of the camera instead of OpenGL's: negate its second and third columns",
         lambda viewmat: OPENGL @ viewmat,
@@ -93,7 +96,7 @@ _OF_TRANSFORMS: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     (_ROLLED.format(90), lambda viewmat: _QUARTER @ viewmat),
     (_ROLLED.format(90), lambda viewmat: _QUARTER.T @ viewmat),
 )
-"""Mistakes in the poses of a transforms.json, and what brings the world to the camera without them."""
+"""Mistakes of a transforms.json."""
 
 
 def _reordered(viewmat: np.ndarray) -> np.ndarray:
@@ -103,7 +106,7 @@ def _reordered(viewmat: np.ndarray) -> np.ndarray:
     return reordered
 
 
-_OF_IMAGES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+_OF_IMAGES: _OfPoses = (
     (
         "poses of images.txt are those of the cameras, but COLMAP's are from the world to the camera: invert them",
         np.linalg.inv,
@@ -115,7 +118,7 @@ _OF_IMAGES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
         lambda viewmat: OPENGL @ viewmat,
     ),
 )
-"""The same of a COLMAP model."""
+"""Mistakes of a COLMAP model."""
 
 
 def slips() -> Iterator[Slip]:
@@ -212,8 +215,8 @@ class _Sight:
             photographs = []
         observed = None
         if points.observed is not None:
-            of = [points.observed.get(view.name, np.empty(0, int)) for view in views]
-            observed = [np.flatnonzero(np.isin(some, each)) for each in of]
+            numbers = np.arange(len(points.positions))
+            observed = [np.flatnonzero(np.isin(some, numbers[points.of(view)])) for view in views]
         return cls(points.positions[some], colours, [view.camera for view in views], photographs, observed)
 
     def seen(self, points: np.ndarray) -> float:
@@ -255,18 +258,16 @@ class _Sight:
     def explanation(self, seen: float, away: float) -> Slip | None:
         """The mistake whose correction gives the most likeness; without colours, one that brings them into view."""
         if not self.photographs:
-            return first_slip(self.points, self._in_view) if seen < self._few or away > _FAR else None
+            return first_slip(self.points, self._in_view) if seen < self._hardly or away > _FAR else None
         found = [(self.alike(slip.corrected(self.points)), slip) for slip in slips()]
         likeness, slip = max(found, key=lambda pair: np.nan_to_num(pair[0]))
         return slip if likeness >= _SEEN and self.seen(slip.corrected(self.points)) >= _SEEN else None
 
-    def explanation_by_poses(
-        self, seen: float, mistakes: Sequence[tuple[str, Callable[[np.ndarray], np.ndarray]]]
-    ) -> str | None:
+    def explanation_by_poses(self, seen: float, mistakes: _OfPoses) -> str | None:
         """The mistake in the poses without which cameras see the points, in these colours where they have some."""
         found = [(self._moved(change), words) for words, change in mistakes]
         if not self.photographs:
-            fitting = (words for sight, words in found if seen < self._few and sight._in_view(self.points))
+            fitting = (words for sight, words in found if seen < self._hardly and sight._in_view(self.points))
             return next(fitting, None)
         likeness, words = max((np.nan_to_num(sight.alike(self.points)), words) for sight, words in found)
         return words if likeness >= _SEEN else None
@@ -278,7 +279,7 @@ class _Sight:
         return replace(self, cameras=[moved(camera) for camera in self.cameras], photographs=photographs)
 
     @property
-    def _few(self) -> float:
+    def _hardly(self) -> float:
         """Share of seen points below which something is wrong, whatever their colours."""
         return _HARDLY if self.observed is None else _SEEN
 
