@@ -215,10 +215,10 @@ class _TrainingViews:
         """Names of the nearest training views on either side that look in about the same direction."""
         if not (seen.depth > 0).any():
             return []
-        reach = 0.9 * float(seen.depth[seen.depth > 0].median())
+        depth = float(seen.depth[seen.depth > 0].median())
         names = [name for name, other in self.views.items() if other is not seen]
-        found = sides(seen.camera, [self.views[name].camera for name in names])
-        near = [sorted(each for each in side if each[0] < reach)[:NEIGHBOURS] for side in found]
+        found = sides(seen.camera, [self.views[name].camera for name in names], depth)
+        near = [sorted(each for each in side if each[0] < 0.9 * depth)[:NEIGHBOURS] for side in found]
         return [names[index] for side in near for _, index in side]
 
 

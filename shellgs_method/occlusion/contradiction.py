@@ -126,7 +126,7 @@ def offsets_before(view: Camera, others: Sides, depth: float) -> list[float]:
         others: the other cameras, by :func:`sides`.
         depth: typical depth of the shell in the view.
     """
-    nearest = min((baseline for side in others for baseline, _ in side if baseline > 1e-6 * depth), default=depth)
+    nearest = min((baseline for side in others for baseline, _ in side), default=depth)
     most = max(MOVES_ON * depth / (nearest * float(view.K[0, 0])), _FINEST)
     offsets = [_NEAREST]
     while offsets[-1] < _FARTHEST:
@@ -150,23 +150,22 @@ def neighbours(
         Index and side of each camera: 0 on the left, 1 on the right.
     """
     wanted = MOVES * depth / (abs(offset) * float(view.K[0, 0]))
-    found = [
-        sorted(
-            (max(baseline / wanted, wanted / baseline), index) for baseline, index in side if baseline > 1e-6 * depth
-        )
-        for side in others
-    ]
+    found = [sorted((max(baseline / wanted, wanted / baseline), index) for baseline, index in side) for side in others]
     return [(index, side) for side in (0, 1) for _, index in found[side][:per_side]]
 
 
-def sides(view: Camera, others: Sequence[Camera]) -> Sides:
-    """Distances and indices of the cameras left and right of a view that look in about the same direction."""
+def sides(view: Camera, others: Sequence[Camera], depth: float) -> Sides:
+    """Distances and indices of the cameras left and right of a view that look in about the same direction.
+
+    Those at the view's own position, relative to the typical depth of the shell, show no parallax and are left out.
+    """
     found: Sides = ([], [])
     if others:
         viewmats = torch.stack([other.viewmat for other in others])
         steps = -(viewmats[:, :3, 3:].mT @ viewmats[:, :3, :3])[:, 0] - view.position
-        alike = viewmats[:, 2, :3] @ view.viewmat[2, :3] > 0.5
-        is_right, baselines = (steps @ view.viewmat[0, :3] > 0).tolist(), steps.norm(dim=-1).tolist()
+        away = steps.norm(dim=-1)
+        alike = (viewmats[:, 2, :3] @ view.viewmat[2, :3] > 0.5) & (away > 1e-6 * depth)
+        is_right, baselines = (steps @ view.viewmat[0, :3] > 0).tolist(), away.tolist()
         for index in alike.nonzero()[:, 0].tolist():
             found[is_right[index]].append((baselines[index], index))
     return found
@@ -183,7 +182,8 @@ def sweep(view: ShellView, others: Sequence[ShellView]) -> Sweep:
     """
     if not (view.depth > 0).any():
         return _nothing(view)
-    pixels, near = _Pixels(view), _sides_of(view, others)
+    pixels = _Pixels(view)
+    near = _sides_of(pixels, others)
     offsets, scores = offsets_before(view.camera, near, pixels.depth), []
     for k in range(0, len(offsets), _AT_ONCE):
         on_shell, nearer = _costs(pixels, others, near, offsets[k : k + _AT_ONCE]).amin(dim=2)
@@ -211,7 +211,7 @@ def sweep_behind(view: ShellView, others: Sequence[ShellView], sweeps: Sequence[
     window = 2 * min(reach, max(view.depth.shape)) + 1
     near, far = (each(pixels.surface.numpy(), window, mode="nearest") for each in (minimum_filter, maximum_filter))
     surfaces = [pixels.surface / torch.from_numpy(depth) - 1 for depth in (near, far)]
-    *shells, behind = _costs(pixels, others, _sides_of(view, others), OFFSETS_BEHIND, surfaces, sweeps).amin(dim=2)
+    *shells, behind = _costs(pixels, others, _sides_of(pixels, others), OFFSETS_BEHIND, surfaces, sweeps).amin(dim=2)
     on_shell = torch.stack([_smooth(pixels, each) for each in shells]).amin(dim=0)
     inside = torch.from_numpy(minimum_filter((view.depth > 0).numpy(), window, mode="nearest"))
     found = _best(view, OFFSETS_BEHIND, on_shell - _smooth(pixels, behind))
@@ -225,8 +225,8 @@ def _plain(view: ShellView) -> Bool[Tensor, "h w"]:
     return torch.from_numpy(squares - mean**2 < (_PLAIN * mean) ** 2)
 
 
-def _sides_of(view: ShellView, others: Sequence[ShellView]) -> Sides:
-    return sides(view.camera, [other.camera for other in others])
+def _sides_of(pixels: _Pixels, others: Sequence[ShellView]) -> Sides:
+    return sides(pixels.camera, [other.camera for other in others], pixels.depth)
 
 
 def _nothing(view: ShellView) -> Sweep:

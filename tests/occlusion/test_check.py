@@ -327,7 +327,7 @@ def test_an_object_either_moved_or_stands():
 def test_tried_depths_are_as_close_as_what_moves_from_one_to_the_next():
     """A place moves by at most 4 pixels in the nearest photograph; of near ones, each offset is 1.4 times the last."""
     view = camera_at(0.0)
-    near, far = (offsets_before(view, sides(view, [camera_at(-x), camera_at(2 * x)]), WALL) for x in (0.3, 2.5))
+    near, far = (offsets_before(view, sides(view, [camera_at(-x), camera_at(2 * x)], WALL), WALL) for x in (0.3, 2.5))
     np.testing.assert_allclose(near, 0.0125 * 1.4 ** np.arange(15))
     assert far[0] == near[0]
     assert far[-1] >= 1.38
@@ -338,10 +338,16 @@ def test_tried_depths_are_as_close_as_what_moves_from_one_to_the_next():
     assert (np.diff(far) < 0.4001 * np.array(far[:-1])).all()
 
 
+def test_cameras_at_the_views_own_position_are_on_no_side():
+    """As the photographs of a panorama are: nothing moves between them."""
+    view = camera_at(0.0)
+    assert sides(view, [camera_at(0.0), camera_at(1e-9), camera_at(1.0)], WALL) == ([], [(1.0, 2)])
+
+
 @pytest.mark.parametrize("offset", [0.034, 0.18])
 def test_chosen_neighbours_are_on_both_sides_and_have_the_wanted_parallax(offset: float):
     view, others = camera_at(0.0), [camera_at(x) for x in np.linspace(-12, 12, 200)]
-    chosen = neighbours(view, sides(view, others), WALL, offset)
+    chosen = neighbours(view, sides(view, others, WALL), WALL, offset)
     assert {side for _, side in chosen} == {0, 1}
     for index, side in chosen:
         x = float(others[index].position[0])
