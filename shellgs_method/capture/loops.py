@@ -7,9 +7,11 @@ model, from neighbours alone, does: it drifts by centimetres, and a bay is metre
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +29,16 @@ _SAMPLE = 200  # points of a view that are projected into all others
 _RATIO, _COSINE = 3.0, 0.75  # of distances and between directions, within which features match
 _LEAST_SHARE = 0.25  # of a view's points
 _LEAST_ACROSS = 100  # matches across a cut that say something of it
+
+
+def along_the_walk(name: str) -> tuple[Any, ...]:
+    """Key that sorts names of photographs as they were taken: folder by folder, and 9 before 10."""
+    folder, _, file = name.rpartition("/")
+    return (*((_with_numbers(part), part) for part in (folder, file)),)
+
+
+def _with_numbers(text: str) -> list[Any]:
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", text))]
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+from shellgs_method.capture.loops import along_the_walk
 from shellgs_method.errors import SceneError, notice
 
 LEAST_SHOTS = 3
@@ -20,7 +21,7 @@ def taken_at_once(names: Sequence[str], cameras: Collection[str]) -> dict[str, l
     shots: dict[str, list[str]] = {}
     for name in names:
         shots.setdefault(name.partition("/")[2] if name.startswith(tuple(cameras)) else name, []).append(name)
-    return dict(sorted(shots.items()))
+    return {name: shots[name] for name in sorted(shots, key=along_the_walk)}
 
 
 def folders(names: Sequence[str]) -> list[str]:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from loops import CONFIRMED, DRIFT, View, agree, astray, bridges, loops, shared, weakest_cut  # pyright: ignore[reportMissingImports]  isort: skip
+from loops import CONFIRMED, DRIFT, View, agree, along_the_walk, astray, bridges, loops, shared, weakest_cut  # pyright: ignore[reportMissingImports]  isort: skip
 
 SEED = 0
 _RIGID_DEGREES, _RIGID_STEPS = 3.0, 0.5  # most that cameras which are mounted together move against each other
@@ -197,7 +197,7 @@ def follow(database: str, passes: list[list[str]]) -> list[list[str]]:
 
 def find_bridges(models: str) -> list[list[str]]:
     """Pairs of names to match between models."""
-    groups = [sorted(image.name for image in _registered(model)) for model in _read(models)]
+    groups = [sorted((image.name for image in _registered(model)), key=along_the_walk) for model in _read(models)]
     return [list(pair) for pair in bridges(groups, max(_BRIDGES // max(1, len(groups) - 1), 4))]
 
 
@@ -312,7 +312,7 @@ class _Weakest(NamedTuple):
 
 def _weakest(database: str, model: pycolmap.Reconstruction) -> _Weakest:
     """Share of the matches of neighbours that a model confirms where it does least, and the names around that place."""
-    images = sorted(_registered(model), key=lambda image: image.name)
+    images = sorted(_registered(model), key=lambda image: along_the_walk(image.name))
     at = {image.image_id: k for k, image in enumerate(images)}
     points = {
         image.image_id: np.array([p.point3D_id if p.has_point3D() else -1 for p in image.points2D], np.int64)
@@ -344,7 +344,7 @@ def mount(database: str, photographs: str, model: str, prefixes: list[str]) -> d
     """
     single = pycolmap.Reconstruction(model)
     poses = {image.name: image.cam_from_world() for image in (single.image(i) for i in single.reg_image_ids())}
-    first = [poses[name] for name in sorted(poses) if name.startswith(prefixes[0])]
+    first = [poses[name] for name in sorted(poses, key=along_the_walk) if name.startswith(prefixes[0])]
     path = np.array([pose.inverse().translation for pose in first]).reshape(-1, 3)
     step = np.median(np.linalg.norm(np.diff(path, axis=0), axis=1)) if len(path) > 1 else 0.0
     for prefix in prefixes[1:]:

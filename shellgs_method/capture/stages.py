@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from shellgs_method.capture.config import LEAST_REGISTERED, LEAST_SHARE, CaptureConfig
+from shellgs_method.capture.loops import along_the_walk
 from shellgs_method.capture.pairs import Pair, choose_matching, image_pairs
 from shellgs_method.capture.panoramas import (
     FACES,
@@ -365,7 +366,7 @@ class _Capture:
         """
         names, models = found["photographs"], found["models"]
         largest: dict[str, Any] = models[0] if models else {"names": []}
-        missing = sorted(set(names) - set(largest["names"]))
+        missing = sorted(set(names) - set(largest["names"]), key=along_the_walk)
         registered = len(largest["names"])
         is_flat = found.get("flat_pairs", 0) > _NO_PARALLAX
         points, seen_in = largest.get("points", 0), largest.get("track_length", 0.0)
@@ -410,7 +411,8 @@ class _Capture:
             )
         for model in models[1:]:
             if len(model["names"]) >= LEAST_REGISTERED:
-                self._tell_of_a_pass_apart(sorted(set(model["names"]) - set(largest["names"])), found.get("apart", []))
+                only = sorted(set(model["names"]) - set(largest["names"]), key=along_the_walk)
+                self._tell_of_a_pass_apart(only, found.get("apart", []))
         return Summary(missing=missing, registered=largest.pop("names"), **largest)
 
     def _tell_of_a_pass_apart(self, names: list[str], faults: list[dict[str, Any]]) -> None:
@@ -470,8 +472,9 @@ class _Capture:
 
 
 def _files(folder: Path) -> list[str]:
-    """Names of the files in a folder and below."""
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    """Names of the files in a folder and below, along the walk."""
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    return sorted(names, key=along_the_walk)
 
 
 def _rows(database: Path, table: str) -> int:

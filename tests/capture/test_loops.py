@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shellgs_method.capture.loops import CONFIRMED, DRIFT, View, agree, astray, bridges, loops, shared, weakest_cut
+from shellgs_method.capture.loops import (
+    CONFIRMED,
+    DRIFT,
+    View,
+    agree,
+    along_the_walk,
+    astray,
+    bridges,
+    loops,
+    shared,
+    weakest_cut,
+)
 
 BAY = 3.0
 EXTENT = np.array([0.65, 0.4])
@@ -115,6 +126,13 @@ def test_groups_are_bridged_by_views_that_are_spread_over_each():
     assert len(pairs) == len(set(pairs)) == 4 * 4 + 4 * 2 + 4 * 2
     assert {a for a, _ in pairs if a in first} == {"a00", "a33", "a66", "a99"}
     assert all(a < b for a, b in pairs)
+
+
+def test_a_walk_goes_folder_by_folder_with_numbers_in_their_order():
+    walk = ["f1.jpg", "f2.jpg", "f010.jpg", "f10.jpg", "f10b.jpg", "pass 2/9.jpg", "pass 10/1.jpg", "pass 10/x.jpg"]
+    assert sorted(sorted(walk), key=along_the_walk) == walk
+    apart = ["01/1", "01/2", "1/1", "1/2"]
+    assert sorted(["1/2", "01/1", "1/1", "01/2"], key=along_the_walk) == apart
 
 
 def test_a_view_of_two_groups_is_not_matched_with_itself():
