@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -96,10 +96,13 @@ def find_sparse_points(layout: SceneLayout) -> SparsePoints:
 
 
 def _warned(points: SparsePoints, layout: SceneLayout) -> SparsePoints:
-    """The points, after a warning if they are stored too coarsely."""
+    """The points, after a warning if they are stored too coarsely, and grey if they have no colours."""
     if len(points.positions):
         warn_of_coarse(points.step, points.positions, f"the SfM points of {layout.data}")
-    return points
+    if points.colours is None or len(points.colours) == 0 or points.colours.any():
+        return points
+    notice(f"{points.called} are all black, as where colours were not extracted: Gaussians begin grey.")
+    return replace(points, colours=np.full_like(points.colours, transforms.GREY))
 
 
 def _sound(positions: Float64[np.ndarray, "N 3"], layout: SceneLayout) -> Int[np.ndarray, " M"]:

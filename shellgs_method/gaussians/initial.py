@@ -30,6 +30,7 @@ MAX_SEEDS = 200_000
 """Most seeds; the spacing is increased where it would give more."""
 SKYBOX_SEEDS = 2500
 """Seeds of the skybox, without which the sky is painted in front of what is beside the building."""
+_DARKEST = 1 / 255
 
 
 def sfm_points(
@@ -92,8 +93,8 @@ class InitialGaussians:
 
 
 def harmonics(colours: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Coefficients of degree 0 of colours in [0, 1]."""
-    return (colours - 0.5) / DEGREE_0
+    """Coefficients of degree 0 of colours in [0, 1]; none is 0, where :func:`view_colours` passes no gradient on."""
+    return (colours.clamp_min(_DARKEST) - 0.5) / DEGREE_0
 
 
 def _random_quats(count: int) -> Float[Tensor, "N 4"]:
