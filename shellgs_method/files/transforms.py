@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import read_json
 from shellgs_method.files.frames import FISHEYE, Frame, Recording, frame, in_order
 from shellgs_method.files.headers import read_ply_header
@@ -29,7 +29,7 @@ GREY = 128
 # Applied to COLMAP's frame by old versions of ns-process-data, without being recorded.
 _UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _ANGLES = ("camera_angle_x", "camera_angle_y")
-_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model", *COEFFICIENTS)
+_LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model")
 
 
 def read_recording(scene: Path, images_path: Path) -> Recording:
@@ -117,10 +117,13 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
         pose = np.empty(0)
     if pose.shape != (4, 4):
         raise SceneError(f"{where} ({entry['file_path']}): its transform_matrix is not a 4x4 matrix of numbers")
-    lens = {key: source[key] for key in _LENS for source in (entry, meta) if key in source}
-    for key in COEFFICIENTS if _has_distortion(meta) else ():  # as in nerfstudio, the file's own take precedence
-        lens.pop(key, None)
-    lens |= _distortion(meta if _has_distortion(meta) else entry, where)
+    for_all, own = ({key: each[key] for key in _LENS if key in each} | _distortion(each, where) for each in (meta, entry))
+    lens = for_all | own
+    if other := [key for key in own if key in for_all and own[key] != for_all[key]]:
+        notice(
+            f"{files.where} has frames with another {other[0]} than it gives for all, and theirs counts; nerfstudio's "
+            "own parsers take the one for all."
+        )
     fisheye = entry.get("is_fisheye", meta.get("is_fisheye"))
     if fisheye is True and str(lens.get("camera_model")).upper() != FISHEYE:  # instant-ngp's
         raise SceneError(
@@ -153,10 +156,6 @@ def _by_angles(angles: Mapping[str, Any], photograph: Path, where: str) -> dict[
     focal = width / 2 / math.tan(angles["camera_angle_x"] / 2)
     vertical = height / 2 / math.tan(angles["camera_angle_y"] / 2) if "camera_angle_y" in angles else focal
     return {"fl_x": focal, "fl_y": vertical, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
-
-
-def _has_distortion(meta: Mapping[str, Any]) -> bool:
-    return any(key in meta for key in (*COEFFICIENTS, "distortion_params"))
 
 
 def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:
