@@ -21,7 +21,7 @@ from shellgs_method.errors import SceneError, refusals_end_the_program
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
 from shellgs_method.files.cue_maps import CueMaps, find_cues
 from shellgs_method.files.frames import Frame, Recording
-from shellgs_method.files.photographs import View
+from shellgs_method.files.photographs import View, tell_of_other_sizes
 from shellgs_method.files.scene import SceneLayout
 from shellgs_method.files.sparse_points import find_sparse_points
 from shellgs_method.files.undistortion import refuse_folding, undistort
@@ -156,7 +156,9 @@ def _views(frames: Sequence[Frame], layout: SceneLayout) -> list[View]:
                 pinholes[key] = Camera(camera.viewmat, torch.from_numpy(K), width, height)
             camera = replace(pinholes[key], viewmat=camera.viewmat)
         views.append(View(frame.name, frame.image, camera, lens, masks.get(frame.name)))
-    return oriented(views, layout)
+    views = oriented(views, layout)
+    tell_of_other_sizes([view for view in views if view.image.is_file()], layout.data)
+    return views
 
 
 def _rescaled(

@@ -25,6 +25,7 @@ from shellgs_method.files.paths import (
     PHOTOGRAPHS,
     RAW,
     captured_name,
+    files_below,
     mask_names,
     photographs_in,
     tell_of_masks,
@@ -58,10 +59,10 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
     """
     photographs = photographs_in(folder, deep=True)
     if masks:
-        root, among = folder.resolve(), masks.resolve()
-        if root == among:
+        among = masks.resolve()
+        if folder.resolve() == among:
             raise SceneError(f"the masks lie among the photographs in {folder}: move them into a folder of their own")
-        photographs = [path for path in photographs if not (root / path.relative_to(folder)).is_relative_to(among)]
+        photographs = [path for path in photographs if not path.parent.resolve().is_relative_to(among)]
     found: dict[str, Path] = {}
     _tell_what_is_left_out(folder, photographs)
     for path in _without_copies(folder, photographs):
@@ -74,7 +75,7 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
 
 def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
     """Tell the user how many files of a folder are no photographs, and refuse what should be some."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+    files = [path for path in sorted(files_below(folder)) if path.is_file() and not path.name.startswith(".")]
     developed = {path.with_suffix("") for path in photographs}
     raw = [path for path in files if path.suffix.lower() in RAW and path.with_suffix("") not in developed]
     if raw:
@@ -200,12 +201,12 @@ def masks_as_stored(photographs: Mapping[str, Path], masks: Mapping[str, Path]) 
     Raises:
         SceneError: a mask is not a readable image.
     """
-    from shellgs_method.files.photographs import read_mask
+    from shellgs_method.files.photographs import opened, read_mask
 
     told: set[bool] = set()
     upside_down = []
     for name, mask in masks.items():
-        with Image.open(photographs[name]) as stored:
+        with opened(photographs[name], whole=False) as stored:
             orientation, size = orientation_of(stored), stored.size
         if orientation == 1 or orientation_of(drawn := read_mask(mask)) != 1:
             continue
@@ -235,9 +236,9 @@ def add_mask(mask: Path | None, source: Path, photograph: Path, target: Path, as
         SceneError: the mask is not a readable image, or has another size.
     """
     from shellgs_method.files.masks import OPAQUE
-    from shellgs_method.files.photographs import read_image, read_mask
+    from shellgs_method.files.photographs import opened, read_image, read_mask
 
-    with Image.open(source) as stored, Image.open(photograph) as upright:
+    with opened(source, whole=False) as stored, Image.open(photograph) as upright:
         stored_size, upright_size, exif = stored.size, upright.size, exif_of(stored)
         transparent = stored.has_transparency_data
     kept = np.ones(upright_size[::-1], bool)

@@ -95,6 +95,8 @@ def read_ply_header(path: Path) -> PlyHeader:
                 elements[-1].properties.append(PlyProperty(name.lower(), _TYPES[kind], _TYPES[counted]))
             case ["property", kind, name]:
                 elements[-1].properties.append(PlyProperty(name.lower(), _TYPES[kind]))
+            case ["element" | "property", *_]:
+                raise ValueError(f"its header has the line {' '.join(words)!r}")
     for element in elements:
         for k, prop in enumerate(element.properties):
             if any(other.name == prop.name for other in element.properties[:k]):

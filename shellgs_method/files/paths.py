@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import unicodedata
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 
 from pi_heif import register_heif_opener
@@ -181,12 +182,21 @@ def tell_of_masks(masks: Mapping[str, Path | None], there: Collection[Path], fol
         notice(f"{len(without)} of {len(masks)} photographs have no mask in {folder}{kept}{stray}.")
 
 
+def files_below(folder: Path) -> Iterator[Path]:
+    """Files in a folder and its sub-folders, also in those that are links; each folder once."""
+    been: set[Path] = set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        been.add(Path(root).resolve())
+        folders[:] = [name for name in folders if Path(root, name).resolve() not in been]
+        yield from (Path(root, name) for name in files)
+
+
 def photographs_in(folder: Path, *, deep: bool) -> list[Path]:
     """Photographs in a folder, by their suffixes, or also in its sub-folders.
 
     Hidden ones are left out, and thumbnails of network drives (Synology's @eaDir).
     """
-    found = sorted(folder.rglob("*") if deep else folder.glob("*"))
+    found = sorted(files_below(folder) if deep else folder.glob("*"))
     below = (
         (path, path.relative_to(folder).parts)
         for path in found

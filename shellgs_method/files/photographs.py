@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,18 @@ from shellgs_method.geometry.lens import Lens
 
 BLACK = 16
 """Brightest of 256 levels in a photograph that shows nothing: that of 12 bits stored as 16."""
+_SCALED = 0.1
+"""Difference of sizes, as a share, from which one is taken for the other scaled on purpose."""
+_TURN_BACK = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+"""What undoes each EXIF orientation."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +129,28 @@ def upright_size(view: View) -> tuple[int, int]:
     with opened(view.image, whole=False) as image:
         is_turned = _is_turned(view, image, view.image) and orientation_of(image) > 4
         return (image.height, image.width) if is_turned else image.size
+
+
+def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
+    """Tell the user of photographs that are about as large as their cameras, but not quite: nobody scales by 2 %.
+
+    COLMAP's undistorted photographs have other sizes than the originals, often by less.
+    """
+    other = []
+    for view in views:
+        with suppress(SceneError):  # which is raised where the photograph is used
+            size = upright_size(view)
+            scale = size[0] / _calibrated_size(view)[0]
+            if max(abs(a - b) for a, b in zip(size, _calibrated_size(view), strict=True)) > 1 and _SCALED > abs(scale - 1):
+                other.append((view, size))
+    if other:
+        view, (width, height) = other[0]
+        of = "{}x{}".format(*_calibrated_size(view))
+        notice(
+            f"{len(other)} photographs of {scene} have nearly the size of their cameras, but not quite: {view.name} is "
+            f"{width}x{height} pixels, its camera {of}. They are scaled, which is wrong if these are undistorted "
+            "cameras with the original photographs, or the other way round: both must be of one set."
+        )
 
 
 def load_upright(view: View) -> Image.Image:
@@ -217,7 +251,7 @@ def has_alpha(path: Path) -> bool:
 
 @contextmanager
 def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
-    """Open an image file, decoded unless ``whole`` is false.
+    """Open an image file, decoded unless ``whole`` is false; also of a TIFF, which Pillow turns, the pixels as stored.
 
     Raises:
         SceneError: the image cannot be read, is raw, has too many pixels, holds floating-point numbers, or has bands of
@@ -229,7 +263,8 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
         image = Image.open(path)
         if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
             raise Image.DecompressionBombError(f"it claims {image.width}x{image.height} pixels")
-        if whole:
+        orientation = orientation_of(image) if isinstance(image, TiffImageFile) else 1
+        if whole or orientation != 1:
             image.load()
     except Image.DecompressionBombError as error:
         raise SceneError(
@@ -257,7 +292,16 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
             raise SceneError(
                 f"{path} holds floating-point numbers{broken}, whose white is undefined: save it with 8 or 16 bits"
             )
-        yield image
+        yield image if orientation == 1 else _turned_back(image, orientation)
+
+
+def _turned_back(image: Image.Image, orientation: int) -> Image.Image:
+    """The pixels as they are stored of an image that was turned by its EXIF orientation, which is kept."""
+    stored = image.transpose(_TURN_BACK[orientation])
+    stored.format, exif = image.format, exif_of(image)
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.info["exif"] = exif.tobytes()
+    return stored
 
 
 def _is_misread(image: TiffImageFile) -> bool:

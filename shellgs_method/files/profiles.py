@@ -63,7 +63,7 @@ def _transform_of(image: Image.Image) -> ImageCms.ImageCmsTransform | None:
 
 
 def _is_adobe_rgb(image: Image.Image) -> bool:
-    if image.format != "JPEG":
+    if image.format not in ("JPEG", "MPO"):  # MPO: with previews, as of many cameras
         return False
     return str(exif_of(image).get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex)).startswith(_ADOBE)
 

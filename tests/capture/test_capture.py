@@ -366,6 +366,20 @@ def test_thumbnails_of_a_network_drive_are_no_photographs(tmp_path):
     assert list(find_photographs(tmp_path)) == ["a.jpg"]
 
 
+def test_photographs_in_a_linked_folder_are_found_once(tmp_path):
+    for name in ("photographs/front/1.jpg", "photographs/notes/a.txt", "side/2.jpg"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(name.encode())
+    folder = tmp_path / "photographs"
+    (folder / "side").symlink_to(tmp_path / "side")
+    (folder / "front" / "again").symlink_to(folder)
+    assert list(find_photographs(folder)) == ["front/1.jpg", "side/2.jpg"]
+    (folder / "masks").symlink_to(tmp_path / "painted")
+    (tmp_path / "painted").mkdir()
+    (tmp_path / "painted" / "1.jpg").touch()
+    assert list(find_photographs(folder, folder / "masks")) == ["front/1.jpg", "side/2.jpg"]
+
+
 def test_photographs_that_would_share_a_name_are_refused(tmp_path):
     (tmp_path / "a b.jpg").touch()
     (tmp_path / "a_b.jpg").touch()
@@ -608,6 +622,23 @@ def test_a_mask_is_rotated_with_its_photograph(tmp_path, as_stored):
     mask = Image.fromarray(upright)
     kept = masked(tmp_path, mask.rotate(90, expand=True) if as_stored else mask)
     np.testing.assert_array_equal(np.asarray(kept), upright)
+
+
+def test_a_mask_of_a_tiff_is_rotated_with_it(tmp_path):
+    """Pillow turns TIFFs alone as it reads them."""
+    upright = photograph()
+    upright.rotate(90, expand=True).save(tmp_path / "a.tif", tiffinfo={ExifTags.Base.Orientation: 6})
+    add_photograph(tmp_path / "a.tif", tmp_path / "upright.png")
+    with Image.open(tmp_path / "upright.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), np.asarray(upright))
+    kept = np.zeros((48, 64), np.uint8)
+    kept[:12, :16] = 255
+    for mask, as_stored in ((Image.fromarray(kept), False), (Image.fromarray(kept).rotate(90, expand=True), True)):
+        mask.save(tmp_path / "a.png")
+        assert masks_as_stored({"a": tmp_path / "a.tif"}, {"a": tmp_path / "a.png"}) == as_stored
+        add_mask(tmp_path / "a.png", tmp_path / "a.tif", tmp_path / "upright.png", tmp_path / "kept.png")
+        with Image.open(tmp_path / "kept.png") as image:
+            np.testing.assert_array_equal(np.asarray(image), kept)
 
 
 def test_masks_of_photographs_on_their_side_tell_how_those_of_others_are_stored(tmp_path, caplog):

@@ -99,6 +99,52 @@ def test_points_without_colours_are_grey(scene):
     assert (parse(scene).metadata["points3D_rgb"] == torch.full((4, 3), 128)).all()
 
 
+@pytest.mark.parametrize("kind", ["transforms.json", "COLMAP"])
+def test_black_points_are_grey_and_told(scene, caplog, kind):
+    """As where colours were not extracted: a black Gaussian would get no gradient."""
+    if kind == "COLMAP":
+        write_colmap(scene, read_views(FacadeDataParserConfig(data=scene)), list(range(1, 11)))
+        points = scene / "sparse/0/points3D.txt"
+        points.write_text(points.read_text().replace(" 9 9 9 ", " 0 0 0 "))
+    else:
+        cloud = trimesh.PointCloud(np.eye(4)[:, :3], np.zeros((4, 3), np.uint8))
+        cloud.export(scene / "sparse_pc.ply")
+    assert (parse(scene).metadata["points3D_rgb"] == 128).all()
+    assert "are all black, as where colours were not extracted: Gaussians begin grey" in caplog.text
+
+
+@pytest.mark.parametrize("given", ["k1", "distortion_params"])
+def test_a_frames_own_intrinsics_count_before_those_for_all(scene, caplog, given):
+    path = scene / "transforms.json"
+    meta = json.loads(path.read_text())
+    meta |= {"k1": 0.0, "k2": 0.01} if given == "k1" else {given: [0.0, 0.01, 0, 0, 0, 0]}
+    meta["frames"][1] |= {"fl_x": 1.5 * meta["fl_x"], "k1": -0.1}
+    path.write_text(json.dumps(meta))
+    first, second = read_views(FacadeDataParserConfig(data=scene))[:2]
+    assert first.lens is not None
+    assert second.lens is not None
+    assert float(second.lens.K[0, 0]) == 1.5 * float(first.lens.K[0, 0])
+    assert float(second.lens.K[1, 1]) == float(first.lens.K[1, 1])
+    assert (first.lens.distortion[:2], second.lens.distortion[:2]) == ((0, 0.01), (-0.1, 0.01))
+    assert "has frames with another fl_x than it gives for all, and theirs counts" in caplog.text
+
+
+@pytest.mark.parametrize(("size", "told"), [((4082, 3033), True), ((4000, 3000), False), ((2000, 1500), False)])
+def test_photographs_of_nearly_their_cameras_size_are_told_of(scene, caplog, size, told):
+    """As the undistorted ones of COLMAP beside the cameras of the originals."""
+    path = scene / "transforms.json"
+    meta = json.loads(path.read_text())
+    frames = meta["frames"]
+    for frame in frames[:2]:
+        with Image.open(scene / frame["file_path"]) as image:
+            image.resize((4000, 3000)).save(scene / frame["file_path"])
+        frame |= {"w": size[0], "h": size[1], "cx": size[0] / 2, "cy": size[1] / 2, "fl_x": size[0], "fl_y": size[0]}
+    meta["frames"] = frames[:2]
+    path.write_text(json.dumps(meta))
+    read_views(FacadeDataParserConfig(data=scene))
+    assert ("2 photographs of" in caplog.text and "not quite: images/frame_00001.png is" in caplog.text) == told
+
+
 COLOURS: dict[str, tuple[tuple[str, ...], str, float]] = {
     "bytes": (("red", "green", "blue"), "u1", 1.0),
     "floats to 255": (("red", "green", "blue"), "<f4", 1.0),

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 from scenes import photograph
 
 from dataparsers.orientation import _orientation
 from shellgs_method.capture.photographs import add_mask, add_photograph, group_by_lens, keep_exposure
 from shellgs_method.files.exif import exif_of, orientation_of, tags_of
-from shellgs_method.files.photographs import exif_log_gains, read_image, read_mask
+from shellgs_method.files.photographs import exif_log_gains, opened, read_image, read_mask
 
 
 def exif_data() -> bytes:
@@ -49,6 +49,21 @@ def test_a_photograph_with_damaged_exif_data_is_read_without_them(tmp_path, suff
     read_everywhere(path, tmp_path / "work")
     with Image.open(path) as image:
         assert tags_of(image).keys() <= {ExifTags.Base.Make, ExifTags.Base.Orientation, 0x8769}
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_tiff_is_read_as_it_is_stored_as_other_photographs_are(tmp_path, orientation):
+    stored, tag = photograph(48, 32), {ExifTags.Base.Orientation: orientation}
+    stored.save(tmp_path / "a.tif", tiffinfo=tag)
+    exif = Image.Exif()
+    exif.update(tag)
+    stored.save(tmp_path / "a.png", exif=exif)
+    tiff, png = (read_image(tmp_path / name) for name in ("a.tif", "a.png"))
+    np.testing.assert_array_equal(np.asarray(tiff), np.asarray(stored))
+    np.testing.assert_array_equal(*(np.asarray(ImageOps.exif_transpose(image)) for image in (tiff, png)))
+    assert orientation_of(tiff) == orientation
+    with opened(tmp_path / "a.tif", whole=False) as header:
+        assert (header.size, orientation_of(header)) == ((48, 32), orientation)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

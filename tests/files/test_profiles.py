@@ -46,6 +46,8 @@ def test_adobe_rgb_of_a_camera_is_known_by_its_exif_data(tmp_path, stored):
     exif = Image.Exif()
     exif[0x8769] = {0xA001: 65535, 0xA005: {1: "R03"}}
     np.testing.assert_allclose(colour(save(tmp_path / "a.jpg", stored, exif=exif)), ADOBE[stored], atol=3)
+    preview = {"format": "MPO", "save_all": True, "append_images": [Image.new("RGB", (8, 8))]}
+    np.testing.assert_allclose(colour(save(tmp_path / "b.jpg", stored, exif=exif, **preview)), ADOBE[stored], atol=3)
 
 
 def test_a_captured_photograph_is_in_srgb(tmp_path):
