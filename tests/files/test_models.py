@@ -394,6 +394,46 @@ def test_an_ifc_that_cannot_be_used_is_refused(tmp_path: Path, change: Callable,
         read_geometry(path)
 
 
+@pytest.mark.parametrize("beside_a_body", [True, False])
+@pytest.mark.parametrize("in_body", [True, False])
+def test_a_clearance_is_no_surface_of_an_ifc(tmp_path: Path, in_body: bool, beside_a_body: bool):
+    """The free space before a door is a solid of the door, beside its body or in a product of its own."""
+    file = made.Ifc()
+    wall, door = file.block("IfcWall", (0, 0, 0), (6, 0.3, 3)), file.block("IfcDoor", (2, -0.05, 0), (3, 0, 2))
+    free = file.block("IfcBuildingElementProxy", (2, -1.5, 0), (3, 0, 2))
+    (clearance,) = free.Representation.Representations
+    clearance.RepresentationIdentifier = "Clearance"
+    if in_body:
+        kind = "IfcGeometricRepresentationSubContext"
+        body, other = (file.add(kind, name, "Model", ParentContext=file.context, TargetView="MODEL_VIEW")
+                       for name in ("Body", "Clearance"))  # fmt: skip
+        clearance.ContextOfItems = other
+        for product in (wall, door):
+            product.Representation.Representations[0].ContextOfItems = body
+    if in_body and beside_a_body:
+        door.Representation.Representations = [*door.Representation.Representations, clearance]
+        free.Representation = None
+    read = read_geometry(file.save(tmp_path / "a.ifc"))
+    np.testing.assert_allclose(read.vertices.min(axis=0), (0, -0.05, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_parts_of_an_ifc_that_do_not_stay_are_told(tmp_path: Path, caplog, listed: bool):
+    file = made.Ifc()
+    for k, status in enumerate(("EXISTING", "DEMOLISH", "NEW", "TEMPORARY", "DEMOLISH")):
+        wall = file.block("IfcWall", (0, 2 * k, 0), (6, 2 * k + 0.3, 3))
+        label = file.add("IfcLabel", status)
+        prop = (
+            file.add("IfcPropertyEnumeratedValue", "Status", EnumerationValues=[label])
+            if listed
+            else file.add("IfcPropertySingleValue", "Status", NominalValue=label)
+        )
+        common = file.add("IfcPropertySet", file.new(), Name="Pset_WallCommon", HasProperties=[prop])
+        file.add("IfcRelDefinesByProperties", file.new(), RelatedObjects=[wall], RelatingPropertyDefinition=common)
+    assert len(read_geometry(file.save(tmp_path / "a.ifc")).faces) == 5 * 12
+    assert "some of its 5 parts are marked 2 DEMOLISH, 1 TEMPORARY" in caplog.text
+
+
 def test_faults_of_an_ifc_are_said(tmp_path: Path, caplog):
     path = made.ifc_house().save(tmp_path / "a.ifc")
     read_geometry(path)

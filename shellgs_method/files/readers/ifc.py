@@ -48,6 +48,12 @@ _GLASS = 0.3
 """Transparency from which a part of anything but a door is a window: the glazing of a curtain wall, for example."""
 
 
+_NO_SURFACE = {
+    *("Annotation", "Axis", "Box", "Clearance", "CoG", "FootPrint", "Lighting", "Profile", "Reference", "SurveyPoints"),
+}
+"""Identifiers of representations that are not what is seen of a product, though some are solids."""
+_PASSING = ("DEMOLISH", "TEMPORARY")
+"""Status of parts that do not stay."""
 _PROJECTION = 0.01
 """Largest difference of a map's scale from 1."""
 _FOOT = 0.3048
@@ -79,6 +85,8 @@ def read_ifc(path: Path) -> Geometry:
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
     say_left_out(path, Counter(each.is_a() for each in products if classes[each.id()] is None))
     seen = [each for each in products if classes[each.id()] is not None]
+    if any(each.Name == "Status" for each in model.by_type("IfcProperty")):
+        _tell_of_phases(path, seen, ifcopenshell)
     made = [_read(shape, classes[shape.id]) for shape in _shapes(ifcopenshell.geom, model, seen)]
     made.sort(key=lambda part: part.product)  # threads finish them in any order
     known = {part.product for part in made}
@@ -120,12 +128,31 @@ def _read(shape: Any, own: SurfaceClass | None) -> _Part:
 
 
 def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
-    """The triangulated shapes of products, in metres and their placements, with openings cut; valid until the next."""
-    iterator = geom.iterator(geom.settings(), model, os.cpu_count() or 1, include=products) if products else None
-    if iterator is not None and iterator.initialize():
-        yield iterator.get()
-        while iterator.next():
+    """The triangulated shapes of products, in metres and their placements, with openings cut; valid until the next.
+
+    Of a product with a body, that alone: a clearance before a door is a solid too.
+    """
+    contexts = model.by_type("IfcGeometricRepresentationSubContext")
+    bodies = {each.id() for each in contexts if (each.ContextIdentifier, each.TargetView) == ("Body", "MODEL_VIEW")}
+    with_body = [each for each in products if _contexts_of(each) & bodies]
+    others = [each for each in products if not _contexts_of(each) & bodies and _identifiers(each) - _NO_SURFACE]
+    for some, used in ((with_body, bodies), (others, set())):
+        settings = geom.settings()
+        if used:
+            settings.set("context-ids", sorted(used))
+        iterator = geom.iterator(settings, model, os.cpu_count() or 1, include=some) if some else None
+        if iterator is not None and iterator.initialize():
             yield iterator.get()
+            while iterator.next():
+                yield iterator.get()
+
+
+def _contexts_of(product: Any) -> set[int]:
+    return {each.ContextOfItems.id() for each in product.Representation.Representations if each.Items}
+
+
+def _identifiers(product: Any) -> set[str | None]:
+    return {each.RepresentationIdentifier for each in product.Representation.Representations if each.Items}
 
 
 def _class_of(product: Any, ifcopenshell: ModuleType) -> SurfaceClass | None:
@@ -165,8 +192,27 @@ def _with_glass(own: SurfaceClass | None, shape: Any, count: int) -> UInt8[np.nd
 
 def _has_body(product: Any) -> bool:
     """Whether a product has a solid or a surface, and not only an axis, a footprint, or a box around it."""
-    kinds = {each.RepresentationIdentifier for each in product.Representation.Representations if each.Items}
-    return bool(kinds & {"Body", "Facetation", "Surface"})
+    return bool(_identifiers(product) & {"Body", "Facetation", "Surface"})
+
+
+def _tell_of_phases(path: Path, products: list, ifcopenshell: ModuleType) -> None:
+    """Tell the user which parts are not of the building as it stays: photographs show one state, a model may hold all.
+
+    By the Status of their property sets (PEnum_ElementStatus).
+    """
+    said = Counter(status for each in products for status in _status_of(each, ifcopenshell))
+    if passing := {status: said[status] for status in _PASSING if said[status]}:
+        counted = ", ".join(f"{count} {status}" for status, count in passing.items())
+        notice(
+            f"{path}: some of its {len(products)} parts are marked {counted}, and are read as the others: where "
+            "photographs do not show them, export the model without them, or they hide the building."
+        )
+
+
+def _status_of(product: Any, ifcopenshell: ModuleType) -> set[str]:
+    sets = ifcopenshell.util.element.get_psets(product, psets_only=True)
+    found = next((each["Status"] for name, each in sets.items() if name.endswith("Common") and "Status" in each), None)
+    return {str(status).upper() for status in (found if isinstance(found, (list, tuple)) else [found])}
 
 
 def _on_the_map(model: Any, points: Float64[np.ndarray, "N 3"], path: Path) -> Float64[np.ndarray, "N 3"]:
