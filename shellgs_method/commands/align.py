@@ -157,6 +157,7 @@ class _Start:
             FileNotFoundError: a file is missing.
             SceneError: the shell or a file cannot be used, or it fits nowhere.
         """
+        from shellgs_method.files.crs import crs_there
         from shellgs_method.registration.align import system_of
         from shellgs_method.registration.frames import ShellPlace
 
@@ -164,9 +165,9 @@ class _Start:
         place = ShellPlace(*self.shell) if self.shell and (self.picks or self.positions) else None
         placement = self._placed(scene, views, points, place, crs)
         alignment = placement.alignment.meshed_by(self.mesher, self.spacing)
-        alignment = replace(alignment, crs=crs or alignment.crs)
         mesh = alignment.load_shell(scene, views, place.surfaces if place else ())
-        return replace(placement, alignment=alignment), mesh
+        crs = crs_there(crs or alignment.crs, mesh.centre, alignment.metres_per_shell_unit)
+        return replace(placement, alignment=replace(alignment, crs=crs)), mesh
 
     def _placed(
         self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float64
 from shellgs_method.errors import SceneError, notice
 
 if TYPE_CHECKING:  # training needs no PROJ
+    from laspy import LasHeader
     from pyproj import CRS
 
 IN_METRES = (".ifc", ".ifczip")
@@ -41,6 +42,15 @@ _IN_FILES = {
     **dict.fromkeys((".gml", ".xml", ".citygml"), re.compile(rb"srsName\s*=\s*[\"']([^\"']+)")),
     **dict.fromkeys((".json", ".jsonl", ".cityjson"), re.compile(rb'"referenceSystem"\s*:\s*"([^"]+)"')),
 }
+
+_VERTICAL, _VERTICAL_UNIT, _EPSG = 4096, 4099, range(1024, 32767)
+"""GeoTIFF keys of the system of heights and of their unit, and what may be a code of EPSG there."""
+_HEIGHTS = {9001: 5703, 9002: 8228, 9003: 6360}
+"""Some system of heights in each unit, by EPSG: metres, feet, US survey feet."""
+_SITE = 1e4
+"""Metres from the origin of its numbers, within which a shell may have been moved there."""
+_BEYOND = 5.0
+"""Degrees beyond the area of a system up to which it is used."""
 
 
 def known_crs(text: str) -> CRS | None:
@@ -105,8 +115,7 @@ def _written_in(path: Path) -> str:
         import laspy
 
         with laspy.open(path) as file:
-            crs = file.header.parse_crs()
-            return crs.to_wkt() if crs else ""
+            return _of_las(file.header)
     if suffix == ".e57":
         from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -121,6 +130,27 @@ def _written_in(path: Path) -> str:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as contents:
         found = pattern.search(contents)
         return found[1].decode().replace("\\/", "/") if found else ""
+
+
+def _of_las(header: LasHeader) -> str:
+    """A scan's system, which laspy reads without heights; with them where they are in another unit."""
+    from pyproj.crs import CRS, CompoundCRS
+
+    crs = header.parse_crs()
+    if crs is None:
+        return ""
+    keys = {key.id: key.value_offset for vlr in header.vlrs.get("GeoKeyDirectoryVlr") for key in vlr.geo_keys}
+    code = _HEIGHTS.get(keys.get(_VERTICAL_UNIT, 0), keys.get(_VERTICAL, 0))
+    if len(crs.axis_info) == 2 and code in _EPSG:
+        heights = CRS.from_epsg(code)
+        if _differ({axis.unit_conversion_factor for axis in (*crs.axis_info, *heights.axis_info)}):
+            crs = CompoundCRS(crs.name, [crs, heights])
+    return crs.to_wkt()
+
+
+def _differ(units: Collection[float]) -> bool:
+    """Whether lengths are in different units, and not in two kinds of feet."""
+    return max(units) > 1.1 * min(units)
 
 
 def given_crs(text: str) -> str:
@@ -157,13 +187,39 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
             "heights are not: convert the shell to a system of its region, such as UTM, or name that with --crs"
         )
     units = {axis.unit_name: axis.unit_conversion_factor for axis in crs.axis_info}
-    if max(units.values()) > 1.1 * min(units.values()):
+    if _differ(units.values()):
         raise SceneError(f"{crs.name} has axes in {' and in '.join(units)}: convert the shell to one unit")
     name, metres = next(iter(units.items()))
     if given != 1 or abs(metres - 1) < 1e-9:
         return given
     notice(f"The shell's system, {crs.name}, is in {name}: its unit is taken for {metres:.9g} m.")
     return metres
+
+
+def crs_there(system: str, place: Float64[np.ndarray, " 3"], metres: float) -> str:
+    """A system, or "" where what is said to be in it is not in its area, which is told: a shell less an offset is not.
+
+    Args:
+        system: name of the system; empty if unknown.
+        place: a point of the shell, in its own unit.
+        metres: metres of that unit.
+    """
+    crs = known_crs(system)
+    if crs is None:
+        return system
+    crs = crs.sub_crs_list[0] if crs.sub_crs_list else crs
+    if crs.area_of_use is None or crs.geodetic_crs is None:
+        return system
+    beyond = 0 if metres * np.abs(place[:2]).max() < _SITE else _BEYOND
+    point = metres / crs.axis_info[0].unit_conversion_factor * place[None, :2]
+    if _within(crs, conversion(crs, crs.geodetic_crs)(point), beyond)[0]:
+        return system
+    notice(
+        f"The shell is said to be in {crs.name}, but {place[0]:.0f} {place[1]:.0f} is outside its area: results are "
+        "not said to be in it. If an offset was taken from the shell (of *_offset.xyz, for example), add it; if "
+        "another system is meant, name that with --crs."
+    )
+    return ""
 
 
 def _is_of_the_earth(crs: CRS) -> bool:
@@ -218,13 +274,14 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
     return checked
 
 
-def _within(crs: CRS, degrees: np.ndarray) -> Bool[np.ndarray, " N"]:
-    """Whether longitudes and latitudes are in the area that a system is made for, where it is known."""
+def _within(crs: CRS, degrees: np.ndarray, beyond: float = 0.0) -> Bool[np.ndarray, " N"]:
+    """Whether longitudes and latitudes are in the area that a system is made for, where it is known, or near it."""
     area, (longitude, latitude) = crs.area_of_use, degrees.T[:2]
     if area is None:
         return np.zeros(len(degrees), bool)
-    inside = (longitude >= area.west) & (longitude <= area.east)
-    return inside & (latitude >= area.south) & (latitude <= area.north)
+    across = (area.east - area.west) % 360 or 360.0  # may cross the meridian of 180 degrees
+    inside = (longitude - area.west + beyond) % 360 <= across + 2 * beyond
+    return inside & (latitude >= area.south - beyond) & (latitude <= area.north + beyond)
 
 
 def _words(point: np.ndarray) -> str:

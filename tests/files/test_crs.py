@@ -7,12 +7,14 @@ import re
 from pathlib import Path
 
 import laspy
+import numpy as np
 import pyproj
 import pytest
+from laspy.vlrs.known import GeoKeyEntryStruct
 from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.crs import crs_of, given_crs, known_crs, metres_of, name_of
+from shellgs_method.files.crs import crs_of, crs_there, given_crs, known_crs, metres_of, name_of
 
 UTM = "EPSG:25832"
 
@@ -129,6 +131,61 @@ def test_a_projection_of_the_whole_earth_has_no_unit_of_length(system):
     with pytest.raises(SceneError, match=r"stretched .* convert the shell to a system of its region"):
         metres_of(system, 1.0, (Path("scan.las"),))
     assert metres_of(system, 1.0, (Path("a.ifc"),)) == 1  # whose map conversion does not stretch
+
+
+@pytest.mark.parametrize(
+    ("system", "keys", "differ"),
+    [
+        (2263, {4099: 9001}, True),  # feet, and metres
+        (2263, {4096: 5703}, True),
+        (2263, {4096: 6360, 4099: 9003}, False),
+        (2263, {4099: 9002}, False),  # two kinds of feet
+        (26918, {4096: 6360}, True),
+        (26918, {4096: 5703, 4099: 9001}, False),
+        (26918, {4096: 32767}, False),
+        (26918, {}, False),
+    ],
+)
+def test_heights_of_a_scan_in_another_unit_are_refused(tmp_path, system, keys, differ):
+    """GeoTIFF keys tell their system and unit apart from those of eastings."""
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.add_crs(pyproj.CRS.from_epsg(system), keep_compatibility=True)
+    (directory,) = header.vlrs.get("GeoKeyDirectoryVlr")
+    directory.geo_keys += [GeoKeyEntryStruct(id=key, count=1, value_offset=value) for key, value in keys.items()]
+    directory.geo_keys_header.number_of_keys = len(directory.geo_keys)
+    laspy.LasData(header).write(str(tmp_path / "a.las"))
+    found = crs_of(tmp_path / "a.las")
+    if differ:
+        with pytest.raises(SceneError, match=r"axes in .* and in .*: convert the shell to one unit"):
+            metres_of(found, 1.0, (tmp_path / "a.las",))
+    else:
+        assert found == f"EPSG:{system}"
+
+
+FEET = 1200 / 3937
+
+
+@pytest.mark.parametrize(
+    ("system", "place", "metres", "is_there"),
+    [
+        (UTM, (412_300, 5_123_400, 200), 1.0, True),
+        (UTM, (42, 56, 3), 1.0, False),  # less an offset
+        (UTM, (5_123_400, 412_300, 200), 1.0, False),  # northing first
+        (UTM, (900_000, 5_700_000, 0), 1.0, True),  # of a neighbouring zone
+        (UTM, (412_300_000, 5_123_400_000, 0), 0.001, True),
+        ("EPSG:25832+5783", (412_300, 5_123_400, 200), 1.0, True),
+        ("EPSG:2263", (980_000, 200_000, 0), FEET, True),
+        ("EPSG:2263", (298_700, 60_960, 0), 1.0, True),  # the same in metres
+        ("EPSG:28991", (100, 200, 0), 1.0, True),  # has its origin in its area
+        ("EPSG:2193", (1_750_000, 5_420_000, 0), 1.0, True),  # whose area crosses 180 degrees
+        ("EPSG:2193", (0, 0, 0), 1.0, False),
+        ("", (42, 56, 3), 1.0, True),
+        ('LOCAL_CS["site",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]', (42, 56, 3), 1.0, True),
+    ],
+)
+def test_a_shell_that_is_not_in_the_area_of_its_system_is_not_said_to_be_in_it(caplog, system, place, metres, is_there):
+    assert crs_there(system, np.array(place, float), metres) == (system if is_there else "")
+    assert ("outside its area: results are not said to be in it" in caplog.text) == (not is_there)
 
 
 def test_polar_systems_have_lengths():
