@@ -139,9 +139,9 @@ def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
     other = []
     for view in views:
         with suppress(SceneError):  # which is raised where the photograph is used
-            size = upright_size(view)
-            scale = size[0] / _calibrated_size(view)[0]
-            if max(abs(a - b) for a, b in zip(size, _calibrated_size(view), strict=True)) > 1 and _SCALED > abs(scale - 1):
+            size = np.array(upright_size(view))
+            apart = np.abs(size - _calibrated_size(view))
+            if apart.max() > 1 and (apart < _SCALED * size).all():
                 other.append((view, size))
     if other:
         view, (width, height) = other[0]

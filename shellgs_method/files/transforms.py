@@ -117,7 +117,7 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
         pose = np.empty(0)
     if pose.shape != (4, 4):
         raise SceneError(f"{where} ({entry['file_path']}): its transform_matrix is not a 4x4 matrix of numbers")
-    for_all, own = ({key: each[key] for key in _LENS if key in each} | _distortion(each, where) for each in (meta, entry))
+    for_all, own = _lens(meta, where), _lens(entry, where)
     lens = for_all | own
     if other := [key for key in own if key in for_all and own[key] != for_all[key]]:
         notice(
@@ -156,6 +156,10 @@ def _by_angles(angles: Mapping[str, Any], photograph: Path, where: str) -> dict[
     focal = width / 2 / math.tan(angles["camera_angle_x"] / 2)
     vertical = height / 2 / math.tan(angles["camera_angle_y"] / 2) if "camera_angle_y" in angles else focal
     return {"fl_x": focal, "fl_y": vertical, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+
+
+def _lens(source: Mapping[str, Any], where: str) -> dict[str, Any]:
+    return {key: source[key] for key in _LENS if key in source} | _distortion(source, where)
 
 
 def _distortion(source: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -689,6 +689,7 @@ def columns(order: list[int], separator: str = " ") -> list[str]:
         ["X Y Z R G B", *LINES],
         ["//X Y Z R G B", *LINES],
         ["# made by hand", "", *LINES, ""],
+        ["% X Y Z R G B", *LINES],
         ["300", *LINES],
         ["//X Y Z", "300", *LINES],
         ["100", *LINES[:100], "200", *LINES[100:]],
@@ -734,6 +735,22 @@ def test_a_column_of_points_numbers_is_said(tmp_path: Path, caplog):
     (tmp_path / "a.xyz").write_text("\n".join(f"{k + 1000} {line}" for k, line in enumerate(LINES)))
     read_geometry(tmp_path / "a.xyz")
     assert "its first column (1000) is taken for the points' numbers" in caplog.text
+
+
+@pytest.mark.parametrize("start", [319_000.0, 1.7e9])
+def test_a_column_of_times_is_said(tmp_path: Path, caplog, start: float):
+    (tmp_path / "a.xyz").write_text("\n".join(f"{start + 3e-6 * k:.6f} {line}" for k, line in enumerate(LINES)))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.xyz").vertices, SURVEYED)
+    assert f"its first column ({start:.6f}) is taken for times, and X for the second" in caplog.text
+
+
+@pytest.mark.parametrize("form", ["{:.3f}", "{!r}"])
+@pytest.mark.parametrize("shift", [0.0, 3000.0])
+def test_points_sorted_by_x_have_no_times(tmp_path: Path, form: str, shift: float):
+    points = POINTS[np.argsort(POINTS[:, 0])] + [shift, 100, 0]
+    points = points[np.append(True, np.diff(points.round(3)[:, 0]) > 0)].tolist()
+    (tmp_path / "a.xyz").write_text("\n".join(" ".join([*(form.format(v) for v in point), "7"]) for point in points))
+    np.testing.assert_allclose(read_geometry(tmp_path / "a.xyz").vertices, points, atol=6e-4)
 
 
 def test_whole_numbers_in_all_columns_are_coordinates(tmp_path: Path, caplog):

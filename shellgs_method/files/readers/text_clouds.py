@@ -17,9 +17,10 @@ from shellgs_method.files.readers.contents import left_out
 from shellgs_method.files.readers.points import NO_POINTS, PIECE, Points
 from shellgs_method.files.tables import COORDINATES, LATITUDE, LONGITUDE
 
-_COMMENTS = ("#", "//")
+_COMMENTS = ("#", "//", "%")
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _SAMPLE = 100  # lines that decide on the layout
+_TIMED, _SECONDS = 10, 1000.0  # lines that show that a column rises, and what scanners' times are beyond
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _WHOLE = re.compile(r"[-+]?\d+")
 _XYZ = {axis: (axis.lower(),) for axis in "XYZ"}
@@ -32,8 +33,8 @@ def read_text_cloud(path: Path) -> Iterator[Points]:
     A header may call them easting, northing and height, in any order.
 
     Columns are separated by spaces, tabs, commas or semicolons. A line with one number counts the points after it.
-    Where the first column numbers or names the points, X is the second; where two are a scanner's rows and columns, as
-    FARO's programs write them, the third.
+    Where the first column numbers, names or times the points, X is the second; where two are a scanner's rows and
+    columns, as FARO's programs write them, the third.
 
     Raises:
         SceneError: the first lines are no such columns.
@@ -114,7 +115,7 @@ class _Lines:
         for line in self.file:
             line = line.strip()
             if not line or line.startswith(_COMMENTS):
-                comment = line.lstrip("#/ ")
+                comment = line.lstrip("#/% ")
                 if not begun and _axes(re.split(r"[\s,;]+", comment)):
                     self.header = comment
                 continue
@@ -196,6 +197,9 @@ def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
         if not numeric[0] or (varies and whole[0] and not any(whole[1:4])):
             notice(f"{path}: its first column ({rows[0][0]}) is taken for the points' numbers, and X for the second.")
             return [1, 2, 3]
+        if all(numeric[:4]) and _is_time(rows):
+            notice(f"{path}: its first column ({rows[0][0]}) is taken for times, and X for the second.")
+            return [1, 2, 3]
     if all(whole[:2]) and all(numeric) and len(numeric) == 5 and not any(whole[2:]) and _is_raster(rows):
         notice(f"{path}: its first two columns are taken for the scanner's rows and columns, and X for the third.")
         return [2, 3, 4]
@@ -205,6 +209,17 @@ def _columns(rows: list[list[str]], line: str, path: Path) -> list[int]:
             "it with these in each line, after a line that names the columns, if they are not the first three"
         )
     return [0, 1, 2]
+
+
+def _is_time(rows: list[list[str]]) -> bool:
+    """Whether the first column rises from line to line, and has more decimals than the next three.
+
+    The X of sorted points has as many, or more where it is small, of numbers that are written with all their digits.
+    """
+    first = np.array([float(row[0]) for row in rows])
+    decimals = [max(len(row[k].partition(".")[2]) for row in rows) for k in range(4)]
+    rises = (np.diff(first) > 0).all() and first[0] > _SECONDS
+    return bool(len(rows) >= _TIMED and rises and decimals[0] > max(decimals[1:]))
 
 
 def _is_raster(rows: list[list[str]]) -> bool:
