@@ -6,7 +6,7 @@ import mmap
 import re
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -139,7 +139,8 @@ def _of_las(header: LasHeader) -> str:
     crs = header.parse_crs()
     if crs is None:
         return ""
-    keys = {key.id: key.value_offset for vlr in header.vlrs.get("GeoKeyDirectoryVlr") for key in vlr.geo_keys}
+    directories: Any = header.vlrs.get("GeoKeyDirectoryVlr")
+    keys: dict[int, int] = {key.id: key.value_offset for each in directories for key in each.geo_keys}
     code = _HEIGHTS.get(keys.get(_VERTICAL_UNIT, 0), keys.get(_VERTICAL, 0))
     if len(crs.axis_info) == 2 and code in _EPSG:
         heights = CRS.from_epsg(code)

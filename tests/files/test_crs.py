@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -150,7 +151,7 @@ def test_heights_of_a_scan_in_another_unit_are_refused(tmp_path, system, keys, d
     """GeoTIFF keys tell their system and unit apart from those of eastings."""
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.add_crs(pyproj.CRS.from_epsg(system), keep_compatibility=True)
-    (directory,) = header.vlrs.get("GeoKeyDirectoryVlr")
+    directory: Any = header.vlrs.get("GeoKeyDirectoryVlr")[0]
     directory.geo_keys += [GeoKeyEntryStruct(id=key, count=1, value_offset=value) for key, value in keys.items()]
     directory.geo_keys_header.number_of_keys = len(directory.geo_keys)
     laspy.LasData(header).write(str(tmp_path / "a.las"))

@@ -53,14 +53,14 @@ def test_a_photograph_with_damaged_exif_data_is_read_without_them(tmp_path, suff
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_tiff_is_read_as_it_is_stored_as_other_photographs_are(tmp_path, orientation):
-    stored, tag = photograph(48, 32), {ExifTags.Base.Orientation: orientation}
-    stored.save(tmp_path / "a.tif", tiffinfo=tag)
-    exif = Image.Exif()
-    exif.update(tag)
+    stored, exif = photograph(48, 32), Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.save(tmp_path / "a.tif", tiffinfo={ExifTags.Base.Orientation: orientation})
     stored.save(tmp_path / "a.png", exif=exif)
     tiff, png = (read_image(tmp_path / name) for name in ("a.tif", "a.png"))
     np.testing.assert_array_equal(np.asarray(tiff), np.asarray(stored))
-    np.testing.assert_array_equal(*(np.asarray(ImageOps.exif_transpose(image)) for image in (tiff, png)))
+    upright = [np.asarray(ImageOps.exif_transpose(image)) for image in (tiff, png)]
+    np.testing.assert_array_equal(upright[0], upright[1])
     assert orientation_of(tiff) == orientation
     with opened(tmp_path / "a.tif", whole=False) as header:
         assert (header.size, orientation_of(header)) == ((48, 32), orientation)
