@@ -34,7 +34,7 @@ _LEAST_ACROSS = 100  # matches across a cut that say something of it
 def along_the_walk(name: str) -> tuple[Any, ...]:
     """Key that sorts names of photographs as they were taken: folder by folder, and 9 before 10."""
     folder, _, file = name.rpartition("/")
-    return (*((_with_numbers(part), part) for part in (folder, file)),)
+    return _with_numbers(folder), folder, _with_numbers(file), file
 
 
 def _with_numbers(text: str) -> list[Any]:

@@ -186,9 +186,11 @@ def files_below(folder: Path) -> Iterator[Path]:
     """Files in a folder and its sub-folders, also in those that are links; each folder once."""
     been: set[Path] = set()
     for root, folders, files in os.walk(folder, followlinks=True):
-        been.add(Path(root).resolve())
-        folders[:] = [name for name in folders if Path(root, name).resolve() not in been]
-        yield from (Path(root, name) for name in files)
+        if (real := Path(root).resolve()) in been:
+            folders.clear()
+        else:
+            been.add(real)
+            yield from (Path(root, name) for name in files)
 
 
 def photographs_in(folder: Path, *, deep: bool) -> list[Path]:

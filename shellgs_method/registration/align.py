@@ -23,7 +23,7 @@ from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.precision import FINE, REMEDY
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import FEW, SIGNIFICANT, Adjustment, adjusted
-from shellgs_method.registration.correspondences import Correspondence, measured_again, residuals_in_words
+from shellgs_method.registration.correspondences import MAX_ERROR, Correspondence, measured_again, residuals_in_words
 from shellgs_method.registration.frames import ShellPlace, apart
 from shellgs_method.registration.geotags import REACH, GeoTags
 from shellgs_method.registration.picks import PickedPoint, align_picks, picked_again, read_picks
@@ -145,11 +145,18 @@ def place_by_picks(
 
     Raises:
         FileNotFoundError: the file does not exist.
-        SceneError: the picks cannot be read, triangulated or trusted, or are not in the shell's frame.
+        SceneError: the picks cannot be read, triangulated or trusted, are not in the shell's frame, or less than half
+            agree.
     """
     picks = read_picks(path, views, crs)
     place.check_picks(np.stack([pick.shell for pick in picks]), f"the picks of {path}")
     matrix, picked = align_picks(picks, views, metres_per_shell_unit)
+    fitted = [point.is_used for point in picked if point.is_sharp and not point.held_out]
+    if 2 * sum(fitted) < len(fitted):
+        raise SceneError(
+            f"only {sum(fitted)} of {len(fitted)} picks of {path} agree with the photographs within {MAX_ERROR} m, "
+            "which three do by chance: are they of the same points, and all axes of the shell in one unit?"
+        )
     alignment = Alignment(matrix, shells, metres_per_shell_unit, source=f"picks in {path.name}")
     return Placement(alignment, [residuals_in_words(picked, "picks")], picked)
 

@@ -87,12 +87,17 @@ def fit_robustly(
         remedy: advice if they lie on one line, for messages.
 
     Raises:
-        SceneError: fewer than 3 points, or only points on one line, can be trusted.
+        SceneError: fewer than 3 points, or only points on one line, agree.
     """
     survey_from_shell = centred(shell.mean(axis=0), metres_per_shell_unit)
     shell = transformed(shell, survey_from_shell)
     _check_spread(scene[candidates], shell[candidates], called, remedy)
     used = _consensus(scene, shell, candidates)
+    if used.sum() < 3:
+        raise SceneError(
+            f"only {used.sum()} of {candidates.sum()} {called} agree with the photographs within {MAX_ERROR} m: are "
+            "they of the same points, and all axes of the shell in one unit?"
+        )
     _check_spread(scene[used], shell[used], called, remedy)
     survey_from_scene = fit_similarity(scene[used], shell[used])
     residuals = np.linalg.norm(transformed(scene, survey_from_scene) - shell, axis=1)

@@ -374,6 +374,9 @@ def test_photographs_in_a_linked_folder_are_found_once(tmp_path):
     (folder / "side").symlink_to(tmp_path / "side")
     (folder / "front" / "again").symlink_to(folder)
     assert list(find_photographs(folder)) == ["front/1.jpg", "side/2.jpg"]
+    (folder / "twice").symlink_to(tmp_path / "side")
+    assert len(find_photographs(folder)) == 2
+    (folder / "twice").unlink()
     (folder / "masks").symlink_to(tmp_path / "painted")
     (tmp_path / "painted").mkdir()
     (tmp_path / "painted" / "1.jpg").touch()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -926,11 +927,15 @@ def test_a_matrix_is_validated_reported_and_written(scene, shellgs):
     assert json.loads((scene / REPORT / "validation.json").read_text())["verdict"] == written.verdict
 
 
-def test_picks_and_refinement_give_the_alignment_and_residuals(scene, shellgs):
-    true = Alignment.load(scene / ALIGNMENT)
+FEET_UP = (1, 1, 1 / 0.3048)
+
+
+def pick_corners(scene: Path, scaled: Sequence[float] = (1, 1, 1), moved: int = 0) -> Path:
+    """Exact picks of the corners of openings, of a shell whose axes are scaled; the first ones are about 0.5 m off."""
     corners = [(o.x0, 0.0, o.z0) for o in Layout(6, 3).openings] + [(o.x1, 0.0, o.z1) for o in Layout(6, 3).openings]
     building = np.array(corners)
-    on_shell = transformed(building, SHELL_FROM_BUILDING)
+    on_shell = transformed(building, SHELL_FROM_BUILDING) * scaled
+    on_shell[:moved] += np.random.default_rng(0).normal(0, 0.3, (moved, 3))
     lines = []
     for view in read_views(FacadeDataParserConfig(data=scene)):
         projection = (view.camera.K @ view.camera.viewmat[:3]).numpy()
@@ -941,6 +946,25 @@ def test_picks_and_refinement_give_the_alignment_and_residuals(scene, shellgs):
     seen = [k for k, _ in lines]
     picks = scene / "picks.txt"
     picks.write_text("\n".join(line for k, line in lines if seen.count(k) >= 4))
+    return picks
+
+
+def test_picks_of_which_less_than_half_agree_are_refused(scene, shellgs):
+    shell = scene / Alignment.load(scene / ALIGNMENT).shells[0]
+    said = shellgs("align", scene, shell, "--picks", pick_corners(scene, moved=28))
+    assert re.search(r"refused: shellgs: only \d+ of 31 picks of .* agree .* which three do by chance", said)
+
+
+def test_picks_of_a_shell_whose_heights_are_in_another_unit_are_refused(scene, shellgs, tmp_path):
+    shell = load_shell(*Alignment.load(scene / ALIGNMENT).files(scene))
+    trimesh.Trimesh(shell.vertices * FEET_UP, shell.faces, process=False).export(tmp_path / "feet.obj")
+    said = shellgs("align", scene, tmp_path / "feet.obj", "--picks", pick_corners(scene, scaled=FEET_UP))
+    assert re.search(r"refused: shellgs: only \d of 31 picks agree .* all axes of the shell in one unit\?", said)
+
+
+def test_picks_and_refinement_give_the_alignment_and_residuals(scene, shellgs):
+    true = Alignment.load(scene / ALIGNMENT)
+    picks = pick_corners(scene)
     (scene / ALIGNMENT).unlink()
     output = shellgs("align", scene, scene / true.shells[0], "--picks", picks, "--refine", 0.3)
     assert "picks are used" in output
