@@ -85,8 +85,8 @@ def test_faces_are_named_by_panorama_and_belong_together(tmp_path):
     photograph().save(tmp_path / "faces" / "b.jpg")
     names = sorted(p.relative_to(tmp_path / "faces").as_posix() for p in (tmp_path / "faces").rglob("*.jpg"))
     shots = taken_at_once(names, FACES)
-    assert list(shots) == ["2.jpg", "a/1.jpg", "b.jpg"]
-    two, one, alone = shots.values()
+    assert list(shots) == ["2.jpg", "b.jpg", "a/1.jpg"]
+    two, alone, one = shots.values()
     assert one == [f"{prefix}a/1.jpg" for prefix in sorted(FACES)]
     assert two == [f"{prefix}2.jpg" for prefix in sorted(FACES)]
     assert alone == ["b.jpg"]
