@@ -45,6 +45,8 @@ _IN_FILES = {
 
 _VERTICAL, _VERTICAL_UNIT, _EPSG = 4096, 4099, range(1024, 32767)
 """GeoTIFF keys of the system of heights and of their unit, and what may be a code of EPSG there."""
+_UNIT, _FEET = 3076, {9002: "0.3048", 9003: "0.30480061"}
+"""GeoTIFF key of the unit of eastings, and metres of feet and of US survey feet."""
 _HEIGHTS = {9001: 5703, 9002: 8228, 9003: 6360}
 """Some system of heights in each unit, by EPSG: metres, feet, US survey feet."""
 _SITE = 1e4
@@ -115,7 +117,7 @@ def _written_in(path: Path) -> str:
         import laspy
 
         with laspy.open(path) as file:
-            return _of_las(file.header)
+            return _of_las(file.header, path)
     if suffix == ".e57":
         from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -132,15 +134,23 @@ def _written_in(path: Path) -> str:
         return found[1].decode().replace("\\/", "/") if found else ""
 
 
-def _of_las(header: LasHeader) -> str:
-    """A scan's system, which laspy reads without heights; with them where they are in another unit."""
+def _of_las(header: LasHeader, path: Path) -> str:
+    """A scan's system, which laspy reads without heights; with them where they are in another unit.
+
+    That it has none but is in feet is told.
+    """
     from pyproj.crs import CRS, CompoundCRS
 
     crs = header.parse_crs()
-    if crs is None:
-        return ""
     directories: Any = header.vlrs.get("GeoKeyDirectoryVlr")
     keys: dict[int, int] = {key.id: key.value_offset for each in directories for key in each.geo_keys}
+    if crs is None:
+        if feet := _FEET.get(keys.get(_UNIT, 0)):
+            notice(
+                f"{path} says that it is in feet, and names no system that is known: give it with --crs, or "
+                f"--metres-per-shell-unit {feet}."
+            )
+        return ""
     code = _HEIGHTS.get(keys.get(_VERTICAL_UNIT, 0), keys.get(_VERTICAL, 0))
     if len(crs.axis_info) == 2 and code in _EPSG:
         heights = CRS.from_epsg(code)

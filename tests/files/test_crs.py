@@ -163,6 +163,19 @@ def test_heights_of_a_scan_in_another_unit_are_refused(tmp_path, system, keys, d
         assert found == f"EPSG:{system}"
 
 
+def test_a_scan_in_feet_of_an_unknown_system_is_told(tmp_path, caplog):
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.add_crs(pyproj.CRS.from_epsg(2263), keep_compatibility=True)
+    directory: Any = header.vlrs.get("GeoKeyDirectoryVlr")[0]
+    for key in directory.geo_keys:
+        key.value_offset = 32767 if key.id == 3072 else key.value_offset
+    directory.geo_keys.append(GeoKeyEntryStruct(id=3076, count=1, value_offset=9003))
+    laspy.LasData(header).write(str(tmp_path / "a.las"))
+    assert not crs_of(tmp_path / "a.las")
+    assert "a.las says that it is in feet, and names no system" in caplog.text
+    assert "--metres-per-shell-unit 0.30480061" in caplog.text
+
+
 FEET = 1200 / 3937
 
 
