@@ -157,7 +157,7 @@ def _views(frames: Sequence[Frame], layout: SceneLayout) -> list[View]:
             camera = replace(pinholes[key], viewmat=camera.viewmat)
         views.append(View(frame.name, frame.image, camera, lens, masks.get(frame.name)))
     views = oriented(views, layout)
-    tell_of_other_sizes([view for view in views if view.image.is_file()], layout.data)
+    tell_of_other_sizes(views, layout.data)
     return views
 
 

@@ -138,7 +138,7 @@ def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
     """
     other = []
     for view in views:
-        with suppress(SceneError):  # which is raised where the photograph is used
+        with suppress(SceneError):  # of a missing or damaged one, which is raised where it is used
             size = np.array(upright_size(view))
             apart = np.abs(size - _calibrated_size(view))
             if apart.max() > 1 and (apart < _SCALED * size).all():
