@@ -434,6 +434,25 @@ def test_parts_of_an_ifc_that_do_not_stay_are_told(tmp_path: Path, caplog, liste
     assert "some of its 5 parts are marked 2 DEMOLISH, 1 TEMPORARY" in caplog.text
 
 
+@pytest.mark.parametrize("kind", ["IfcOpeningElement", "IfcWall"])
+def test_a_shape_of_an_ifc_without_a_context_is_read_and_cuts(tmp_path: Path, caplog, kind: str):
+    """An opening without one was not cut, without a word."""
+    file = made.ifc_house()
+    for product in file.model.by_type(kind):
+        for shape in product.Representation.Representations:
+            shape.ContextOfItems = None
+    assert_cast_as(file.save(tmp_path / "a.ifc"), made.ifc_house_faces())
+    assert "of its shapes have no context, against IFC" in caplog.text
+
+
+def test_parts_of_an_ifc_without_a_placement_are_told(tmp_path: Path, caplog):
+    file = made.Ifc()
+    wall = file.block("IfcWall", (0, 0, 0), (6, 0.3, 3))
+    wall.ObjectPlacement = None
+    assert len(read_geometry(file.save(tmp_path / "a.ifc")).faces) == 12
+    assert f"1 of 1 parts have a shape but no placement, against IFC, such as IfcWall {wall.GlobalId}" in caplog.text
+
+
 def test_faults_of_an_ifc_are_said(tmp_path: Path, caplog):
     path = made.ifc_house().save(tmp_path / "a.ifc")
     read_geometry(path)

@@ -82,6 +82,7 @@ def read_ifc(path: Path) -> Geometry:
     ifcopenshell.get_log()  # which empties it
     model: Any = ifcopenshell.open(str(path))
     products = [each for each in model.by_type("IfcProduct") if each.Representation]
+    _complete(path, model, products)
     classes = {each.id(): _class_of(each, ifcopenshell) for each in products}
     say_left_out(path, Counter(each.is_a() for each in products if classes[each.id()] is None))
     seen = [each for each in products if classes[each.id()] is not None]
@@ -127,6 +128,26 @@ def _read(shape: Any, own: SurfaceClass | None) -> _Part:
     return _Part(shape.id, vertices, faces, _with_glass(own, shape.geometry, len(faces)))
 
 
+def _complete(path: Path, model: Any, products: list) -> None:
+    """Give shapes without a context one of their kind, and tell of parts without a placement: both break IFC's rules.
+
+    ifcopenshell leaves out shapes without a context, and does not cut such openings, without a word.
+    """
+    contexts = {each.ContextIdentifier: each for each in model.by_type("IfcGeometricRepresentationContext")}
+    lost = [each for each in model.by_type("IfcShapeRepresentation") if each.ContextOfItems is None]
+    for shape in lost if contexts else ():
+        shape.ContextOfItems = contexts.get(shape.RepresentationIdentifier) or next(iter(contexts.values()))
+    if lost:
+        notice(
+            f"{path}: {len(lost)} of its shapes have no context, against IFC: they are taken for what they say to be."
+        )
+    if nowhere := [each for each in products if each.ObjectPlacement is None]:
+        notice(
+            f"{path}: {len(nowhere)} of {len(products)} parts have a shape but no placement, against IFC, such as "
+            f"{nowhere[0].is_a()} {nowhere[0].GlobalId}: they are put at the origin, and openings are cut there."
+        )
+
+
 def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
     """The triangulated shapes of products, in metres and their placements, with openings cut; valid until the next.
 
@@ -148,7 +169,8 @@ def _shapes(geom: Any, model: Any, products: list) -> Iterator[Any]:
 
 
 def _contexts_of(product: Any) -> set[int]:
-    return {each.ContextOfItems.id() for each in product.Representation.Representations if each.Items}
+    shapes = [each for each in product.Representation.Representations if each.Items]
+    return {each.ContextOfItems.id() for each in shapes if each.ContextOfItems}
 
 
 def _identifiers(product: Any) -> set[str | None]:
