@@ -453,6 +453,15 @@ def test_parts_of_an_ifc_without_a_placement_are_told(tmp_path: Path, caplog):
     assert f"1 of 1 parts have a shape but no placement, against IFC, such as IfcWall {wall.GlobalId}" in caplog.text
 
 
+def test_a_shape_of_an_ifc_without_items_is_said(tmp_path: Path, caplog):
+    file = made.Ifc()
+    file.block("IfcWall", (0, 0, 0), (6, 0.3, 3))
+    roof = file.block("IfcRoof", (0, 0, 3), (6, 0.3, 4))
+    roof.Representation.Representations[0].Items = None
+    assert len(read_geometry(file.save(tmp_path / "a.ifc")).faces) == 12
+    assert f"the geometry of 1 of 2 parts cannot be made, such as IfcRoof {roof.GlobalId}" in caplog.text
+
+
 def test_faults_of_an_ifc_are_said(tmp_path: Path, caplog):
     path = made.ifc_house().save(tmp_path / "a.ifc")
     read_geometry(path)

@@ -214,7 +214,8 @@ def _with_glass(own: SurfaceClass | None, shape: Any, count: int) -> UInt8[np.nd
 
 def _has_body(product: Any) -> bool:
     """Whether a product has a solid or a surface, and not only an axis, a footprint, or a box around it."""
-    return bool(_identifiers(product) & {"Body", "Facetation", "Surface"})
+    shapes = product.Representation.Representations  # also one without items, which ArchiCAD has written
+    return any(each.RepresentationIdentifier in ("Body", "Facetation", "Surface") for each in shapes)
 
 
 def _tell_of_phases(path: Path, products: list, ifcopenshell: ModuleType) -> None:
