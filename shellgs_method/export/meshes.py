@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from jaxtyping import Float32
 
 from shellgs_method.errors import SceneError, check_output
 from shellgs_method.export.frame import Frame
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.transfer import linear_of
 from shellgs_method.files.usd import USD_FORMATS, add_mesh, import_pxr, make_collider, new_stage
 from shellgs_method.geometry.axes import name_of, turn
 
@@ -38,8 +40,8 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
     """Write a mesh, and beside it (``.json``) its frame, the offset of georeferenced coordinates, and ``facts``.
 
     glTF is y-up and in metres by its specification, so coordinates are rotated for it; USD states its up axis, y or z,
-    and its unit; ply and obj state neither. Coordinates in the files are float32, which is why the frame is near the
-    facade.
+    and its unit; ply and obj state neither. Colours of glTF and USD are linear light, those of ply and obj sRGB.
+    Coordinates in the files are float32, which is why the frame is near the facade.
     """
     check_mesh_format(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,12 +55,35 @@ def write_mesh(path: Path, mesh: trimesh.Trimesh, frame: Frame, facts: dict | No
     if format in USD_FORMATS:
         _write_usd(path, mesh, "y" if name_of(up) == "y" else "z", frame.metric)
     else:
-        content: Any = mesh.export(file_type=format[1:])
+        content: Any = _glb(mesh) if format == ".glb" else mesh.export(file_type=format[1:])
         with atomic_write(path) as file:
             file.write(content.encode() if isinstance(content, str) else content)
     about = {"up_in_file": name_of(up), "faces": len(mesh.faces)}
     about |= {"unit_in_file": "metre"} if format in METRE_FORMATS else {}
     frame.describe(Path(f"{path}.json"), about | mesh.metadata | (facts or {}))
+
+
+def _glb(mesh: trimesh.Trimesh) -> bytes:
+    """Binary glTF, whose colours are linear light, and whose material is metal where none is given."""
+    import trimesh
+
+    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, metadata=mesh.metadata, process=False)
+    plain.vertex_attributes["_COLOR_0"] = _linear_colours(mesh)  # as float32: bytes would show steps where it is dark
+
+    def finish(tree: dict) -> None:
+        tree["materials"] = [
+            {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": True}
+        ]
+        for primitive in (each for one in tree["meshes"] for each in one["primitives"]):
+            primitive["material"] = 0
+            primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
+
+    return plain.export(file_type="glb", tree_postprocessor=finish)
+
+
+def _linear_colours(mesh: trimesh.Trimesh) -> Float32[np.ndarray, "V 3"]:
+    colours = mesh.visual.vertex_colors[:, :3]  # pyright: ignore[reportAttributeAccessIssue]
+    return np.ascontiguousarray(linear_of(colours / 255), dtype=np.float32)
 
 
 def _write_usd(path: Path, mesh: trimesh.Trimesh, up: Literal["y", "z"], metric: bool) -> None:
@@ -70,6 +95,6 @@ def _write_usd(path: Path, mesh: trimesh.Trimesh, up: Literal["y", "z"], metric:
     with new_stage(pxr, path, up, metric) as stage:
         prim = add_mesh(pxr, stage, "/facade", np.asarray(mesh.vertices), np.asarray(mesh.faces))
         prim.CreateDoubleSidedAttr(True)
-        colours = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3] / 255, dtype=np.float32)  # pyright: ignore
-        prim.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex).Set(pxr.Vt.Vec3fArray.FromNumpy(colours))
+        colours = pxr.Vt.Vec3fArray.FromNumpy(_linear_colours(mesh))
+        prim.CreateDisplayColorPrimvar(pxr.UsdGeom.Tokens.vertex).Set(colours)
         make_collider(pxr, prim, "none")

@@ -84,10 +84,20 @@ class TrainedRun:
         assert self.datamanager.eval_dataset is not None
         return self.datamanager.train_dataset, self.datamanager.eval_dataset
 
+    @property
+    def scene(self) -> Path:
+        """The scene's folder."""
+        return Path(self.datamanager.config.dataparser.data)
+
+    @property
+    def block(self) -> str:
+        """Name of the block whose run it is; empty of a whole scene's."""
+        return self.cell.block.name if self.cell else ""
+
     @cached_property
     def shell(self) -> tuple[Alignment, ShellMesh] | None:
         """The scene's shell and its alignment, if there is one."""
-        scene = Path(self.datamanager.config.dataparser.data)
+        scene = self.scene
         if not (scene / ALIGNMENT).is_file():
             return None
         alignment = Alignment.load(scene / ALIGNMENT)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from shellgs_method.errors import SceneError, check_output
+from shellgs_method.errors import SceneError, check_output, notice
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.splats_page import splats_page
 from shellgs_method.geometry.camera import Camera
@@ -253,6 +253,8 @@ def _glb(splats: Splats, comments: Sequence[str]) -> bytes:
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 3
 SPZ_COLOUR = 0.15
 """Factor of coefficients of degree 0 in spz, which bytes then hold with some room."""
+SPZ_LARGEST = 255 / 16 - 10
+"""Logarithm of the largest standard deviation in spz."""
 SPZ_BITS = 6
 """Significant bits of the coefficients above degree 0; the others are zero, for gzip. The 5, 4 and 4 of Niantic's
 encoder for degrees 1 to 3 save up to a quarter, but trained coefficients are as small as their steps: a run was 35 dB
@@ -265,6 +267,11 @@ def _spz(splats: Splats) -> bytes:
     fraction = int(np.clip(22 - math.ceil(math.log2(max(most, 1e-6))), 0, 20))  # bits after the point
     if most * 2**fraction >= 2**23:
         raise SceneError(f"the splats reach {most:.0f} from the origin, too far for spz: name a .ply or .glb")
+    if cut := int((splats.scales > SPZ_LARGEST).any(dim=1).sum()):
+        notice(
+            f"{cut} Gaussians have standard deviations of more than {math.exp(SPZ_LARGEST):.0f} units, which spz and "
+            "pages cannot hold, and are cut to that: a .ply or .glb has them whole."
+        )
     fixed = (splats.means.double() * 2**fraction).round().int().numpy().astype("<i4")
     positions = fixed.view("u1").reshape(len(fixed), 3, 4)[:, :, :3]
     harmonics = splats.harmonics.double().numpy()

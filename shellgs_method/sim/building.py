@@ -111,14 +111,14 @@ class Reconstruction:
         tell("Simplifying the surface")
         fused = decimated_mesh(surface, faces)
         known = run.shell_in_frame.vertices if run.shell else np.asarray(fused.vertices)
-        frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground)
-        folder = Path(run.datamanager.config.dataparser.data)
+        unit = run.shell[0].metres_per_shell_unit if run.shell else 1.0
+        frame, motion = sim_frame(run.frame, known, [view.camera for view in views], ground, unit)
         if home is not None:
-            frame, motion = moved_into(frame, motion, home, folder.name)
+            frame, motion = moved_into(frame, motion, home, run.scene.name)
         shell = Triangles(transformed(known, motion), run.shell_in_frame.faces) if run.shell else None
         return cls(
-            folder,
-            run.cell.block.name if run.cell else "",
+            run.scene,
+            run.block,
             frame,
             fused.apply_transform(motion),
             shell,

@@ -44,6 +44,7 @@ def sim_frame(
     surface: Float64[np.ndarray, "N 3"],
     cameras: Sequence[Camera],
     ground: float | None = None,
+    unit: float = 1.0,
 ) -> tuple[SimFrame, Float64[np.ndarray, "4 4"]]:
     """The simulation frame for results in ``frame``, and the rigid motion into it.
 
@@ -54,7 +55,8 @@ def sim_frame(
         frame: frame of the exported results, which is turned upright.
         surface: points of the shell, or else of the reconstruction, in that frame.
         cameras: cameras of the photographs, in the scene.
-        ground: ground height in the shell's own coordinates, in metres; the surface's lower edge if None.
+        ground: ground height in the shell's own coordinates; the surface's lower edge if None.
+        unit: metres of a unit of these coordinates.
 
     Raises:
         SceneError: the ground is far from the surface's lower edge.
@@ -66,12 +68,13 @@ def sim_frame(
     points = transformed(surface, upright) + offset
     origin = np.median(transformed(transformed(positions(cameras), from_scene), upright), axis=0) + offset
     lowest = float(np.quantile(points[:, 2], LOWEST))
-    if ground is not None and abs(ground - lowest) > MAX_STEP:
+    if ground is not None and abs(ground * unit - lowest) > MAX_STEP:
+        surfaces, metre = ("shell", " m") if frame.metric else ("reconstruction", "")
         raise SceneError(
-            f"--ground {ground:g} is {abs(ground - lowest):.0f} m from the lower edge of the shell, which is at "
-            f"{lowest:.2f} in its own coordinates: give the height of the ground in these"
+            f"--ground {ground:g} is {abs(ground * unit - lowest):.0f}{metre} from the lower edge of the {surfaces}, "
+            f"which is at {lowest / unit:.2f} in its own coordinates: give the height of the ground in these"
         )
-    origin[2] = lowest if ground is None else ground
+    origin[2] = lowest if ground is None else ground * unit
     origin[:2] = np.round(origin[:2]) if frame.metric else origin[:2]
     motion = upright.copy()
     motion[:3, 3] = offset - origin

@@ -25,6 +25,8 @@ class SimSettings:
     """Maximum size of visual.glb; its texture is scaled down to fit."""
     ground: Optional[Annotated[float, Bounds(-1e6, 1e6)]] = None
     """Height of level ground in the shell's coordinates. If not set: the ground as scan and photographs show it."""
+    name: str = "facade"
+    """Name of the building in the files, as of ROS' package. Of several buildings, each has its scene's."""
     test: bool = False
     """Also throw bodies at the world and walk along it, in MuJoCo: half a minute or more."""
 

@@ -119,19 +119,21 @@ def _world(
 ) -> tuple[dict, list[Chapter]]:
     """Write the files of :func:`simulate`."""
     names: list[str] = []
+    places: dict[tuple[Path, str], Path] = {}
     chapters, home = [], None
     for number, config in enumerate(configs):
         run = TrainedRun.load(config)
+        _refuse_twice(run, config, places)
         made = Reconstruction.of(run, settings.faces, settings.voxel, settings.ground, home)
         home = home or made.frame
         made.warn_if_unaligned(log)
-        names.append(_name(made.scene, names) if len(configs) > 1 else "facade")
+        names.append(_name(made.scene if len(configs) > 1 else settings.name, names))
         truth = truths[number](np.linalg.inv(made.frame.to_scene)) if number < len(truths) else None
         chapters.append(_building(made, out / names[-1], settings, log, truth))
     assert home is not None
     assets = [chapter.asset for chapter in chapters]
     ground = _common_ground([chapter.made for chapter in chapters])
-    log(str(ground) if settings.ground is None else f"The ground is level, {settings.ground:g} m high, as given.")
+    log(str(ground) if settings.ground is None else f"The ground is level, at {settings.ground:g}, as given.")
     tell("Writing the world")
     for chapter in chapters:
         _report_steps(chapter.made, ground, log)
@@ -148,6 +150,14 @@ def _world(
     with atomic_write(out / "metrics.json") as file:
         file.write((json.dumps(metrics, indent=1) + "\n").encode())
     return metrics, chapters
+
+
+def _refuse_twice(run: TrainedRun, config: Path, places: dict[tuple[Path, str], Path]) -> None:
+    """Refuse a run of a building that is in the world, and note where this one is."""
+    place = run.scene.resolve(), run.block
+    if place in places:
+        raise SceneError(f"{places[place]} and {config} are runs of the same building: give one of them")
+    places[place] = config
 
 
 def _building(

@@ -11,6 +11,7 @@ import torch
 import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from splat_files import glb_attributes
 from training_runs import data_of, model_of, trainer_of
 
 from dataparsers.cameras import pinhole_camera
@@ -245,6 +246,28 @@ def test_usd_is_a_static_collider_of_the_triangles_in_metres(sphere, tmp_path, s
     points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get())  # pyright: ignore
     np.testing.assert_allclose(points, sphere.vertices, atol=1e-6)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_colours_of_gltf_and_usd_are_linear_light_and_not_metal(sphere, tmp_path):
+    """Viewers show sRGB in their place washed out, and the material of glTF's default black."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom  # pyright: ignore[reportMissingImports]
+
+    mesh, grey = sphere.copy(), np.linspace(0, 255, len(sphere.vertices)).round()
+    mesh.visual.vertex_colors = np.stack([grey, grey, grey, np.full_like(grey, 255)], axis=1).astype(np.uint8)
+    for suffix in (".glb", ".usda"):
+        write_mesh(tmp_path / f"mesh{suffix}", mesh, FRAME)
+    light = np.where(grey <= 10, grey / 255 / 12.92, ((grey / 255 + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+
+    document, attributes = glb_attributes(tmp_path / "mesh.glb")
+    np.testing.assert_allclose(attributes["COLOR_0"], np.stack([light] * 3, axis=1), atol=1e-6)
+    assert document["materials"][document["meshes"][0]["primitives"][0]["material"]]["pbrMetallicRoughness"] == {
+        "metallicFactor": 0.0,
+        "roughnessFactor": 1.0,
+    }
+    stage = Usd.Stage.Open(str(tmp_path / "mesh.usda"))  # pyright: ignore
+    colours = UsdGeom.Mesh(stage.GetDefaultPrim()).GetDisplayColorAttr().Get()  # pyright: ignore
+    np.testing.assert_allclose(colours, np.stack([light] * 3, axis=1), atol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".glb"])

@@ -110,6 +110,16 @@ def test_formats_that_cannot_be_written_are_refused(tmp_path, name, discs, messa
         check_splats_format(tmp_path / name, discs)
 
 
+def test_gaussians_that_are_too_large_for_spz_are_told(tmp_path, caplog):
+    """Those of the background of a scene in millimetres were cut without a word."""
+    splats = some()
+    write_splats(tmp_path / "a.spz", splats)
+    assert not caplog.text
+    splats.scales[:3, 0] = 7.0
+    write_splats(tmp_path / "a.spz", splats)
+    assert "3 Gaussians have standard deviations of more than 379 units" in caplog.text
+
+
 def columns(path: Path) -> dict[str, np.ndarray]:
     header, _, data = path.read_bytes().partition(b"end_header\n")
     names = [line.split()[2] for line in header.decode().split("\n") if line.startswith("property float")]

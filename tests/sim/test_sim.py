@@ -416,6 +416,17 @@ def test_the_ground_height_can_be_set():
     assert isinstance(made, SimFrame)
 
 
+def test_the_ground_height_is_in_the_unit_of_the_shell():
+    """One in feet had its ground three times too low, without a word."""
+    frame, points = metric_frame()
+    made, _ = sim_frame(frame, points, cameras_of_scene(), ground=215.0 / 0.3048, unit=0.3048)
+    assert made.to_national[2, 3] == pytest.approx(215.0)
+    with pytest.raises(
+        SceneError, match=r"--ground 215 is 147 m from .* shell, which is at 696\.65 in its own coordinates"
+    ):
+        sim_frame(frame, points, cameras_of_scene(), ground=215.0, unit=0.3048)
+
+
 def test_a_second_building_is_moved_into_the_frame_of_the_first():
     """By national coordinates; refused if they are far apart or unknown."""
     frame, points = metric_frame()

@@ -206,6 +206,12 @@ def test_the_command_writes_the_whole_folder(made):
     assert "nan" not in page
 
 
+def test_the_same_building_is_not_put_into_a_world_twice(config, tmp_path):
+    with pytest.raises(SceneError, match="are runs of the same building: give one of them"):
+        cli.sim((config, config, tmp_path / "sim"), SMALL)
+    assert not (tmp_path / "sim").exists()
+
+
 def test_every_file_that_the_readme_names_is_there(made):
     """Its patterns have one match at least; this shell's classes are not known."""
     text = (made / "README.md").read_text()

@@ -97,7 +97,8 @@ def make_collider(
     most = int(np.ceil(density * surface.areas.sum() / 100))
     if not most:
         raise SceneError(
-            "there is nothing to collide with: neither shell nor reconstruction has a surface that cameras see"
+            "there is nothing to collide with: neither shell nor reconstruction has a surface that cameras see, of "
+            f"{SPECK:g} m² or more"
         )
     coarse = decimated(surface, FINENESS * most)
     found, filled = clusters(coarse, most)

@@ -13,7 +13,7 @@ _TEXT = """# {title}
 
 {frame} z points up, from the foot of the facade. `frame.json` has the matrices to the
 scene's cameras (`to_scene`) and to national coordinates (`to_national`). Coordinates and `offset` add up to those of
-the shell with z up, as in the json of `shellgs mesh`.
+the shell with z up, in metres, as in the json of `shellgs mesh`.
 
 | file | what it is |
 |---|---|
