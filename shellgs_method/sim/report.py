@@ -161,9 +161,9 @@ def text(errors: Mapping[str, float]) -> str:
 
 def _section(world: Path, chapter: Chapter, log: Callable[[str], None]) -> Iterator[str]:
     yield f"<h2>{escape(chapter.asset.name)}</h2>"
-    width, height = chapter.facts["texture"]
+    (width, height), (small_width, small_height) = (chapter.facts[name] for name in ("texture", "glb_texture"))
     yield f"<p>{chapter.facts['triangles']} triangles with a texture of {width} x {height} pixels; "
-    yield f"visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB.</p>"
+    yield f"visual.glb has {chapter.facts['glb_bytes'] / 1e6:.1f} MB, with one of {small_width} x {small_height}.</p>"
     yield from _images(world, chapter, log)
     yield "<h3>Distances of the collision geometry</h3>"
     rows = [

@@ -22,7 +22,7 @@ class SimSettings:
     texel: Optional[Length] = None
     """Size of a texture pixel in metres. If not set: a little finer than the photographs."""
     megabytes: Annotated[float, Bounds(TINY, 1e6)] = 30.0
-    """Maximum size of visual.glb; its texture is scaled down to fit."""
+    """Maximum size of visual.glb; its texture is scaled down to fit, that of the obj is not."""
     ground: Optional[Annotated[float, Bounds(-1e6, 1e6)]] = None
     """Height of level ground in the shell's coordinates. If not set: the ground as scan and photographs show it."""
     name: str = "facade"

@@ -368,16 +368,37 @@ def test_splats_in_usd_are_the_gaussians(world):
     assert prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() == 3
 
 
-def test_the_glb_is_upright_textured_and_small_enough(collider, tmp_path):
+@pytest.fixture
+def noisy(collider) -> TexturedMesh:
+    """The building with a texture that is large as a JPEG."""
     noise = np.random.default_rng(0).integers(0, 255, (512, 512, 3), dtype=np.uint8)
     look = painted(collider.surface)
-    look = TexturedMesh(look.vertices, look.faces, look.uv, Image.fromarray(noise), 1.0)
-    facts = write_visual(tmp_path, look, np.zeros(len(look.faces), np.uint8), megabytes=0.1)
+    return TexturedMesh(look.vertices, look.faces, look.uv, Image.fromarray(noise), 1.0)
+
+
+def test_the_glb_is_upright_textured_and_small_enough(noisy, tmp_path, caplog):
+    facts = write_visual(tmp_path, noisy, np.zeros(len(noisy.faces), np.uint8), megabytes=0.1)
     assert (tmp_path / "visual.glb").stat().st_size == facts["glb_bytes"] <= 1e5
     scene = trimesh.load_scene(tmp_path / "visual.glb")
-    assert scene.extents[1] == pytest.approx(np.ptp(look.vertices[:, 2]), rel=1e-4)  # glTF is y-up
+    assert scene.extents[1] == pytest.approx(np.ptp(noisy.vertices[:, 2]), rel=1e-4)  # glTF is y-up
     (mesh,) = scene.geometry.values()
-    assert list(mesh.visual.material.baseColorTexture.size) == facts["texture"]
+    assert list(mesh.visual.material.baseColorTexture.size) == facts["glb_texture"]
+    assert max(facts["glb_texture"]) < 512
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("megabytes", [0.1, 0.001])
+def test_simulators_have_the_whole_texture_however_small_the_glb_is(noisy, tmp_path, megabytes):
+    facts = write_visual(tmp_path, noisy, np.zeros(len(noisy.faces), np.uint8), megabytes)
+    assert facts["texture"] == [512, 512]
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "visual.png")), np.asarray(noisy.image))
+
+
+def test_a_glb_whose_triangles_alone_are_too_large_is_told(noisy, tmp_path, caplog):
+    facts = write_visual(tmp_path, noisy, np.zeros(len(noisy.faces), np.uint8), megabytes=0.001)
+    assert (tmp_path / "visual.glb").stat().st_size == facts["glb_bytes"] > 1e3
+    assert f"has {facts['glb_bytes'] / 1e6:.3g} MB, more than 0.001" in caplog.text
+    assert "give fewer --faces" in caplog.text
 
 
 def test_the_parts_of_an_earlier_collider_are_removed(collider, tmp_path):

@@ -12,11 +12,14 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from shellgs_method.errors import notice
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.sim.look.texture import TexturedMesh
 
 TEXTURE = "visual.png"
+LEAST_TEXTURE = 64
+"""Shorter side in pixels below which a texture is scaled down no further: it shows nothing, and has hardly a size."""
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Turns z-up coordinates into y-up ones."""
@@ -30,29 +33,28 @@ def visual_file(each: SurfaceClass) -> str:
 def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " F"], megabytes: float) -> dict:
     """Write ``visual.glb`` (y-up, as glTF requires), and objs with ``visual.mtl`` and ``visual.png``.
 
-    There is an obj for each class of surface: simulators segment images by object. Those of an earlier run are removed.
+    The texture of the glb alone is scaled down: simulators show ``visual.png``. There is an obj for each class of
+    surface: simulators segment images by object. Those of an earlier run are removed.
 
     Args:
         folder: output folder.
         mesh: textured mesh, z up.
         classes: class of each triangle.
-        megabytes: maximum size of the glb; the texture is scaled down to fit.
+        megabytes: maximum size of the glb; its texture is scaled down to fit.
 
     Returns:
-        Size of the glb in bytes and of the texture in pixels.
+        Size of the glb in bytes, and of both textures in pixels.
     """
-    image = mesh.image
-    while True:
-        content = _glb(mesh, image)
-        if len(content) <= 1e6 * megabytes or min(image.size) < 64:
-            break
-        shrink = min(0.9, float(np.sqrt(1e6 * megabytes / len(content))))
-        width, height = (max(1, int(side * shrink)) for side in image.size)
-        image = image.resize((width, height), Image.Resampling.BOX)
+    content, small = _glb_within(mesh, 1e6 * megabytes)
+    if len(content) > 1e6 * megabytes:
+        notice(
+            f"visual.glb of {folder.name} has {len(content) / 1e6:.3g} MB, more than {megabytes:g}, with hardly any "
+            "texture: give fewer --faces or more --megabytes."
+        )
     with atomic_write(folder / "visual.glb") as file:
         file.write(content)
     with atomic_write(folder / TEXTURE) as file:
-        image.save(file, "PNG")
+        mesh.image.save(file, "PNG")
     with atomic_write(folder / "visual.mtl") as file:
         file.write(f"newmtl visual\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {TEXTURE}\n".encode())
     for stale in folder.glob("visual*.obj"):
@@ -60,7 +62,23 @@ def write_visual(folder: Path, mesh: TexturedMesh, classes: UInt8[np.ndarray, " 
     for each in map(SurfaceClass, np.unique(classes)):
         with atomic_write(folder / visual_file(each)) as file:
             file.write(_obj(mesh, mesh.faces[classes == each]).encode())
-    return {"glb_bytes": len(content), "texture": list(image.size), "triangles": len(mesh.faces)}
+    sizes = {"texture": list(mesh.image.size), "glb_texture": list(small)}
+    return {"glb_bytes": len(content), **sizes, "triangles": len(mesh.faces)}
+
+
+def _glb_within(mesh: TexturedMesh, most: float) -> tuple[bytes, tuple[int, int]]:
+    """The glb with its texture scaled down to fit into some bytes, and that texture's size.
+
+    It is larger than that if its triangles alone are.
+    """
+    image = mesh.image
+    content = _glb(mesh, image)
+    while len(content) > most and min(image.size) >= LEAST_TEXTURE:
+        shrink = min(0.9, float(np.sqrt(most / len(content))))
+        width, height = (max(1, int(side * shrink)) for side in image.size)
+        image = image.resize((width, height), Image.Resampling.BOX)
+        content = _glb(mesh, image)
+    return content, image.size
 
 
 def _glb(mesh: TexturedMesh, image: Image.Image) -> bytes:
