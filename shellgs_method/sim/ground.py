@@ -52,6 +52,9 @@ ASIDE = 5.0
 """Horizontal distance in metres from a camera up to which the ground that it stands on is measured."""
 STOOD_ON = 0.1
 """Share of the cameras that must stand on a street: fewer are held over a parapet."""
+EXTENT, AROUND = 200.0, 50.0
+"""Least side of level ground, and its least width around buildings and cameras, in metres, where a format has no
+infinite plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,7 @@ class Ground:
     known: Bool[np.ndarray, "R C"]
 
     @classmethod
-    def level(cls, height: float = 0.0, extent: float = 200.0) -> Ground:
+    def level(cls, height: float = 0.0, extent: float = EXTENT) -> Ground:
         """Level ground around the origin, of which nothing is measured."""
         return cls(np.full((2, 2), height), extent, np.full(2, -extent / 2), np.zeros((2, 2), bool))
 
@@ -111,6 +114,19 @@ class Ground:
     def is_level(self) -> bool:
         """Whether it is a level plane."""
         return bool(np.ptp(self.heights) == 0)
+
+    @property
+    def extent(self) -> float:
+        """Side in metres of the square around the origin that it is, if it is level, in formats without a plane."""
+        end = self.origin + self.cell * (np.array(self.heights.shape[::-1]) - 1)
+        return max(EXTENT, 2 * float(np.abs([self.origin, end]).max()))
+
+    def under(self, places: Float64[np.ndarray, "N C"]) -> Ground:
+        """The ground of a world of buildings and cameras: a level one is larger where these are far from the origin."""
+        extent = 2 * float(np.ceil(np.abs(places[:, :2]).max() + AROUND))
+        if not self.is_level or extent <= self.extent:
+            return self
+        return Ground.level(float(self.heights[0, 0]), extent)
 
     def at(self, places: Float64[np.ndarray, "*N C"]) -> Float64[np.ndarray, " *N"]:
         """Height below places, given by x, y and any more coordinates; beyond the edge, that of the edge."""

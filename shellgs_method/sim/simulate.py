@@ -137,11 +137,12 @@ def _world(
     tell("Writing the world")
     for chapter in chapters:
         _report_steps(chapter.made, ground, log)
-    write_world(out, assets, home, ground)
     trusted = _trusted([chapter.made for chapter in chapters])
+    parts = [part.vertices for chapter in chapters for part in chapter.collider.parts]
+    ground = ground.under(np.concatenate([*parts, trusted.eyes]))
+    write_world(out, assets, home, ground)
     buildings = {name: chapter.made.scene for name, chapter in zip(names, chapters, strict=True)}
     home.write(out, {"buildings": buildings, "trusted": trusted.facts})
-    parts = [part.vertices for chapter in chapters for part in chapter.collider.parts]
     paths = trusted.eyes[:, :2]
     FreeSpace.of(parts, ground, paths).write(out, paths)
     tell("Throwing, walking and drawing in MuJoCo" if settings.test else "Drawing in MuJoCo")

@@ -21,6 +21,7 @@ from shellgs_method.sim.env import NAME
 from shellgs_method.sim.env.course import WALK
 from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
+from shellgs_method.sim.env.world import World
 from shellgs_method.sim.free_space import CELL, FreeSpace
 from shellgs_method.sim.ground import LEVEL
 from shellgs_method.sim.trials.engine import import_mujoco
@@ -266,6 +267,14 @@ def test_the_robot_follows_uneven_ground(collider, folder, tmp_path):
         env.step(np.array([1, 0, 0]))
         height = env.data.qpos[env._qpos + 2] - env.world.ground.at(env._place[None])[0]
         assert abs(height) < 0.05
+
+
+def test_level_ground_is_below_a_place_far_from_the_origin(collider, tmp_path):
+    out = write_folder(tmp_path / "sim", collider)
+    far = np.array([[300.0, -6, 1.6]])
+    workspace = Workspace(far, np.array([[0.0, 1, 0]]), 3.0)
+    frame_at().write(out, {"buildings": {"facade": "x"}, "trusted": workspace.facts})
+    assert World.load(out).solid.cast(far, np.array([[0.0, 0, -1]])).t == pytest.approx(1.6)
 
 
 @pytest.mark.parametrize(

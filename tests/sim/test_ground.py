@@ -17,7 +17,7 @@ from shellgs_method.sim.building import MOST_GROUND, ground_step
 from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.formats.world import write_world
-from shellgs_method.sim.ground import CELL, LEAST, LEVEL, Ground
+from shellgs_method.sim.ground import AROUND, CELL, EXTENT, LEAST, LEVEL, Ground
 from shellgs_method.sim.trials.engine import lidar
 
 EYES = np.stack([np.linspace(-5, 5, 12), np.full(12, -4.0), np.full(12, 1.6)], axis=1)
@@ -156,6 +156,50 @@ def test_files_of_a_ground_are_removed_with_it(ground, tmp_path):
     write_world(tmp_path, [], frame_at())
     assert not [*tmp_path.glob("ground.*")]
     assert "hfield" not in (tmp_path / "world.xml").read_text()
+
+
+def test_level_ground_of_a_small_site_stays_as_it_is(ground):
+    near = np.array([[EXTENT / 2 - AROUND, -20, 5], [0, 0, 90]])
+    assert LEVEL.under(near) is LEVEL
+    assert LEVEL.extent == EXTENT
+    assert ground.under(near + 1000) is ground  # a height field
+
+
+@pytest.mark.parametrize("away", [300.0, 5000.0])
+def test_level_ground_goes_on_below_a_building_that_is_far_from_the_origin(tmp_path, away):
+    made = LEVEL.under(np.array([[0, 0, 3.0], [0, -away, 9.0]]))
+    assert made.extent == 2 * (away + AROUND)
+    write_world(tmp_path, [], frame_at(), made)
+    box = ET.parse(tmp_path / "world.urdf").getroot().find(".//collision/geometry/box")
+    assert box is not None
+    assert box.get("size") == f"{made.extent} {made.extent} 1.0"
+    size = ET.parse(tmp_path / "world.sdf").getroot().findtext(".//collision[@name='ground']//size", "")
+    stage = import_pxr("sim").Usd.Stage.Open(str(tmp_path / "world.usda"))
+    plane = stage.GetPrimAtPath("/World/ground")
+    sides = [*map(float, size.split()), plane.GetAttribute("width").Get(), plane.GetAttribute("length").Get()]
+    assert sides == [made.extent] * 4
+    assert np.isfinite(made.surface.cast(np.array([[40, -away - 40, 5]]), np.array([[0.0, 0, -1]])).t).all()
+
+
+def test_bodies_stay_on_level_ground_far_from_the_origin(tmp_path):
+    pybullet = pytest.importorskip("pybullet", reason="it has no wheel for this Python")
+    write_world(tmp_path, [], frame_at(), LEVEL.under(np.array([[5000.0, 300, 0]])))
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        pybullet.setGravity(0, 0, -9.81)
+        pybullet.loadURDF(str(tmp_path / "world.urdf"), useFixedBase=True)
+        shapes = [
+            pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.1),
+            pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[0.1] * 3),
+        ]
+        places = [(0, -6), (-310, 300), (5040, 300)]
+        bodies = [pybullet.createMultiBody(1, shape, -1, [*at, 0.5]) for at in places for shape in shapes]
+        for _ in range(240):
+            pybullet.stepSimulation()
+        heights = [pybullet.getBasePositionAndOrientation(body)[0][2] for body in bodies]
+    finally:
+        pybullet.disconnect(client)
+    assert heights == pytest.approx([0.1] * len(bodies), abs=0.005)
 
 
 def level_points(x: tuple[float, float], y: tuple[float, float], z: float, density: int = 300) -> np.ndarray:

@@ -93,7 +93,8 @@ class World:
             raise SceneError(f"{robot}: the first body of a robot needs a free joint, and the robot actuators")
         if not (model.actuator_ctrllimited.astype(bool) & (np.ptp(model.actuator_ctrlrange, axis=1) > 0)).all():
             raise SceneError(f"{robot}: each actuator needs a ctrlrange, which actions of -1 to 1 are scaled to")
-        ground, parts = _ground(model), _parts(model)
+        parts = _parts(model)
+        ground = _ground(model).under(np.concatenate([*parts, workspace.eyes]))
         grid = FreeSpace.of(parts, ground, workspace.eyes[:, :2])
         solid = _solid(ground, parts)
         buildings = list(facts.get("buildings") or ["facade"])

@@ -18,8 +18,6 @@ from shellgs_method.sim.look.visual import visual_file
 
 FRICTION = 0.7
 """Coefficient of friction of walls and ground: that of rubber on concrete or stone is 0.6 to 0.85."""
-EXTENT = 200.0
-"""Side of the ground in metres, where a format has no infinite plane."""
 
 
 @dataclass(frozen=True)

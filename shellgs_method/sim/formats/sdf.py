@@ -9,7 +9,7 @@ import numpy as np
 from pyproj import CRS, Geod, Transformer
 
 from shellgs_method.errors import notice
-from shellgs_method.sim.formats.asset import EXTENT, FRICTION, Asset, add
+from shellgs_method.sim.formats.asset import FRICTION, Asset, add
 from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.formats.mjcf import TIMESTEP
 from shellgs_method.sim.frame import SimFrame
@@ -98,7 +98,7 @@ def _ground(world: ET.Element, ground: Ground) -> None:
             continue
         plane = add(add(each, "geometry"), "plane")
         add(plane, "normal", "0 0 1")
-        add(plane, "size", f"{EXTENT:g} {EXTENT:g}")
+        add(plane, "size", f"{ground.extent:g} {ground.extent:g}")
     _rub(collision)
     material = add(visual, "material")
     for light in ("ambient", "diffuse"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 
-from shellgs_method.sim.formats.asset import EXTENT, FRICTION, Asset, add
+from shellgs_method.sim.formats.asset import FRICTION, Asset, add
 from shellgs_method.sim.formats.ground import MESH
 from shellgs_method.sim.ground import Ground
 
@@ -41,7 +41,7 @@ def _ground(root: ET.Element, ground: Ground) -> None:
             add(add(slab, "geometry"), "mesh", filename=MESH)
             continue
         add(slab, "origin", xyz=f"0 0 {-THICK / 2}", rpy="0 0 0")
-        add(add(slab, "geometry"), "box", size=f"{EXTENT} {EXTENT} {THICK}")
+        add(add(slab, "geometry"), "box", size=f"{ground.extent} {ground.extent} {THICK}")
 
 
 def package(asset: Asset) -> ET.Element:

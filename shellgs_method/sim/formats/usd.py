@@ -16,7 +16,8 @@ from shellgs_method.files.usd import add_mesh, import_pxr, make_collider, new_st
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.parts import Part
-from shellgs_method.sim.formats.asset import EXTENT, FRICTION, Asset
+from shellgs_method.sim.formats.asset import FRICTION, Asset
+from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.texture import TexturedMesh
 from shellgs_method.sim.look.visual import TEXTURE
 
@@ -78,7 +79,7 @@ def write_usd_asset(
         looks.SetVariantSelection("mesh")
 
 
-def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool, ground: Triangles | None) -> None:
+def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool, ground: Ground, mesh: Triangles | None) -> None:
     """Write the stage that has gravity, ground (level if there is no mesh) and light, and refers to the assets."""
     pxr = import_pxr("sim")
     with new_stage(pxr, path, "z", metric) as stage:
@@ -88,25 +89,26 @@ def write_usd_world(path: Path, assets: Sequence[Asset], metric: bool, ground: T
         scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(0, 0, -1))
         scene.CreateGravityMagnitudeAttr(9.81)
         pxr.UsdLux.DomeLight.Define(stage, "/World/light").CreateIntensityAttr(1000)  # for robots: buildings are unlit
-        _ground(pxr, stage, ground)
+        _ground(pxr, stage, ground, mesh)
         for asset in assets:
             prim = stage.DefinePrim(f"/World/{asset.name}")
             prim.GetReferences().AddReference(f"./{asset.name}/{asset.name}.usda")
 
 
-def _ground(pxr: SimpleNamespace, stage, mesh: Triangles | None) -> None:
+def _ground(pxr: SimpleNamespace, stage, ground: Ground, mesh: Triangles | None) -> None:
     if mesh is None:
-        ground = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
-        ground.CreateAxisAttr("Z")
-        ground.CreateWidthAttr(EXTENT)
-        ground.CreateLengthAttr(EXTENT)
-        ground.CreateExtentAttr([(-EXTENT / 2, -EXTENT / 2, 0), (EXTENT / 2, EXTENT / 2, 0)])
-        pxr.UsdPhysics.CollisionAPI.Apply(ground.GetPrim())
+        side = ground.extent
+        made = pxr.UsdGeom.Plane.Define(stage, "/World/ground")
+        made.CreateAxisAttr("Z")
+        made.CreateWidthAttr(side)
+        made.CreateLengthAttr(side)
+        made.CreateExtentAttr([(-side / 2, -side / 2, 0), (side / 2, side / 2, 0)])
+        pxr.UsdPhysics.CollisionAPI.Apply(made.GetPrim())
     else:
-        ground = add_mesh(pxr, stage, "/World/ground", mesh.vertices, mesh.faces)
-        make_collider(pxr, ground, "none")
-    ground.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
-    _rub(pxr, ground, _friction(pxr, stage, "/World/friction"))
+        made = add_mesh(pxr, stage, "/World/ground", mesh.vertices, mesh.faces)
+        make_collider(pxr, made, "none")
+    made.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
+    _rub(pxr, made, _friction(pxr, stage, "/World/friction"))
 
 
 def compliance_errors(stage: Path | Any) -> list[str]:

@@ -31,4 +31,4 @@ def write_world(out: Path, assets: Sequence[Asset], frame: SimFrame, ground: Gro
     write_xml(out / "world.xml", mjcf.world_mjcf(assets, ground))
     write_xml(out / "world.urdf", urdf.world_urdf(assets, ground))
     write_xml(out / "world.sdf", sdf.world_sdf(assets, frame, ground))
-    write_usd_world(out / "world.usda", assets, frame.metric, mesh)
+    write_usd_world(out / "world.usda", assets, frame.metric, ground, mesh)
