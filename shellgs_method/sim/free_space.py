@@ -83,6 +83,11 @@ class FreeSpace:
         rows, columns = np.indices(self.occupied.shape)
         return self.origin + CELL * np.stack([columns, rows], axis=-1)
 
+    @property
+    def bounds(self) -> Float64[np.ndarray, "2 2"]:
+        """Smallest and largest x and y of the cells, with their edges."""
+        return self.origin + CELL * (np.array([[0, 0], self.occupied.shape[::-1]]) - 0.5)
+
     def reachable(self, radius: float, places: Float64[np.ndarray, "P 2"]) -> FreeSpace:
         """The cells where a robot of a radius in metres can be: those joined that hold most of the places.
 

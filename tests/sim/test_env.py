@@ -245,6 +245,34 @@ def test_an_unknown_option_and_a_mode_that_is_not_rendered_are_refused(folder):
         make(folder, depth=False).reset(options={"gaol": (9, -6)})
     with pytest.raises(SceneError, match="'human' cannot be"):
         FacadeNav(folder, render_mode="human")
+    with pytest.raises(SceneError, match="pedestrians -1 cannot be"):
+        FacadeNav(folder, pedestrians=-1)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"start": (400, -6), "goal": (9, -6)}, r"given start \(400, -6\) is not .* x of -10.1 to 2"),
+        ({"start": (2, -6), "goal": (9, 4.4)}, r"given goal \(9, 4.4\) is not .* y of -16.1 to 3.9 m"),
+        ({"start": (2, -6, 0)}, r"given start \(2, -6, 0\) is not two finite numbers"),
+        ({"goal": (np.nan, -6)}, r"given goal \(nan, -6\) is not"),
+        ({"goal": "left"}, "given goal left is not"),
+        ({"start": (2, -6), "goal": (9, -6), "heading": np.inf}, "given heading inf is not a finite number"),
+        ({"heading": None}, "given heading None is not"),
+    ],
+)
+def test_a_start_or_goal_beyond_the_grid_or_without_two_numbers_is_refused(folder, options, says):
+    with pytest.raises(SceneError, match=says):
+        make(folder, depth=False).reset(seed=0, options=options)
+
+
+def test_the_last_cells_of_the_grid_are_on_it_to_their_edges(folder):
+    course = make(folder, depth=False, everywhere=True).course
+    for place in course.space.bounds:
+        assert course.given({"start": place, "goal": place}).keys() == {"start", "goal"}
+        for beyond in (place - course.space.bounds.mean(axis=0)) * 1e-6 * np.eye(2):
+            with pytest.raises(SceneError, match="is not two finite numbers on the grid"):
+                course.given({"start": place + beyond})
 
 
 def test_another_robot_is_attached_and_its_actuators_are_the_actions(folder, tmp_path):

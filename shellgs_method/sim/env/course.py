@@ -62,22 +62,21 @@ class Course:
         """Draw what the options do not give, and put the obstacle between.
 
         Raises:
-            SceneError: an option is unknown, or there is no free way.
+            SceneError: an option is unknown or cannot be, or there is no free way.
         """
         if unknown := set(options) - set(OPTIONS):
             raise SceneError(f"reset has no option {', '.join(map(str, unknown))}: it has {', '.join(OPTIONS)}")
         low, high = self._distance
-        given = "goal" in options and "start" in options
+        places = self.given(options)
+        given = len(places) == 2
         for _ in range(TRIES):
-            goal = np.asarray(options.get("goal", self._any(rng, self.places)), float)
-            start = options.get("start")
+            goal, start = places.get("goal", self._any(rng, self.places)), places.get("start")
             if start is None:
                 off = np.linalg.norm(self.places - goal, axis=1)
                 far = self.places[(off > low) & (off < high)]
                 if len(far) == 0:
                     continue
                 start = self._any(rng, far)
-            start = np.asarray(start, float)
             space = self._blocked(data, rng, start, goal) if self._obstacle else self.space
             episode = Episode(start, goal, space, space.distances(goal))
             if np.isfinite(left := episode.left(start)) and (given or low <= left <= high):
@@ -88,6 +87,25 @@ class Course:
             else f"{self._world.folder}: found no start and goal with a free way of {low:g} to {high:g} m"
         )
 
+    def given(self, options: dict[str, Any]) -> dict[str, Float64[np.ndarray, " 2"]]:
+        """The start and goal that options give: on the grid, as beyond it those of its edge would be taken.
+
+        Raises:
+            SceneError: they are not, or the heading is not a number.
+        """
+        (left, right), (bottom, top) = self.space.bounds.T
+        places = {name: _numbers(options[name]) for name in ("start", "goal") if options.get(name) is not None}
+        for name, place in places.items():
+            if place.shape != (2,) or not ((place >= (left, bottom)) & (place <= (right, top))).all():
+                raise SceneError(
+                    f"{self._world.folder}: the given {name} {options[name]} is not two finite numbers on the grid, "
+                    f"x of {left:.1f} to {right:.1f} m and y of {bottom:.1f} to {top:.1f} m in the folder's frame"
+                )
+        heading = _numbers(options.get("heading", 0.0))
+        if heading.shape != () or not np.isfinite(heading):
+            raise SceneError(f"the given heading {options['heading']} is not a finite number of radians")
+        return places
+
     def _any(self, rng: np.random.Generator, places: np.ndarray) -> np.ndarray:
         return places[rng.integers(len(places))]
 
@@ -97,6 +115,14 @@ class Course:
         middle = start + ahead * rng.uniform(0.4, 0.6)
         self._world.put(data, "obstacle", middle, 1.0, float(np.arctan2(ahead[1], ahead[0])))
         return self.space.without(middle, np.sqrt(2) * BOX + self._world.radius)
+
+
+def _numbers(value: Any) -> np.ndarray:
+    """A value as numbers; NaN if it is none."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError, OverflowError):
+        return np.array(np.nan)
 
 
 class Pedestrians:

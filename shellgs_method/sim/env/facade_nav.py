@@ -103,6 +103,8 @@ class FacadeNav(gymnasium.Env):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise SceneError(f"render_mode {render_mode!r} cannot be: give 'rgb_array'; its images can be shown")
+        if pedestrians < 0:
+            raise SceneError(f"pedestrians {pedestrians} cannot be: give the number of people who walk about, or 0")
         self.world = World.load(Path(world), Path(robot) if robot else None, pedestrians, obstacle)
         self.model = self.world.model
         self.data = mujoco.MjData(self.model)
