@@ -78,11 +78,13 @@ def _glb(mesh: trimesh.Trimesh) -> bytes:
             primitive["material"] = 0
             primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
 
-    return plain.export(file_type="glb", tree_postprocessor=finish)
+    content = plain.export(file_type="glb", tree_postprocessor=finish)
+    assert isinstance(content, bytes)
+    return content
 
 
 def _linear_colours(mesh: trimesh.Trimesh) -> Float32[np.ndarray, "V 3"]:
-    colours = mesh.visual.vertex_colors[:, :3]  # pyright: ignore[reportAttributeAccessIssue]
+    colours = mesh.visual.vertex_colors[:, :3]  # pyright: ignore
     return np.ascontiguousarray(linear_of(colours / 255), dtype=np.float32)
 
 

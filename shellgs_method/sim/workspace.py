@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError
+from shellgs_method.geometry.nearest import point_tree
 
 SHARE = 0.3
 """Distance from a camera, as a share of its distance to the building, at which images are still believed: a point of
@@ -69,8 +70,7 @@ class Workspace:
 
     def has(self, places: Float64[np.ndarray, "*N C"]) -> Bool[np.ndarray, " *N"]:
         """Whether places, given by x, y and any more coordinates, are above or below the workspace or in it."""
-        off = np.linalg.norm(places[..., None, :2] - self.eyes[:, :2], axis=-1)
-        return off.min(axis=-1) <= self.radius
+        return np.asarray(point_tree(self.eyes[:, :2]).query(places[..., :2])[0]) <= self.radius
 
     def trusts(self, eye: Float64[np.ndarray, " 3"], direction: Float64[np.ndarray, " 3"]) -> bool:
         """Whether an image from there, along a unit vector, is to be believed."""

@@ -22,8 +22,8 @@ from shellgs_method.sim.env.course import WALK
 from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
 from shellgs_method.sim.env.world import World
-from shellgs_method.sim.free_space import CELL, FreeSpace
-from shellgs_method.sim.ground import LEVEL
+from shellgs_method.sim.free_space import CELL, CELLS, MARGIN, FreeSpace
+from shellgs_method.sim.ground import LEVEL, Ground
 from shellgs_method.sim.trials.engine import import_mujoco
 from shellgs_method.sim.workspace import Workspace
 
@@ -159,7 +159,10 @@ def test_the_length_on_the_grid_is_that_of_the_way_around_a_wall():
     assert np.isinf(sealed.distances(np.array([0.0, 0.0]))[0, 20])
 
 
-def test_a_part_is_occupied_on_the_map_of_nav2_where_it_stands(tmp_path):
+@pytest.mark.parametrize("larger", [1, 2.5])
+def test_a_part_is_occupied_on_the_map_of_nav2_where_it_stands(tmp_path, monkeypatch, larger):
+    cell = larger * CELL
+    monkeypatch.setattr("shellgs_method.sim.free_space.CELLS", (2 * MARGIN / cell) ** 2)
     corners = np.array([[x, y, z] for x in (1.0, 2.0) for y in (3.0, 3.4) for z in (0.0, 2.0)])
     place = np.array([[0.0, 0.0]])
     FreeSpace.of([corners], LEVEL, place).write(tmp_path, place)
@@ -168,7 +171,51 @@ def test_a_part_is_occupied_on_the_map_of_nav2_where_it_stands(tmp_path):
     rows, columns = np.nonzero(image == 0)
     x = origin[0] + (columns + 0.5) * float(facts["resolution"])
     y = origin[1] + (len(image) - rows - 0.5) * float(facts["resolution"])
-    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((1, 2, 3, 3.4), abs=CELL)
+    assert float(facts["resolution"]) == pytest.approx(cell)
+    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((1, 2, 3, 3.4), abs=cell)
+
+
+@pytest.mark.parametrize(("span", "cell"), [(0, CELL), (600, CELL), (2100, 0.67), (2e4, 6.33)])
+def test_cells_grow_with_a_large_site_and_their_number_is_bounded(span, cell):
+    places = np.array([[0.0, 0.0], [span, span]])
+    space = FreeSpace.of([], LEVEL, places)
+    assert space.cell == (CELL if cell == CELL else pytest.approx(cell, rel=0.01))
+    assert space.occupied.size < 1.01 * CELLS
+    assert ((places > space.bounds[0]) & (places < space.bounds[1])).all()
+    assert space.centres[-1, -1] == pytest.approx(space.bounds[1] - space.cell / 2)
+
+
+@pytest.mark.parametrize("cell", [CELL, 0.35, 0.4, 1.0])
+def test_a_robot_stays_as_far_from_walls_in_larger_cells(monkeypatch, cell):
+    monkeypatch.setattr("shellgs_method.sim.free_space.CELLS", 23**2 / cell**2)
+    place = np.array([[0.0, 0.0], [3.0, 3.0]])
+    for front in np.linspace(4, 5, 21):
+        wall = np.array([[x, y, z] for x in (-20.0, 30.0) for y in (front, 6.0) for z in (0.0, 2.0)])
+        space = FreeSpace.of([wall], LEVEL, place)
+        clear = space.reachable(0.31, place)
+        assert space.cell == pytest.approx(cell)
+        assert front - clear.centres[~clear.occupied][:, 1].max() >= 0.31 - CELL / 2 - 1e-9
+
+
+def test_a_slope_that_a_robot_climbs_is_as_steep_in_larger_cells(monkeypatch):
+    place = np.zeros((1, 2))
+    for slope, free in ((0.3, True), (0.5, False)):
+        ground = Ground(np.tile([0.0, 40 * slope], (2, 1)), 40.0, np.full(2, -20.0), np.ones((2, 2), bool))
+        for cells in (CELLS, 1000):
+            monkeypatch.setattr("shellgs_method.sim.free_space.CELLS", cells)
+            space = FreeSpace.of([], ground, place)
+            assert space.occupied[:, :-1].all() != free
+            assert space.occupied[:, :-1].any() != free
+
+
+def test_ways_and_walks_are_in_metres_in_larger_cells():
+    space = FreeSpace(np.zeros((9, 9), bool), np.array([-2.0, 1.0]), 0.5)
+    lengths = space.distances(np.array([-2.0, 1.0]))
+    assert space.at(lengths, np.array([2.0, 1.0])) == pytest.approx(4)
+    assert space.downhill(lengths, np.array([1.0, 1.1])) == pytest.approx([0.5, 1])
+    blocked = space.without(np.array([0.0, 1.0]), 0.6)
+    assert blocked.at(blocked.distances(np.array([-2.0, 1.0])), np.array([2.0, 1.0])) > 4
+    assert blocked.cell == 0.5
 
 
 def test_the_inside_of_a_building_is_unknown_on_the_map(tmp_path):
