@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -156,7 +155,7 @@ def _metres(run: TrainedRun) -> float:
 
 def _cells(run: TrainedRun) -> Sequence[Cell]:
     """The cells in the world of the model."""
-    blocks = Blocks.read(Path(run.datamanager.config.dataparser.data) / BLOCKS)
+    blocks = Blocks.read(run.scene / BLOCKS)
     return [cell.moved(run.datamanager.scene_to_world) for cell in blocks.cells]
 
 

@@ -97,14 +97,13 @@ class TrainedRun:
     @cached_property
     def shell(self) -> tuple[Alignment, ShellMesh] | None:
         """The scene's shell and its alignment, if there is one."""
-        scene = self.scene
-        if not (scene / ALIGNMENT).is_file():
+        if not (self.scene / ALIGNMENT).is_file():
             return None
-        alignment = Alignment.load(scene / ALIGNMENT)
+        alignment = Alignment.load(self.scene / ALIGNMENT)
         views = [view for dataset in self.datasets for view in dataset.views]
-        alignment.check(scene, views)
-        alignment = alignment if alignment.cameras.cameras else alignment.bound(scene, views)
-        return alignment, alignment.load_shell(scene, views)
+        alignment.check(self.scene, views)
+        alignment = alignment if alignment.cameras.cameras else alignment.bound(self.scene, views)
+        return alignment, alignment.load_shell(self.scene, views)
 
     @cached_property
     def frame(self) -> Frame:
