@@ -786,10 +786,10 @@ def test_later_pieces_of_a_text_are_read_like_the_first(tmp_path: Path, monkeypa
     assert len([*cloud]) == 5
 
 
-def scan_of_ptx(points: np.ndarray, matrix: np.ndarray) -> list[str]:
-    """A scan of 10 columns; the matrix is for columns, as everywhere but in PTX."""
+def scan_of_ptx(points: np.ndarray, matrix: np.ndarray, transposed: bool = True) -> list[str]:
+    """A scan of 10 columns; the matrix is for columns, as everywhere but in PTX, where it stands transposed."""
     head = ["10", f"{len(points) // 10}", *(" ".join(map(str, row)) for row in (matrix[:3, 3], *np.eye(3)))]
-    rows = [" ".join(map(repr, row)) for row in matrix.T.tolist()]
+    rows = [" ".join(map(repr, row)) for row in (matrix.T if transposed else matrix).tolist()]
     return [
         *head,
         *rows,
@@ -797,14 +797,16 @@ def scan_of_ptx(points: np.ndarray, matrix: np.ndarray) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("piece", [7, 1000])
-def test_a_ptx_is_moved_by_its_matrices_and_tells_its_scanners(tmp_path: Path, caplog, monkeypatch, piece: int):
+@pytest.mark.parametrize(("piece", "transposed"), [(7, True), (1000, True), (1000, False)])
+def test_a_ptx_is_moved_by_its_matrices_and_tells_its_scanners(
+    tmp_path: Path, caplog, monkeypatch, piece: int, transposed: bool
+):
     monkeypatch.setattr(text_clouds, "PIECE", piece)
     points, missed = np.round(POINTS.astype(np.float64), 3), np.arange(300) % 5 == 0
     local = np.where(missed[:, None], 0.0, points)
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = TURNED.as_matrix(), NATIONAL
-    lines = [*scan_of_ptx(local[:100], np.eye(4)), *scan_of_ptx(local[100:], matrix)]
+    lines = [*scan_of_ptx(local[:100], np.eye(4)), *scan_of_ptx(local[100:], matrix, transposed)]
     (tmp_path / "a.ptx").write_text("\r\n".join(lines) + "\r\n")
     read, placed = read_geometry(tmp_path / "a.ptx"), TURNED.apply(points[100:]) + NATIONAL
     np.testing.assert_allclose(read.vertices, np.concatenate([points[:100], placed])[~missed], atol=1e-9)
@@ -820,6 +822,7 @@ def test_a_ptx_is_moved_by_its_matrices_and_tells_its_scanners(tmp_path: Path, c
         (lambda lines: [*lines[:5], *lines[6:]], "a scan does not begin with its size"),
         (lambda lines: [*lines, "1 2 3 0.5"], "cannot be read"),
         (lambda lines: ["-10", *lines[1:]], "a scan does not begin with its size"),
+        (lambda lines: [*lines[:6], "1 0 0 4", *lines[7:9], "5 0 0 1", *lines[10:]], "the matrix of a scan is no 4x4"),
     ],
 )
 def test_a_damaged_ptx_is_refused(tmp_path: Path, change: Callable[[list[str]], list[str]], words: str):

@@ -86,6 +86,10 @@ def read_ptx(path: Path) -> Iterator[Points]:
             if rays < 0 or [len(row) for row in rows] != [3] * 4 + [4] * 4:
                 raise ValueError("a scan does not begin with its size, the scanner's place and axes, and a 4x4 matrix")
             matrix = np.stack(rows[4:])
+            if matrix[:3, 3].any() and not matrix[3, :3].any():  # for column vectors, as some programs write it
+                matrix = matrix.T
+            if not np.allclose(matrix[:, 3], (0, 0, 0, 1)):
+                raise ValueError("the matrix of a scan is no 4x4 matrix of a rotation and a translation")
             if not np.array_equal(matrix, np.eye(4)):
                 yield Points(NO_POINTS, scanners=matrix[3:, :3])
             total += rays
