@@ -455,7 +455,7 @@ class FacadeModel(SplatfactoModel):
         """The objective's terms of the view that was rendered last."""
         view, progress = self._view(batch, outputs["background"]), self.step / self.num_iterations
         transient = self._transient(view, batch["image_idx"], outputs["rgb"]) if self.training else None
-        losses = self.objective(view, batch, outputs["rgb"], self.geometry, progress, transient)
+        losses = self.objective(view, outputs["rgb"], self.geometry, progress, transient)
         return losses | self.objective.of_shapes(self.scales, self.info["radii"][0, : self.num_points])
 
     def _transient(self, view: ViewLosses, index: int, rgb: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W 1"] | None:

@@ -12,7 +12,7 @@ from training_runs import trainer_of
 
 from benchmarks.gpu import one_step
 
-MOST = {"photo_gs": 95, "shellgs": 195, "shellgs_metric": 330, "two_dgs": 205}
+MOST = {"photo_gs": 95, "shellgs": 175, "shellgs_metric": 265, "two_dgs": 172}
 STEPS = range(11_000, 11_010)
 """Of 30 000: all terms count, and none of them logs, refines or looks for skipped steps but the first."""
 

@@ -11,6 +11,7 @@ import av.container
 import av.error
 import cv2
 import numpy as np
+from av.sidedata.sidedata import Type
 from av.stream import Disposition
 from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
@@ -32,6 +33,7 @@ _PICTURES = Disposition.attached_pic | Disposition.timed_thumbnails | Dispositio
 _NEIGHBOURHOOD = 31  # frames, about a second, in which the subject hardly changes
 _SMALL = 128  # pixels, the width at which motion is measured
 _PACE = 0.2  # seconds between the frames that motion is measured between: pixels, not fractions of one
+_UNTAGGED = 2  # a colour space that is not said (H.273)
 _SQUARE = 0.01  # by which a pixel's sides may differ: programs round them
 _BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
@@ -213,14 +215,27 @@ def _pixel_aspect(stream: VideoStream) -> float:
 
 def _upright(frame: av.VideoFrame, transfer: Transfer | None, aspect: float) -> Image.Image:
     if transfer is None:
-        image = frame.to_image()
+        hd = frame.width >= 1280 or frame.height > 576
+        # FFmpeg takes what does not say so for BT.601, where players take HD for BT.709.
+        untagged = frame.colorspace == _UNTAGGED
+        image = frame.to_image(src_colorspace="ITU709" if hd and untagged else None)
     else:
         image = Image.fromarray(tone_mapped(frame.to_ndarray(format="rgb48le"), transfer))
     if frame.interlaced_frame and _is_combed(pixels := np.asarray(image)):
         image = Image.fromarray(_first_field(pixels))
     if aspect != 1:
         image = image.resize((round(image.width * aspect), image.height), Image.Resampling.BICUBIC)
-    return image.rotate(frame.rotation, expand=True)
+    angle = frame.rotation
+    if (matrix := _display_matrix(frame)) is not None and np.linalg.det(matrix) < 0:  # FFmpeg's angle is without it
+        image = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+        angle = float(np.degrees(np.arctan2(matrix[0, 1], -matrix[0, 0])))
+    return image.rotate(angle, expand=True)
+
+
+def _display_matrix(frame: av.VideoFrame) -> Float[np.ndarray, "2 2"] | None:
+    """How the picture is turned or mirrored for display, for row vectors; None if it is not."""
+    stored = frame.side_data.get(Type.DISPLAYMATRIX)
+    return None if stored is None else np.frombuffer(bytes(stored), np.int32).reshape(3, 3)[:2, :2] / 2**16
 
 
 def _is_combed(pixels: UInt8[np.ndarray, "H W 3"]) -> bool:

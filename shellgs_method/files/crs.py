@@ -187,11 +187,17 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
         shell: its files.
 
     Raises:
-        SceneError: the system has heights in another unit than eastings, or is a projection of the whole Earth.
+        SceneError: the system has heights in another unit than eastings, counts from the middle of the Earth, or is a
+            projection of all of it.
     """
     crs = known_crs(system)
     if crs is None or any(path.suffix.lower() in IN_METRES for path in shell):
         return given
+    if crs.is_geocentric:
+        raise SceneError(
+            f"{crs.name} counts from the middle of the Earth, and its axes are neither level nor vertical: convert the "
+            "shell to a system of its region, such as UTM, or name that with --crs"
+        )
     if _is_of_the_earth(crs):
         raise SceneError(
             f"{crs.name} is a projection of the whole Earth, in which lengths are stretched (by a half in Europe) and "
@@ -243,10 +249,14 @@ def _is_of_the_earth(crs: CRS) -> bool:
 def conversion(source: CRS, target: CRS) -> Callable[[np.ndarray], Float64[np.ndarray, "N D"]]:
     """Conversion of coordinates, x (or longitude) first, from one system to another; infinite where there is none."""
     from pyproj import Transformer
+    from pyproj.exceptions import ProjError
 
     if source.to_2d() == target.to_2d() and len(source.axis_info) <= len(target.axis_info):
         return lambda points: points
-    transformer = Transformer.from_crs(source, target, always_xy=True)
+    try:
+        transformer = Transformer.from_crs(source, target, always_xy=True)
+    except ProjError:  # to or from a local system
+        return lambda points: np.full(points.shape, np.inf)
     return lambda points: np.stack(transformer.transform(*points.T), axis=-1)
 
 
@@ -277,8 +287,8 @@ def converter(source: CRS, target: str, where: str) -> Callable[[np.ndarray], Fl
         if not np.isfinite(converted).all():
             first = points[~np.isfinite(converted).all(axis=1)][0]
             raise SceneError(
-                f"{where}: {_words(first)} cannot be converted from {source.name} to {wanted.name}: is the longitude "
-                "first?"
+                f"{where}: {_words(first)} cannot be converted from {source.name} to {wanted.name}: "
+                + ("that is local" if wanted.is_engineering else "is the longitude first?")
             )
         return converted
 

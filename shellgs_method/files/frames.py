@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.paths import inside
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import COEFFICIENTS, Lens
@@ -29,6 +29,8 @@ _WIDEST = 170.0
 """Degrees that no perspective photograph shows."""
 _CORNER = 0.02
 """Share of the width and height that is a corner of a photograph."""
+_OFF_CENTRE = 0.2
+"""Share of the width and height by which a principal point is far from the middle."""
 _ORTHONORMAL = 1e-3  # largest entry of RᵀR - 1 taken for rounding: of four printed digits
 
 
@@ -123,6 +125,13 @@ def in_order(frames: Sequence[Frame], where: str) -> list[Frame]:
             f"{where} has the principal points of all photographs in their upper left corner, at {cx:g} {cy:g} for "
             "example: give them in pixels from that corner, not from the middle or as shares of the size"
         )
+    if all(_is_off_centre(frame.camera) for frame in frames):
+        camera = frames[0].camera
+        notice(
+            f"{where} has the principal points of all photographs far from their middle, at "
+            f"{camera.K[0, 2]:g} {camera.K[1, 2]:g} of {camera.width}x{camera.height} pixels for example, as only "
+            "cropped photographs have: give it and the size for the same photographs."
+        )
     frames = sorted(frames, key=lambda frame: frame.name)
     for one, other in pairwise(frames):
         if one.name == other.name:
@@ -134,6 +143,11 @@ def _is_at_corner(camera: Camera) -> bool:
     """Whether the principal point is in the upper left corner, as one that counts from the middle, or in shares, is."""
     cx, cy = camera.K[:2, 2].tolist()
     return abs(cx) < max(1.0, _CORNER * camera.width) and abs(cy) < max(1.0, _CORNER * camera.height)
+
+
+def _is_off_centre(camera: Camera) -> bool:
+    off = [abs(float(camera.K[k, 2]) / size - 0.5) for k, size in enumerate((camera.width, camera.height))]
+    return min(off) > _OFF_CENTRE
 
 
 def remedy_for(model: str) -> str:

@@ -166,7 +166,7 @@ def read_image(path: Path) -> Image.Image:
     """Read an image file as 8-bit RGB or RGBA in sRGB; EXIF data are kept, the orientation is not applied.
 
     Raises:
-        SceneError: the image cannot be read, or holds floating-point numbers.
+        SceneError: the image cannot be read, or holds floating-point numbers or integers of more than 16 bits.
     """
     with opened(path) as image:
         exif = exif_of(image)
@@ -177,7 +177,11 @@ def read_image(path: Path) -> Image.Image:
             )
             codes = _wide(path) if "nclx_profile" in image.info else np.asarray(image.convert("RGB"), np.uint16) * 257
             image = Image.fromarray(tone_mapped(codes, transfer))
-        if image.mode.startswith("I"):  # 16 bits
+        if image.mode.startswith("I"):
+            if np.max(image.getextrema()) > np.iinfo(np.uint16).max:
+                raise SceneError(
+                    f"{path} holds integers of more than 16 bits, whose white is undefined: save it with 8 or 16 bits"
+                )
             image = Image.fromarray((np.asarray(image) / 257).round().clip(0, 255).astype(np.uint8))
         image = in_srgb(image)
         image = image.convert("RGBA" if image.has_transparency_data else "RGB")
@@ -254,8 +258,8 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
     """Open an image file, decoded unless ``whole`` is false; also of a TIFF, which Pillow turns, the pixels as stored.
 
     Raises:
-        SceneError: the image cannot be read, is raw, has too many pixels, holds floating-point numbers, or has bands of
-            16 bits that are not interleaved.
+        SceneError: the image cannot be read, is raw, has too many pixels, holds floating-point numbers, has bands of
+            16 bits that are not interleaved, or is a TIFF whose first page is a smaller one.
     """
     if path.suffix.lower() in RAW:
         raise SceneError(f"{path} is raw, of which only a thumbnail can be read: {DEVELOP}")
@@ -263,7 +267,10 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
         image = Image.open(path)
         if image.width * image.height > MAX_PIXELS:  # by the header: nothing is allocated yet
             raise Image.DecompressionBombError(f"it claims {image.width}x{image.height} pixels")
-        orientation = orientation_of(image) if isinstance(image, TiffImageFile) else 1
+        orientation, first = 1, image.size
+        largest = first
+        if isinstance(image, TiffImageFile):
+            orientation, largest = orientation_of(image), _largest_page(image)
         if whole or orientation != 1:
             image.load()
     except Image.DecompressionBombError as error:
@@ -282,6 +289,12 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
             f"{path} cannot be read as an image ({reason}): put the whole file back, or leave it out"
         ) from error
     with image:
+        if largest != first:
+            raise SceneError(
+                "{} begins with a thumbnail of {}x{} pixels, and a page of {}x{} follows: save that alone".format(
+                    path, *first, *largest
+                )
+            )
         if isinstance(image, TiffImageFile) and _is_misread(image):
             raise SceneError(
                 f"{path} stores its bands one after another with more than 8 bits, which is not read: save it with "
@@ -302,6 +315,15 @@ def _turned_back(image: Image.Image, orientation: int) -> Image.Image:
     exif[ExifTags.Base.Orientation] = orientation
     stored.info["exif"] = exif.tobytes()
     return stored
+
+
+def _largest_page(image: TiffImageFile) -> tuple[int, int]:
+    sizes = []
+    for page in range(getattr(image, "n_frames", 1)):
+        image.seek(page)
+        sizes.append(image.size)
+    image.seek(0)
+    return max(sizes, key=lambda size: size[0] * size[1])  # the first of equals
 
 
 def _is_misread(image: TiffImageFile) -> bool:

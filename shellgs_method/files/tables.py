@@ -31,7 +31,7 @@ COORDINATES = {
 }
 IMAGE = (
     *("image", "photo", "photograph", "picture", "img", "file", "filename", "foto", "bild", "sourcefile"),
-    *("imagename", "photoname", "imagefile"),
+    *("imagename", "photoname", "imagefile", "photoid"),
 )
 NAME = ("name", "id", "point", "punkt", "nr", "label", "gcp", "pointname", "pointid", "gcpname")
 PIXELS = {"x": ("u", "px", "col", "column", "imagex", "pixelx"), "y": ("v", "py", "row", "line", "imagey", "pixely")}

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine.crops import crops
 from shellgs_method.machine.elementwise import Value, cross, dot, elementwise
 
 
@@ -25,11 +26,11 @@ def normals_from_depth(depth: Float[Tensor, "H W 1"], camera: Camera) -> Float[T
 
 def normals_along_rays(depth: Float[Tensor, "H W 1"], rays: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     """:func:`normals_from_depth` given the camera's rays, which are scaled to z = 1."""
-    if min(depth.shape[:2]) < 3:
+    height, width, _ = depth.shape
+    if min(height, width) < 3:
         return torch.zeros_like(rays) + 0 * depth
-    points = depth * rays
-    around = points[1:-1, 2:], points[1:-1, :-2], points[:-2, 1:-1], points[2:, 1:-1]
-    (normal,) = elementwise(_normal, points[1:-1, 1:-1], *around)
+    cross_shaped = crops(depth * rays, height - 2, width - 2, (1, 1), (1, 2), (1, 0), (0, 1), (2, 1))
+    (normal,) = elementwise(_normal, *cross_shaped)
     return pad(normal, (0, 0, 1, 1, 1, 1))
 
 

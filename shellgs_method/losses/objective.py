@@ -27,7 +27,6 @@ from shellgs_method.losses import (
     normal_consistency_loss,
     vid2sim_ncc_loss,
 )
-from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.machine.memory import free_memory
 from shellgs_method.render.maps import Geometry
 
@@ -36,8 +35,8 @@ Trust = Literal["shell", "photographs"]
 
 MAX_KEPT_SHARE = 0.1
 """Share of the device's free memory that losses of training views may take, which are made in their first step."""
-KEPT_BYTES = 110
-"""Bytes that the losses of a pixel take, of all terms: 109 of `shellgs-metric`."""
+KEPT_BYTES = 120
+"""Bytes that the losses of a pixel take, of all terms: 118 of `shellgs-metric`."""
 SOLID = 0.5
 """Opacity that the shell must have where what is behind it may be seen through it."""
 DISTORTION_FROM = 3000
@@ -87,12 +86,11 @@ class ExtraLossConfig:
 
 
 class ViewLosses(NamedTuple):
-    """Losses of one view against its photograph and its cue."""
+    """Losses of one view against its photograph, itself and its cue."""
 
     photometric: PhotometricLoss
+    own: SelfLosses
     cue: CueLosses | None
-    with_cue: Bool[Tensor, "H W 1"] | None
-    """Pixels with a cue, believed or not; None in a view without a map."""
 
 
 class Objective:
@@ -140,7 +138,8 @@ class Objective:
             doubted = self.cues == "shell" and self.trust == "photographs"
             trust = shell_trust(batch, maps.mask) if doubted else maps.mask.to(target)
             cue = CueLosses(maps, trust, self.paper, self.extra, self.metres_per_unit, self.shell_error)
-        view = ViewLosses(PhotometricLoss(target, kept), cue, with_cue)
+        own = SelfLosses(kept_pixels(batch, target), with_cue, self.extra)
+        view = ViewLosses(PhotometricLoss(target, kept), own, cue)
         if keep and self._has_room(target):
             self._views[index] = view
         return view
@@ -158,19 +157,18 @@ class Objective:
     def __call__(
         self,
         view: ViewLosses,
-        batch: dict,
         rgb: Float[Tensor, "H W 3"],
         geometry: Geometry | None,
         progress: float,
         transient: Bool[Tensor, "H W 1"] | None = None,
     ) -> dict[str, Tensor]:
-        """Weighted terms of a rendered view of a batch, at ``progress`` in [0, 1] of the run.
+        """Weighted terms of a rendered view, at ``progress`` in [0, 1] of the run.
 
         R leaves out the pixels that are ``transient``.
         """
         losses = {"photometric": view.photometric(rgb, transient)}
         if geometry is not None:
-            losses |= self_losses(geometry, self.extra, progress, kept_pixels(batch, rgb), view.with_cue)
+            losses |= view.own(geometry, progress)
             if view.cue is not None:
                 losses |= view.cue(geometry, progress)
         return losses
@@ -249,31 +247,40 @@ class CueLosses:
         return self._splats(geometry.moments.about(self.cue.depth, geometry.solid), _opacity(geometry))
 
 
-def self_losses(
-    geometry: Geometry,
-    extra: ExtraLossConfig,
-    progress: float,
-    kept: Bool[Tensor, "H W 1"],
-    with_cue: Bool[Tensor, "H W 1"] | None = None,
-) -> dict[str, Tensor]:
-    """Weighted terms of 2DGS on the rendered geometry, without a cue, at ``progress`` in [0, 1] of the run.
+class SelfLosses:
+    """Weighted terms of 2DGS on the rendered geometry of one view, without a cue.
 
-    They are means over the pixels kept by the user's mask; normal consistency is 0 in those ``with_cue``.
+    Args:
+        kept: pixels kept by the user's mask, over which the terms are means.
+        with_cue: pixels with a cue, believed or not, where normal consistency is 0; None in a view without a map.
+        extra: the terms.
     """
-    iteration = progress * PAPER_ITERATIONS
-    losses = {}
-    if extra.normal_consistency > 0 and iteration >= extra.normal_consistency_from:
-        where = kept if with_cue is None else kept & ~with_cue
-        share = where.sum() / kept.sum().clamp_min(1)  # a pixel weighs the same however few count
-        losses["normal_consistency"] = (
-            extra.normal_consistency
-            * share
-            * normal_consistency_loss(geometry.normal, geometry.depth_normal, geometry.alpha, where)
-        )
-    if extra.distortion > 0 and iteration >= DISTORTION_FROM:
-        assert geometry.distortion is not None
-        losses["distortion"] = extra.distortion * weighted_mean(geometry.distortion, kept)
-    return losses
+
+    def __init__(self, kept: Bool[Tensor, "H W 1"], with_cue: Bool[Tensor, "H W 1"] | None, extra: ExtraLossConfig):
+        self.kept, self.with_cue, self.extra = kept, with_cue, extra
+
+    def __call__(self, geometry: Geometry, progress: float) -> dict[str, Tensor]:
+        """Weighted terms of one render, at ``progress`` in [0, 1] of the run."""
+        extra, iteration = self.extra, progress * PAPER_ITERATIONS
+        losses = {}
+        if extra.normal_consistency > 0 and iteration >= extra.normal_consistency_from:
+            consistency = normal_consistency_loss(
+                geometry.normal, geometry.depth_normal, geometry.alpha, self._without_cue
+            )
+            losses["normal_consistency"] = extra.normal_consistency * consistency
+        if extra.distortion > 0 and iteration >= DISTORTION_FROM:
+            assert geometry.distortion is not None
+            losses["distortion"] = extra.distortion * (self._weights * geometry.distortion).sum()
+        return losses
+
+    @cached_property
+    def _weights(self) -> Float[Tensor, "H W 1"]:
+        return self.kept / self.kept.sum().clamp_min(1)
+
+    @cached_property
+    def _without_cue(self) -> Float[Tensor, "H W 1"]:
+        """Weights of normal consistency: a pixel weighs the same however few are without a cue."""
+        return self._weights if self.with_cue is None else self._weights.where(~self.with_cue, 0.0)
 
 
 def _opacity(geometry: Geometry) -> Tensor:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from shellgs_method.losses.reduction import mean_weights, weighted_mean
+from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.machine.elementwise import Value, dot, elementwise
 
 
@@ -16,9 +15,9 @@ def normal_consistency_loss(
     normal: Float[Tensor, "H W 3"],
     depth_normal: Float[Tensor, "H W 3"],
     alpha: Float[Tensor, "H W 1"],
-    mask: Bool[Tensor, "H W 1"] | None = None,
+    weights: Float[Tensor, "H W 1"],
 ) -> Float[Tensor, ""]:
-    """Mean of 1 - <N, A n>: composited normals against those of the rendered depth (Huang et al. 2024, eq. 14).
+    """Sum of 1 - <N, A n>: composited normals against those of the rendered depth (Huang et al. 2024, eq. 14).
 
     Alpha A is only a weight, without gradient. N is not normalised, so that splats behind one another lower the loss by
     having the same normal.
@@ -27,14 +26,15 @@ def normal_consistency_loss(
         normal: N, composited and not normalised.
         depth_normal: n, unit normals of the rendered depth, zero where there are none.
         alpha: accumulated opacity A.
-        mask: pixels that count; all by default.
+        weights: weight of each pixel, of sum 1 for a mean.
     """
-    weights = mean_weights(torch.ones_like(alpha, dtype=torch.bool) if mask is None else mask, like=alpha)
-    return weights.sum() - elementwise(_agreement, normal, depth_normal, weights * alpha.detach())[0].sum()
+    return elementwise(_disagreement, normal, depth_normal, alpha.detach(), weights)[0].sum()
 
 
-def _agreement(normal: Sequence[Value], depth_normal: Sequence[Value], weight: Sequence[Value]) -> list[list[Value]]:
-    return [[weight[0] * dot(normal, depth_normal)]]
+def _disagreement(
+    normal: Sequence[Value], depth_normal: Sequence[Value], alpha: Sequence[Value], weight: Sequence[Value]
+) -> list[list[Value]]:
+    return [[weight[0] * (1 - alpha[0] * dot(normal, depth_normal))]]
 
 
 def flattening_loss(scales: Float[Tensor, "N 3"], visible: Bool[Tensor, "N"]) -> Float[Tensor, ""]:

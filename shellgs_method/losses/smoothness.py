@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
 from shellgs_method.losses.normal import unit_vector
+from shellgs_method.machine.crops import crops
 from shellgs_method.machine.elementwise import Value, dot, elementwise
 
 
@@ -32,7 +33,8 @@ class SmoothnessLoss:
 
     def __call__(self, normal: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """Loss of one render, given its normals of any length, as composited."""
-        neighbours = normal[1:, 1:], normal[1:, :-1], normal[:-1, 1:]
+        height, width, _ = self._weights.shape
+        neighbours = crops(normal, height, width, (1, 1), (1, 0), (0, 1))
         return elementwise(_roughness, *neighbours, self._weights)[0].sum()
 
 

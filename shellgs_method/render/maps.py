@@ -39,14 +39,24 @@ class DepthMoments(NamedTuple):
     origin: Float[Tensor, ""]
     """Constant depth that the moments are about, for accuracy in float32."""
     first: Float[Tensor, "H W 1"]
-    """Σ w (z - origin)."""
+    """Σ w z."""
     second: Float[Tensor, "H W 1"]
     """Σ w (z - origin)²."""
 
     def about(self, depth: Float[Tensor, "H W 1"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "H W 1"]:
         """Σ w (z - depth)², positive if splats of a pixel are off the depth even if their mean is not; alpha is Σ w."""
-        d = depth - self.origin
-        return self.second - 2 * d * self.first + d.square() * alpha
+        return elementwise(_about, *self[1:], depth, alpha, self.origin[None])[0]
+
+
+def _about(
+    first: Sequence[Value],
+    second: Sequence[Value],
+    depth: Sequence[Value],
+    alpha: Sequence[Value],
+    origin: Sequence[Value],
+) -> list[list[Value]]:
+    d = depth[0] - origin[0]
+    return [[second[0] - 2 * d * (first[0] - origin[0] * alpha[0]) + d * d * alpha[0]]]
 
 
 @dataclass(frozen=True)
@@ -170,7 +180,6 @@ def rendered_geometry(
     camera: Camera,
     depth: DepthKind,
     origin: Float[Tensor, ""] | None = None,
-    surface: Float[Tensor, "H W 1"] | None = None,
 ) -> Geometry:
     """Depth and normals of a view from the composite of :func:`geometry_channels`.
 
@@ -180,16 +189,17 @@ def rendered_geometry(
     * ``mode``: expected, from which the caller makes :func:`mode_of_depth`.
 
     Args:
-        composited: normals and depth channel; with ``origin`` also the channel of :func:`squared_depths`; with
-            ``surface`` all of them times a weight of each Gaussian.
+        composited: normals and depth channel; with ``origin`` also the channel of :func:`squared_depths`; all of them
+            times a weight of each Gaussian, and these weights, if they have any.
         alpha: accumulated opacity.
         info: third output of the rasterizer.
         camera: camera of the view.
         depth: kind of depth, as given to :func:`geometry_channels`.
         origin: origin of the squared depths.
-        surface: the composited weights, if Gaussians have any.
     """
-    normal, channel = composited[..., :3], composited[..., 3:4]
+    normal, channel, *more = composited.split([3, *[1] * (composited.shape[-1] - 3)], dim=-1)
+    moments = None if origin is None else DepthMoments(origin, channel, more.pop(0))
+    surface = more.pop() if more else None
     weight = alpha if surface is None else surface
     solid = weight.clamp_min(1e-6)
     if depth == "plane":
@@ -202,7 +212,6 @@ def rendered_geometry(
     else:
         z = channel / solid
     z = torch.where(alpha > 0, z, z.detach().max())
-    moments = None if origin is None else DepthMoments(origin, channel - origin * weight, composited[..., 4:5])
     if surface is not None:
         normal = normal * (alpha / solid)
     return Geometry(z, normal, alpha, camera, info.get("distortion"), moments, surface)

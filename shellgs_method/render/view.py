@@ -77,14 +77,14 @@ class ViewRenderer:
         # Colours minus the background, so that the photometric gradient of alpha comes through the colours too.
         features, origin = view_colours(gaussians, camera, degree) - background, None
         if geometry:
-            channels, origin = self._channels(gaussians, camera)
-            features = torch.cat([features, *channels], dim=-1)
+            of_geometry, origin = self._channels(gaussians, camera)
+            features = torch.cat([features, *of_geometry], dim=-1)
         composited, alpha, info = self._rasterize(gaussians, features, camera, 3 if geometry and densifies else None)
-        rgb, maps = composited[..., :3] + background, None
+        rgb, maps = composited, None
         if geometry:
-            surface = composited[..., -1:] if "surface" in gaussians else None
-            maps = rendered_geometry(composited[..., 3:], alpha, info, camera, self.depth, origin, surface)
-        return Rendered(rgb, alpha, maps, info)
+            rgb, channels = composited.split([3, composited.shape[-1] - 3], dim=-1)
+            maps = rendered_geometry(channels, alpha, info, camera, self.depth, origin)
+        return Rendered(rgb + background, alpha, maps, info)
 
     def view_of_geometry(
         self, geometry: Geometry, gaussians: Gaussians, camera: Camera

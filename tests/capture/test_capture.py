@@ -66,14 +66,12 @@ def save_rotated(image: Image.Image, path: Path) -> None:
     image.rotate(90, expand=True).save(path, exif=exif, quality=95)
 
 
-def turn_video(path: Path) -> None:
-    """Set the display matrix of an mp4 to a clockwise rotation by 90 degrees, as phones held upright do."""
+def turn_video(path: Path, *rows: int) -> None:
+    """Set the display matrix of an mp4, of which the first two numbers of the first two rows are given."""
     data = bytearray(path.read_bytes())
     matrix = data.index(b"tkhd") + 4 + 40  # after version, flags, times, track, duration, layer and volume
-    one = (1 << 16).to_bytes(4, "big")
-    minus_one = (-(1 << 16)).to_bytes(4, "big", signed=True)
-    zero = bytes(4)
-    data[matrix : matrix + 24] = zero + one + zero + minus_one + zero + zero
+    a, b, c, d = ((value << 16).to_bytes(4, "big", signed=True) for value in rows)
+    data[matrix : matrix + 24] = a + b + bytes(4) + c + d + bytes(4)
     path.write_bytes(data)
 
 
@@ -155,14 +153,41 @@ def test_frames_are_spread_by_motion(tmp_path):
     assert ((taken >= 10) & (taken < 30)).sum() <= 3  # by time alone it is five
 
 
-def test_frames_of_a_rotated_video_are_upright(tmp_path):
+@pytest.mark.parametrize(
+    ("matrix", "size", "red"),
+    [
+        ((0, 1, -1, 0), (48, 64), (44, 4)),  # clockwise by 90 degrees, as phones held upright write it
+        ((-1, 0, 0, -1), (64, 48), (60, 44)),
+        ((-1, 0, 0, 1), (64, 48), (60, 4)),  # mirrored, as phones write it of their front cameras
+        ((1, 0, 0, -1), (64, 48), (4, 44)),
+        ((0, 1, 1, 0), (48, 64), (4, 4)),
+        ((0, -1, -1, 0), (48, 64), (44, 60)),
+    ],
+)
+def test_frames_of_a_video_are_turned_and_mirrored_as_players_show_them(tmp_path, matrix, size, red):
     write_video(tmp_path / "walk.mp4", [photograph(64, 48)] * 3, rate=2)
-    turn_video(tmp_path / "walk.mp4")
+    turn_video(tmp_path / "walk.mp4", *matrix)
     (tmp_path / "frames").mkdir()
     extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 3, QUIET)
     with Image.open(next((tmp_path / "frames").iterdir())) as frame:
-        assert frame.size == (48, 64)
-        assert is_red(frame, 44, 4)
+        assert frame.size == size
+        assert is_red(frame, *red)
+
+
+def test_hd_video_that_does_not_say_its_colours_is_of_bt_709(tmp_path):
+    colour, matrix = (40, 180, 60), {"ITU709": 1280, "ITU601": 640}
+    for name, width in matrix.items():
+        with av.open(str(tmp_path / "a.mp4"), "w") as container:
+            stream = container.add_stream("mpeg4", rate=5)
+            stream.width, stream.height, stream.pix_fmt = width, 96, "yuv420p"
+            frame = av.VideoFrame.from_image(Image.new("RGB", (width, 96), colour))
+            for _ in range(3):
+                container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=name)))
+            container.mux(stream.encode())
+        (tmp_path / name).mkdir()
+        extract_frames(tmp_path / "a.mp4", tmp_path / name, 1, QUIET)
+        with Image.open(next((tmp_path / name).iterdir())) as shown:
+            np.testing.assert_allclose(np.asarray(shown).mean(axis=(0, 1)), colour, atol=4)
 
 
 def add_streams(path: Path, *streams: tuple[tuple[int, int], int, dict[str, object]]) -> None:

@@ -337,6 +337,24 @@ def write_tiff(path: Path, pixels: np.ndarray, planar: int, kind: int) -> Path:
     return path
 
 
+def test_a_tiff_that_begins_with_a_thumbnail_is_refused(tmp_path):
+    photograph = Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    thumbnail = photograph.resize((16, 12))
+    photograph.save(tmp_path / "a.tif", save_all=True, append_images=[thumbnail])
+    np.testing.assert_array_equal(np.asarray(read_image(tmp_path / "a.tif")), np.asarray(photograph))
+    thumbnail.save(tmp_path / "a.tif", save_all=True, append_images=[photograph])
+    with pytest.raises(
+        SceneError, match=r"a\.tif begins with a thumbnail of 16x12 pixels, and a page of 64x48 follows"
+    ):
+        read_image(tmp_path / "a.tif")
+
+
+def test_integers_of_more_than_16_bits_have_no_white(tmp_path):
+    Image.fromarray(np.full((12, 16), 70_000, np.int32)).save(tmp_path / "a.tif")
+    with pytest.raises(SceneError, match=r"a\.tif holds integers of more than 16 bits"):
+        read_image(tmp_path / "a.tif")
+
+
 def test_a_tiff_is_read_in_its_colours_or_refused_as_what_it_is(tmp_path):
     pixels = np.arange(12 * 16 * 3, dtype=np.uint16).reshape(12, 16, 3) % 256
     for planar, kind in ((1, np.uint8), (2, np.uint8), (1, np.uint16)):

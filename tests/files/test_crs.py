@@ -15,7 +15,16 @@ from laspy.vlrs.known import GeoKeyEntryStruct
 from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.crs import crs_of, crs_there, given_crs, known_crs, metres_of, name_of
+from shellgs_method.files.crs import (
+    conversion,
+    converter,
+    crs_of,
+    crs_there,
+    given_crs,
+    known_crs,
+    metres_of,
+    name_of,
+)
 
 UTM = "EPSG:25832"
 
@@ -200,6 +209,21 @@ FEET = 1200 / 3937
 def test_a_shell_that_is_not_in_the_area_of_its_system_is_not_said_to_be_in_it(caplog, system, place, metres, is_there):
     assert crs_there(system, np.array(place, float), metres) == (system if is_there else "")
     assert ("outside its area: results are not said to be in it" in caplog.text) == (not is_there)
+
+
+def test_a_system_from_the_middle_of_the_earth_is_refused():
+    with pytest.raises(SceneError, match="counts from the middle of the Earth"):
+        metres_of("EPSG:4978", 1.0, (Path("scan.las"),))
+
+
+def test_nothing_is_converted_to_a_local_system():
+    local = 'LOCAL_CS["Site grid",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'
+    wgs84 = known_crs("EPSG:4326")
+    assert wgs84 is not None
+    assert np.isinf(conversion(wgs84, pyproj.CRS(local))(np.array([[8.4, 49.0]]))).all()
+    convert = converter(wgs84, local, "gcp.txt")
+    with pytest.raises(SceneError, match=r"gcp.txt: 8.4 49 100 cannot be converted from WGS 84 to Site grid: that is"):
+        convert(np.array([[8.4, 49.0, 100.0]]))
 
 
 def test_polar_systems_have_lengths():

@@ -22,7 +22,7 @@ from shellgs_method.files.photographs import load_mask, load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.gaussians.seeds import shell_seeds, view_of_shell
 from shellgs_method.geometry.camera import Camera
-from shellgs_method.losses.objective import ExtraLossConfig, self_losses
+from shellgs_method.losses.objective import ExtraLossConfig, SelfLosses
 from shellgs_method.registration import validate
 from shellgs_method.render.maps import Geometry
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
@@ -348,7 +348,7 @@ def test_masked_pixels_are_in_no_term_of_the_rendered_geometry():
 
     def terms(scale: float) -> dict[str, torch.Tensor]:
         changed = torch.where(kept, 1.0, scale)
-        return self_losses(Geometry(depth, changed * normal, alpha, camera, changed), extra, 0.5, kept)
+        return SelfLosses(kept, None, extra)(Geometry(depth, changed * normal, alpha, camera, changed), 0.5)
 
     assert terms(1.0).keys() == {"normal_consistency", "distortion"}
     for name, value in terms(1.0).items():
@@ -365,7 +365,7 @@ def test_normal_consistency_leaves_out_pixels_with_a_cue():
 
     def term(with_cue: torch.Tensor | None) -> torch.Tensor:
         extra = ExtraLossConfig(normal_consistency=2.0, normal_consistency_from=0)
-        return self_losses(geometry, extra, 0.5, kept, with_cue)["normal_consistency"]
+        return SelfLosses(kept, with_cue, extra)(geometry, 0.5)["normal_consistency"]
 
     each = 1 - (normal * geometry.depth_normal).sum(-1, keepdim=True)
     torch.testing.assert_close(term(None), 2 * each[kept].mean())

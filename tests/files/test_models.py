@@ -89,6 +89,25 @@ def test_the_features_of_a_cityjsonseq_have_vertices_of_their_own(tmp_path: Path
     assert_cast_as(tmp_path / "a.city.jsonl", moved([*house(), *other]))
 
 
+def test_files_of_features_that_were_joined_keep_their_transforms(tmp_path: Path):
+    lines = []
+    for name, east in (("a", 0.0), ("b", 20.0)):
+        document = made.cityjson(house(), name=name)
+        document["transform"]["translate"][0] += east
+        lines += [{**document, "CityObjects": {}, "vertices": []}]
+        lines += [{"type": "CityJSONFeature", **{k: document[k] for k in ("CityObjects", "vertices")}}]
+    (tmp_path / "a.city.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    other = [Face([ring + np.array([20, 0, 0]) for ring in face.rings], face.surface) for face in house()]
+    assert_cast_as(tmp_path / "a.city.jsonl", moved([*house(), *other]))
+
+
+def test_levels_of_detail_may_be_called_so_and_objects_have_no_geometry(tmp_path: Path):
+    document = made.cityjson(house())
+    document["CityObjects"]["a"]["geometry"][0]["lod"] = "LoD3"
+    document["CityObjects"]["b"] = {"type": "Building", "geometry": None}
+    assert_cast_as(made.save_json(tmp_path / "a.json", document), moved(house()))
+
+
 def test_the_highest_level_of_detail_is_read_and_said(tmp_path: Path, caplog):
     document = made.cityjson(house())
     low = {"type": "MultiSurface", "lod": "1.2", "boundaries": [[[0, 1, 2]]]}

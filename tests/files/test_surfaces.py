@@ -494,6 +494,12 @@ def test_all_solids_of_an_ascii_stl_are_read(tmp_path: Path):
     assert_same_surface(read_geometry(tmp_path / "a.stl"))
 
 
+@pytest.mark.parametrize("end", ["end solid ", "endsolid", "ENDSOLID"])
+def test_solids_of_an_ascii_stl_end_as_programs_write_it(tmp_path: Path, end: str):
+    (tmp_path / "a.stl").write_text(solid("a", FACES).replace("endsolid ", end))
+    assert_same_surface(read_geometry(tmp_path / "a.stl"))
+
+
 @pytest.mark.parametrize("lines", [-1, -2, -4, -30])
 def test_a_cut_ascii_stl_is_refused(tmp_path: Path, lines: int):
     text = solid("a", FACES[:5]) + solid("b", FACES[5:])
@@ -786,6 +792,16 @@ def test_later_pieces_of_a_text_are_read_like_the_first(tmp_path: Path, monkeypa
     assert len([*cloud]) == 5
 
 
+@pytest.mark.parametrize("written", ["-nan(ind)", "-1.#IND", "1.#QNAN0", "1.#INF"])
+@pytest.mark.parametrize(("name", "before"), [("a.xyz", ""), ("a.obj", "v ")])
+def test_nan_is_read_as_windows_writes_it(tmp_path: Path, name: str, before: str, written: str):
+    lines = [before + " ".join(map(str, point)) for point in POINTS[:50].tolist()]
+    lines[7] = f"{before}0.5 {written} 1.5"
+    (tmp_path / name).write_text("\n".join(lines))
+    finite = np.isfinite(read_geometry(tmp_path / name).vertices).all(axis=1)
+    np.testing.assert_array_equal(finite, np.arange(50) != 7)
+
+
 def scan_of_ptx(points: np.ndarray, matrix: np.ndarray, transposed: bool = True) -> list[str]:
     """A scan of 10 columns; the matrix is for columns, as everywhere but in PTX, where it stands transposed."""
     head = ["10", f"{len(points) // 10}", *(" ".join(map(str, row)) for row in (matrix[:3, 3], *np.eye(3)))]
@@ -976,6 +992,18 @@ def test_spherical_coordinates_of_an_e57_become_cartesian_without_misses(tmp_pat
     writer.close()
     file.close()
     np.testing.assert_allclose(read_geometry(tmp_path / "a.e57").vertices, POINTS, atol=1e-5)
+
+
+def test_a_las_that_counts_its_points_as_before_1_4_alone_is_refused_as_such(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.4"))
+    las.x, las.y, las.z = POINTS.astype(np.float64).T
+    las.write(str(tmp_path / "a.las"))
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[107:111], data[247:255] = len(POINTS).to_bytes(4, "little"), bytes(8)
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(SceneError, match=f"counts {len(POINTS)} points as before LAS 1.4, and 0 as LAS 1.4 does"):
+        read_geometry(tmp_path / "a.las")
 
 
 @pytest.mark.parametrize("kind", [3, 6])

@@ -368,16 +368,19 @@ def test_the_gradient_of_empty_space_is_right_and_finite_on_the_wall(random):
 def test_normal_consistency_equals_its_formula_pixel_by_pixel(random):
     normal, depth_normal = some_normals(random), some_normals(random)
     alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
-    expected = np.mean(
-        [1 - alpha[v, u, 0] * (normal[v, u] @ depth_normal[v, u]) for v in range(HEIGHT) for u in range(WIDTH)]
+    weights = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    expected = sum(
+        float(weights[v, u, 0] * (1 - alpha[v, u, 0] * (normal[v, u] @ depth_normal[v, u])))
+        for v in range(HEIGHT)
+        for u in range(WIDTH)
     )
-    assert float(normal_consistency_loss(normal, depth_normal, alpha)) == pytest.approx(expected)
+    assert float(normal_consistency_loss(normal, depth_normal, alpha, weights)) == pytest.approx(expected)
 
 
 def test_normal_consistency_has_no_gradient_to_alpha(random):
     alpha = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64).requires_grad_()
     normal = some_normals(random).requires_grad_()
-    loss = normal_consistency_loss(normal, some_normals(random), alpha)
+    loss = normal_consistency_loss(normal, some_normals(random), alpha, torch.ones_like(alpha))
     assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
 
 
@@ -408,7 +411,7 @@ def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[s
         "smoothness": (SmoothnessLoss(x, mask), normal),
         "empty space": (partial(EmptySpaceLoss(x, target, rays, mask.float()), alpha=b[..., :1] + 0.5), y),
         "normals of depth": (lambda depth: (target * normals(depth)).sum(), y),
-        "normal consistency": (lambda normal: normal_consistency_loss(normal, target, x, mask), normal),
+        "normal consistency": (lambda normal: normal_consistency_loss(normal, target, x, mask.float()), normal),
     }
 
 

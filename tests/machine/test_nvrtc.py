@@ -69,7 +69,7 @@ def calls(device: str) -> dict[str, tuple[Callable, list[Tensor]]]:
         "smoothness": (lambda n: SmoothnessLoss(x, mask)(n), [normal]),
         "empty space": (lambda squares, alpha: empty_space(squares, alpha), [y, b[..., :1] + 0.5]),
         "normals of depth": (lambda depth: normals_along_rays(depth, rays), [y]),
-        "normal consistency": (lambda normal: normal_consistency_loss(normal, target, x, mask), [normal]),
+        "normal consistency": (lambda normal: normal_consistency_loss(normal, target, x, mask.float()), [normal]),
         "channels": (channels, [means, quats]),
         "colours": (colours, [means, coefficients[:, :1], coefficients[:, 1:]]),
         "Gaussians": splat_maps(project_gaussians, make_splats, device),

@@ -726,6 +726,7 @@ def test_a_file_of_positions_is_read_in_opendronemaps_format(tmp_path, first):
     [
         "imageName X Y Z Omega Phi Kappa",  # of Pix4D
         "filename,pose.position.x,pose.position.y,pose.position.z,pose.orientation.x,a,b",  # of ROS
+        "#PhotoID, X, Y, Z, Omega, Phi, Kappa",  # of Metashape
         "Image Name,Position X,Position Y,Position Z,a,b,c",
     ],
 )

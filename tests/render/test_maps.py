@@ -132,7 +132,7 @@ def test_what_is_behind_the_surface_does_not_move_its_depth_and_normals():
     means, quats, scales = (both[name] for name in ("means", "quats", "scales"))
     opacities = torch.full((len(means),), 0.1)
     composited, alpha, info = rasterize(means, quats, scales.exp(), opacities, channels, CAMERA)
-    geometry = rendered_geometry(composited, alpha, info, CAMERA, "expected", origin, composited[..., -1:])
+    geometry = rendered_geometry(composited, alpha, info, CAMERA, "expected", origin)
     alone = render(front, "3d", "expected", 0.1)
     assert geometry.surface is not None
     assert geometry.moments is not None

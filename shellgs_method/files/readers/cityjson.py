@@ -50,31 +50,37 @@ def read_cityjson(path: Path) -> Geometry:
         documents = [json.loads(line) for line in text.splitlines() if line.strip()]
         if len(documents) < 2:
             raise
-    first = documents[0]
-    if not isinstance(first, dict) or first.get("type") != "CityJSON":
-        raise SceneError(f"the shell {path} is {_other_json(first)}")
-    if not str(first.get("version", "")).startswith(("1.", "2.")):
-        raise SceneError(f"the shell {path} is CityJSON {first.get('version')}: upgrade it to 2.0 (cjio … upgrade)")
+    head = documents[0]
+    if not isinstance(head, dict) or head.get("type") != "CityJSON":
+        raise SceneError(f"the shell {path} is {_other_json(head)}")
     missing: Counter[str] = Counter()
-    objects = [each for document in documents for each in _Document(document, first, missing).objects()]
+    objects: list[CityObject] = []
+    for document in documents:
+        if document.get("type") == "CityJSON":  # of several files that were joined, each begins with one
+            head = document
+            if not str(head.get("version", "")).startswith(("1.", "2.")):
+                raise SceneError(
+                    f"the shell {path} is CityJSON {head.get('version')}: upgrade it to 2.0 (cjio … upgrade)"
+                )
+        objects += _Document(document, head, missing).objects()
     return outside(objects, path, missing)
 
 
 class _Document:
-    """A CityJSON, or a feature of a CityJSONSeq, whose transform and templates are in the first line.
+    """A CityJSON, or a feature of a CityJSONSeq, whose transform and templates are in the CityJSON above it.
 
     Args:
         document: its json.
-        first: the json of the file's first line.
+        head: that of the CityJSON.
         missing: counts what is not read.
     """
 
-    def __init__(self, document: dict[str, Any], first: dict[str, Any], missing: Counter[str]) -> None:
+    def __init__(self, document: dict[str, Any], head: dict[str, Any], missing: Counter[str]) -> None:
         self.json, self.missing = document, missing
         self.vertices = np.array(document.get("vertices", []), np.float64).reshape(-1, 3)
-        if transform := first.get("transform"):
+        if transform := head.get("transform"):
             self.vertices = self.vertices * np.array(transform["scale"]) + np.array(transform["translate"])
-        templates = first.get("geometry-templates", {})
+        templates = head.get("geometry-templates", {})
         self.templates = templates.get("templates", [])
         self.template_vertices = np.array(templates.get("vertices-templates", []), np.float64).reshape(-1, 3)
 
@@ -90,7 +96,7 @@ class _Document:
 
     def _object(self, fields: dict[str, Any]) -> CityObject:
         made = CityObject(str(fields["type"]))
-        for geometry in fields.get("geometry", []):
+        for geometry in fields.get("geometry") or []:
             polygons = list(self._polygons(geometry))
             if polygons:
                 made.levels.setdefault(self._level(geometry), []).extend(polygons)
@@ -99,7 +105,7 @@ class _Document:
     def _level(self, geometry: dict[str, Any]) -> float:
         if "template" in geometry:
             geometry = self.templates[geometry["template"]]
-        return float(geometry.get("lod", 0))
+        return float(str(geometry.get("lod", 0)).lower().removeprefix("lod"))
 
     def _polygons(self, geometry: dict[str, Any]) -> Iterator[Polygon]:
         if geometry["type"] != "GeometryInstance":

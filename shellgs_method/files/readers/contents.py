@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from shellgs_method.files.readers.points import NO_POINTS
 from shellgs_method.geometry.polygons import triangulated
 from shellgs_method.geometry.surface_classes import NO_CLASSES, classes_of
 
+_WINDOWS_NAN = re.compile(r"[-+]?(1\.#[A-Z]+\d*|nan\([a-z]*\))", re.IGNORECASE)
 NO_FACES = np.empty((0, 3), np.int64)
 
 
@@ -54,6 +56,11 @@ def splats(path: Path) -> SceneError:
 def drawing(path: Path) -> SceneError:
     """The refusal of a file of lines without faces, whose ends are no points of the surface between them."""
     return SceneError(f"the shell {path} is a drawing of lines, which have no surface: export its faces, or a scan")
+
+
+def with_nan(line: str) -> str:
+    """A line of numbers, with NaN where Windows writes it, or infinity, as ``-1.#IND`` or ``-nan(ind)``."""
+    return _WINDOWS_NAN.sub("nan", line) if "#" in line or "(" in line else line
 
 
 def left_out(path: Path, count: int, total: int, what: str) -> None:

@@ -10,7 +10,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.readers.contents import NO_POINTS, Geometry, drawing, left_out, numbers_in, polygon_triangles
+from shellgs_method.files.readers.contents import (
+    NO_POINTS,
+    Geometry,
+    drawing,
+    left_out,
+    numbers_in,
+    polygon_triangles,
+    with_nan,
+)
 
 _CURVED = ("curv", "surf", "bsp", "bzp", "cdc", "cdp", "res ")
 
@@ -41,7 +49,7 @@ def read_obj(path: Path) -> Geometry:
     left_out(path, curved, curved + len(faces), "elements, which are curves or curved surfaces")
     if lines and not faces:
         raise drawing(path)
-    points = np.loadtxt(vertices, usecols=(1, 2, 3), ndmin=2) if vertices else NO_POINTS
+    points = np.loadtxt(map(with_nan, vertices), usecols=(1, 2, 3), ndmin=2) if vertices else NO_POINTS
     sizes = np.array([len(face.split()) for face in faces], np.int64)
     stored = numbers_in(re.sub(r"/\S*", "", " ".join(faces)), int)
     corners = np.where(stored > 0, stored - 1, stored + np.repeat(np.array(above, np.int64), sizes))
@@ -68,7 +76,8 @@ def read_stl(path: Path) -> Geometry:
     if b"\0" in data[:_STL_PROBE]:  # text has none
         return _binary_stl(path, data)
     words = [line.split() for line in data.decode("latin-1").removeprefix(_BOM).lower().splitlines()]
-    solids, ends, facets = (sum(line[:1] == [word] for line in words) for word in ("solid", "endsolid", "facet"))
+    solids, facets = (sum(line[:1] == [word] for line in words) for word in ("solid", "facet"))
+    ends = sum("".join(line[:2]).startswith("endsolid") for line in words)  # end solid NAME, endsolidNAME
     if not solids:
         raise ValueError("it is neither a binary STL nor one of text")
     corners = np.array([line[1:4] for line in words if line[:1] == ["vertex"]], np.float64).reshape(-1, 3)

@@ -13,7 +13,7 @@ from typing import TextIO
 import numpy as np
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.readers.contents import left_out
+from shellgs_method.files.readers.contents import left_out, with_nan
 from shellgs_method.files.readers.points import NO_POINTS, PIECE, Points
 from shellgs_method.files.tables import COORDINATES, LATITUDE, LONGITUDE
 
@@ -78,7 +78,7 @@ def read_ptx(path: Path) -> Iterator[Points]:
         ValueError: it is damaged, or cut off.
     """
     misses = total = 0
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         lines = (line for line in file if line.strip())
         while size := next(lines, ""):
             rays = int(size) * int(next(lines, ""))
@@ -127,7 +127,7 @@ class _Lines:
             if _WHOLE.fullmatch(line):
                 self.claimed += int(line)
                 continue
-            yield line
+            yield with_nan(line)
 
 
 def _separator(lines: list[str], path: Path) -> str | None:
