@@ -125,7 +125,8 @@ class Recipe:
             raise SceneError("give a video (or a folder of photographs) and a scan")
         for path in (*self.sources, self.picks, self.matrix, self.positions):
             if path and not path.exists():
-                raise FileNotFoundError(f"{path} does not exist")
+                later = path == self.picks and ": leave --picks out until `shellgs pick` or a text editor has made it"
+                raise FileNotFoundError(f"{path} does not exist{later or ''}")
         scene = self.sources[0]
         if any(cameras.exists() for cameras in _cameras(scene)):
             raise SceneError(

@@ -269,7 +269,7 @@ def _histogram(validation: Validation) -> Figure | None:
     axes.hist(np.clip(100 * validation.signed, -50, 50), bins=100, color="#4493f8")
     axes.axvline(100 * validation.bias, color=COLOURS["refused"], linewidth=1, label="median")
     axes.set(xlabel="distance from the shell (cm), positive in front of it", ylabel="SfM points", xlim=(-51, 51))
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="upper right")
     return figure
 
 

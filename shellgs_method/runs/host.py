@@ -17,7 +17,7 @@ from typing import Any, NoReturn, TextIO
 
 import numpy as np
 
-from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.errors import SceneError, check_output, notice, refusals_end_the_program
 from shellgs_method.render.panorama import check_camera_type
 from shellgs_method.runs.limits import check_viewer
 
@@ -127,8 +127,27 @@ def _is_pose(matrix: object) -> bool:
     return values.size == 16 and bool(np.isfinite(values).all())
 
 
+def _mend_eval(evaluation: Any) -> None:
+    """Ns-eval refuses other suffixes than .json by a bare assert, and a file that it may not write at the end."""
+    if command := _running(evaluation.ComputePSNR):
+        path = command.output_path
+        with refusals_end_the_program():
+            if path.suffix != ".json":
+                raise SceneError(f"--output-path {path} must end in .json, which ns-eval writes")
+            check_output(path)
+
+
 def _mend_exporter(exporter: Any) -> None:
-    """Ns-export writes no empty file of Gaussians."""
+    """Ns-export writes no empty file of Gaussians, none where it may not, and says nothing of its frame."""
+    if command := _running(exporter.ExportGaussianSplat):
+        path = command.output_dir / command.output_filename
+        with refusals_end_the_program():
+            check_output(path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+        notice(
+            "ns-export writes Gaussians in nerfstudio's frame, whose z is up by the cameras, and not in metres: "
+            "`shellgs splats CONFIG` writes them in metres, in the shell's frame."
+        )
 
     def refuse_none(filename: str, count: int, _columns: Any) -> None:
         if count == 0:
@@ -147,7 +166,18 @@ def _mend_viewer(run_viewer: Any) -> None:
     )
 
 
+def _running(kind: type) -> Any:
+    """The command of a class whose ``main`` is loading the run; None if another one is."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        if frame.f_code.co_name == "main" and isinstance(command := frame.f_locals.get("self"), kind):
+            return command
+        frame = frame.f_back
+    return None
+
+
 _MENDS = {
+    "nerfstudio.scripts.eval": _mend_eval,
     "nerfstudio.scripts.render": _mend_render,
     "nerfstudio.scripts.exporter": _mend_exporter,
     "nerfstudio.scripts.viewer.run_viewer": _mend_viewer,

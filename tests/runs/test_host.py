@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.scripts import eval as evaluation
 from nerfstudio.scripts import exporter, render  # before a pipeline is built, as in their commands
 from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.viewer.utils import parse_object
@@ -20,6 +21,8 @@ from nerfstudio.viewer_legacy.server.gui_utils import parse_object as parse_for_
 from PIL import Image
 from training_runs import data_of, held_out, model_of, trainer_of
 
+from shellgs_method.pipeline import FacadePipeline
+from shellgs_method.runs.host import mend_commands
 from shellgs_method.trainer import FacadeTrainer
 
 NOWHERE = {
@@ -184,3 +187,37 @@ def test_what_is_refused_to_commands_does_not_stop_the_viewer(trainer):
     """It reads every attribute of a pipeline in search of its elements."""
     assert parse_object(trainer.pipeline, ViewerElement, "Custom") is not None
     assert parse_for_legacy(trainer.pipeline, ViewerElement, "Custom") is not None
+
+
+@pytest.fixture
+def loads(trainer, monkeypatch) -> None:
+    """Ns-eval and ns-export load that run as they do a file's, which mends them."""
+
+    def load(*_: Any, **__: Any) -> tuple:
+        mend_commands()
+        return trainer.config, trainer.pipeline, Path("step-1.ckpt"), 0
+
+    for module in (evaluation, exporter):
+        monkeypatch.setattr(module, "eval_setup", load)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"), [("eval", "must end in .json"), ("file/eval.json", "is a file, not a folder")]
+)
+def test_ns_eval_refuses_an_output_before_it_evaluates(loads, tmp_path, monkeypatch, name, why):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(FacadePipeline, "get_average_eval_image_metrics", lambda *_, **__: pytest.fail("evaluated"))
+    with pytest.raises(SystemExit, match=rf"^shellgs: .*{why}"):
+        evaluation.ComputePSNR(CONFIG, tmp_path / name).main()
+
+
+def test_ns_export_tells_of_its_frame_and_makes_folders(loads, tmp_path, caplog):
+    exporter.ExportGaussianSplat(CONFIG, tmp_path, output_filename="a/b.ply").main()
+    assert (tmp_path / "a/b.ply").stat().st_size > 1000
+    assert "`shellgs splats CONFIG` writes them in metres" in caplog.text
+
+
+def test_ns_export_refuses_a_file_that_cannot_be_written(loads, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"^shellgs: .*is a file, not a folder"):
+        exporter.ExportGaussianSplat(CONFIG, tmp_path, output_filename="file/b.ply").main()
