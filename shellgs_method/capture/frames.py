@@ -11,7 +11,6 @@ import av.container
 import av.error
 import cv2
 import numpy as np
-from av.sidedata.sidedata import Type
 from av.stream import Disposition
 from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
@@ -234,7 +233,7 @@ def _upright(frame: av.VideoFrame, transfer: Transfer | None, aspect: float) -> 
 
 def _display_matrix(frame: av.VideoFrame) -> Float[np.ndarray, "2 2"] | None:
     """How the picture is turned or mirrored for display, for row vectors; None if it is not."""
-    stored = frame.side_data.get(Type.DISPLAYMATRIX)
+    stored = frame.side_data.get("DISPLAYMATRIX")
     return None if stored is None else np.frombuffer(bytes(stored), np.int32).reshape(3, 3)[:2, :2] / 2**16
 
 
