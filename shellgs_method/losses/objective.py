@@ -27,6 +27,7 @@ from shellgs_method.losses import (
     normal_consistency_loss,
     vid2sim_ncc_loss,
 )
+from shellgs_method.losses.reduction import mean_weights
 from shellgs_method.machine.memory import free_memory
 from shellgs_method.render.maps import Geometry
 
@@ -275,7 +276,7 @@ class SelfLosses:
 
     @cached_property
     def _weights(self) -> Float[Tensor, "H W 1"]:
-        return self.kept / self.kept.sum().clamp_min(1)
+        return mean_weights(self.kept, like=self.kept.float())
 
     @cached_property
     def _without_cue(self) -> Float[Tensor, "H W 1"]:
