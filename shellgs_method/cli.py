@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 
 import tyro
@@ -46,20 +45,13 @@ COMMANDS = (
     doctor,
 )
 
-INTERRUPTED = 130
-"""What a shell expects of a command that Ctrl-C ended."""
-
 
 def main() -> None:
     """Entry point."""
     for category in (FutureWarning, SyntaxWarning):  # raised by dependencies, no use to a user
         warnings.filterwarnings("ignore", category=category)
-    try:
-        with refusals_end_the_program():
-            tyro.extras.subcommand_cli_from_dict(
-                {command.__name__: command for command in COMMANDS},
-                description="Prepare scenes, compare methods, evaluate and export runs. `ns-train` trains the methods.",
-            )
-    except KeyboardInterrupt:
-        print("shellgs: stopped", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+    with refusals_end_the_program():
+        tyro.extras.subcommand_cli_from_dict(
+            {command.__name__: command for command in COMMANDS},
+            description="Prepare scenes, compare methods, evaluate and export runs. `ns-train` trains the methods.",
+        )

@@ -15,6 +15,10 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 
+INTERRUPTED = 130
+"""What a shell expects of a command that Ctrl-C ended."""
+
+
 class SceneError(ValueError):
     """The input cannot be used; the message says what is wrong, in which file or view, and what to do."""
 
@@ -105,7 +109,7 @@ def _stdout_is_closed() -> bool:
 
 @contextmanager
 def refusals_end_the_program() -> Iterator[None]:
-    """Turn a refusal into one sentence on stderr and exit status 1; a bug keeps its traceback."""
+    """Turn a refusal into one sentence on stderr and exit status 1, and Ctrl-C into 130; a bug keeps its traceback."""
     try:
         yield
     except OSError as error:
@@ -115,3 +119,6 @@ def refusals_end_the_program() -> Iterator[None]:
         raise SystemExit(f"shellgs: {error if ours else explained(error)}") from error
     except SceneError as error:
         raise SystemExit(f"shellgs: {error}") from error
+    except KeyboardInterrupt:
+        print("shellgs: stopped", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None

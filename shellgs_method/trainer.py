@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import sys
 from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -19,16 +20,18 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 from tyro.conf import Suppress
 
 from shellgs_method.bounds import Rate
-from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.errors import INTERRUPTED, SceneError, refusals_end_the_program
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.gaussians.pruning import broken, hardly_shown, unshaped
 from shellgs_method.geometry.camera import Camera
+from shellgs_method.machine.interrupts import at_interrupt
 from shellgs_method.machine.progress import ITERATION, Lines, tell, track
 from shellgs_method.runs.checkpoints import find_checkpoint, load_checkpoint, unwritten
 from shellgs_method.runs.folders import held
@@ -144,6 +147,8 @@ class FacadeTrainer(Trainer):
         self._skipped = 0
         self._unread: list[tuple[int, str, dict[str, Tensor]]] = []
         self._lines = Lines(ITERATION, self.config.max_num_iterations)
+        self._stopped = False  # by Ctrl-C
+        self._trained = self._start_step - 1  # the last step that was
         self._last_step = self.config.max_num_iterations - 1  # later versions of nerfstudio change the setting
 
     def setup_optimizers(self) -> GuardedOptimizers:
@@ -164,7 +169,12 @@ class FacadeTrainer(Trainer):
             self.pipeline.restore_training()
             _ = self.pipeline.datamanager.cached_train  # read the photographs here, not in the first iteration
             tell("Loading kernels")
-            super().train()
+            with at_interrupt(self._stop):
+                super().train()
+
+    def _stop(self) -> None:
+        CONSOLE.print("[yellow]Stopping after this iteration, to save it; Ctrl-C again stops at once.")
+        self._stopped = self.stop_training = True
 
     def train_iteration(self, step: int):
         """One step, skipped where its gradients are not finite. The last one ends the run.
@@ -187,7 +197,8 @@ class FacadeTrainer(Trainer):
             self._remove_broken_gaussians(step)
         if step == self.pipeline.model.strategy.refine_stop_iter and self.pipeline.model.config.init == "shell":
             self._remove_hardly_shown_gaussians()
-        if step >= self._last_step:
+        self._trained = step
+        if step >= self._last_step or self._stopped:
             self.stop_training = True
         return loss, losses, metrics
 
@@ -257,12 +268,23 @@ class FacadeTrainer(Trainer):
             raise SceneError(f"training stopped at step {step} with no Gaussian left, because {why}; {self._last_good}")
 
     def _after_train(self) -> None:
+        self.step = self._trained  # nerfstudio's is the next one
         if self.step >= self._last_step:
-            self.step = self._last_step
             with self.train_lock:  # the viewer renders
                 self._remove_broken_gaussians(self.step)
                 self._remove_unshaped_gaussians()
+        elif self._stopped:
+            self._save_and_exit()
         super()._after_train()
+
+    def _save_and_exit(self) -> None:
+        done = f"{self.step + 1} of {self.config.max_num_iterations} iterations"
+        if self.step >= self._start_step:
+            self.save_checkpoint(self.step)
+            done += f": resume with --load-dir {self.checkpoint_dir}"
+        writer.write_out_storage()
+        CONSOLE.print(f"Stopped after {done}.", soft_wrap=True, highlight=False)
+        sys.exit(INTERRUPTED)
 
     def _load_checkpoint(self) -> None:
         """Resume from the checkpoint that ``load_dir`` or ``load_checkpoint`` names, if any."""

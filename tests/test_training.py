@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import math
 import shutil
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 import torch
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from scipy.spatial.transform import Rotation
 from training_runs import data_of, held_out, model_of, render, trainer_of
 
@@ -19,7 +22,7 @@ import benchmarks.step
 import shellgs_method.render.view
 import shellgs_method.trainer
 from dataparsers.cameras import pinhole_camera
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import INTERRUPTED, SceneError
 from shellgs_method.evaluation import colours_to_normals
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.losses.objective import KEPT_BYTES, MAX_KEPT_SHARE
@@ -295,33 +298,62 @@ def test_a_resumed_run_trains_the_restored_parameters_to_the_planned_end(pristin
     assert (model.opacities.detach() - saved["opacities"]).abs().max() > 0.05
 
 
-def test_a_resumed_run_ends_as_one_that_was_never_stopped(pristine_scene, tmp_path, monkeypatch):
-    """To the last digit, on one thread: Gaussians, moments, sums of gradients, the order of views, random numbers."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+def saving_often(config) -> None:
+    densify_early(config)
+    config.steps_per_save, config.save_only_latest_checkpoint = 8, False
 
-    def change(config):
-        densify_early(config)
-        config.steps_per_save, config.save_only_latest_checkpoint = 8, False
 
+@pytest.fixture(scope="module")
+def whole(pristine_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[FacadeTrainer]:
+    """A run of 20 iterations on one thread, with which a seed gives the same numbers again."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    whole = trainer_of(pristine_scene, tmp_path, "shellgs", iterations=20, change=change)
-    whole.train()
-    for last in whole.checkpoint_dir.glob("step-00000001[69].ckpt"):
-        last.unlink()
-    resumed = trainer_of(pristine_scene, tmp_path / "r", "shellgs", 20, whole.checkpoint_dir, change=change)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")
+        torch.set_num_threads(1)
+        trainer = trainer_of(pristine_scene, tmp_path_factory.mktemp("whole"), "shellgs", 20, change=saving_often)
+        trainer.train()
+        yield trainer
+    torch.set_num_threads(before)
+
+
+def ends_alike(trainer: FacadeTrainer, whole: FacadeTrainer) -> bool:
+    """Whether Gaussians and sums of gradients are the same to the last digit."""
+    gaussians, sums = model_of(whole).gauss_params, model_of(whole).strategy_state
+    return all(torch.equal(each, gaussians[name]) for name, each in model_of(trainer).gauss_params.items()) and all(
+        torch.equal(sums[name], each)
+        for name, each in model_of(trainer).strategy_state.items()
+        if name in ("grad2d", "count")
+    )
+
+
+def test_a_resumed_run_ends_as_one_that_was_never_stopped(whole, pristine_scene, tmp_path):
+    """Moments, the order of views and random numbers are those that were saved, too."""
+    (tmp_path / "saved").mkdir()
+    shutil.copy(whole.checkpoint_dir / "step-000000008.ckpt", tmp_path / "saved")
+    resumed = trainer_of(pristine_scene, tmp_path, "shellgs", 20, tmp_path / "saved", change=saving_often)
     assert resumed._start_step == 9
     torch.manual_seed(1)
     resumed.train()
-    torch.set_num_threads(before)
-    gaussians = model_of(whole).gauss_params
-    assert all(torch.equal(each, gaussians[name]) for name, each in model_of(resumed).gauss_params.items())
-    sums = model_of(whole).strategy_state
-    assert all(
-        torch.equal(sums[name], each)
-        for name, each in model_of(resumed).strategy_state.items()
-        if name in ("grad2d", "count")
-    )
+    assert ends_alike(resumed, whole)
+
+
+def test_ctrl_c_saves_the_iteration_and_the_run_resumes_there(whole, pristine_scene, tmp_path, monkeypatch, capsys):
+    def stop_at_12(step: int) -> None:
+        if step == 12:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(signal, "getsignal", lambda _: signal.default_int_handler)  # a test's may be another
+    stopped = trainer_of(pristine_scene, tmp_path / "s", "shellgs", 20, change=saving_often)
+    stopped.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], stop_at_12))
+    with pytest.raises(SystemExit) as end:
+        stopped.train()
+    assert end.value.code == INTERRUPTED
+    saved = stopped.checkpoint_dir
+    assert sorted(path.name for path in saved.iterdir()) == ["step-000000008.ckpt", "step-000000012.ckpt"]
+    assert f"Stopped after 13 of 20 iterations: resume with --load-dir {saved}." in capsys.readouterr().out
+    resumed = trainer_of(pristine_scene, tmp_path / "r", "shellgs", 20, saved, change=saving_often)
+    resumed.train()
+    assert ends_alike(resumed, whole)
 
 
 def test_a_resumed_run_keeps_which_gaussians_are_behind_the_shell(pristine_scene, tmp_path):

@@ -16,6 +16,7 @@ from PIL import Image
 from shellgs_method import cli
 from shellgs_method.cli import main
 from shellgs_method.commands.common import open_page
+from shellgs_method.errors import INTERRUPTED
 from shellgs_method.machine import doctor
 
 DEMO = ("demo", "demo", "--width", 64, "--height", 48, "--views", 10, "--iterations", 20)
@@ -230,5 +231,5 @@ def test_a_command_that_is_stopped_by_its_user_says_so_without_a_traceback(monke
     monkeypatch.setattr("sys.argv", ["shellgs", "street"])
     with pytest.raises(SystemExit) as end:
         cli.main()
-    assert end.value.code == cli.INTERRUPTED
+    assert end.value.code == INTERRUPTED
     assert capsys.readouterr().err.splitlines() == ["shellgs: stopped"]
