@@ -452,12 +452,12 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
             )
 
     def _load_images(self, split, cache_images_device):
-        # "cpu" pins memory, which needs CUDA, and nerfstudio switches to it by itself above 500 images; "gpu" means
-        # self.device (https://github.com/nerfstudio-project/nerfstudio/issues/3290).
+        # "cpu" pins memory, which needs CUDA; "gpu" means self.device
+        # (https://github.com/nerfstudio-project/nerfstudio/issues/3290). What fits a GPU is moved there by _on_gpu.
         with refusals_end_the_program():
             if split == "train":
                 self._hold_maps_if_they_fit()
-            return super()._load_images(split, cache_images_device if torch.cuda.is_available() else "gpu")
+            return super()._load_images(split, "cpu" if torch.cuda.is_available() else "gpu")
 
 
 def _moved(value: Any, device: torch.device | str) -> Any:

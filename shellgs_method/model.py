@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from tyro.conf import Suppress
 
 from dataparsers.cameras import pinhole_camera
-from shellgs_method.bounds import Bounds, Count, FromOne, Share, Weight
+from shellgs_method.bounds import Bounds, Count, FromOne, Weight
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import Rendering, colours_to_normals, geometry_images, normals_to_colours
 from shellgs_method.evaluation.pixels import kept_pixels
@@ -102,7 +102,7 @@ class FacadeModelConfig(SplatfactoModelConfig):
     warmup_length: Count = 500
     stop_split_at: Count = 15_000
     refine_every: FromOne = 100
-    cull_alpha_thresh: Share = 0.005
+    cull_alpha_thresh: Annotated[float, Bounds(0, 0.5)] = 0.005
     cull_scale_thresh: Weight = 0.1
     densify_grad_thresh: Weight = 0.0002
 
@@ -445,7 +445,7 @@ class FacadeModel(SplatfactoModel):
         """Metrics of a training view, in the steps in which they are logged."""
         if self.training and self.step % self.log_every > 0:
             return {}
-        target = self._view(batch, outputs["background"]).photometric.target
+        target = self._view(batch).photometric.target
         error = (outputs["rgb"].detach() - target).square()
         psnr = -10 * weighted_mean(error, kept_pixels(batch, target)).log10()
         metrics = {"psnr": psnr, "gaussian_count": torch.tensor(float(self.num_points))}
@@ -453,7 +453,7 @@ class FacadeModel(SplatfactoModel):
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """The objective's terms of the view that was rendered last."""
-        view, progress = self._view(batch, outputs["background"]), self.step / self.num_iterations
+        view, progress = self._view(batch), self.step / self.num_iterations
         transient = self._transient(view, batch["image_idx"], outputs["rgb"]) if self.training else None
         losses = self.objective(view, outputs["rgb"], self.geometry, progress, transient)
         return losses | self.objective.of_shapes(self.scales, self.info["radii"][0, : self.num_points])
@@ -466,14 +466,8 @@ class FacadeModel(SplatfactoModel):
             images = (exposed(image, -self.exposures.log_gains[index].detach()) for image in images)
         return self.transients(index, *images, self.geometry.depth.detach(), self.geometry.camera)
 
-    def _view(self, batch: dict, background: Tensor) -> ViewLosses:
-        changes = self.config.background_color == "random" and batch["image"].shape[-1] == 4
-        return self.objective.view(
-            batch, lambda: self._photograph(batch, background), keep=self.training and not changes
-        )
-
-    def _photograph(self, batch: dict, background: Tensor) -> Float[Tensor, "H W 3"]:
-        return self.composite_with_background(self.get_gt_img(batch["image"]), background)
+    def _view(self, batch: dict) -> ViewLosses:
+        return self.objective.view(batch, lambda: self.get_gt_img(batch["image"]), keep=self.training)
 
     def _unclipped_of(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
         """An image before it was clipped, if it is the last; at another exposure, what is white may be grey."""
@@ -487,7 +481,7 @@ class FacadeModel(SplatfactoModel):
 
         Every method has both: the shell is a reference even where it is not a cue.
         """
-        target = self._photograph(batch, outputs["background"])
+        target = self.get_gt_img(batch["image"])
         height, width = target.shape[:2]
         camera = Camera(torch.eye(4, device=self.device), batch["K"].to(self.device), width, height)
         normal = colours_to_normals(outputs["normal"])

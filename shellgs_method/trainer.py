@@ -38,7 +38,7 @@ from shellgs_method.runs.folders import held
 from shellgs_method.runs.guard import MAX_SKIPPED, GuardedOptimizers
 from shellgs_method.runs.host import wandb_refusals
 from shellgs_method.runs.limits import check_settings, check_training
-from shellgs_method.runs.run_folder import check_method, guard_nerfstudio, written_config
+from shellgs_method.runs.run_folder import check_method, check_world, guard_nerfstudio, written_config
 
 if TYPE_CHECKING:
     from shellgs_method.pipeline import FacadePipeline
@@ -295,6 +295,8 @@ class FacadeTrainer(Trainer):
         if path is None:
             return
         check_method(path, self.config.method_name)
+        parsed = self.pipeline.datamanager.train_dataparser_outputs
+        check_world(path.absolute().parents[1], parsed, "--data, or train anew")
         state = load_checkpoint(path)
         try:
             self.pipeline.load_pipeline(state["pipeline"], state["step"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import math
 import shutil
 import signal
@@ -140,14 +141,14 @@ def test_metrics_of_training_views_are_computed_in_the_steps_that_log_them(train
 
 
 def test_losses_of_a_training_view_are_cached_while_there_is_room(trained, monkeypatch):
-    model, (_, batch), outputs = model_of(trained), held_out(trained), render(trained)
+    model, (_, batch) = model_of(trained), held_out(trained)
     assert len(model.objective._views) == 8  # of 10, two are held out
     monkeypatch.setattr(model.objective, "_views", {})
-    held_out_view = model._view(batch, outputs["background"])
-    assert model._view(batch, outputs["background"]) is not held_out_view  # its index is also a training view's
+    held_out_view = model._view(batch)
+    assert model._view(batch) is not held_out_view  # its index is also a training view's
     monkeypatch.setattr(model, "training", True)
-    kept = model._view(batch, outputs["background"])
-    assert model._view(batch, outputs["background"]) is kept
+    kept = model._view(batch)
+    assert model._view(batch) is kept
     pixels = batch["image"][..., 0].numel()
     monkeypatch.setattr(model.objective, "_room", None)
     monkeypatch.setattr(
@@ -155,9 +156,9 @@ def test_losses_of_a_training_view_are_cached_while_there_is_room(trained, monke
     )
     for index in (20, 21):
         new = batch | {"image_idx": index}
-        assert model._view(new, outputs["background"]) is model._view(new, outputs["background"])
+        assert model._view(new) is model._view(new)
     full = batch | {"image_idx": 22}
-    assert model._view(full, outputs["background"]) is not model._view(full, outputs["background"])
+    assert model._view(full) is not model._view(full)
 
 
 def test_training_improves_image_and_normals(trained, pristine_scene, tmp_path):
@@ -378,6 +379,20 @@ def test_a_resumed_run_loads_another_number_of_gaussians(pristine_scene, tmp_pat
     first.pipeline.load_pipeline(fewer, 0)
     assert model_of(first).num_points == 50
     first.train()
+
+
+def test_a_run_is_not_resumed_over_other_cameras(pristine_scene, tmp_path):
+    scene = Path(shutil.copytree(pristine_scene, tmp_path / "scene"))
+    first = trainer_of(scene, tmp_path / "first", "photo_gs", iterations=4)
+    first.train()
+    path = scene / "transforms.json"
+    cameras = json.loads(path.read_text())
+    for frame in cameras["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 2  # as of structure from motion that was made again
+    path.write_text(json.dumps(cameras))
+    with pytest.raises(SystemExit, match=r"is not the scene that the run .*: correct --data, or train anew"):
+        trainer_of(scene, tmp_path / "second", "photo_gs", 6, first.checkpoint_dir)
 
 
 def test_resuming_a_finished_run_changes_nothing(trained, pristine_scene, tmp_path):

@@ -20,6 +20,8 @@ from shellgs_method.render.maps import DISC_LOG_THICKNESS
 
 WIDE = 0.05
 """Radius in a view, in units of its longer side, above which a Gaussian counts as wide."""
+LEAST_RESET = 0.01
+"""Least opacity of a reset, whose logit must be finite."""
 MIN_RESET_EVERY = 1000
 """Fewest iterations between two opacity resets: opacities recover no faster in a short run."""
 
@@ -91,7 +93,7 @@ class GradientStrategy(DefaultStrategy):
                     state[gathered].zero_()
                 torch.cuda.empty_cache()  # tensors of other sizes follow
             if step > 0 and step % self.reset_every == 0:
-                reset_opa(params, optimizers, state, value=2 * self.prune_opa)
+                reset_opa(params, optimizers, state, value=max(2 * self.prune_opa, LEAST_RESET))
         if self.key_for_gradient == "gradient_2dgs":  # of discs: a split divides all scales
             params["scales"].data[:, 2] = DISC_LOG_THICKNESS
 
@@ -105,7 +107,7 @@ class GradientStrategy(DefaultStrategy):
         trained = radii.shape[1] - info.get("frozen", 0)
         if trained != len(params["means"]):
             return  # broken ones were removed since, and nobody knows which of these are left
-        gradients = (centres.absgrad if self.absgrad else centres.grad)[:, :trained]
+        gradients = centres.grad[:, :trained]
         radii = radii[:, :trained]
         half = (size / 2 * len(radii) for size in (info["width"], info["height"]))
         scale = constant(*half, 1 / max(info["width"], info["height"]), like=gradients)

@@ -49,7 +49,7 @@ OF_NERFSTUDIO: dict[type, dict[str, Bounds]] = {
 
 _ONE_DEVICE = "a run is trained on one device, and `shellgs compare --jobs` trains several runs at a time"
 _VIEWS = "in training, held-out views are drawn one at a time, and `ns-eval` measures all of them"
-_STORE = "photographs and masks are kept where datamanager.cache-images says"
+_STORE = "photographs are kept on the GPU with their maps, as far as these fit"
 UNUSED = {
     "machine.num_devices": _ONE_DEVICE,
     "machine.num_machines": _ONE_DEVICE,
@@ -60,6 +60,7 @@ UNUSED = {
     "prompt": "these methods take no text",
     "viewer.relative_log_filename": "the viewer writes no log",
     "viewer.num_rays_per_chunk": "images are rendered whole",
+    "datamanager.cache_images": _STORE,
     "datamanager.masks_on_gpu": _STORE,
     "datamanager.images_on_gpu": _STORE,
     "datamanager.eval_num_images_to_sample_from": _VIEWS,
@@ -70,7 +71,7 @@ UNUSED = {
 """Settings of nerfstudio that would be ignored, by the end of their path, and why."""
 _HIDDEN = ("pipeline.model.", "optimizers.")
 """Where settings that the command line does not show would be ignored too."""
-_AVAILABLE = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
+_DEVICES = ("cpu", "cuda")
 
 
 class Setting(NamedTuple):
@@ -141,10 +142,10 @@ def check_training(config: TrainerConfig) -> None:
             raise SceneError(f"{setting.path} cannot be {value}: {why}; leave it out")
     _check_scene(config)
     device = config.machine.device_type
-    if device in _AVAILABLE and not _AVAILABLE[device]():
+    if device not in _DEVICES or (device == "cuda" and not torch.cuda.is_available()):
+        why = "torch finds no such device here" if device in _DEVICES else "it has no float64, which these methods need"
         raise SceneError(
-            f"machine.device_type cannot be {device}: torch finds no such device here: leave it out, or give "
-            "--machine.device-type cpu"
+            f"machine.device_type cannot be {device}: {why}: leave it out, or give --machine.device-type cpu"
         )
     for group, steps in config.gradient_accumulation_steps.items():
         if group not in config.optimizers or not FROM_ONE.hold(steps):

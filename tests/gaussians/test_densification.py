@@ -84,6 +84,14 @@ def test_opacities_are_reset_at_every_reset_step_and_not_at_the_first():
     assert reset == [20, 40]
 
 
+@pytest.mark.parametrize("prune_opa", [0.0, 0.5])
+def test_reset_opacities_are_finite_at_any_threshold(prune_opa):
+    params = gaussians(5)
+    optimizers, strategy = stepped(params), GradientStrategy(prune_opa=prune_opa, reset_every=10, refine_stop_iter=45)
+    strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 10, rendering(5))
+    assert params["opacities"].isfinite().all()
+
+
 def test_gaussians_that_are_wide_in_a_view_split_and_are_pruned_by_their_radius():
     """Radii of 4, 6 and 20 % of the view's longer side, where above 5 % splits and above 15 % is pruned."""
     params = gaussians(3)
