@@ -92,13 +92,12 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     """
     start = time.monotonic()
     shell = CueMaps.open(scene, "shell")
-    inputs = _digest(views, held_out)
     maps = CueMaps.create(
         scene,
         "checked",
         command=shell.manifest.command,
         sources=[path for source in shell.manifest.sources if (path := scene / source).exists()],
-        revisions={"photographs": inputs, "check": str(VERSION)},
+        revisions={"photographs": _digest(views, held_out), "check": str(VERSION)},
         metres_per_unit=shell.manifest.metres_per_unit,
         max_image_size=shell.manifest.max_image_size,
     )
@@ -106,9 +105,9 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     cameras = {view.name: view.camera.shrunk(shell.manifest.max_image_size) for view in views}
     missing = [view for view in views if not maps.current(view.name, cameras[view.name])]
     if missing:
-        training = _TrainingViews.of(
-            [view for view in views if view.name not in held_out], shell, maps.folder / f".{inputs[:16]}"
-        )
+        inputs = fingerprint(maps.manifest.sources, maps.manifest.max_image_size)[:16]
+        compared_with = [view for view in views if view.name not in held_out]
+        training = _TrainingViews.of(compared_with, shell, maps.folder / f".{inputs}")
 
         def compare(view: View) -> CueMap:
             return training.compare(view, shell.require(view.name, cameras[view.name]))

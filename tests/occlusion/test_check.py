@@ -429,6 +429,37 @@ def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
         assert found.occluder.mean() < 0.01
 
 
+def test_an_interrupted_check_does_not_go_on_with_another_shell(tmp_path: Path, monkeypatch):
+    views, file = [], tmp_path / "shell.ply"
+    for index, (view, _) in enumerate(street(CAMERAS)):
+        name = f"{index}.png"
+        Image.fromarray(view.image.numpy()).save(tmp_path / name)
+        views.append(View(name, tmp_path / name, view.camera))
+
+    def cast(depth: float) -> CueMaps:
+        file.write_text(f"a wall at {depth}")
+        shell = CueMaps.create(tmp_path, "shell", command="cast", sources=[file])
+        there = np.full((HEIGHT, WIDTH), depth, np.float32)
+        for view in views:
+            shell.write(view.name, CueMap(there, np.zeros((*there.shape, 3), np.float16), there > 0), view.camera)
+        return shell
+
+    def interrupted(*_) -> CueMap:
+        raise KeyboardInterrupt
+
+    cast(1.3 * WALL)
+    with monkeypatch.context() as patch:
+        patch.setattr(checking._TrainingViews, "compare", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            check_views(tmp_path, views, [])
+    shell = cast(WALL)
+    check_views(tmp_path, views, [])
+    name, camera = views[MIDDLE].name, views[MIDDLE].camera
+    found = Findings.of(CueMaps.open(tmp_path, "checked").require(name, camera), shell.require(name, camera))
+    assert found.confirmed.mean() > 0.9
+    assert not found.occluder.any()
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_where_the_model_has_windows_only_they_show_what_is_behind(tmp_path: Path, known: bool):
     """A wall with a mirror, whose left half is a window in the shell's model."""
@@ -533,7 +564,7 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
     model, data = model_of(trainer), data_of(trainer)
     index = [view.name for view in data.train_dataset.views].index(name)
     batch = next(batch for batch in data.cached_train if batch["image_idx"] == index)
-    losses = model._view(batch, torch.zeros(3))
+    losses = model._view(batch)
     kept = losses.photometric.mask
     assert kept is not None
     assert losses.cue is not None
@@ -543,7 +574,7 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
     assert losses.cue.cue.mask[..., 0].numpy()[square].mean() > 0.9
     model.objective.trust = "shell"
     model.objective._views.clear()
-    assert model._view(batch, torch.zeros(3)).photometric.mask is None
+    assert model._view(batch).photometric.mask is None
 
 
 def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
