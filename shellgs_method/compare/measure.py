@@ -113,12 +113,12 @@ def measure(config_path: Path, half: Half | None = None, renders: Path | None = 
     for index, (cameras, batch) in enumerate(track(views, "Evaluating view", len(views))):
         camera = pinhole_camera(cameras)
         outputs = model.get_outputs_for_camera(cameras.to(model.device))
-        rendering, photograph = _rendering(model, outputs, camera), _photograph(model, outputs, batch)
+        rendering, photograph = _rendering(model, outputs, camera), _photograph(batch, model.device)
         metrics.append(
             masked_image_errors(rendering.rgb, photograph, batch, metres_per_unit)
             | reference_errors(rendering, camera, batch, metres_per_unit)
         )
-        if renders and "shell_mask" in batch and batch["shell_mask"].any():
+        if renders and "shell_mask" in batch and reference_maps(batch, "shell", camera.K.device).mask.any():
             name = f"{index:04d}-{Path(datamanager.eval_dataset.views[index].name).stem}.npz"
             _snapshot(rendering, photograph, camera, batch, metres_per_unit).save(renders / name)
     learned = model.exposures if isinstance(model, FacadeModel) else None
@@ -174,22 +174,18 @@ def _rendering(model: Model, outputs: dict[str, Tensor], camera: Camera) -> Rend
     return Rendering(outputs["rgb"], depth, outputs["accumulation"], normal)
 
 
-def _photograph(model: Model, outputs: dict[str, Tensor], batch: dict) -> Float[Tensor, "H W 3"]:
-    """The photograph over the background that the method renders; black if it renders none."""
-    image = batch["image"].to(model.device)
-    image = image / 255 if image.dtype == torch.uint8 else image
-    if image.shape[-1] == 3:
-        return image
-    background = outputs["background"] if isinstance(model, SplatfactoModel) else torch.zeros(3, device=model.device)
-    return image[..., :3] * image[..., 3:] + background * (1 - image[..., 3:])
+def _photograph(batch: dict, device: torch.device) -> Float[Tensor, "H W 3"]:
+    image = batch["image"].to(device)
+    return image / 255 if image.dtype == torch.uint8 else image
 
 
 def _snapshot(
     rendering: Rendering, photograph: Tensor, camera: Camera, batch: dict, metres_per_unit: float | None
 ) -> Snapshot:
     reference = reference_maps(batch, "shell", rendering.depth.device)
-    depth = rendering.depth.where(rendering.alpha >= OPAQUE, 0.0)
-    normal = normals_from_depth(depth, camera) if rendering.normal is None else rendering.normal
+    opaque = rendering.alpha >= OPAQUE
+    depth = rendering.depth.where(opaque, 0.0)
+    normal = normals_from_depth(depth, camera) if rendering.normal is None else rendering.normal.where(opaque, 0.0)
     step = camera.thinning(IMAGE_SIZE)
     K = camera.K.double().cpu().numpy().copy()
     K[:2] /= step

@@ -359,7 +359,7 @@ def grid(
             seed,
             iterations,
             output.resolve(),
-            () if variant.held_out else halves,
+            () if variant.held_out or variant.is_ablation else halves,
             curve_points,
             paths or ScenePaths(),
         )

@@ -52,4 +52,4 @@ def recover_folder(folder: Path) -> None:
 
 
 def _old(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.old")
+    return folder.with_name(f".{folder.name}.replaced")

@@ -34,14 +34,14 @@ from training_runs import Method, trainer_of
 
 from shellgs_method import cli
 from shellgs_method.compare import results
-from shellgs_method.compare.measure import Snapshot, measure, measure_shell, write_metrics
+from shellgs_method.compare.measure import Snapshot, _snapshot, measure, measure_shell, write_metrics
 from shellgs_method.compare.plots import DOT, dotted, exposures, recorded_metrics
 from shellgs_method.compare.results import WRITING, Comparison, compare, write_results
 from shellgs_method.compare.runs import Run, Variant, grid
 from shellgs_method.compare.tables import tables
 from shellgs_method.compare.wandb_report import log_comparison
 from shellgs_method.errors import SceneError
-from shellgs_method.evaluation import pixels
+from shellgs_method.evaluation import Rendering, pixels
 from shellgs_method.evaluation.tables import Column, csv_table, html_table, latex_table, markdown_table
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.cue_maps import CueMaps
@@ -710,9 +710,20 @@ def test_a_folder_is_replaced_whole_and_recovered_after_a_kill(tmp_path):
     replace_folder(folder, fresh)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     assert (folder / "name").read_text() == "run.new"
-    folder.rename(tmp_path / "run.old")  # as after a kill between the two renames
+    folder.rename(tmp_path / ".run.replaced")  # as after a kill between the two renames
     recover_folder(folder)
     assert (folder / "name").read_text() == "run.new"
+
+
+def test_a_copy_that_a_user_keeps_beside_a_run_is_left_alone(tmp_path):
+    run, kept = tmp_path / "seed-0", tmp_path / "seed-0.old"
+    for folder in (run, kept, tmp_path / "fresh"):
+        folder.mkdir()
+    recover_folder(run)
+    replace_folder(run, tmp_path / "fresh")
+    run.rmdir()
+    recover_folder(run)
+    assert [path.name for path in tmp_path.iterdir()] == ["seed-0.old"]
 
 
 def test_a_folder_is_unchanged_by_packing_in_pieces_and_unpacking(tmp_path, monkeypatch):
@@ -818,6 +829,37 @@ def test_snapshots_hold_renders_of_the_views(measured):
     assert shot.rgb.shape == shot.photograph.shape == (32, 48, 3)
     assert shot.mask.any()
     assert shot.error[shot.mask].max() <= 90
+
+
+def flat_wall(alpha: float, before: float = 0.0) -> tuple[Rendering, Camera, dict]:
+    """A render of a wall that is right, of an opacity, and a batch in which photographs show something before it."""
+    height, width = 24, 32
+    camera = Camera(torch.eye(4), torch.tensor([[30.0, 0, width / 2], [0, 30, height / 2], [0, 0, 1]]), width, height)
+    normal, depth = torch.zeros(height, width, 3), torch.full((height, width, 1), 5.0)
+    normal[..., 2] = -1
+    batch = {"shell_depth": depth, "shell_normal": normal, "shell_mask": torch.ones_like(depth, dtype=torch.bool)}
+    batch["other_depth"] = torch.full_like(depth, before)
+    return Rendering(torch.rand(height, width, 3), depth, torch.full_like(depth, alpha), normal), camera, batch
+
+
+def test_a_snapshot_shows_no_normals_where_metrics_count_none():
+    """Where a render is not half opaque, with normals of its own or without."""
+    rendering, camera, batch = flat_wall(0.3)
+    errors = [
+        _snapshot(each, each.rgb, camera, batch, 1.0).error.mean()
+        for each in (rendering, rendering._replace(normal=None))
+    ]
+    assert errors == [90, 90]
+    assert _snapshot(flat_wall(0.9)[0], rendering.rgb, camera, batch, 1.0).error.max() < 0.1
+
+
+def test_a_view_of_which_nothing_counts_is_not_drawn(measured, tmp_path, monkeypatch):
+    """Photographs show something before the shell at all of its pixels."""
+    monkeypatch.setattr(
+        "shellgs_method.evaluation.pixels.occluded", lambda batch, device: batch["shell_mask"].to(device)
+    )
+    measure(measured[0].config, renders=tmp_path)
+    assert not [*tmp_path.glob("*.npz")]
 
 
 def test_a_subsampled_image_has_the_rays_of_the_pixels_it_keeps(measured, tmp_path, monkeypatch):
