@@ -73,7 +73,7 @@ def facade_holdout(maps: CueMaps, views: Sequence[View], width: float, half: Hal
 
     Args:
         maps: shell maps.
-        views: training views, with cameras of the maps' size.
+        views: training views.
         width: width of a band in metres, or in scene units if the maps' metres are unknown.
         half: which half is held out.
 
@@ -82,7 +82,7 @@ def facade_holdout(maps: CueMaps, views: Sequence[View], width: float, half: Hal
     """
     normals = []
     for view in views[:: -(-len(views) // MAX_VIEWS)]:
-        cue = maps.read(view.name, view.camera)
+        cue = maps.read(view.name, view.camera, any_size=True)
         if cue is not None and cue.mask.any():
             on_shell = cue.normal[cue.mask].astype(np.float64)
             thinned = on_shell[:: -(-len(on_shell) // MAX_NORMALS)]

@@ -127,6 +127,17 @@ def test_a_run_with_a_holdout_trains_and_is_evaluated(pristine_scene, tmp_path):
     assert model_of(half).step == 2
 
 
+def test_a_method_without_a_shell_is_held_out_at_another_size_than_the_maps(pristine_scene, tmp_path):
+    """Its held-out views are measured against the maps all the same."""
+
+    def hold_out(config):
+        config.pipeline.datamanager.holdout = "A"
+        config.pipeline.datamanager.dataparser.max_image_size = 24
+
+    trainer = trainer_of(pristine_scene, tmp_path, "photo_gs", change=hold_out)
+    assert data_of(trainer).cached_eval[0]["shell_mask"].shape == (16, 24, 1)
+
+
 def test_a_holdout_does_not_mask_the_photographs(pristine_scene, tmp_path):
     def hold_out(config):
         config.pipeline.datamanager.holdout = "B"
