@@ -61,7 +61,7 @@ class Transients(nn.Module):
         """
         at_cells = camera.resized(GRID, GRID)
         self.colours[index], rendered = _cells(photograph), _cells(rgb)
-        self.depths[index] = interpolate(depth.permute(2, 0, 1)[None], (GRID, GRID), mode="nearest")[0, 0]
+        self.depths[index] = interpolate(depth.permute(2, 0, 1)[None], (GRID, GRID), mode="nearest-exact")[0, 0]
         self.viewmats[index], self.Ks[index] = at_cells.viewmat, at_cells.K
         residual = (self.colours[index] - rendered).abs().mean(dim=-1)
         outliers = residual > FACTOR * (FLOOR + self._elsewhere(index, rendered, at_cells))  # false for NaN

@@ -55,6 +55,16 @@ def test_what_one_photograph_shows_is_found_there_and_nowhere_else():
     assert not any(mask.any() for mask in masks[1:])
 
 
+def test_depth_is_that_of_the_cells_middles():
+    """Of a wall at 45 degrees, whose depth is 8 + x."""
+    transients, view = Transients(1), camera(0)
+    depth = 8 / (1 - view.rays()[..., :1])
+    transients(0, image(), image(), depth, view)
+    at_cells = view.resized(*transients.depths.shape[:0:-1])
+    expected = 8 / (1 - at_cells.rays()[..., 0])
+    assert ((transients.depths[0] - expected) / expected).mean().abs() < 1e-3
+
+
 def test_what_is_not_learned_yet_is_not_left_out():
     """A square of the wall, or another depth of it, that no render shows."""
     photographs = [image(on_wall(k)) for k in range(5)]
