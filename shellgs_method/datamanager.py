@@ -22,8 +22,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from dataparsers.cameras import pinhole_camera, pinhole_cameras, scene_to_world
+from dataparsers.facade import held_out_names, read_views
 from shellgs_method.bounds import Length
-from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.errors import SceneError, notice, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
 from shellgs_method.evaluation.regions import REFERENCES
@@ -35,6 +36,7 @@ from shellgs_method.geometry.camera import Camera
 from shellgs_method.machine.memory import available_memory, free_memory
 from shellgs_method.machine.progress import track
 from shellgs_method.machine.threads import ahead
+from shellgs_method.occlusion import compared_others
 from shellgs_method.occlusion.exposure import (
     Exposed,
     exposed,
@@ -296,9 +298,19 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
                     kind,
                     command,
                 )
+        self._tell_of_other_photographs()
         held_out = self.eval_dataset
         held_out.kinds = {*REFERENCES, *kinds}
         held_out.kinds = [kind for kind in held_out.cues if self._can_be_measured(kind)]
+
+    def _tell_of_other_photographs(self) -> None:
+        """Tell if the photographs that the shell was compared with are not those of this run."""
+        checked, scene = self.train_dataset.sets.get("checked"), self.config.dataparser
+        if checked and compared_others(checked, read_views(scene), held_out_names(scene)):
+            notice(
+                f"photographs of {scene.data}, their cameras, or which are held out have changed since they were "
+                f"compared with the shell, which counts as before: run `{checked.command}`, to compare them again."
+            )
 
     @property
     def scene_to_world(self) -> Float64[np.ndarray, "4 4"]:

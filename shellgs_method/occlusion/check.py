@@ -49,6 +49,8 @@ MAX_SIZE = 640
 """Longer side in pixels at which photographs are compared, also where the maps are smaller: thin things show."""
 NEIGHBOURS = 6
 """Neighbours on either side of a view that are compared with it."""
+COMPARED = "photographs"
+"""Name of the digest of what was compared, in the maps' manifest."""
 VERSION = 14
 """Version of the maps: maps of another version are made again."""
 
@@ -97,7 +99,7 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
         "checked",
         command=shell.manifest.command,
         sources=[path for source in shell.manifest.sources if (path := scene / source).exists()],
-        revisions={"photographs": _digest(views, held_out), "check": str(VERSION)},
+        revisions={COMPARED: _digest(views, held_out), "check": str(VERSION)},
         metres_per_unit=shell.manifest.metres_per_unit,
         max_image_size=shell.manifest.max_image_size,
     )
@@ -124,6 +126,11 @@ def check_views(scene: Path, views: Sequence[View], held_out: Collection[str]) -
     return CheckSummary(
         len(missing), len(views) - len(missing), contradicted / max(supported, 1e-9), time.monotonic() - start
     )
+
+
+def compared_others(checked: CueMaps, views: Sequence[View], held_out: Collection[str]) -> bool:
+    """Whether other photographs were compared with the shell than these, or with other cameras or held-out views."""
+    return checked.manifest.sources.get(COMPARED) != _digest(views, held_out)
 
 
 @dataclass(frozen=True)

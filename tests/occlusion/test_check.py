@@ -488,6 +488,22 @@ def test_a_checked_map_says_what_a_pixel_shows():
     assert [mask[0].tolist() for mask in found] == np.eye(6, 7, dtype=bool).tolist()
 
 
+@pytest.mark.parametrize("change", ["another split", "another photograph"])
+def test_a_training_tells_if_other_photographs_were_compared(scene: Path, tmp_path: Path, caplog, change: str):
+    def others_held_out(config):
+        config.pipeline.datamanager.dataparser.eval_interval = 3
+
+    check(scene)
+    trainer_of(scene, tmp_path / "same", "shellgs_metric")
+    assert "compared with the shell" not in caplog.text
+    if change == "another photograph":
+        shutil.copy(scene / "images/frame_00002.png", scene / "images/frame_00003.png")
+    split = others_held_out if change == "another split" else lambda _: None
+    trainer_of(scene, tmp_path / "other", "shellgs_metric", change=split)
+    assert "or which are held out have changed since they were compared with the shell" in caplog.text
+    assert f"run `shellgs cast {scene}`" in caplog.text
+
+
 def test_a_full_disk_raises_an_error_that_says_so(scene: Path):
     with small_disk(3_000), pytest.raises(OSError, match="File too large") as refusal:
         check(scene)
