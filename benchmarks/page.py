@@ -8,7 +8,7 @@ Its prose is in benchmarks/page.md, which quotes no figures of runs.
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
 from benchmarks.grid import GRID, RESULTS, SHELL, Cell, Setting, records
@@ -87,9 +87,16 @@ def _lists(runs: list[dict]) -> dict[str, list[float]]:
 def origins(results: Path = RESULTS) -> str:
     """How many runs were made at which commit on which machine, and how many are missing."""
     cells: list[Cell] = [cell for setting in GRID for cell in setting.cells if cell.method != SHELL]
-    counts = Counter((record["commit"], record["machine"]) for _, record in records(cells, results))
-    groups = [f"{count} at commit {commit} ({machine})" for (commit, machine), count in counts.items()]
-    return f"Of {len(cells)} runs: {', '.join([*groups, f'{len(cells) - counts.total()} not run yet'])}.\n"
+    commits: dict[str, Counter[str]] = defaultdict(Counter)
+    for _, record in records(cells, results):
+        commits[record["machine"]][record["commit"]] += 1
+    groups = [
+        f"{', '.join(f'{count} at commit {commit}' for commit, count in counts.items())} ({machine})"
+        for machine, counts in commits.items()
+    ]
+    if missing := len(cells) - sum(counts.total() for counts in commits.values()):
+        groups.append(f"{missing} not run yet")
+    return f"Of {len(cells)} runs: {'; '.join(groups)}.\n"
 
 
 if __name__ == "__main__":
