@@ -78,6 +78,7 @@ def align(
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import read_views
+    from shellgs_method.files.atomic import recover_folder
     from shellgs_method.files.scene import ADJUSTED
     from shellgs_method.files.sparse_points import read_sparse_points
     from shellgs_method.registration.align import PROPOSAL, REPORT, misplaced, refined
@@ -88,6 +89,7 @@ def align(
         shell, matrix, picks, positions, same_frame, accept, global_shift, metres_per_shell_unit, crs, mesher, spacing
     )
     start.check()
+    recover_folder(scene / ADJUSTED)
     layout = paths.of(scene)
     if shell or accept or bundle_adjust:
         layout = layout.unadjusted()

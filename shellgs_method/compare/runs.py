@@ -18,12 +18,11 @@ from dataparsers.facade import read_views
 from shellgs_method.compare.settings import config_settings, default_settings, parsed, scene_settings
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.holdout import Half
-from shellgs_method.files.atomic import atomic_write, fingerprint
+from shellgs_method.files.atomic import atomic_write, fingerprint, recover_folder
 from shellgs_method.files.cue_maps import CueMaps, find_cues, relative_path
 from shellgs_method.files.scene import ALIGNMENT, CAPTURE, TRUTH, SceneLayout, ScenePaths
 from shellgs_method.runs.ablations import ABLATIONS
 from shellgs_method.runs.config_file import renamed
-from shellgs_method.runs.folders import recover_folder
 from shellgs_method.shell import Alignment
 from shellgs_method.shell.cast import MASKS
 from shellgs_method.trainer import FacadeTrainerConfig

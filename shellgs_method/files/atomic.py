@@ -53,11 +53,25 @@ def unfinished(path: Path, suffix: str = "") -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp{suffix}")
 
 
-def replace_folder(folder: Path, complete: Path) -> None:
-    """Put a complete folder, made at the path :func:`unfinished`, in the place of another, if that is there."""
-    if folder.is_dir():
-        shutil.rmtree(folder)
-    os.replace(complete, folder)
+def replace_folder(folder: Path, fresh: Path) -> None:
+    """Replace a folder by another; the old one is removed last, see :func:`recover_folder`."""
+    old = _old(folder)
+    if folder.exists():
+        folder.rename(old)
+    fresh.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def recover_folder(folder: Path) -> None:
+    """Restore the folder that a killed :func:`replace_folder` had set aside."""
+    old = _old(folder)
+    if not folder.exists() and old.exists():
+        old.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _old(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.replaced")
 
 
 @contextmanager

@@ -31,14 +31,13 @@ from jaxtyping import UInt8
 from rich.console import Console
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write, fingerprint
+from shellgs_method.files.atomic import atomic_write, fingerprint, replace_folder, unfinished
 from shellgs_method.launch.display import Display
 from shellgs_method.launch.job import Job, JobT
 from shellgs_method.launch.local import BIN, CommandError, finish
 from shellgs_method.launch.resources import Cluster
 from shellgs_method.machine.extras import import_extra
 from shellgs_method.machine.progress import Stage
-from shellgs_method.runs.folders import replace_folder
 from shellgs_method.runs.run_folder import open_run, written_config
 
 RETRIES = 3
@@ -432,8 +431,7 @@ def _unpack(pieces: Iterable[Archive], folder: Path) -> None:
 
 def _store_result(archive: Archive, run: Job) -> None:
     """Replace the run's folder by the one that its task returned."""
-    fresh = run.folder.with_name(f"{run.folder.name}.new")
-    shutil.rmtree(fresh, ignore_errors=True)
+    fresh = unfinished(run.folder)
     _unpack([archive], fresh)
     replace_folder(run.folder, fresh)
     _set_paths_in_config(run)

@@ -1,9 +1,8 @@
-"""Folders locked by one process, and folders replaced whole."""
+"""Folders locked by one process."""
 
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,24 +31,3 @@ def held(folder: Path) -> Iterator[bool]:
             yield True
     finally:
         os.close(handle)
-
-
-def replace_folder(folder: Path, fresh: Path) -> None:
-    """Replace a folder by another; the old one is removed last, see :func:`recover_folder`."""
-    old = _old(folder)
-    if folder.exists():
-        folder.rename(old)
-    fresh.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def recover_folder(folder: Path) -> None:
-    """Restore the folder that a killed :func:`replace_folder` had set aside."""
-    old = _old(folder)
-    if not folder.exists() and old.exists():
-        old.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _old(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}.replaced")
