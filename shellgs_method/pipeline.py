@@ -214,6 +214,8 @@ class FacadePipeline(VanillaPipeline):
     def restore_training(self) -> None:
         """Restore the training state of a loaded checkpoint, so that the run continues as if never stopped.
 
+        With ``fps`` sampling, the views after those that are left come in another order.
+
         Raises:
             SceneError: the state does not fit the checkpoint's Gaussians and views.
         """

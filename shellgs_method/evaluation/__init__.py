@@ -7,7 +7,7 @@ from shellgs_method.evaluation.colours import colours_to_normals, normal_colours
 from shellgs_method.evaluation.geometry import NormalErrors, angular_error, depth_mae, normal_errors
 from shellgs_method.evaluation.image import image_errors, lpips_network
 from shellgs_method.evaluation.surface import SurfaceComparison, back_project, compare_surfaces
-from shellgs_method.evaluation.view import Rendering, evaluate_view, geometry_errors, mean_over_views
+from shellgs_method.evaluation.view import Rendering, geometry_errors, mean_over_views
 from shellgs_method.evaluation.visualization import geometry_images
 
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "colours_to_normals",
     "compare_surfaces",
     "depth_mae",
-    "evaluate_view",
     "geometry_errors",
     "geometry_images",
     "image_errors",

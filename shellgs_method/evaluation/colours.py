@@ -49,11 +49,9 @@ def normal_colours(
     return colours
 
 
-def error_colours(
-    error: Shaped[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"], max_error: float = MAX_ERROR
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Colours of angles in degrees in 8 bits: black at 0, yellow from ``max_error``, grey outside the mask."""
-    return _scale_colours("inferno", error.astype(float) / max_error, mask)
+def error_colours(error: Shaped[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours of angles in degrees in 8 bits: black at 0, yellow from :data:`MAX_ERROR`, grey outside the mask."""
+    return _scale_colours("inferno", error.astype(float) / MAX_ERROR, mask)
 
 
 def depth_colours(

@@ -29,16 +29,20 @@ class Panel(NamedTuple):
     """True where the reference has a normal; other pixels are grey."""
 
 
-def save_strip(path: Path, panels: Sequence[Panel], max_error: float = MAX_ERROR, panel_inches: float = 2.5) -> None:
+PANEL_INCHES = 2.5
+"""Width of a panel."""
+
+
+def save_strip(path: Path, panels: Sequence[Panel]) -> None:
     """Write a PNG with one column per panel: image, normals, and angular error with a common colour bar."""
     height, width = panels[0].rgb.shape[:2]
-    size = (panel_inches * len(panels) + 0.8, panel_inches * 3 * height / width + 0.3)
+    size = (PANEL_INCHES * len(panels) + 0.8, PANEL_INCHES * 3 * height / width + 0.3)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(3, len(panels), squeeze=False)
-    scale = ScalarMappable(Normalize(0, max_error), colormaps["inferno"])
+    scale = ScalarMappable(Normalize(0, MAX_ERROR), colormaps["inferno"])
     for column, panel in zip(axes.T, panels, strict=True):
         mask, normal = panel.mask[..., 0].cpu().numpy(), panel.normal.detach().cpu().numpy()
-        error = error_colours(panel.error[..., 0].cpu().numpy(), mask, max_error)
+        error = error_colours(panel.error[..., 0].cpu().numpy(), mask)
         images = (panel.rgb.detach().clamp(0, 1).cpu().numpy(), normal_colours(normal, mask), error)
         for axis, image in zip(column, images, strict=True):
             axis.imshow(image)

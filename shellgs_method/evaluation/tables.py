@@ -30,7 +30,7 @@ class Column:
     """A metric in a table."""
 
     key: str
-    """Name of the metric, as in :func:`~shellgs_method.evaluation.evaluate_view`."""
+    """Name of the metric, as in :func:`~shellgs_method.evaluation.geometry_errors`."""
     title: str
     best: Callable[..., float]
     """``min`` or ``max``: selects the best value of the column."""

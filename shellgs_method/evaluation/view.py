@@ -11,7 +11,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from shellgs_method.evaluation.geometry import depth_mae, normal_errors, share
-from shellgs_method.evaluation.image import image_errors
 from shellgs_method.evaluation.surface import back_project, compare_surfaces
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_from_depth
@@ -38,20 +37,6 @@ class Rendering(NamedTuple):
     """Accumulated opacity."""
     normal: Float[Tensor, "H W 3"] | None = None
     """Composited normals in the camera frame, of any length; None for a method without normals."""
-
-
-def evaluate_view(
-    rendering: Rendering,
-    image: Float[Tensor, "H W 3"],
-    camera: Camera,
-    reference: Reference | None = None,
-    metres_per_unit: float | None = None,
-) -> dict[str, float]:
-    """All metrics of a view by name: those of :func:`image_errors`, and with a reference :func:`geometry_errors`."""
-    metrics = image_errors(rendering.rgb, image)
-    if reference is not None:
-        metrics |= geometry_errors(rendering, camera, reference, metres_per_unit)
-    return metrics
 
 
 def geometry_errors(

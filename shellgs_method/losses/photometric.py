@@ -10,6 +10,9 @@ from torch import Tensor
 from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.losses.ssim import SsimTarget, ssim
 
+SSIM_WEIGHT = 0.2
+"""Weight w of the structural term."""
+
 
 class PhotometricLoss:
     """(1 - w) L1 + w (1 - SSIM), averaged over the masked pixels (Kerbl et al. 2023, eq. 7).
@@ -20,13 +23,10 @@ class PhotometricLoss:
     Args:
         target: photograph, in [0, 1].
         mask: true where a pixel counts; all pixels by default.
-        ssim_weight: weight w of the structural term.
     """
 
-    def __init__(
-        self, target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"] | None = None, ssim_weight: float = 0.2
-    ):
-        self.target, self.mask, self.ssim_weight = target, mask, ssim_weight
+    def __init__(self, target: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W 1"] | None = None):
+        self.target, self.mask = target, mask
 
     @cached_property
     def _ssim_target(self) -> SsimTarget:
@@ -44,5 +44,5 @@ class PhotometricLoss:
         if mask is not None:
             rgb = rgb.where(mask, self.target)
         l1, dissimilarity = (rgb - self.target).abs(), 1 - ssim(rgb, self._ssim_target)
-        errors = (1 - self.ssim_weight) * l1 + self.ssim_weight * dissimilarity
+        errors = (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * dissimilarity
         return errors.mean() if mask is None else weighted_mean(errors, mask)

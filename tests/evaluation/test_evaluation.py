@@ -26,7 +26,7 @@ from shellgs_method.evaluation import (
     back_project,
     compare_surfaces,
     depth_mae,
-    evaluate_view,
+    geometry_errors,
     geometry_images,
     image,
     image_errors,
@@ -64,12 +64,11 @@ def plane(normal: tuple[float, float, float], distance: float = 6.0) -> tuple[to
     return depth, n.expand(HEIGHT, WIDTH, 3)
 
 
-def perfect(normal: tuple[float, float, float] = (0.3, -0.2, -1.0)) -> tuple[Rendering, torch.Tensor, Reference]:
-    """A perfect rendering of a slanted wall, its photograph, and its reference."""
+def perfect(normal: tuple[float, float, float] = (0.3, -0.2, -1.0)) -> tuple[Rendering, Reference]:
+    """A perfect rendering of a slanted wall, and its reference."""
     depth, normals = plane(normal)
-    photograph = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    rendering = Rendering(0.9 * photograph, depth, torch.ones_like(depth), normals)
-    return rendering, photograph, Reference(depth, normals, EVERYWHERE)
+    rgb = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return Rendering(rgb, depth, torch.ones_like(depth), normals), Reference(depth, normals, EVERYWHERE)
 
 
 # normals
@@ -293,8 +292,8 @@ def test_lpips_is_zero_for_equal_images_and_positive_for_different_ones(tmp_path
 
 
 def test_a_perfect_rendering_has_perfect_geometry():
-    rendering, photograph, reference = perfect()
-    metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=2.0)
+    rendering, reference = perfect()
+    metrics = geometry_errors(rendering, CAMERA, reference, metres_per_unit=2.0)
     for key in ("depth_mae_m", "normal_deg", "depth_normal_deg", "accuracy_m", "completeness_m", "chamfer_m"):
         assert metrics[key] == pytest.approx(0.0, abs=1e-5), key
     for key in ("supported", "rendered", "normal_below_10deg", "f_score_5cm", "f_score_20cm"):
@@ -304,25 +303,26 @@ def test_a_perfect_rendering_has_perfect_geometry():
 def test_lengths_are_in_metres():
     # A frontal wall at 6 units rendered at 6.1, half a metre per unit: each point is 5 cm too far in z, along its ray.
     depth, normals = plane((0, 0, -1))
-    photograph = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64)
-    rendering = Rendering(photograph, depth + 0.1, torch.ones_like(depth), normals)
-    metrics = evaluate_view(rendering, photograph, CAMERA, Reference(depth, normals, EVERYWHERE), 0.5)
+    rendering = Rendering(
+        torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64), depth + 0.1, torch.ones_like(depth), normals
+    )
+    metrics = geometry_errors(rendering, CAMERA, Reference(depth, normals, EVERYWHERE), 0.5)
     assert metrics["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
     assert metrics["accuracy_m"] == pytest.approx(0.05 * CAMERA.rays().norm(dim=-1).mean().item(), rel=1e-5)
     assert (metrics["f_score_5cm"], metrics["f_score_10cm"]) == (0.0, 1.0)
 
 
 def test_lengths_are_in_scene_units_if_metres_are_unknown():
-    metrics = evaluate_view(*perfect()[:2], CAMERA, perfect()[2])
+    metrics = geometry_errors(perfect()[0], CAMERA, perfect()[1])
     assert {"depth_mae_units", "accuracy_units", "completeness_units", "chamfer_units"} <= metrics.keys()
     assert not any(key.endswith(("_m", "cm")) for key in metrics)
 
 
 def test_a_hole_worsens_normals_and_completeness_but_not_depth_error():
-    rendering, photograph, reference = perfect()
+    rendering, reference = perfect()
     alpha = rendering.alpha.clone()
     alpha[:, : WIDTH // 2] = 0.2
-    metrics = evaluate_view(rendering._replace(alpha=alpha), photograph, CAMERA, reference, metres_per_unit=1.0)
+    metrics = geometry_errors(rendering._replace(alpha=alpha), CAMERA, reference, metres_per_unit=1.0)
     assert metrics["rendered"] == 0.5
     assert metrics["normal_deg"] == pytest.approx(45.0, abs=1e-5)
     assert metrics["depth_mae_m"] == pytest.approx(0.0, abs=1e-9)
@@ -330,11 +330,11 @@ def test_a_hole_worsens_normals_and_completeness_but_not_depth_error():
 
 
 def test_an_empty_render_scores_zero_without_nan():
-    rendering, photograph, reference = perfect()
+    rendering, reference = perfect()
     empty = Rendering(
         rendering.rgb, *(torch.zeros_like(t) for t in (rendering.depth, rendering.alpha, reference.normal))
     )
-    metrics = evaluate_view(empty, photograph, CAMERA, reference, metres_per_unit=1.0)
+    metrics = geometry_errors(empty, CAMERA, reference, metres_per_unit=1.0)
     assert metrics["rendered"] == metrics["f_score_20cm"] == metrics["surface_points"] == 0.0
     assert metrics["normal_deg"] == metrics["depth_normal_deg"] == 90.0
     assert "depth_mae_m" not in metrics
@@ -342,28 +342,27 @@ def test_an_empty_render_scores_zero_without_nan():
 
 
 def test_geometry_outside_the_mask_is_ignored():
-    rendering, photograph, reference = perfect()
+    rendering, reference = perfect()
     mask = EVERYWHERE.clone()
     mask[:, :10] = False
     wrong = rendering.depth.clone()
     wrong[:, :9] *= 3
-    metrics = evaluate_view(rendering._replace(depth=wrong), photograph, CAMERA, reference._replace(mask=mask), 1.0)
+    metrics = geometry_errors(rendering._replace(depth=wrong), CAMERA, reference._replace(mask=mask), 1.0)
     assert metrics["depth_normal_deg"] == pytest.approx(0.0, abs=1e-5)
     assert metrics["accuracy_m"] == metrics["completeness_m"] == 0.0
 
 
 @pytest.mark.parametrize("supported", [False, True], ids=["empty mask", "with a mask"])
-def test_a_view_without_a_reference_has_image_metrics_only(supported):
-    rendering, photograph, reference = perfect()
+def test_a_view_without_a_pixel_of_the_reference_has_no_depth_error(supported):
+    rendering, reference = perfect()
     reference = reference._replace(mask=EVERYWHERE & supported)
-    metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
+    metrics = geometry_errors(rendering, CAMERA, reference, metres_per_unit=1.0)
     assert ("depth_mae_m" in metrics) == supported
-    assert evaluate_view(rendering, photograph, CAMERA).keys() == {"psnr", "ssim", "cc_psnr", "cc_ssim"}
 
 
 def test_metrics_are_plain_floats():
-    rendering, photograph, reference = perfect()
-    metrics = evaluate_view(rendering, photograph, CAMERA, reference, metres_per_unit=1.0)
+    rendering, reference = perfect()
+    metrics = geometry_errors(rendering, CAMERA, reference, metres_per_unit=1.0)
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
 
 
@@ -419,7 +418,7 @@ def test_a_table_says_why_lpips_is_missing_and_only_then():
 
 
 def test_strip_is_written_in_one_file_and_grey_outside_the_mask(tmp_path):
-    rendering, _, reference = perfect()
+    rendering, reference = perfect()
     mask = torch.zeros_like(EVERYWHERE)
     error = angular_error(reference.normal, reference.normal)
     panel = Panel("shellgs", rendering.rgb, reference.normal, error, mask)
@@ -432,7 +431,7 @@ def test_strip_is_written_in_one_file_and_grey_outside_the_mask(tmp_path):
 
 
 def test_error_image_is_black_if_exact_yellow_if_not_rendered_and_grey_without_reference():
-    rendering, _, reference = perfect()
+    rendering, reference = perfect()
     alpha, mask = rendering.alpha.clone(), EVERYWHERE.clone()
     alpha[:10], mask[-10:] = 0.2, False
     error = geometry_images(rendering._replace(alpha=alpha), reference._replace(mask=mask))["normal_error"]
@@ -441,7 +440,7 @@ def test_error_image_is_black_if_exact_yellow_if_not_rendered_and_grey_without_r
 
 
 def test_depth_and_normal_images_of_a_perfect_render_have_equal_halves():
-    rendering, _, reference = perfect()
+    rendering, reference = perfect()
     images = geometry_images(rendering, reference)
     for name in ("depth", "normal"):
         assert images[name].shape == (HEIGHT, 2 * WIDTH, 3)
@@ -449,7 +448,7 @@ def test_depth_and_normal_images_of_a_perfect_render_have_equal_halves():
 
 
 def test_images_stay_in_range_if_half_precision_makes_normals_longer_than_one():
-    rendering, _, reference = perfect((0, 0, -1))
+    rendering, reference = perfect((0, 0, -1))
     images = geometry_images(rendering, reference._replace(normal=1.001 * reference.normal))
     assert all(each.min() >= 0 and each.max() <= 1 for each in images.values())
 
