@@ -99,6 +99,11 @@ class FreeSpace:
         """Smallest and largest x and y of the cells, with their edges."""
         return self.origin + self.cell * (np.array([[0, 0], self.occupied.shape[::-1]]) - 0.5)
 
+    def has(self, place: Float64[np.ndarray, " 2"]) -> bool:
+        """Whether a place is on the grid, not beyond its edges."""
+        low, high = self.bounds
+        return bool(((place >= low) & (place <= high)).all())
+
     def reachable(self, radius: float, places: Float64[np.ndarray, "P 2"]) -> FreeSpace:
         """The cells where a robot of a radius in metres can be: those joined that hold most of the places.
 

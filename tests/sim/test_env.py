@@ -17,13 +17,13 @@ from worlds import frame_at, some_splats, uneven, write_folder
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.splats import write_splats
-from shellgs_method.sim.env import NAME
+from shellgs_method.sim.env import NAME, TIME
 from shellgs_method.sim.env.course import WALK
 from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
 from shellgs_method.sim.env.world import World
 from shellgs_method.sim.free_space import CELL, CELLS, MARGIN, FreeSpace
-from shellgs_method.sim.ground import LEVEL, Ground
+from shellgs_method.sim.ground import BEYOND, LEVEL, Ground
 from shellgs_method.sim.trials.engine import import_mujoco
 from shellgs_method.sim.workspace import Workspace
 
@@ -342,6 +342,37 @@ def test_the_robot_follows_uneven_ground(collider, folder, tmp_path):
         env.step(np.array([1, 0, 0]))
         height = env.data.qpos[env._qpos + 2] - env.world.ground.at(env._place[None])[0]
         assert abs(height) < 0.05
+
+
+def test_an_episode_is_truncated_where_the_robot_leaves_the_grid_before_ground_that_is_not_level_ends(
+    collider, folder, tmp_path
+):
+    along = World.load(folder).workspace.eyes[:, :2]
+    low, high = along.min(axis=0) - BEYOND, along.max(axis=0) + BEYOND
+    rows, columns = np.ceil((high - low)[::-1]).astype(int) + 1
+    slope = Ground(np.tile(0.02 * np.arange(columns), (rows, 1)), 1.0, low, np.ones((rows, columns), bool))
+    out = write_folder(tmp_path / "sim", collider, ground=slope)
+    shutil.copy(folder / "frame.json", out)
+    env = gymnasium.make(NAME, world=out, depth=False)
+    bare: Any = env.unwrapped
+    for heading in (np.pi, -np.pi / 2):
+        env.reset(seed=0, options={"start": (2, -6), "goal": (9, -6), "heading": heading})
+        for _ in range(TIME - 1):
+            was = bare._place
+            _, _, terminated, truncated, _ = env.step(np.array([1, 0, 0], np.float32))
+            assert not terminated
+            assert truncated != bare.course.space.has(bare._place)
+            if truncated:
+                break
+        assert truncated
+        assert bare.course.space.has(was)
+        assert abs(bare.data.qpos[bare._qpos + 2] - bare.world.ground.at(bare._place[None])[0]) < 0.05
+
+
+def test_an_episode_on_the_grid_is_truncated_by_its_time_alone(folder):
+    env = gymnasium.make(NAME, world=folder, depth=False, max_episode_steps=4)
+    env.reset(seed=0, options={"start": (2, -6), "goal": (9, -6), "heading": 0.0})
+    assert [env.step(np.zeros(3, np.float32))[3] for _ in range(4)] == [False, False, False, True]
 
 
 def test_level_ground_is_below_a_place_far_from_the_origin(collider, tmp_path):

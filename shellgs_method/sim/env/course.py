@@ -96,7 +96,7 @@ class Course:
         (left, right), (bottom, top) = self.space.bounds.T
         places = {name: _numbers(options[name]) for name in ("start", "goal") if options.get(name) is not None}
         for name, place in places.items():
-            if place.shape != (2,) or not ((place >= (left, bottom)) & (place <= (right, top))).all():
+            if place.shape != (2,) or not self.space.has(place):
                 raise SceneError(
                     f"{self._world.folder}: the given {name} {options[name]} is not two finite numbers on the grid, "
                     f"x of {left:.1f} to {right:.1f} m and y of {bottom:.1f} to {top:.1f} m in the folder's frame"

@@ -68,11 +68,12 @@ class FacadeNav(gymnasium.Env):
 
     Reward: metres of progress along the shortest way, plus 10 at the goal, minus 0.5 for a step with a collision.
 
-    An episode terminates within half a metre of the goal, and is truncated after 300 steps of 0.2 seconds. ``info`` has
-    ``success``, ``spl`` (Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents": 0 without success, else
-    the length of the shortest way over that driven, at most 1), ``collisions`` (steps with one), ``trusted`` (whether
-    the camera is where its images are to be believed), ``shortest`` and ``driven`` in metres; the
-    shortest way ends where the goal is reached.
+    An episode terminates within half a metre of the goal, and is truncated after 300 steps of 0.2 seconds, or once the
+    robot has left the grid of ways, which ends 10 m beyond the photographs' cameras. ``info`` has ``success``, ``spl``
+    (Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents": 0 without success, else the length of the
+    shortest way over that driven, at most 1), ``collisions`` (steps with one), ``trusted`` (whether the camera is where
+    its images are to be believed), ``shortest`` and ``driven`` in metres; the shortest way ends where the goal is
+    reached.
 
     Args:
         world: folder that ``shellgs sim`` wrote.
@@ -173,7 +174,8 @@ class FacadeNav(gymnasium.Env):
         self._left = left if np.isfinite(left) else self._left
         success = bool(np.linalg.norm(self.goal - now) < NEAR)
         reward = progress + SUCCESS * success - COLLISION_COST * collides
-        return self._observed(), reward, success, False, self._info(success)
+        outside = not self.course.space.has(now)  # ways are not known there, and ground that is not level soon ends
+        return self._observed(), reward, success, outside, self._info(success)
 
     def render(self):
         """The robot's camera image by the splats."""
