@@ -18,10 +18,10 @@ from worlds import frame_at, some_splats, uneven, write_folder
 from shellgs_method.errors import SceneError
 from shellgs_method.files.splats import write_splats
 from shellgs_method.sim.env import NAME, TIME
-from shellgs_method.sim.env.course import WALK
+from shellgs_method.sim.env.course import CLEAR, WALK
 from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
-from shellgs_method.sim.env.world import World
+from shellgs_method.sim.env.world import PERSON, World
 from shellgs_method.sim.free_space import CELL, CELLS, MARGIN, FreeSpace
 from shellgs_method.sim.ground import BEYOND, LEVEL, Ground
 from shellgs_method.sim.trials.engine import import_mujoco
@@ -117,6 +117,15 @@ def test_a_pedestrian_that_walks_into_the_robot_is_a_collision_and_pushes_it_no_
         *_, info = env.step(np.zeros(3))
     assert info["collisions"] > 3
     assert info["driven"] < 1.3
+
+
+def test_pedestrians_start_away_from_the_robot(folder):
+    env = make(folder, depth=False, pedestrians=40)
+    for seed in range(4):
+        env.reset(seed=seed)
+        off = np.linalg.norm(env.data.mocap_pos[:, :2] - env._place, axis=1)
+        assert off.min() > env.world.radius + PERSON + CLEAR
+        assert env.step(np.zeros(3))[4]["collisions"] == 0
 
 
 def test_lidar_and_depth_agree_with_the_collision_geometry(folder, collider):

@@ -16,6 +16,8 @@ OPTIONS = "start", "goal", "heading"
 """What ``options`` of :meth:`gymnasium.Env.reset` may have."""
 WALK = 1.0
 """Speed of pedestrians in metres a second."""
+CLEAR = 0.5
+"""Least distance in metres between a pedestrian and the robot at the start of an episode."""
 TRIES = 200
 """Spawns and goals that are tried for an episode."""
 
@@ -138,11 +140,19 @@ class Pedestrians:
         self._world, self._course = world, course
         self._names = [f"pedestrian_{k}" for k in range(count)]
 
-    def spread(self, data, rng: np.random.Generator) -> None:
-        """Put them anywhere."""
+    def spread(self, data, rng: np.random.Generator, episode: Episode) -> None:
+        """Put them anywhere but where the robot starts, which they would throw away.
+
+        Raises:
+            SceneError: there is no such place.
+        """
+        places = self._course.places
+        off = np.linalg.norm(places - episode.start, axis=1)
+        places = places[off > self._world.radius + PERSON + CLEAR]
+        if self._names and len(places) == 0:
+            raise SceneError(f"{self._world.folder}: there is no place for pedestrians away from the given start")
         self._ways = [self._way(rng) for _ in self._names]
         for name in self._names:
-            places = self._course.places
             self._world.put(data, name, places[rng.integers(len(places))], HALF_HEIGHT + PERSON)
 
     def walk(self, data, rng: np.random.Generator, seconds: float) -> None:

@@ -147,7 +147,7 @@ class FacadeNav(gymnasium.Env):
         self.data.qpos[self._qpos : self._qpos + 7] = *start, height, np.cos(heading / 2), 0, 0, np.sin(heading / 2)
         stops = self._rgb.exposure if self._rgb else 0.0
         self._gain = 2 ** (stops * self.np_random.uniform(-1, 1))
-        self._pedestrians.spread(self.data, self.np_random)
+        self._pedestrians.spread(self.data, self.np_random, self._episode)
         mujoco.mj_forward(self.model, self.data)
         self._left = self._episode.left(start)
         self._shortest = max(0.0, self._left - NEAR)
