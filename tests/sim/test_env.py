@@ -19,9 +19,9 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.splats import write_splats
 from shellgs_method.sim.env import NAME, TIME
 from shellgs_method.sim.env.course import CLEAR, WALK
-from shellgs_method.sim.env.facade_nav import NEAR, CameraSettings, FacadeNav
+from shellgs_method.sim.env.facade_nav import NEAR, STEP, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
-from shellgs_method.sim.env.world import PERSON, World
+from shellgs_method.sim.env.world import BOX, PERSON, World
 from shellgs_method.sim.free_space import CELL, CELLS, MARGIN, FreeSpace
 from shellgs_method.sim.ground import BEYOND, LEVEL, Ground
 from shellgs_method.sim.trials.engine import import_mujoco
@@ -126,6 +126,17 @@ def test_pedestrians_start_away_from_the_robot(folder):
         off = np.linalg.norm(env.data.mocap_pos[:, :2] - env._place, axis=1)
         assert off.min() > env.world.radius + PERSON + CLEAR
         assert env.step(np.zeros(3))[4]["collisions"] == 0
+
+
+def test_pedestrians_walk_around_the_obstacle_and_get_somewhere(folder):
+    env = make(folder, depth=False, pedestrians=6, obstacle=True)
+    for seed in range(6):
+        env.reset(seed=seed)
+        box, people, start = env.data.mocap_pos[6, :2], env.data.mocap_pos[:6, :2], env.data.mocap_pos[:6, :2].copy()
+        for _ in range(150):
+            assert np.linalg.norm(people - box, axis=1).min() > np.sqrt(2) * BOX + PERSON
+            env._pedestrians.walk(env.data, env.np_random, STEP)
+        assert (np.linalg.norm(people - start, axis=1) > 1).any()
 
 
 def test_lidar_and_depth_agree_with_the_collision_geometry(folder, collider):

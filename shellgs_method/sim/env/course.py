@@ -128,7 +128,7 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 class Pedestrians:
-    """People who walk along the grid's shortest ways, each to one place after the other.
+    """People who walk along the grid's shortest ways around the obstacle, each to one place after the other.
 
     Args:
         world: a world with as many capsules.
@@ -141,33 +141,32 @@ class Pedestrians:
         self._names = [f"pedestrian_{k}" for k in range(count)]
 
     def spread(self, data, rng: np.random.Generator, episode: Episode) -> None:
-        """Put them anywhere but where the robot starts, which they would throw away.
+        """Put them anywhere with a way to the goal beside the obstacle, but not in the robot: they would throw it away.
 
         Raises:
             SceneError: there is no such place.
         """
-        places = self._course.places
-        off = np.linalg.norm(places - episode.start, axis=1)
-        places = places[off > self._world.radius + PERSON + CLEAR]
-        if self._names and len(places) == 0:
+        places, self._space = self._course.places, episode.space
+        self._places = places[np.isfinite(self._space.at(episode.lengths, places))]
+        off = np.linalg.norm(self._places - episode.start, axis=1)
+        away = self._places[off > self._world.radius + PERSON + CLEAR]
+        if self._names and len(away) == 0:
             raise SceneError(f"{self._world.folder}: there is no place for pedestrians away from the given start")
         self._ways = [self._way(rng) for _ in self._names]
         for name in self._names:
-            self._world.put(data, name, places[rng.integers(len(places))], HALF_HEIGHT + PERSON)
+            self._world.put(data, name, away[rng.integers(len(away))], HALF_HEIGHT + PERSON)
 
     def walk(self, data, rng: np.random.Generator, seconds: float) -> None:
         """Move each along its way."""
-        space = self._course.space
         for k, name in enumerate(self._names):
             here = data.mocap_pos[self._world.mocap(name), :2].copy()
-            ahead = space.downhill(self._ways[k], here) - here
+            ahead = self._space.downhill(self._ways[k], here) - here
             length = float(np.linalg.norm(ahead))
-            if length < 1e-6 or space.at(self._ways[k], here) == 0:
+            if length < 1e-6 or self._space.at(self._ways[k], here) == 0:
                 self._ways[k] = self._way(rng)
                 continue
             self._world.put(data, name, here + ahead * min(1, WALK * seconds / length), HALF_HEIGHT + PERSON)
 
     def _way(self, rng: np.random.Generator) -> np.ndarray:
         """Lengths of the ways to a place where a pedestrian goes."""
-        places = self._course.places
-        return self._course.space.distances(places[rng.integers(len(places))])
+        return self._space.distances(self._places[rng.integers(len(self._places))])
