@@ -13,7 +13,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from PIL import Image
-from worlds import frame_at, some_splats, uneven, write_folder
+from worlds import frame_at, some_splats, uneven, write_building, write_folder
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.splats import write_splats
@@ -22,6 +22,7 @@ from shellgs_method.sim.env.course import CLEAR, WALK
 from shellgs_method.sim.env.facade_nav import NEAR, STEP, CameraSettings, FacadeNav
 from shellgs_method.sim.env.sensors import camera_of, depth_image, splats_of
 from shellgs_method.sim.env.world import BOX, PERSON, World
+from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.free_space import CELL, CELLS, MARGIN, FreeSpace
 from shellgs_method.sim.ground import BEYOND, LEVEL, Ground
 from shellgs_method.sim.trials.engine import import_mujoco
@@ -351,6 +352,17 @@ def test_another_robot_is_attached_and_its_actuators_are_the_actions(folder, tmp
     for _ in range(10):
         env.step(np.array([1.0]))
     assert env._place[0] > 2.5
+
+
+@pytest.mark.parametrize("name", ["robot", "obstacle", "pedestrian_0"])
+def test_a_building_may_be_called_as_what_moves(collider, folder, tmp_path, name):
+    out = tmp_path / "sim"
+    write_world(out, [write_building(out, collider, name)], frame_at(), LEVEL)
+    facts = json.loads((folder / "frame.json").read_text())
+    (out / "frame.json").write_text(json.dumps(facts | {"buildings": {name: "x"}}))
+    envs = [make(each, depth=False, pedestrians=1, obstacle=True) for each in (out, folder)]
+    np.testing.assert_array_equal(episode(envs[0], 0), episode(envs[1], 0))
+    assert envs[0].world.radius == envs[1].world.radius
 
 
 def test_the_robot_follows_uneven_ground(collider, folder, tmp_path):

@@ -31,7 +31,8 @@ PERSON, HALF_HEIGHT = 0.25, 0.6
 """Radius of a pedestrian's capsule, and half the length of its axis, in metres."""
 BOX = 0.6
 """Half the side of the obstacle, in metres."""
-PREFIX = "robot/"
+PREFIX = "robot:"
+"""Names of the robot's parts begin with this, and none of a building's do: those have its name and a slash first."""
 AWAY = np.array([0.0, 0.0, -100.0])
 """Where a body is that is not there."""
 
@@ -79,6 +80,7 @@ class World:
         workspace = Workspace.read(facts, folder / FRAME)
         spec = read_spec(folder / "world.xml")
         spec.option.timestep = TIMESTEP
+        whose = robot or "the default robot"
         given = mujoco.MjSpec.from_string(DEFAULT_ROBOT) if robot is None else read_spec(robot)
         spec.attach(given, prefix=PREFIX, frame=spec.worldbody.add_frame())
         capsule = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [PERSON, HALF_HEIGHT, 0], "rgba": [0.2, 0.3, 0.7, 1]}
@@ -90,9 +92,9 @@ class World:
         model = compiled(spec, folder / "world.xml")
         joints = model.jnt_type[model.jnt_bodyid == root_of(model)]
         if list(joints) != [mujoco.mjtJoint.mjJNT_FREE] or model.nu == 0:
-            raise SceneError(f"{robot}: the first body of a robot needs a free joint, and the robot actuators")
+            raise SceneError(f"{whose}: the first body of a robot needs a free joint, and the robot actuators")
         if not (model.actuator_ctrllimited.astype(bool) & (np.ptp(model.actuator_ctrlrange, axis=1) > 0)).all():
-            raise SceneError(f"{robot}: each actuator needs a ctrlrange, which actions of -1 to 1 are scaled to")
+            raise SceneError(f"{whose}: each actuator needs a ctrlrange, which actions of -1 to 1 are scaled to")
         parts = _parts(model)
         ground = _ground(model).under(np.concatenate([*parts, workspace.eyes]))
         grid = FreeSpace.of(parts, ground, workspace.eyes[:, :2])
