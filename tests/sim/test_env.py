@@ -354,6 +354,30 @@ def test_another_robot_is_attached_and_its_actuators_are_the_actions(folder, tmp
     assert env._place[0] > 2.5
 
 
+@pytest.mark.parametrize("part", ["", '<body name="wheel" pos="0.2 0 0"><geom type="sphere" size="0.05"/></body>'])
+def test_the_first_body_of_a_robot_needs_no_name(folder, tmp_path, part):
+    (tmp_path / "ball.xml").write_text(ROBOT.replace('body name="ball"', "body").replace("<site", f"{part}<site"))
+    env = make(folder, robot=tmp_path / "ball.xml", depth=False)
+    assert env.world.radius == pytest.approx(0.3)
+    env.reset(seed=0, options={"start": (2, -6), "goal": (9, -6), "heading": 0.0})
+    assert env._place == pytest.approx([2, -6])
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [
+        "<mujoco/>",
+        ROBOT.partition("<actuator>")[0] + "</mujoco>",
+        ROBOT.replace('<freejoint name="free"/>', '<joint name="free"/>'),
+        ROBOT.replace("<worldbody>", '<worldbody><body name="stand"/>'),
+    ],
+)
+def test_a_robot_without_bodies_a_free_one_first_or_actuators_is_refused(folder, tmp_path, robot):
+    (tmp_path / "ball.xml").write_text(robot)
+    with pytest.raises(SceneError, match=r"ball\.xml: the first body of a robot needs a free joint, and"):
+        make(folder, robot=tmp_path / "ball.xml")
+
+
 @pytest.mark.parametrize("name", ["robot", "obstacle", "pedestrian_0"])
 def test_a_building_may_be_called_as_what_moves(collider, folder, tmp_path, name):
     out = tmp_path / "sim"

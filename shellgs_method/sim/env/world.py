@@ -82,6 +82,11 @@ class World:
         spec.option.timestep = TIMESTEP
         whose = robot or "the default robot"
         given = mujoco.MjSpec.from_string(DEFAULT_ROBOT) if robot is None else read_spec(robot)
+        first = given.worldbody.first_body()
+        joints = [joint.type for joint in first.joints] if first else []
+        if joints != [mujoco.mjtJoint.mjJNT_FREE] or not given.actuators:
+            raise SceneError(f"{whose}: the first body of a robot needs a free joint, and the robot actuators")
+        first.name = first.name or "first"  # as it is found by its name
         spec.attach(given, prefix=PREFIX, frame=spec.worldbody.add_frame())
         capsule = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [PERSON, HALF_HEIGHT, 0], "rgba": [0.2, 0.3, 0.7, 1]}
         box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [BOX, BOX, 1], "rgba": [0.7, 0.6, 0.4, 1]}
@@ -90,9 +95,6 @@ class World:
             body = spec.worldbody.add_body(name=name, mocap=True, pos=AWAY)
             body.add_geom(name=name, group=MOVING, **shape)
         model = compiled(spec, folder / "world.xml")
-        joints = model.jnt_type[model.jnt_bodyid == root_of(model)]
-        if list(joints) != [mujoco.mjtJoint.mjJNT_FREE] or model.nu == 0:
-            raise SceneError(f"{whose}: the first body of a robot needs a free joint, and the robot actuators")
         if not (model.actuator_ctrllimited.astype(bool) & (np.ptp(model.actuator_ctrlrange, axis=1) > 0)).all():
             raise SceneError(f"{whose}: each actuator needs a ctrlrange, which actions of -1 to 1 are scaled to")
         parts = _parts(model)
