@@ -92,6 +92,15 @@ def test_straight_to_the_goal_is_a_success_of_spl_one_and_progress_adds_up_to_th
     assert sum(rewards) == pytest.approx(10 + 6 - NEAR, abs=0.3)
 
 
+def test_a_success_that_starts_at_the_goal_is_of_spl_one(folder):
+    env = make(folder, depth=False)
+    _, info = env.reset(seed=0, options={"start": (2, -6), "goal": (2.4, -6), "heading": 0.0})
+    assert (info["shortest"], info["success"], info["spl"]) == (0, False, 0)
+    *_, info = env.step(np.array([1, 0, 0]))
+    assert info["driven"] > 0
+    assert (info["success"], info["spl"]) == (True, 1)
+
+
 def test_driving_into_the_wall_is_a_collision_each_step_and_the_wall_stands(folder, collider):
     env = make(folder, depth=False)
     front = collider.surface.vertices[:, 1].min()

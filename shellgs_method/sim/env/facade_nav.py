@@ -71,9 +71,9 @@ class FacadeNav(gymnasium.Env):
     An episode terminates within half a metre of the goal, and is truncated after 300 steps of 0.2 seconds, or once the
     robot has left the grid of ways, which ends 10 m beyond the photographs' cameras. ``info`` has ``success``, ``spl``
     (Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents": 0 without success, else the length of the
-    shortest way over that driven, at most 1), ``collisions`` (steps with one), ``trusted`` (whether the camera is where
-    its images are to be believed), ``shortest`` and ``driven`` in metres; the shortest way ends where the goal is
-    reached.
+    shortest way over that driven, at most 1, and 1 for a start at the goal), ``collisions`` (steps with one),
+    ``trusted`` (whether the camera is where its images are to be believed), ``shortest`` and ``driven`` in metres; the
+    shortest way ends where the goal is reached.
 
     Args:
         world: folder that ``shellgs sim`` wrote.
@@ -231,10 +231,10 @@ class FacadeNav(gymnasium.Env):
 
     def _info(self, success: bool = False) -> dict[str, Any]:
         pose = self.data.cam_xmat[self._camera].reshape(3, 3)
-        spl = self._shortest / max(self._shortest, self._driven, 1e-9) if success else 0.0
+        part = self._shortest / max(self._shortest, self._driven) if self._shortest else 1.0
         return {
             "success": success,
-            "spl": spl,
+            "spl": part if success else 0.0,
             "collisions": self._collisions,
             "trusted": self.world.workspace.trusts(self.data.cam_xpos[self._camera], -pose[:, 2]),
             "shortest": self._shortest,
