@@ -317,13 +317,32 @@ def test_a_camera_behind_the_robot_sees_it_in_its_materials_colour_and_not_its_o
     assert not ((image[..., 1] > 100) & (image[..., [0, 2]].max(axis=-1) < 10)).any()
 
 
-def test_an_unknown_option_and_a_mode_that_is_not_rendered_are_refused(folder):
+def test_an_unknown_option_and_an_action_with_nan_are_refused(folder):
+    env = make(folder, depth=False)
     with pytest.raises(SceneError, match="no option gaol"):
-        make(folder, depth=False).reset(options={"gaol": (9, -6)})
-    with pytest.raises(SceneError, match="'human' cannot be"):
-        FacadeNav(folder, render_mode="human")
-    with pytest.raises(SceneError, match="pedestrians -1 cannot be"):
-        FacadeNav(folder, pedestrians=-1)
+        env.reset(options={"gaol": (9, -6)})
+    env.reset(seed=0)
+    with pytest.raises(SceneError, match=r"action \[nan +0\. +0\.\] cannot be"):
+        env.step(np.array([np.nan, 0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"render_mode": "human"}, "render_mode 'human' cannot be"),
+        ({"pedestrians": -1}, "pedestrians -1 cannot be"),
+        ({"pedestrians": 1.5}, "pedestrians 1.5 cannot be"),
+        ({"rgb": True}, "rgb True cannot be"),
+        ({"rgb": (160, 90)}, r"rgb \(160, 90\) cannot be"),
+        ({"rgb": CameraSettings(0, 0)}, r"rgb CameraSettings\(width=0, .* cannot be"),
+        ({"distance": 5}, "distance 5 cannot be"),
+        ({"distance": (15, 5)}, r"distance \(15, 5\) cannot be"),
+        ({"distance": (5, np.nan)}, r"distance \(5, nan\) cannot be"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused(folder, settings, says):
+    with pytest.raises(SceneError, match=says):
+        FacadeNav(folder, **settings)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +105,12 @@ class FacadeNav(gymnasium.Env):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise SceneError(f"render_mode {render_mode!r} cannot be: give 'rgb_array'; its images can be shown")
-        if pedestrians < 0:
+        if not isinstance(pedestrians, Integral) or pedestrians < 0:
             raise SceneError(f"pedestrians {pedestrians} cannot be: give the number of people who walk about, or 0")
+        if rgb and not (isinstance(rgb, CameraSettings) and min(rgb.width, rgb.height) > 0):
+            raise SceneError(f"rgb {rgb} cannot be: give CameraSettings(160, 90), its width and height, or None")
+        if np.shape(distance) != (2,) or not 0 <= distance[0] < distance[1]:
+            raise SceneError(f"distance {distance} cannot be: give the smallest and the largest in metres, as (5, 15)")
         self.world = World.load(Path(world), Path(robot) if robot else None, pedestrians, obstacle)
         self.model = self.world.model
         self.data = mujoco.MjData(self.model)
@@ -155,7 +160,13 @@ class FacadeNav(gymnasium.Env):
         return self._observed(), self._info()
 
     def step(self, action: Float64[np.ndarray, " A"]):
-        """Drive for a fifth of a second."""
+        """Drive for a fifth of a second.
+
+        Raises:
+            SceneError: the action has NaN, which MuJoCo takes for 0.
+        """
+        if np.isnan(action).any():
+            raise SceneError(f"the action {action} cannot be: give each actuator a number from -1 to 1")
         low, high = self.model.actuator_ctrlrange.T
         self.data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
         was, collides = self.data.mocap_pos.copy(), False
