@@ -128,7 +128,10 @@ def test_a_merged_run_in_its_scene_finds_it(configs, street, tmp_path):
 
 def test_other_commands_take_a_merged_run(configs, tmp_path, shellgs, in_process):
     config = merge(configs, tmp_path / "merged")
-    in_process("ns-eval", "--load-config", config, "--output-path", tmp_path / "eval.json")
+    output = "--output-path", tmp_path / "eval.json", "--render-output-path", tmp_path / "views"
+    in_process("ns-eval", "--load-config", config, *output)
+    for picture in ("img", "depth", "normal", "normal_error"):
+        assert (tmp_path / "views" / f"eval_{picture}_0000.png").is_file()
     assert np.isfinite(json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"])
     assert "Gaussians" in shellgs("splats", config)
     extra = load_checkpoint(find_checkpoint(config.parent / "nerfstudio_models"))["pipeline"]["_extra_state"]
