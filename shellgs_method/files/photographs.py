@@ -270,6 +270,7 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
         orientation, first = 1, image.size
         largest = first
         if isinstance(image, TiffImageFile):
+            image.filename = ""  # else Pillow maps an uncompressed one into memory with the sides of the turned one
             orientation, largest = orientation_of(image), _largest_page(image)
         if whole or orientation != 1:
             image.load()

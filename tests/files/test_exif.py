@@ -66,6 +66,22 @@ def test_a_tiff_is_read_as_it_is_stored_as_other_photographs_are(tmp_path, orien
         assert (header.size, orientation_of(header)) == ((48, 32), orientation)
 
 
+@pytest.mark.parametrize("orientation", [1, 3, 5, 6, 7, 8])
+@pytest.mark.parametrize("mode", ["L", "RGBA", "CMYK", "I;16"])
+def test_an_uncompressed_tiff_is_read_as_it_is_stored_in_all_modes(tmp_path, mode, orientation):
+    grey = photograph(48, 32).convert("L")
+    stored = Image.fromarray(np.asarray(grey, np.uint16) * 257) if mode == "I;16" else grey.convert(mode)
+    stored.save(tmp_path / "a.tif", compression=None, tiffinfo={ExifTags.Base.Orientation: orientation})
+    np.testing.assert_array_equal(np.asarray(read_image(tmp_path / "a.tif").convert("L")), np.asarray(grey))
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_a_mask_that_is_an_uncompressed_tiff_is_read_as_it_is_stored(tmp_path, orientation):
+    stored = Image.fromarray(np.where(np.arange(48) + np.arange(32)[:, None] < 30, 255, 0).astype(np.uint8))
+    stored.save(tmp_path / "a.tif", compression=None, tiffinfo={ExifTags.Base.Orientation: orientation})
+    np.testing.assert_array_equal(np.asarray(read_mask(tmp_path / "a.tif")), np.asarray(stored))
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_no_damage_of_exif_data_raises_an_error():
     whole, random = exif_data(), np.random.default_rng(0)
