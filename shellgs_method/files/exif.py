@@ -12,6 +12,7 @@ def exif_of(image: Image.Image) -> Image.Exif:
     try:
         exif = image.getexif()
         exif.get_ifd(ExifTags.IFD.Exif)
+        exif.bigtiff = False  # else those of a BigTIFF are written as one, which Pillow cannot read in other formats
         exif.tobytes()
     except Exception:  # whatever the damaged bytes lead to
         return Image.Exif()

@@ -51,11 +51,12 @@ def test_a_photograph_with_damaged_exif_data_is_read_without_them(tmp_path, suff
         assert tags_of(image).keys() <= {ExifTags.Base.Make, ExifTags.Base.Orientation, 0x8769}
 
 
+@pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_tiff_is_read_as_it_is_stored_as_other_photographs_are(tmp_path, orientation):
+def test_a_tiff_is_read_as_it_is_stored_as_other_photographs_are(tmp_path, orientation, big):
     stored, exif = photograph(48, 32), Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
-    stored.save(tmp_path / "a.tif", tiffinfo={ExifTags.Base.Orientation: orientation})
+    stored.save(tmp_path / "a.tif", tiffinfo={ExifTags.Base.Orientation: orientation}, big_tiff=big)
     stored.save(tmp_path / "a.png", exif=exif)
     tiff, png = (read_image(tmp_path / name) for name in ("a.tif", "a.png"))
     np.testing.assert_array_equal(np.asarray(tiff), np.asarray(stored))
@@ -64,6 +65,13 @@ def test_a_tiff_is_read_as_it_is_stored_as_other_photographs_are(tmp_path, orien
     assert orientation_of(tiff) == orientation
     with opened(tmp_path / "a.tif", whole=False) as header:
         assert (header.size, orientation_of(header)) == ((48, 32), orientation)
+
+
+def test_a_big_tiff_keeps_its_exposure(tmp_path):
+    exif = Image.Exif()
+    exif.load(exif_data())
+    photograph(48, 32).save(tmp_path / "a.tif", exif=exif, big_tiff=True)
+    assert tags_of(read_image(tmp_path / "a.tif"))[ExifTags.Base.ISOSpeedRatings] == 200
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 5, 6, 7, 8])
