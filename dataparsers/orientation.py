@@ -83,7 +83,7 @@ def _orientation_of(photograph: Path, _changed: int) -> int:
 
 def _by_colours(views: Sequence[View], points: SparsePoints) -> bool | None:
     """Whether points have rather the colours of the upright photographs; None if these differ as much."""
-    if points.colours is None or np.ptp(points.colours, axis=0).max(initial=0) == 0:
+    if points.colours is None or (points.colours == points.colours[:1]).all():  # which is so where there are none
         return None
     differences, images = ([], []), []
     for view in views[:: max(1, len(views) // _COMPARED)]:

@@ -354,6 +354,12 @@ def without_colours(scene: Path) -> None:
     (scene / "sparse_pc.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "0 0 1"]) + "\n")
 
 
+def without_points(scene: Path) -> None:
+    transforms = json.loads((scene / "transforms.json").read_text())
+    del transforms["ply_file_path"]
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+
+
 def differences(scene: Path, upright: dict[str, np.ndarray]) -> list[float]:
     views = [view for view in read_views(FacadeDataParserConfig(data=scene)) if view.image.stem in upright]
     return [np.abs(load_photograph(view).astype(float) - upright[view.image.stem]).mean() for view in views]
@@ -391,7 +397,7 @@ def test_without_coloured_points_photographs_stored_turned_are_judged_by_their_n
     assert f"are of them {'upright' if applied else 'as stored'}, by the cameras' up axes" in caplog.text
 
 
-@pytest.mark.parametrize("cloud", [with_heights_as_colours, without_colours])
+@pytest.mark.parametrize("cloud", [with_heights_as_colours, without_colours, without_points])
 def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, caplog, cloud):
     cloud(scene)
     store_turned(scene, 3)
