@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from shellgs_method.errors import notice
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.exif import orientation_of
-from shellgs_method.files.photographs import View, load_photograph
+from shellgs_method.files.photographs import View, is_turned, load_photograph, opened
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
 from shellgs_method.geometry.camera import image_up, in_view
 from shellgs_method.registration.sfm_frame import may_be_of
@@ -36,8 +36,9 @@ _ALIKE, _UNLIKE = 0.7, 0.3  # cosines of mean up axes
 def oriented(views: Sequence[View], layout: SceneLayout) -> list[View]:
     """The views, those ``turned`` whose cameras are of the upright photograph.
 
-    One program found all cameras, so that they are judged together: by the colours of the SfM points, else by the up
-    axes of the cameras of photographs that are stored upright. What is found is told.
+    One program found all cameras, so that they are judged together: by the colours of the SfM points, else by the
+    shapes of cameras of photographs that are stored on their side, else by the up axes of those of photographs that are
+    stored upright. What is found is told.
     """
     # A block is sent to another machine without the photographs of others.
     there = [view for view in views if view.image.is_file()]
@@ -45,6 +46,8 @@ def oriented(views: Sequence[View], layout: SceneLayout) -> list[View]:
     if not marked:
         return list(views)
     applied, by = _by_colours(marked, find_sparse_points(layout)), "the colours of the SfM points"
+    if applied is None:
+        applied, by = _by_shapes([v for v in there if _is_on_its_side(v.image)]), "the shapes of cameras of others"
     if applied is None:
         applied, by = _by_axes(marked, [v for v in there if _orientation(v.image) == 1]), "the cameras' up axes"
     shown = (
@@ -60,13 +63,15 @@ def oriented(views: Sequence[View], layout: SceneLayout) -> list[View]:
 
 def _is_unclear(photograph: Path) -> bool:
     """Whether a photograph has an EXIF orientation that leaves its shape as it is."""
-    orientation = _orientation(photograph)
-    if orientation in (2, 3, 4):
-        return True
-    if orientation == 1:
+    return _orientation(photograph) != 1 and not _is_on_its_side(photograph)
+
+
+def _is_on_its_side(photograph: Path) -> bool:
+    """Whether a photograph has an EXIF orientation that changes its shape."""
+    if _orientation(photograph) < 5:
         return False
     with Image.open(photograph) as image:
-        return abs(image.width - image.height) <= _ROUNDING * image.width
+        return abs(image.width - image.height) > _ROUNDING * image.width
 
 
 def _orientation(photograph: Path) -> int:
@@ -99,6 +104,15 @@ def _by_colours(views: Sequence[View], points: SparsePoints) -> bool | None:
         return None
     less, more = sorted((stored.mean(), upright.mean()))
     return bool(upright.mean() < stored.mean()) if less < _CLEARER * more else None
+
+
+def _by_shapes(views: Sequence[View]) -> bool | None:
+    """Whether cameras have the shapes of the upright photographs; None if only some have, or there are none."""
+    found = set()
+    for view in views:
+        with suppress(SceneError), opened(view.image, whole=False) as image:  # damage is told where it is used
+            found.add(is_turned(view, image, view.image))
+    return found.pop() if len(found) == 1 else None
 
 
 def _by_axes(views: Sequence[View], straight: Sequence[View]) -> bool | None:

@@ -127,8 +127,37 @@ def upright_size(view: View) -> tuple[int, int]:
         SceneError: as :func:`load_upright`.
     """
     with opened(view.image, whole=False) as image:
-        is_turned = _is_turned(view, image, view.image) and orientation_of(image) > 4
-        return (image.height, image.width) if is_turned else image.size
+        on_its_side = is_turned(view, image, view.image) and orientation_of(image) > 4
+        return (image.height, image.width) if on_its_side else image.size
+
+
+def is_turned(view: View, image: Image.Image, path: Path) -> bool:
+    """Whether SfM applied the EXIF orientation, which the shape of its camera shows, or what is known of the view.
+
+    Args:
+        view: the photograph.
+        image: its pixels, or those of a mask of it, as they are stored.
+        path: file of the image.
+
+    Raises:
+        SceneError: the camera is of another shape, turned or not.
+    """
+    width, height = _calibrated_size(view)
+    for turned in (True, False) if view.turned else (False, True):
+        across, down = image.size[::-1] if turned and orientation_of(image) > 4 else image.size
+        aspect = across / down
+        rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which matters in thumbnails
+        if abs(width - height * aspect) < max(0.01 * width, rounding):
+            return turned
+    if path != view.image:
+        raise SceneError(
+            f"the mask {path} is {image.width}x{image.height} pixels, but the camera of {view.name} is "
+            f"{width}x{height}: paint it on that photograph"
+        )
+    raise SceneError(
+        f"{path} is {image.width}x{image.height} pixels, but its camera is {width}x{height}: "
+        "the photographs and the cameras do not belong together"
+    )
 
 
 def tell_of_other_sizes(views: Sequence[View], scene: Path) -> None:
@@ -375,24 +404,4 @@ def _calibrated_per_stored(view: View) -> Float64[np.ndarray, " 2"]:
 
 def _upright(view: View, image: Image.Image, path: Path) -> Image.Image:
     """Apply the EXIF orientation if SfM did."""
-    return ImageOps.exif_transpose(image) if _is_turned(view, image, path) else image
-
-
-def _is_turned(view: View, image: Image.Image, path: Path) -> bool:
-    """Whether SfM applied the EXIF orientation, which the shape of its camera shows, or what is known of the view."""
-    width, height = _calibrated_size(view)
-    for turned in (True, False) if view.turned else (False, True):
-        across, down = image.size[::-1] if turned and orientation_of(image) > 4 else image.size
-        aspect = across / down
-        rounding = 0.5 + 0.5 * aspect  # of both sides to whole pixels, which matters in thumbnails
-        if abs(width - height * aspect) < max(0.01 * width, rounding):
-            return turned
-    if path != view.image:
-        raise SceneError(
-            f"the mask {path} is {image.width}x{image.height} pixels, but the camera of {view.name} is "
-            f"{width}x{height}: paint it on that photograph"
-        )
-    raise SceneError(
-        f"{path} is {image.width}x{image.height} pixels, but its camera is {width}x{height}: "
-        "the photographs and the cameras do not belong together"
-    )
+    return ImageOps.exif_transpose(image) if is_turned(view, image, path) else image

@@ -397,6 +397,26 @@ def test_without_coloured_points_photographs_stored_turned_are_judged_by_their_n
     assert f"are of them {'upright' if applied else 'as stored'}, by the cameras' up axes" in caplog.text
 
 
+@pytest.mark.parametrize("sides", [[True], [False], [True, False]])  # whether cameras are of the upright photographs
+def test_without_coloured_points_photographs_stored_turned_are_judged_by_the_shapes_of_others_cameras(
+    scene, caplog, sides
+):
+    upright = store_turned(scene, 3, slice(0, 10, 2))
+    store_turned(scene, 6, slice(1, 10, 2))
+    without_colours(scene)
+    transforms = json.loads((scene / "transforms.json").read_text())
+    swapped = {one: transforms[other] for one, other in ("wh", "hw", ("fl_x", "fl_y"), ("fl_y", "fl_x"), ("cx", "cy"))}
+    for k, frame in enumerate(transforms["frames"][1::2]):
+        if not sides[k % len(sides)]:
+            frame |= swapped | {"cy": transforms["w"] - transforms["cx"]}
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    applied = sides == [True]
+    expected = {stem: pixels if applied else np.rot90(pixels, 2) for stem, pixels in upright.items()}
+    assert max(differences(scene, expected)) < 4
+    how = f"are of them {'upright' if applied else 'as stored'}, by the shapes of cameras of others"
+    assert ("nothing tells" if len(sides) > 1 else how) in caplog.text
+
+
 @pytest.mark.parametrize("cloud", [with_heights_as_colours, without_colours, without_points])
 def test_photographs_of_which_nothing_tells_how_they_are_stored_are_told(scene, caplog, cloud):
     cloud(scene)
