@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float64
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.paths import folded
 from shellgs_method.files.photographs import View, to_camera
 from shellgs_method.files.tables import IMAGE, NAME, PIXELS, Table, words_of
 from shellgs_method.registration.correspondences import (
@@ -93,6 +94,7 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
 def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
+    captured: list[str] = []
     convert, columns = table.to_shell(crs), table.columns({**PIXELS, "image": IMAGE, "name": NAME}, _COLUMNS)
     for where, row in table.rows(columns, "X Y Z of the shell, x y in the photograph, the image, a name"):
         coordinates = [row[axis] for axis in "XYZ"]
@@ -100,17 +102,20 @@ def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
         view = view_named(row["image"], views, where)
         if view is None:
             raise SceneError(f"{where}: {row['image']} is not a photograph of the scene; quote a name with spaces")
-        if PureWindowsPath(row["image"]).name not in (PurePosixPath(view.name).name, view.image.name):
-            notice(
-                f"{table.path} names photographs as they were before the capture ({row['image']} is {view.name}, for "
-                "example): pixels must be those of the photographs in the scene, which have no lens distortion."
-            )
+        names = {folded(name) for name in (PurePosixPath(view.name).name, view.image.name)}
+        if folded(PureWindowsPath(row["image"]).name) not in names:
+            captured.append(f"{row['image']} is {view.name}")
         name = row["name"] or " ".join(coordinates)
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")
         if view.name in pixels.setdefault(name, {}):
             raise SceneError(f"{where}: the point {name} is picked twice in {row['image']}")
         pixels[name][view.name] = pixel
+    if captured:
+        notice(
+            f"{table.path} names photographs as they were before the capture ({captured[0]}, for example): pixels must "
+            "be those of the photographs in the scene, which have no lens distortion."
+        )
     points = convert(np.array([*shell.values()]).reshape(-1, 3))
     return [Pick(name, point, pixels[name]) for name, point in zip(shell, points, strict=True)]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -532,6 +533,20 @@ def test_a_picks_file_is_read_in_opendronemaps_format(rigged, tmp_path):
     assert door.pixels == {"images/0.png": (10.5, 20), "images/1.png": (30, 40)}
     np.testing.assert_array_equal(door.shell, [410000.5, 5413000.25, 251])
     assert nameless.pixels["images/1.png"] == (70, 80)
+
+
+def test_names_from_before_the_capture_are_told_once_and_other_spellings_are_none(rigged, tmp_path, caplog):
+    views = [replace(view, name=f"images/Façade {k}.png") for k, view in enumerate(rigged[0])]
+    file = tmp_path / "picks.txt"
+    macos = [unicodedata.normalize("NFD", f"Façade {k}.PNG") for k in range(3)]  # as macOS writes it
+    file.write_text("".join(f"1 2 3 4 5 '{name}' a\n" for name in macos))
+    assert len(read_picks(file, views)[0].pixels) == 3
+    assert not caplog.messages
+    file.write_text("".join(f"1 2 3 4 5 'Façade {k}.heic' a\n" for k in range(3)))
+    views = [replace(view, name=view.name.replace(" ", "_")) for view in views]
+    assert len(read_picks(file, views)[0].pixels) == 3
+    (told,) = caplog.messages
+    assert "before the capture (Façade 0.heic is images/Façade_0.png, for example)" in told
 
 
 @pytest.mark.parametrize(
