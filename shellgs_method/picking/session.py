@@ -11,11 +11,19 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import SceneError
-from shellgs_method.files.photographs import View, from_camera, to_camera, upright_size
+from shellgs_method.files.photographs import View, from_camera, to_camera
 from shellgs_method.geometry.camera import in_view, positions
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.correspondences import residuals_in_words
-from shellgs_method.registration.picks import Pick, PickedPoint, PicksFile, Triangulation, align_picks, triangulated
+from shellgs_method.registration.picks import (
+    Pick,
+    PickedPoint,
+    PicksFile,
+    Triangulation,
+    align_picks,
+    check_inside,
+    triangulated,
+)
 
 _LINE = np.geomspace(1e-2, 1e3, 200)
 """Distances, in extents of the cameras, at which a point of one photograph is drawn in others."""
@@ -96,9 +104,7 @@ class Session:
         pick = self._pick(name)
         if view not in self._by_name:
             raise SceneError(f"{view} is not a photograph of the scene")
-        (x, y), (width, height) = pixel, upright_size(self._by_name[view])
-        if not (0 <= x <= width and 0 <= y <= height):
-            raise SceneError(f"the pixel ({x:.0f}, {y:.0f}) is outside {view}, which has {width}x{height}")
+        check_inside(name, self._by_name[view], pixel)
         self._step(self.state.with_pick(replace(pick, pixels={**pick.pixels, view: pixel})))
 
     def unmark(self, name: str, view: str) -> None:

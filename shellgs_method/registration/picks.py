@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float64
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.paths import folded
-from shellgs_method.files.photographs import View, to_camera
+from shellgs_method.files.photographs import View, to_camera, upright_size
 from shellgs_method.files.tables import IMAGE, NAME, PIXELS, Table, words_of
 from shellgs_method.registration.correspondences import (
     Correspondence,
@@ -268,6 +268,20 @@ def picked_again(
     return measured_again(moved, alignment)
 
 
+def check_inside(name: str, view: View, pixel: tuple[float, float]) -> None:
+    """Check that a pixel of a pick is in its photograph.
+
+    Raises:
+        SceneError: it is outside, or the photograph cannot be read.
+    """
+    (x, y), (width, height) = pixel, upright_size(view)
+    if not (0 <= x <= width and 0 <= y <= height):
+        raise SceneError(
+            f"the pixel ({x:.0f}, {y:.0f}) of the pick {name} is outside {view.name}, which has {width}x{height}: "
+            "pixels must be of photographs of that size"
+        )
+
+
 @dataclass(frozen=True)
 class Triangulation:
     """The point in the scene that a pick's pixels show.
@@ -291,11 +305,14 @@ def triangulated(pick: Pick, views: Mapping[str, View]) -> Triangulation:
         views: the views of the scene by name.
 
     Raises:
-        SceneError: it is in one photograph only, or its rays are parallel or meet behind a camera.
+        SceneError: it is in one photograph only, a pixel is outside its photograph, or its rays are parallel or meet
+            behind a camera.
     """
     if len(pick.pixels) < 2:
         raise SceneError(f"the pick {pick.name} is seen in one photograph only: pick it in another as well")
     seen = [views[name] for name in pick.pixels]
+    for view in seen:
+        check_inside(pick.name, view, pick.pixels[view.name])
     pixels = np.concatenate([to_camera(v, np.array([pick.pixels[v.name]], dtype=np.float64)) for v in seen])
     viewmats, Ks = (
         np.stack([getattr(view.camera, name).cpu().double().numpy() for view in seen]) for name in ("viewmat", "K")

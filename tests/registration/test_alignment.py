@@ -496,6 +496,15 @@ def test_a_pick_with_a_wrong_pixel_is_flagged_and_left_out(rigged):
     assert far_off(matrix, truth, picks) < 0.05
 
 
+def test_pixels_of_larger_photographs_are_refused(rigged):
+    views, projections = rigged
+    picks, _ = picked(projections)
+    larger = [replace(pick, pixels={v: (4 * x, 4 * y) for v, (x, y) in pick.pixels.items()}) for pick in picks]
+    words = r"of the pick p0 is outside images/\d.png, which has 1000x800: pixels must be of photographs of that size"
+    with pytest.raises(SceneError, match=words):
+        align_picks(larger, views)
+
+
 def test_check_points_are_measured_and_not_fitted(rigged):
     views, projections = rigged
     picks, _ = picked(projections)
