@@ -159,22 +159,20 @@ class _Start:
             FileNotFoundError: a file is missing.
             SceneError: the shell or a file cannot be used, or it fits nowhere.
         """
-        from shellgs_method.files.crs import crs_there
-        from shellgs_method.registration.align import system_of
+        from shellgs_method.registration.align import in_its_system, system_and_unit
         from shellgs_method.registration.frames import ShellPlace
 
-        crs = system_of(self.shell, self.crs, scene)
+        crs, unit = system_and_unit(self.shell, self.crs, self.metres_per_shell_unit, scene)
         place = ShellPlace(*self.shell) if self.shell and (self.picks or self.positions) else None
-        placement = self._placed(scene, views, points, place, crs)
+        placement = self._placed(scene, views, points, place, crs, unit)
         alignment = placement.alignment.meshed_by(self.mesher, self.spacing)
         mesh = alignment.load_shell(scene, views, place.surfaces if place else ())
-        crs = crs_there(crs or alignment.crs, mesh.centre, alignment.metres_per_shell_unit)
-        return replace(placement, alignment=replace(alignment, crs=crs)), mesh
+        alignment = in_its_system(replace(alignment, crs=crs or alignment.crs), mesh)
+        return replace(placement, alignment=alignment), mesh
 
     def _placed(
-        self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str
+        self, scene: Path, views: Sequence[View], points: SparsePoints, place: ShellPlace | None, crs: str, unit: float
     ) -> Placement:
-        from shellgs_method.files.crs import metres_of
         from shellgs_method.registration import align as by
         from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
@@ -182,7 +180,7 @@ class _Start:
             return by.place_as_proposed(scene / by.PROPOSAL, scene, views)
         if not self.shell:
             return by.place_as_before(scene / ALIGNMENT, scene, views)
-        names, unit = by.names_in(scene, self.shell), metres_of(crs, self.metres_per_shell_unit, self.shell)
+        names = by.names_in(scene, self.shell)
         if self.matrix:
             return by.Placement(Alignment.from_matrix_file(self.matrix, names, unit, self.global_shift))
         if self.same_frame:

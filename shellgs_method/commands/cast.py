@@ -31,6 +31,7 @@ def cast(
     matrix: Optional[Path] = None,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: Length = 1.0,
+    crs: Optional[str] = None,
     truth: tuple[Path, ...] = (),
     max_image_size: Optional[FromOne] = None,
     mesher: Optional[Mesher] = None,
@@ -54,7 +55,9 @@ def cast(
             scene/shell/alignment.json.
         matrix: File of the 4x4 similarity from the shell's (or the truth's) frame to the scene's (text, json or npy).
         global_shift: CloudCompare's global shift, with --matrix.
-        metres_per_shell_unit: Length of the shell's unit in metres, with --matrix.
+        metres_per_shell_unit: Length of the shell's unit in metres, with --matrix. If not set: that of its coordinate
+            reference system, else a metre.
+        crs: Coordinate reference system of the shell (or the truth), with --matrix. If not set: as for `shellgs align`.
         truth: Files of the building to measure against, which were held apart: meshes, models or point clouds, in the
             shell's frame and unit, or in their own with --matrix.
         max_image_size: Longer side in pixels that photographs are resized to for training. If not set: full size, or
@@ -67,7 +70,8 @@ def cast(
         paths: Paths of the scene's files.
     """
     from dataparsers.facade import FacadeDataParserConfig, read_views
-    from shellgs_method.files.cue_maps import CueMaps, relative_path
+    from shellgs_method.files.cue_maps import CueMaps
+    from shellgs_method.registration.align import in_its_system, names_in, system_and_unit
     from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 
     files = truth or shell
@@ -75,13 +79,14 @@ def cast(
         raise SceneError("the truth is cast after the shell: give --shell or --truth")
     if (matrix and not files) or (shell and not matrix):
         raise SceneError("--shell and --matrix go together: give both or neither")
-    if matrix is None and (any(global_shift) or metres_per_shell_unit != 1):
-        raise SceneError("--global-shift and --metres-per-shell-unit go with --matrix")
+    if matrix is None and (any(global_shift) or metres_per_shell_unit != 1 or crs):
+        raise SceneError("--global-shift, --metres-per-shell-unit and --crs go with --matrix")
     config = FacadeDataParserConfig(**vars(paths), data=scene)
     views = read_views(config)
-    names = tuple(relative_path(path, scene) for path in files)
+    names = names_in(scene, files)
     if matrix is not None:
-        alignment = Alignment.from_matrix_file(matrix, names, metres_per_shell_unit, global_shift)
+        system, unit = system_and_unit(files, crs, metres_per_shell_unit, scene)
+        alignment = replace(Alignment.from_matrix_file(matrix, names, unit, global_shift), crs=system)
     else:
         alignment = Alignment.load(scene / ALIGNMENT)
         if not alignment.cameras.cameras:
@@ -101,7 +106,7 @@ def cast(
     for meshing in placed.mesh.meshing:
         where = f"The shell is a point cloud; its mesh is cached in {scene / 'shell'}"
         console.print(f"{where}: {meshing}", soft_wrap=True)
-    aligned.record(scene / ALIGNMENT, views)
+    in_its_system(aligned, placed.mesh).record(scene / ALIGNMENT, views)
     summary = cast_views(placed, max_image_size=max_image_size, flags=paths.flags)
     seconds = time.monotonic() - start
     console.print(
@@ -125,6 +130,7 @@ def _cast_truth(
     from dataparsers.facade import held_out_names
     from shellgs_method.files.atomic import content_hash
     from shellgs_method.files.cue_maps import CueMaps
+    from shellgs_method.registration.align import in_its_system
     from shellgs_method.shell import ALIGNMENT, TRUTH, Alignment, PlacedShell, cast_views
     from shellgs_method.shell.cast import truth_coverage
 
@@ -135,7 +141,7 @@ def _cast_truth(
         if same := [path for path in alignment.files(scene) if path.is_file() and content_hash(path) in of_shell]:
             raise SceneError(f"{same[0]} is the shell itself, and proves nothing: give a scan that was held apart")
     placed = PlacedShell.load(scene, views, alignment)
-    alignment.record(scene / TRUTH, views)
+    in_its_system(alignment, placed.mesh).record(scene / TRUTH, views)
     size = max_image_size or shell.manifest.max_image_size
     summary = cast_views(placed, kind="truth", max_image_size=size, flags=flags)
     names = held_out_names(config)

@@ -50,11 +50,10 @@ def pick(
 
     from dataparsers.facade import read_views
     from shellgs_method.errors import check_output
-    from shellgs_method.files.crs import metres_of
     from shellgs_method.picking.scan import Scan
     from shellgs_method.picking.server import PickServer
     from shellgs_method.picking.session import Session
-    from shellgs_method.registration.align import system_of
+    from shellgs_method.registration.align import system_and_unit
     from shellgs_method.registration.frames import ShellPlace
 
     if not shell:
@@ -67,8 +66,8 @@ def pick(
     with PickServer(port) as server:
         tell(f"Reading {', '.join(path.name for path in shell)}")
         place = ShellPlace(*shell)
-        system = system_of(shell, crs, scene)
-        session = Session(picks, views, metres_of(system, metres_per_shell_unit, shell), system)
+        system, unit = system_and_unit(shell, crs, metres_per_shell_unit, scene)
+        session = Session(picks, views, unit, system)
         if session.state.picks:
             place.check_picks(np.stack([point.shell for point in session.state.picks]), f"the picks of {picks}")
         tell("Preparing it to be drawn and picked")

@@ -184,14 +184,20 @@ def metres_of(system: str, given: float, shell: Sequence[Path]) -> float:
     Args:
         system: name of the system; empty if unknown.
         given: metres of the unit that the user gives, 1 if none.
-        shell: its files.
+        shell: its files; none where its unit is known already.
 
     Raises:
         SceneError: the system has heights in another unit than eastings, counts from the middle of the Earth, or is a
-            projection of all of it.
+            projection of all of it; or a unit is given for a file that is read in metres.
     """
+    if in_metres := [path for path in shell if path.suffix.lower() in IN_METRES]:
+        if given != 1:
+            raise SceneError(
+                f"{in_metres[0]} is read in metres, whatever its unit is: leave --metres-per-shell-unit out"
+            )
+        return given
     crs = known_crs(system)
-    if crs is None or any(path.suffix.lower() in IN_METRES for path in shell):
+    if crs is None or not shell:
         return given
     if crs.is_geocentric:
         raise SceneError(

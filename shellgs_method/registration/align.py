@@ -13,7 +13,7 @@ import numpy as np
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.colmap import read_model, read_points
-from shellgs_method.files.crs import crs_of, given_crs
+from shellgs_method.files.crs import crs_of, crs_there, given_crs, metres_of
 from shellgs_method.files.cue_maps import relative_path
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import ADJUSTED, ALIGNMENT, SceneLayout
@@ -75,6 +75,27 @@ def system_of(shell: Sequence[Path], given: str | None, scene: Path) -> str:
                 notice(f"The shell is in {before.crs[:60]}, as it was aligned before; --crs names another one.")
                 return before.crs
     return ""
+
+
+def system_and_unit(shell: Sequence[Path], crs: str | None, metres: float, scene: Path) -> tuple[str, float]:
+    """The shell's coordinate reference system, by :func:`system_of`, and metres of its unit.
+
+    Args:
+        shell: its files; none if it is where it was before.
+        crs: the system that the user gives.
+        metres: metres of the unit that the user gives, 1 if none.
+        scene: the scene's folder.
+
+    Raises:
+        SceneError: the system is unknown, or no shell can be in it; or the unit contradicts the files.
+    """
+    system = system_of(shell, crs, scene)
+    return system, metres_of(system, metres, shell)
+
+
+def in_its_system(alignment: Alignment, mesh: ShellMesh) -> Alignment:
+    """The alignment, which is said to be in its system only if the shell is in the area of that."""
+    return replace(alignment, crs=crs_there(alignment.crs, mesh.centre, alignment.metres_per_shell_unit))
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,11 @@ def test_the_unit_of_a_system_is_that_of_its_shell_unless_another_is_given(caplo
         metres_of("EPSG:2229+5703", 1.0, scan)
 
 
+def test_a_unit_of_a_model_that_is_read_in_metres_is_refused():
+    with pytest.raises(SceneError, match=r"a\.ifc is read in metres, .* leave --metres-per-shell-unit out"):
+        metres_of("", 0.3048, (Path("scan.ply"), Path("a.ifc")))
+
+
 @pytest.mark.parametrize("system", ["EPSG:3857", "ESRI:102100", "EPSG:3857+5773", "EPSG:3395"])
 def test_a_projection_of_the_whole_earth_has_no_unit_of_length(system):
     with pytest.raises(SceneError, match=r"stretched .* convert the shell to a system of its region"):

@@ -1346,6 +1346,37 @@ def test_a_global_shift_is_cast(scene, shellgs):
     np.testing.assert_allclose(Alignment.load(scene / ALIGNMENT).shell_to_scene, true.shell_to_scene, atol=1e-6)
 
 
+def test_a_matrix_is_of_the_unit_and_system_of_the_shell_for_cast_as_for_align(scene, shellgs, tmp_path, caplog):
+    true, foot = Alignment.load(scene / ALIGNMENT), 1200 / 3937
+    mesh, size = load_shell(*true.files(scene)), CueMaps.open(scene, "shell").manifest.metres_per_unit
+    middle = mesh.vertices.mean(axis=0)
+    to_feet = np.diag([1 / foot, 1 / foot, 1 / foot, 1])
+    to_feet[:3, 3] = [980_000, 200_000, 50] - middle / foot
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in transformed(mesh.vertices, to_feet)]
+    lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + 1]
+    (tmp_path / "feet.obj").write_text("\n".join(lines) + "\n")
+    (tmp_path / "feet.prj").write_text(pyproj.CRS("EPSG:2263").to_wkt("WKT1_ESRI"))
+    np.save(tmp_path / "matrix.npy", true.shell_to_scene @ np.linalg.inv(to_feet))
+    placed = "--matrix", tmp_path / "matrix.npy"
+    (scene / ALIGNMENT).unlink()
+    shellgs("cast", scene, "--shell", tmp_path / "feet.obj", *placed, "--no-check")
+    cast_there = Alignment.load(scene / ALIGNMENT)
+    assert "is in US survey foot: its unit is taken for 0.30480061 m" in caplog.text
+    assert cast_there.metres_per_shell_unit == pytest.approx(foot)
+    assert CueMaps.open(scene, "shell").manifest.metres_per_unit == pytest.approx(size)
+    assert "Long_Island" in cast_there.crs or cast_there.crs == "EPSG:2263"
+    (scene / ALIGNMENT).unlink()
+    shellgs("align", scene, tmp_path / "feet.obj", *placed)
+    aligned = Alignment.load(scene / ALIGNMENT)
+    assert cast_there.places_like(aligned)
+    assert cast_there.crs == aligned.crs
+    before = (scene / ALIGNMENT).read_bytes()
+    for flag in ("--shell", "--truth"):
+        told = shellgs("cast", scene, flag, tmp_path / "feet.obj", *placed, "--crs", "EPSG:3857")
+        assert re.match("refused: .*is a projection of the whole Earth", told)
+    assert (scene / ALIGNMENT).read_bytes() == before
+
+
 def test_an_alignment_without_a_verdict_is_read(tmp_path):
     fields = {"shell_to_scene": np.eye(4).tolist(), "shell": "a.ply", "metres_per_shell_unit": 1.0, "source": "matrix"}
     (tmp_path / "alignment.json").write_text(json.dumps(fields))
