@@ -15,7 +15,7 @@ from jaxtyping import Bool
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, source_hash
-from shellgs_method.files.photographs import View, load_mask
+from shellgs_method.files.photographs import View, has_alpha, load_mask
 from shellgs_method.files.scene import ALIGNMENT, TRUTH
 from shellgs_method.geometry.camera import Camera, positions
 from shellgs_method.geometry.precision import FINE, camera_step, refuse_coarse
@@ -208,8 +208,9 @@ def _command(max_image_size: int | None, of_cloud: Alignment | None) -> str:
 
 
 def _mask_sources(scene: Path, views: Sequence[View]) -> list[Path]:
-    """Top-level files or folders of the scene that hold the masks of the shell and of the photographs."""
-    return [scene / MASKS, *sorted({scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask})]
+    """Files and folders that hold masks: those at the top of the scene, the shell's, and photographs with alpha."""
+    given = {scene / view.mask.relative_to(scene).parts[0] for view in views if view.mask}
+    return [scene / MASKS, *sorted(given), *(view.image for view in views if has_alpha(view.image))]
 
 
 def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:

@@ -609,3 +609,27 @@ def test_a_mask_painted_after_the_cast_makes_the_maps_stale(tmp_path: Path, alig
     Image.fromarray(np.zeros((48, 64), np.uint8)).save(path)
     with pytest.raises(SceneError, match=r"shell/masks has changed since; run `shellgs cast"):
         CueMaps.open(tmp_path, "shell").read(VIEWS[2].name, VIEWS[2].camera)
+
+
+def test_maps_of_photographs_whose_alpha_channel_has_changed_are_made_again(tmp_path: Path, alignment: Alignment):
+    path, half = tmp_path / "images/2.png", np.zeros((48, 64, 4), np.uint8)
+    half[:, 32:] = 255
+    path.parent.mkdir()
+    views = [View("images/2.png", path, VIEWS[2].camera), *VIEWS[3:]]
+
+    def cast_with(pixels: np.ndarray) -> tuple[int, np.ndarray]:
+        Image.fromarray(pixels).save(path)
+        number = cast(tmp_path, views, alignment).cast
+        return number, CueMaps.open(tmp_path, "shell").require(views[0].name, views[0].camera).mask
+
+    _, masked = cast_with(half)
+    assert cast_with(half)[0] == 0
+    for other in (half[:, ::-1], half[..., :3] + np.uint8(1)):  # another mask, and none
+        number, mask = cast_with(other)
+        assert number == len(views)
+        assert (mask != masked).any()
+    Image.fromarray(half).save(path)
+    cast(tmp_path, views, alignment)
+    Image.fromarray(half[:, ::-1]).save(path)
+    with pytest.raises(SceneError, match=r"images/2.png has changed since; run `shellgs cast"):
+        CueMaps.open(tmp_path, "shell").read(views[0].name, views[0].camera)
