@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Optional
 
 from shellgs_method.bounds import FromOne, Length, bounded
@@ -94,7 +94,7 @@ def cast(
             console.print(f"{unbound}: `shellgs align {scene}` records them.")
     if truth:
         in_place = replace(alignment, shells=names, hashes=(), verdict="", metrics={})
-        flags = _words(truth, matrix) + paths.flags
+        flags = _words(truth, matrix, global_shift, metres_per_shell_unit, crs) + paths.flags
         _cast_truth(config, views, in_place.meshed_by(mesher, spacing), max_image_size, flags)
         return
     aligned = alignment.meshed_by(mesher, spacing)
@@ -158,11 +158,14 @@ def _cast_truth(
     console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: what is grey has no truth.")
 
 
-def _words(truth: Sequence[Path], matrix: Path | None) -> str:
+def _words(truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], unit: float, crs: str | None) -> str:
     """The words of a command that casts the truth again."""
-    matrices = () if matrix is None else ("--matrix", matrix)
-    words = ("--truth", *truth, *matrices)
-    return "".join(f" {quote(str(word.resolve() if isinstance(word, Path) else word))}" for word in words)
+    words = ["--truth", *(path.resolve() for path in truth)]
+    words += ["--matrix", matrix.resolve()] if matrix else []
+    words += ["--global-shift", *shift] if any(shift) else []
+    words += ["--metres-per-shell-unit", unit] if unit != 1 else []
+    words += ["--crs", crs] if crs else []
+    return f" {shlex.join(map(str, words))}"
 
 
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:

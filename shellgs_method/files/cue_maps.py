@@ -36,6 +36,7 @@ from shellgs_method.files.map_files import (
     resampled,
     write_map,
 )
+from shellgs_method.files.scene import ALIGNMENT
 from shellgs_method.geometry.camera import Camera
 
 __all__ = [
@@ -298,9 +299,15 @@ class CueMaps:
             known = path.is_file() or (path.is_dir() and not Path(source).is_absolute())
             if known and sha256 not in (source_hash(path), content_hash(path)):
                 first = f"run `shellgs align {shlex.quote(str(self.scene))}` first, to validate it as it is now"
-                aligned = any(sha256 in str(fields.get("hashes")) for fields in self._alignments)
-                return f"{source} has changed since" + (f": {first}" if aligned else "")
+                return f"{source} has changed since" + (f": {first}" if sha256 in self._validated else "")
         return None
+
+    @property
+    def _validated(self) -> str:
+        """Hashes of the shell's files that were aligned, as they are written; a truth is not validated."""
+        with suppress(OSError, SceneError):
+            return str(read_json(self.scene / ALIGNMENT).get("hashes"))
+        return ""
 
     @cached_property
     def _aligned_to(self) -> BoundCameras:

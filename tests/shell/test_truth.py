@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +103,29 @@ def test_a_truth_in_the_frame_of_the_shell_is_stale_once_the_shell_has_moved(sce
     with pytest.raises(SceneError, match=f"alignment.json has changed since.*cast {scene} .*--truth {survey}"):
         read_after_the_move()
     read_after_the_move("--matrix", tmp_path / "matrix.npy")
+
+
+def test_the_command_that_a_changed_truth_is_refused_with_casts_it_again_in_its_place(scene, shellgs, tmp_path):
+    to_scene, shift = Alignment.load(scene / ALIGNMENT).shell_to_scene, np.array([-412_000_250.5, -5_123_000_000.0, 0])
+    survey, lines = write_survey(scene, tmp_path / "survey.obj", materials=Material.RAILING), []
+    for line in survey.read_text().splitlines():  # in millimetres
+        letter, *numbers = line.split()
+        lines.append(" ".join([letter, *(f"{1000 * float(each):.3f}" if letter == "v" else each for each in numbers)]))
+    survey.write_text("\n".join(lines) + "\n")
+    to_survey = np.diag([1000.0, 1000, 1000, 1])
+    to_survey[:3, 3] = shift
+    np.save(tmp_path / "matrix.npy", to_scene @ np.linalg.inv(to_survey))
+    placing = ("--matrix", tmp_path / "matrix.npy", "--global-shift", *shift, "--metres-per-shell-unit", 0.001)
+    assert "the two are 0.000 m apart" in shellgs("cast", scene, "--truth", survey, *placing)
+    before, view = Alignment.load(scene / TRUTH), views_of(scene)[0]
+    survey.write_text(survey.read_text() + "# measured again\n")
+    with pytest.raises(SceneError, match=r"survey\.obj has changed since; run `shellgs cast .*`") as refused:
+        map_of(scene, "truth", view)
+    program, *words = shlex.split(str(refused.value).split("`")[1])
+    assert program == "shellgs"
+    assert "the two are 0.000 m apart" in shellgs(*words)
+    assert replace(Alignment.load(scene / TRUTH), hashes=before.hashes) == before
+    map_of(scene, "truth", view)
 
 
 @pytest.mark.parametrize(
