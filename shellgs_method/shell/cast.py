@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from shellgs_method.errors import SceneError
+from shellgs_method.files.atomic import fingerprint
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, source_hash
 from shellgs_method.files.photographs import View, has_alpha, load_mask
 from shellgs_method.files.scene import ALIGNMENT, TRUTH
@@ -126,18 +127,21 @@ def cast_views(
     recorded = Alignment.load(path)
     if not recorded.places_like(shell.alignment):
         raise SceneError(f"{path} has changed since the shell was loaded: run the same command again")
+    compared = _compared(scene) if kind == "truth" else None
+    revisions = {"mesher": f"{recorded.mesher} {VERSION}"} if meshing else {}
+    if compared:  # what they found is cut out of the truth
+        revisions["findings"] = fingerprint(compared[0].manifest.sources)
     (scene / MASKS).mkdir(parents=True, exist_ok=True)  # a source of the maps: a mask painted later makes them stale
     maps = CueMaps.create(
         scene,
         kind,
         command=_command(max_image_size, recorded if meshing else None) + flags,
         sources=[*recorded.files(scene), path, *_followed(scene, recorded, kind), *_mask_sources(scene, views)],
-        revisions={"mesher": f"{recorded.mesher} {VERSION}"} if meshing else {},
+        revisions=revisions,
         metres_per_unit=recorded.metres_per_unit,
         max_image_size=max_image_size,
         error=recorded.error,
     )
-    compared = _compared(scene) if kind == "truth" else None
     cast = 0
     with ThreadPoolExecutor(1) as writer:  # one view is written while the next is cast: at most two are in memory
         written: Future[None] | None = None

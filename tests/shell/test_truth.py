@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,6 +69,23 @@ def test_what_photographs_show_before_the_truth_is_left_out_of_it(scene, shellgs
         assert not truth.mask[hidden].any()
         assert truth.mask[~hidden & (truth.depth > 0)].mean() > 0.99  # but for what the shell's masks leave out
     assert left_out > 20
+
+
+def test_a_truth_is_cast_again_once_the_photographs_have_been_compared(scene, shellgs, tmp_path):
+    number, survey = len(views_of(scene)), write_survey(scene, tmp_path / "survey.obj", materials=Material.RAILING)
+
+    def masks_of(expected: str) -> list[np.ndarray]:
+        assert expected in shellgs("cast", scene, "--truth", survey)
+        return [map_of(scene, "truth", view).mask for view in views_of(scene)]
+
+    whole = masks_of(f"{number} views cast")
+    shellgs("cast", scene)
+    first = masks_of(f"{number} views cast")
+    assert sum(map(np.sum, first)) < sum(map(np.sum, whole))
+    masks_of(f"0 views cast, {number} already there")
+    shutil.rmtree(scene / "cues/truth")
+    for mask, again in zip(first, masks_of(f"{number} views cast"), strict=True):
+        np.testing.assert_array_equal(mask, again)
 
 
 def test_it_is_told_how_much_of_the_shell_has_a_truth_and_how_far_apart_they_are(scene, shellgs, tmp_path):
