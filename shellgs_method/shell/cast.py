@@ -13,9 +13,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool
 
-from shellgs_method.errors import SceneError
+from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, source_hash
+from shellgs_method.files.paths import photographs_in
 from shellgs_method.files.photographs import View, has_alpha, load_mask
 from shellgs_method.files.scene import ALIGNMENT, TRUTH
 from shellgs_method.geometry.camera import Camera, positions
@@ -93,6 +94,7 @@ class PlacedShell:
             )
         caster = ShellCaster(mesh, alignment.shell_to_scene)
         _check_placement(caster, cameras, alignment.named)
+        _tell_of_strays(scene, views)
         if not any(mask is None or mask.any() for mask in (_load_masks(view, scene) for view in views)):
             raise SceneError(f"the masks of {scene} are black everywhere in every view: white is kept")
         return cls(scene, views, alignment, mesh, caster)
@@ -221,6 +223,18 @@ def _load_masks(view: View, scene: Path) -> Bool[np.ndarray, "H W"] | None:
     """Intersection of the photograph's mask and the shell's mask of a view; None if it has neither."""
     painted = scene / MASKS / f"{view.name}.png"
     return load_mask(view, painted if painted.is_file() else None)
+
+
+def _tell_of_strays(scene: Path, views: Sequence[View]) -> None:
+    """Tell the user of masks painted for the shell that are not called as :func:`_load_masks` looks for them."""
+    painted, used = photographs_in(scene / MASKS, deep=True), {scene / MASKS / f"{view.name}.png" for view in views}
+    if strays := [path for path in painted if path not in used]:
+        name = views[0].name
+        notice(
+            f"{len(strays)} of {len(painted)} masks in {scene / MASKS} belong to no photograph, "
+            f"{strays[0].relative_to(scene / MASKS)} for example, and are not used: that of {name} must be {name}.png "
+            "there."
+        )
 
 
 def _unmasked(cue: CueMap, view: View, scene: Path) -> CueMap:

@@ -633,3 +633,20 @@ def test_maps_of_photographs_whose_alpha_channel_has_changed_are_made_again(tmp_
     Image.fromarray(half[:, ::-1]).save(path)
     with pytest.raises(SceneError, match=r"images/2.png has changed since; run `shellgs cast"):
         CueMaps.open(tmp_path, "shell").read(views[0].name, views[0].camera)
+
+
+def test_a_mask_that_is_called_as_no_photograph_is_told(
+    tmp_path: Path, alignment: Alignment, caplog: pytest.LogCaptureFixture
+):
+    folder = tmp_path / "shell/masks"
+    for name in ("images/2.jpg.png", "2.jpg.png", "images/3.png", ".hidden.png"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((48, 64), 255, np.uint8)).save(folder / name)
+    cast(tmp_path, VIEWS, alignment)
+    assert f"2 of 3 masks in {folder} belong to no photograph, 2.jpg.png for example" in caplog.text
+    assert "that of images/0.jpg must be images/0.jpg.png there" in caplog.text
+    caplog.clear()
+    (folder / "2.jpg.png").unlink()
+    (folder / "images/3.png").unlink()
+    cast(tmp_path, VIEWS, alignment)
+    assert not caplog.records
