@@ -374,9 +374,11 @@ def source_hash(path: Path) -> str:
 
 
 def relative_path(path: Path, scene: Path) -> str:
-    """Path relative to the scene if it lies inside, so that a scene can be moved; else absolute."""
-    path, scene = path.resolve(), scene.resolve()
-    return path.relative_to(scene).as_posix() if path.is_relative_to(scene) else str(path)
+    """Path relative to the scene if it lies inside, or a link there leads to it, so that a scene can be moved."""
+    for inner, folder in ((path.absolute(), scene.absolute()), (path.resolve(), scene.resolve())):
+        if inner.is_relative_to(folder) and ".." not in (relative := inner.relative_to(folder)).parts:
+            return relative.as_posix()
+    return str(path.resolve())
 
 
 def _version() -> str:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write
-from shellgs_method.files.cue_maps import CueMap, CueMaps
+from shellgs_method.files.cue_maps import CueMap, CueMaps, relative_path
 from shellgs_method.geometry.camera import Camera
 
 HEIGHT, WIDTH = 12, 16
@@ -329,3 +329,30 @@ def test_a_reader_keeps_the_file_it_opened(tmp_path: Path):
             file.write(b"after")
         assert reader.read() == b"before"
     assert path.read_bytes() == b"after"
+
+
+def test_a_folder_that_is_a_link_is_a_source_like_any_other(tmp_path: Path):
+    scene, elsewhere = tmp_path / "scene", tmp_path / "elsewhere"
+    scene.mkdir()
+    elsewhere.mkdir()
+    (elsewhere / "a.png").write_bytes(b"a mask")
+    (scene / "masks").symlink_to(elsewhere)
+    maps = CueMaps.create(scene, "shell", command="shellgs cast {scene}", sources=[scene / "masks"])
+    maps.write(VIEW, a_map(), a_camera())
+    moved = scene.rename(tmp_path / "moved")
+    assert equal(CueMaps.open(moved, "shell").read(VIEW, a_camera()), a_map())
+    (elsewhere / "a.png").write_bytes(b"another")
+    assert "masks has changed since" in refusal(CueMaps.open(moved, "shell"))
+
+
+def test_a_path_is_relative_to_the_scene_that_it_is_in_and_else_absolute(tmp_path: Path):
+    scene, other = tmp_path / "scene", tmp_path / "other.ply"
+    (scene / "shell").mkdir(parents=True)
+    other.touch()
+    (scene / "shell/linked.ply").symlink_to(other)
+    (tmp_path / "link").symlink_to(scene)
+    for inside in (scene / "shell/linked.ply", tmp_path / "link/shell/linked.ply"):
+        assert relative_path(inside, inside.parents[1]) == "shell/linked.ply"
+    assert relative_path(scene / "shell/../shell/own.ply", tmp_path / "link") == "shell/own.ply"
+    for outside in (other, scene / "../other.ply"):
+        assert relative_path(outside, scene) == str(other.resolve())
