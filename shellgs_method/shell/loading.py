@@ -107,6 +107,7 @@ def _load_file(
     metres_per_unit: float,
 ) -> ShellMesh:
     """Load one file; the mesh of a point cloud is that at ``cached``, if it is still valid."""
+    spacing = spacing and spacing / metres_per_unit  # from here on in the shell's unit, as the cached mesh is
     if cached is not None and path.is_file() and (mesh := _read_cached(cached, path, cameras, spacing)):
         refuse_coarse(mesh.step.scaled(metres_per_unit), f"the coordinates of {path}")
         return mesh
@@ -127,7 +128,7 @@ def _load_file(
         step = cloud_step(whole.sample)
         refuse_coarse(step.scaled(metres_per_unit), "the coordinates")
         sights = Sights.of(cameras, whole.points) if cameras and len(whole.points) else None
-        cloud = as_seen(surface, sights, spacing and spacing / metres_per_unit, metres_per_unit)
+        cloud = as_seen(surface, sights, spacing, metres_per_unit)
         viewpoints = whole.scanners if len(whole.scanners) else positions(cameras)
         vertices, faces, meshing = mesh_cloud(cloud, viewpoints, mesher)
         mesh = _with_area(ShellMesh(vertices, faces, (meshing,), step))

@@ -155,3 +155,10 @@ def test_another_spacing_is_meshed_again(tmp_path: Path):
         assert mesh.meshing == load_shell(path, cache=tmp_path, spacing=wanted).meshing
         assert mesh.meshing
         assert wanted in (None, mesh.meshing[0].voxel)
+
+
+def test_a_cloud_is_meshed_again_where_its_unit_is_corrected(tmp_path: Path):
+    path = saved(tmp_path / "street.xyz", street(0, 10))
+    for metres_per_unit in (1.0, 0.5, 1.0):
+        (meshing,) = load_shell(path, cache=tmp_path, spacing=0.3, metres_per_unit=metres_per_unit).meshing
+        assert meshing.voxel == 0.3 / metres_per_unit
