@@ -81,7 +81,7 @@ def align(
     from shellgs_method.files.atomic import recover_folder
     from shellgs_method.files.scene import ADJUSTED
     from shellgs_method.files.sparse_points import read_sparse_points
-    from shellgs_method.registration.align import PROPOSAL, REPORT, misplaced, refined
+    from shellgs_method.registration.align import PROPOSAL, REPORT, frame_of_matrix, misplaced, refined
     from shellgs_method.registration.sfm_frame import check_points
     from shellgs_method.shell import ALIGNMENT
 
@@ -114,6 +114,7 @@ def align(
         kept = f"{target} is unchanged" if target.exists() else "nothing is written"
         why = f"{misplacement}; " if misplacement else ""
         advice = "; pick points with `shellgs pick`, and give them with --picks" if placement.proposed else ""
+        advice += f"; {frame}" if matrix and (frame := frame_of_matrix(layout)) else ""
         raise SceneError(f"the alignment is refused, and {kept}: {why}see {scene / REPORT / 'index.html'}{advice}")
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from shellgs_method.files.photographs import View
     from shellgs_method.shell import Alignment
 
+SELDOM = 0.01
+"""Share of all pixels that show the shell, below which it is hardly where the photographs show it."""
 LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
 
@@ -71,7 +73,7 @@ def cast(
     """
     from dataparsers.facade import FacadeDataParserConfig, read_views
     from shellgs_method.files.cue_maps import CueMaps
-    from shellgs_method.registration.align import in_its_system, names_in, system_and_unit
+    from shellgs_method.registration.align import frame_of_matrix, in_its_system, names_in, system_and_unit
     from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 
     files = truth or shell
@@ -113,6 +115,12 @@ def cast(
         f"{summary.cast} views cast, {summary.skipped} already there, in {seconds:.1f} s; the shell is visible "
         f"in {summary.seeing} of {len(views)} views and covers {summary.supported:.0%} of their pixels."
     )
+    if summary.supported < SELDOM:
+        hint = frame_of_matrix(config) if matrix else ""
+        console.print(
+            f"[yellow]Hardly any pixel shows the shell: is it in its place? `shellgs align` validates that"
+            f"{f'; {hint}' if hint else ''}."
+        )
     if check:
         _check(scene, config)
     panel = save_panel(CueMaps.open(scene, "shell"), views)

@@ -98,6 +98,16 @@ def in_its_system(alignment: Alignment, mesh: ShellMesh) -> Alignment:
     return replace(alignment, crs=crs_there(alignment.crs, mesh.centre, alignment.metres_per_shell_unit))
 
 
+def frame_of_matrix(layout: SceneLayout) -> str:
+    """What to do with a matrix to the frame of transforms.json, in words; empty where that is the cameras' frame."""
+    if layout.colmap_folder() is not None or np.allclose(layout.read().applied, np.eye(4)):
+        return ""
+    return (
+        f"{layout.data / 'transforms.json'} has an applied_transform, which is undone: if the --matrix was found on "
+        "its poses or points, multiply it from the left by the inverse of that"
+    )
+
+
 @dataclass(frozen=True)
 class Placement:
     """An alignment and how it was found.

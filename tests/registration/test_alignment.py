@@ -1377,6 +1377,23 @@ def test_a_matrix_is_of_the_unit_and_system_of_the_shell_for_cast_as_for_align(s
     assert (scene / ALIGNMENT).read_bytes() == before
 
 
+def test_a_matrix_to_the_frame_that_an_applied_transform_leads_to_is_told(scene, shellgs, tmp_path):
+    true, path = Alignment.load(scene / ALIGNMENT), scene / "transforms.json"
+    (scene / ALIGNMENT).unlink()
+    applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"applied_transform": applied[:3].tolist()}))
+    placed, why = ("--matrix", tmp_path / "matrix.npy"), "multiply it from the left by the inverse of that"
+    np.save(tmp_path / "matrix.npy", true.shell_to_scene)  # as the poses and points of the file show it
+    assert re.match(f"refused: .*the alignment is refused.*{why}", shellgs("align", scene, *true.files(scene), *placed))
+    told = shellgs("cast", scene, "--shell", *true.files(scene), *placed, "--no-check")
+    assert "Hardly any pixel shows the shell" in told
+    assert why in told
+    np.save(tmp_path / "matrix.npy", np.linalg.inv(applied) @ true.shell_to_scene)
+    told = shellgs("cast", scene, "--shell", *true.files(scene), *placed, "--no-check")
+    assert "Hardly any pixel" not in told
+    assert re.search(r"covers [5-9]\d% of their pixels", told)
+
+
 def test_an_alignment_without_a_verdict_is_read(tmp_path):
     fields = {"shell_to_scene": np.eye(4).tolist(), "shell": "a.ply", "metres_per_shell_unit": 1.0, "source": "matrix"}
     (tmp_path / "alignment.json").write_text(json.dumps(fields))
