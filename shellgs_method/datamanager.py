@@ -22,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from dataparsers.cameras import pinhole_camera, pinhole_cameras, scene_to_world
-from dataparsers.facade import held_out_names, read_views
+from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from shellgs_method.bounds import Length
 from shellgs_method.errors import SceneError, notice, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import Covisibility
@@ -306,6 +306,7 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
     def _tell_of_other_photographs(self) -> None:
         """Tell if the photographs that the shell was compared with are not those of this run."""
         checked, scene = self.train_dataset.sets.get("checked"), self.config.dataparser
+        assert isinstance(scene, FacadeDataParserConfig)
         if checked and compared_others(checked, read_views(scene), held_out_names(scene)):
             notice(
                 f"photographs of {scene.data}, their cameras, or which are held out have changed since they were "
