@@ -156,8 +156,7 @@ def _heights(surface: Triangles, wall: Wall, width: int, height: int, pixel: flo
 @torch.no_grad()
 def _render(run: TrainedRun, wall: Wall, width: int, height: int, pixel: float) -> UInt8[np.ndarray, "H W 3"]:
     """Render the Gaussians of a wall by tiles from far away, over white."""
-    to_frame = np.linalg.inv(run.frame.to_scene) @ run.model_to_scene
-    scale, to_model = scale_of(to_frame), np.linalg.inv(to_frame)
+    scale, to_model = scale_of(run.model_to_frame), np.linalg.inv(run.model_to_frame)
     right, up, out = wall.axes
     axes = scale * to_model[:3, :3] @ wall.axes.T
     middle = transformed(((wall.low + wall.high) / 2 @ wall.axes)[None], to_model)[0]

@@ -45,11 +45,11 @@ class Level:
 
     @classmethod
     def whole(cls, run: TrainedRun, splats: Splats) -> Level:
-        """All finite Gaussians of a run, which ``splats`` holds in any frame."""
+        """All finite Gaussians of :meth:`TrainedRun.splats`, which ``splats`` holds in any frame."""
         views = run.datasets[0]
         cameras = track(map(views.camera, range(len(views))), "Ranking the Gaussians", len(views))
         shown = contributions((camera.to(run.model.device) for camera in cameras), run.model.coverage).cpu()
-        return cls(splats.finite, shown[splats.is_finite])
+        return cls(splats.finite, shown[run.in_core][splats.is_finite])
 
     def reduced(self, count: int) -> Level:
         """Merge Gaussians until ``count`` are left; those that no view shows are left out first.

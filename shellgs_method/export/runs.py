@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
+from torch import Tensor
 
 from shellgs_method.datamanager import FacadeDataManager, FacadeDataset
 from shellgs_method.errors import SceneError, notice
@@ -118,7 +119,7 @@ class TrainedRun:
     def cell(self) -> Cell | None:
         """The region of a block's run in the frame, of whose core it has the geometry; None of a whole scene's."""
         cell = self.datamanager.train_dataparser_outputs.metadata["cell"]
-        return cell and cell.moved(np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
+        return cell and cell.moved(self.model_to_frame)
 
     @cached_property
     def shell_in_frame(self) -> ShellMesh:
@@ -142,6 +143,11 @@ class TrainedRun:
         """The similarity from the model's frame, nerfstudio's rescaled world, to the scene."""
         return np.linalg.inv(self.datamanager.scene_to_world)
 
+    @property
+    def model_to_frame(self) -> Float64[np.ndarray, "4 4"]:
+        """The similarity from the model's frame to :attr:`frame`."""
+        return np.linalg.inv(self.frame.to_scene) @ self.model_to_scene
+
     def box(self, margin: float) -> Box:
         """The facade's box: the shell's, wider by ``margin`` metres, or else that of most SfM points."""
         if self.shell is not None:
@@ -154,8 +160,7 @@ class TrainedRun:
     def sfm_points(self) -> Float64[np.ndarray, "N 3"]:
         """The SfM points in the frame."""
         assert self.model.seed_points is not None
-        to_frame = np.linalg.inv(self.frame.to_scene) @ self.model_to_scene
-        return transformed(self.model.seed_points[0].double().cpu().numpy(), to_frame)
+        return transformed(self.model.seed_points[0].double().cpu().numpy(), self.model_to_frame)
 
     def resolution(self, box: Box) -> float:
         """What the photographs resolve inside a box: a pixel's size at the SfM points there, in the nearest view.
@@ -263,8 +268,16 @@ class TrainedRun:
             harmonics,
             discs=self.model.config.primitive == "2d",
         )
-        splats = moved(splats, np.linalg.inv(self.frame.to_scene) @ self.model_to_scene)
-        return splats if self.cell is None else splats[torch.from_numpy(self.cell.core(splats.means.numpy()))]
+        splats = moved(splats, self.model_to_frame)
+        return splats if self.cell is None else splats[self.in_core]
+
+    @property
+    def in_core(self) -> Bool[Tensor, "N"]:
+        """Which Gaussians of the model :meth:`splats` has: those of the core of a block's run, or all."""
+        means = self.model.means.detach().cpu().double().numpy()
+        if self.cell is None:
+            return torch.ones(len(means), dtype=torch.bool)
+        return torch.from_numpy(self.cell.core(transformed(means, self.model_to_frame)))
 
 
 def mesh_errors(run: TrainedRun, mesh: trimesh.Trimesh) -> dict[str, float]:

@@ -15,6 +15,7 @@ from training_runs import data_of, model_of
 from two_blocks import HALVES, block_run, coarse_run, cut_in_two, save_config
 
 from shellgs_method.errors import SceneError
+from shellgs_method.export.levels import Level
 from shellgs_method.export.runs import TrainedRun, mesh_errors
 from shellgs_method.files.blocks import BLOCKS
 from shellgs_method.geometry.triangles import area_vectors
@@ -97,6 +98,20 @@ def test_the_gaussians_and_the_mesh_of_a_block_are_in_its_core(runs):
             assert run.cell.core(points).all()
             assert not other.cell.core(points).any()
         assert mesh_errors(run, surface)["rendered"] > 0.5
+
+
+def test_a_level_of_detail_of_a_block_has_what_its_photographs_show_of_its_core(runs):
+    _, blocks = runs
+    for run in blocks:
+        splats = run.splats()
+        level = Level.whole(run, splats)
+        assert len(level.splats) == len(level.shown) == len(splats)
+        kept = {tuple(mean) for mean in splats[level.shown > 0].means.tolist()}
+        assert kept
+        assert len(level.reduced(len(splats) // 2).splats) == len(splats) // 2
+        area, _ = run.model.coverage(run.datasets[0].camera(0).to(run.model.device))
+        shown = run.in_core & (area.cpu() > 1)
+        assert {tuple(mean) for mean in splats[shown[run.in_core]].means.tolist()} <= kept
 
 
 def test_a_block_is_a_building_with_its_name(runs):
