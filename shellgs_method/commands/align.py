@@ -268,7 +268,7 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
             table.add_row(*row)
         console.print(table)
     for reason in validation.reasons:
-        console.print(f"[yellow]{reason}.", highlight=False)
+        console.print(f"{reason}.", style="yellow", highlight=False)
     if validation.verdict == "refused":
         return
     report = scene / REPORT / "index.html"

@@ -43,7 +43,8 @@ def capture(
         console.print(f"Not registered: {', '.join(summary.missing)}.", highlight=False)
     if summary.reprojection_error > SUSPICIOUS_ERROR:
         console.print(
-            f"[yellow]More than {SUSPICIOUS_ERROR:g} px is a sign that identical windows were confused. Look at the "
+            f"More than {SUSPICIOUS_ERROR:g} px is a sign that identical windows were confused. Look at the "
             f"cameras in {scene}/colmap: if their path jumps or folds, try --overlap 5 (sequential), more --frames, or "
-            "--masks."
+            "--masks.",
+            style="yellow",
         )

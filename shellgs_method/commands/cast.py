@@ -118,8 +118,9 @@ def cast(
     if summary.supported < SELDOM:
         hint = frame_of_matrix(config) if matrix else ""
         console.print(
-            f"[yellow]Hardly any pixel shows the shell: is it in its place? `shellgs align` validates that"
-            f"{f'; {hint}' if hint else ''}."
+            f"Hardly any pixel shows the shell: is it in its place? `shellgs align` validates that"
+            f"{f'; {hint}' if hint else ''}.",
+            style="yellow",
         )
     if check:
         _check(scene, config)
@@ -162,7 +163,8 @@ def _cast_truth(
         f"In the median, the two are {metres:.3f} m apart there."
     )
     if covered < LITTLE or not metres < FAR_OFF:
-        console.print("[yellow]Is it of this building, and in the shell's frame? Look before you believe its metrics.")
+        doubt = "Is it of this building, and in the shell's frame? Look before you believe its metrics."
+        console.print(doubt, style="yellow")
     console.print(f"Look at {save_panel(CueMaps.open(scene, 'truth'), views)}: what is grey has no truth.")
 
 

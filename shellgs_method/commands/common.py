@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from shellgs_method.compare.runs import Run
     from shellgs_method.export.frame import Frame
 
-# Without a terminal rich assumes 80 columns, which cut the tables of a log.
-console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160)
+# Without a terminal rich assumes 80 columns, which cut the tables of a log. Its markup would swallow a folder's [name].
+console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160, markup=False)
 
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 RunConfig = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG")]

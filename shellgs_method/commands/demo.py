@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from dataclasses import asdict
 from functools import partial
@@ -52,9 +53,10 @@ def demo(
 
     scene = folder / "scene"
     _make(scene, FacadeConfig(width, height, views, seed))
-    console.print(f"[bold]$ shellgs cast {scene}", highlight=False)
+    casting = ["shellgs", "cast", str(scene)]
+    console.print(f"$ {shlex.join(casting)}", style="bold", highlight=False)
     with Display(console) as display, display.work("scene") as tell, following(1) as pool:
-        cast = pool.submit(follow, [["shellgs", "cast", str(scene)]], tell=tell)
+        cast = pool.submit(follow, [casting], tell=tell)
         # Slow to import, so while the shell is cast; nerfstudio first, as its import takes longer from deep in others.
         import nerfstudio.configs.method_configs  # noqa: F401
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from rich.table import Table
+from rich.text import Text
 
 from shellgs_method.commands.common import console
 
@@ -18,8 +19,8 @@ def doctor() -> None:
         table.add_column(heading)
     findings = list(examine())
     for finding in findings:
-        mark = "[green]✓" if finding.works else "[red]✗" if finding.needed else "[yellow]–"
-        table.add_row(mark, finding.subject, finding.detail)
+        mark = ("✓", "green") if finding.works else ("✗", "red") if finding.needed else ("–", "yellow")
+        table.add_row(Text(*mark), finding.subject, finding.detail)
     console.print(table)
     if missing := [f"{found.subject}: {found.detail}" for found in findings if found.needed and not found.works]:
         sys.exit(f"shellgs: nothing runs here until this is fixed: {'; '.join(missing)}")

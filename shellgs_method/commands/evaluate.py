@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Optional
 
-from rich.markup import escape
 from rich.table import Table
 
 from shellgs_method.commands.common import RunConfig, console
@@ -55,7 +54,7 @@ def _print_surveyed(surveyed: Surveyed) -> None:
 
     table = Table("Point", "Surface in front of the point (m)")
     for name, before in surveyed.before.items():
-        table.add_row(escape(name), "no surface near it" if before is None else f"{before:+.3f}")
+        table.add_row(name, "no surface near it" if before is None else f"{before:+.3f}")
     console.print(table)
     off = surveyed.distances
     console.print(
@@ -63,8 +62,7 @@ def _print_surveyed(surveyed: Surveyed) -> None:
         f"{off.max():.3f} m at most."
     )
     if pairs := sorted(surveyed.pairs, key=lambda pair: abs(pair[3])):
-        *names, apart, difference = pairs[-1]
-        one, other = map(escape, names)
+        one, other, apart, difference = pairs[-1]
         console.print(
             f"Distances between {len(pairs)} pairs of them differ by {abs(pairs[len(pairs) // 2][3]):.3f} m in the "
             f"median, at most by {abs(difference):.3f} m, from {one} to {other}, {apart:.3f} m apart."

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 from rich.table import Table
+from rich.text import Text
 
 from shellgs_method.commands.common import console
 from shellgs_method.machine.progress import tell
@@ -54,9 +55,9 @@ def report_seams(config: Path, coarse: Path) -> None:
     near = f"within {NEAR:g} {'m' if run.model.metres_per_unit else 'scene unit'} of one"
     table = Table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: {near})")
     for criterion, *values, lost in seams:
-        good = "good" if lost <= criterion.most else f"[bold]more than {criterion.most:g}"
+        good = "good" if lost <= criterion.most else Text(f"more than {criterion.most:g}", "bold")
         table.add_row(criterion.title, *(f"{value:.3f}" for value in (*values, lost)), good)
-    good = "good" if double["share"] <= DOUBLES else f"[bold]more than {DOUBLES:.0%}"
+    good = "good" if double["share"] <= DOUBLES else Text(f"more than {DOUBLES:.0%}", "bold")
     table.add_row("Doubled Gaussians", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
     console.print(table)
     console.print("What to do if more is lost: docs/street.md, Along the cuts.", highlight=False)

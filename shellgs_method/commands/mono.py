@@ -52,7 +52,7 @@ def mono(
     licence = f", licence {predictor.licence}" if predictor.licence else ""
     console.print(f"{predictor.name}, revision {predictor.revision[:12]}{licence}.", highlight=False)
     if predictor.non_commercial:
-        console.print("[yellow]The licence of these weights forbids commercial use.")
+        console.print("The licence of these weights forbids commercial use.", style="yellow")
     if points.observed is None:
         console.print("The scene does not say which points a view observes: all points that project into it are used.")
     size = f" --max-image-size {max_image_size}" if max_image_size else ""

@@ -80,7 +80,7 @@ def pick(
     said = session.said()
     for point in said["points"]:
         if point["problem"] and not point["left_out"]:
-            console.print(f"[yellow]{point['problem']}.", highlight=False, soft_wrap=True)
+            console.print(f"{point['problem']}.", style="yellow", highlight=False, soft_wrap=True)
     fit = said["fit"]
     if "problem" in fit:
         console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)

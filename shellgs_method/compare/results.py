@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
+from rich.text import Text
 
 from shellgs_method.compare.measure import Snapshot, measure_shell
 from shellgs_method.compare.plots import common_views, curves, exposures, strip, surfaces
@@ -81,7 +82,8 @@ def _compare(runs: Sequence[Run], launch: Launcher, output: Path, console: Conso
     for table in comparison.tables:
         console.print(rich_table(table.rows, table.columns, console.width, table.title))
     for run, why in failures.items():
-        console.print(f"[red]{run.label} failed.[/red] All of its output is in {run.folder / 'log.txt'}.")
+        where = f" All of its output is in {run.folder / 'log.txt'}."
+        console.print(Text.assemble((f"{run.label} failed.", "red"), where))
         console.print(why, markup=False, highlight=False)
     return comparison
 
@@ -90,13 +92,13 @@ def _remove_damaged(run: Run, console: Console) -> None:
     """Remove unreadable metrics and renders, so that they are made again."""
     for half in (None, *run.halves):
         if (path := run.metrics(half)).exists() and read_metrics(path) is None:
-            console.print(f"[yellow]{path} is damaged: measuring it again.", highlight=False)
+            console.print(f"{path} is damaged: measuring it again.", style="yellow", highlight=False)
             path.unlink()
     for path in run.renders.glob("*.npz"):
         try:
             Snapshot.load(path)
         except SceneError as error:
-            console.print(f"[yellow]{error}: rendering it again.", highlight=False)
+            console.print(f"{error}: rendering it again.", style="yellow", highlight=False)
             path.unlink()
             run.metrics().unlink(missing_ok=True)
 

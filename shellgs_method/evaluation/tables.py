@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from shellgs_method.evaluation.image import SMALLEST_LPIPS_IMAGE
 
@@ -141,18 +141,18 @@ def rich_table(rows: Rows, columns: Sequence[Column], width: int, title: str | N
         width: width of the terminal in characters.
         title: title of the table.
     """
-    lines = [["Method", *(column.heading for column in columns)]]
+    lines = [[Text("Method"), *(Text(column.heading) for column in columns)]]
     for method, cells in _cells(rows, columns):
-        lines.append([escape(method), *(f"[bold]{text}[/bold]" if best else text for text, best in cells)])
+        lines.append([Text(method), *(Text(text, "bold" if best else "") for text, best in cells)])
     (_, *headings), *methods = lines
     wide, narrow = (
         _rich(each, title, footnote(rows, columns))
-        for each in (lines, list(zip(["Metric", *headings], *methods, strict=True)))
+        for each in (lines, list(zip([Text("Metric"), *headings], *methods, strict=True)))
     )
     return wide if _width(wide) <= max(width, _width(narrow)) else narrow
 
 
-def _rich(lines: Sequence[Sequence[str]], title: str | None, caption: str | None) -> Table:
+def _rich(lines: Sequence[Sequence[Text]], title: str | None, caption: str | None) -> Table:
     (first, *others), *rows = lines
     table = Table(title=title, caption=caption)
     table.add_column(first, no_wrap=True)

@@ -58,8 +58,8 @@ class Display:
 
     def __init__(self, console: Console):
         self._console, self._works, self._ended = console, dict[str, tuple[Work, TaskID]](), threading.Event()
-        columns = TextColumn("{task.description}"), BarColumn(None), TextColumn("{task.fields[work]}")
-        self._bars = Progress(*columns, console=console, transient=True, expand=True)
+        label, work = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[work]}"))
+        self._bars = Progress(label, BarColumn(None), work, console=console, transient=True, expand=True)
         self._log = threading.Thread(target=self._tell_log, daemon=True)
 
     def __enter__(self) -> Display:

@@ -15,7 +15,6 @@ from queue import SimpleQueue
 
 import torch
 from rich.console import Console
-from rich.markup import escape
 
 from shellgs_method.launch.display import Display
 from shellgs_method.launch.in_turn import command_in_turn, heading
@@ -166,7 +165,7 @@ def _finish_visibly(run: Job, console: Console, display: Display, devices: Simpl
     device = devices.get()
 
     def announce(command: Sequence[str]) -> None:
-        console.print(f"[bold]$ {escape(shlex.join(command))}", highlight=False, soft_wrap=True)
+        console.print(f"$ {shlex.join(command)}", style="bold", highlight=False, soft_wrap=True)
 
     try:
         with display.work(run.label) as tell:

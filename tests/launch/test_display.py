@@ -92,7 +92,7 @@ def test_a_command_is_shown_with_the_stages_that_it_prints(tmp_path, monkeypatch
     )
     output = io.StringIO()
     console = Console(file=output, force_terminal=terminal, width=120)
-    with Display(console) as shown, shown.work("scene/shellgs/seed-0") as tell:
+    with Display(console) as shown, shown.work("scene [final]/shellgs/seed-0") as tell:
         follow([["ns-train"]], tell=tell)
     stages = [
         "reading the scene (0:0",
@@ -105,6 +105,7 @@ def test_a_command_is_shown_with_the_stages_that_it_prints(tmp_path, monkeypatch
     assert text.index(stages[0]) < text.index(stages[1]) < text.index(stages[2]) < text.index(stages[3])
     assert "all" not in text.replace("for all runs", "")
     assert ("━" in text) == terminal
+    assert "scene [final]/shellgs" in text
     if not terminal:
         assert text.count("\n") <= 6
 
