@@ -112,8 +112,8 @@ class Ground:
 
     @property
     def is_level(self) -> bool:
-        """Whether it is a level plane."""
-        return bool(np.ptp(self.heights) == 0)
+        """Whether it is a level plane, of which nothing is measured."""
+        return not self.known.any()
 
     @property
     def extent(self) -> float:

@@ -91,6 +91,19 @@ def test_a_small_slope_beside_the_wall_does_not_tilt_the_street(size):
     assert made.is_level == (size**2 < LEAST)
 
 
+def test_ground_that_is_exactly_flat_has_its_height_in_the_world(tmp_path):
+    """The yard of a BIM, a step below the foot of the shell."""
+    x, y = np.random.default_rng(0).uniform((-8, -8), (8, 0), (20_000, 2)).T
+    made = Ground.of(np.stack([x, y, np.full(len(x), -0.4)], axis=1), EYES)
+    assert np.ptp(made.heights) == 0
+    write_world(tmp_path, [], frame_at(), made)
+    places = np.array([[0.0, -4, 2], [5, -2, 2]])
+    measured = lidar(tmp_path / "world.xml", places, np.array([[0.0, 0, -1]]), 0)
+    np.testing.assert_allclose(measured, 2.4, atol=1e-5)
+    for name in ("world.sdf", "world.urdf"):
+        assert MESH in (tmp_path / name).read_text()
+
+
 def test_without_points_the_ground_is_level_and_nothing_is_known():
     for points in (np.empty((0, 3)), np.array([[0.0, 0, 9], [1, 0, 9], [0, 1, 9]])):
         made = Ground.of(points, EYES)

@@ -16,6 +16,8 @@ TIMESTEP = 0.002
 """Time step in seconds: MuJoCo's default."""
 BASE = 1.0
 """Depth in metres of a height field below its lowest point."""
+FLATTEST = 1e-3
+"""Least difference in height in metres that a height field states."""
 STIFF = 2.5 * TIMESTEP
 """Time constant of contacts in seconds; MuJoCo allows no less than two time steps."""
 
@@ -66,13 +68,14 @@ def world_mjcf(assets: Sequence[Asset], ground: Ground) -> ET.Element:
 def _ground(default: ET.Element, files: ET.Element, world: ET.Element, ground: Ground) -> None:
     """Ground, which gives way: of two geoms the one of higher priority decides about their contact.
 
-    MuJoCo scales the heights of a field to 0..1, and has its middle at the geom's place.
+    MuJoCo scales the heights of a field to 0..1, and has its middle at the geom's place. It refuses a field without
+    any height, as of a paved yard in a BIM.
     """
     add(add(default, "default", **{"class": "ground"}), "geom", priority=-1, rgba="0.4 0.4 0.4 1")
     if ground.is_level:
         add(world, "geom", name="ground", type="plane", size="0 0 1", **{"class": "ground"})
         return
     half = ground.cell * (np.array(ground.heights.shape[::-1]) - 1) / 2
-    (x, y), low, high = ground.origin + half, ground.heights.min(), np.ptp(ground.heights)
+    (x, y), low, high = ground.origin + half, ground.heights.min(), max(np.ptp(ground.heights), FLATTEST)
     add(files, "hfield", name="ground", file=FIELD, size=f"{half[0]} {half[1]} {high} {BASE}")
     add(world, "geom", name="ground", type="hfield", hfield="ground", pos=f"{x} {y} {low}", **{"class": "ground"})
