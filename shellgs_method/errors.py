@@ -82,14 +82,16 @@ def check_output(path: Path) -> None:
 
 
 def check_output_folder(path: Path) -> None:
-    """Refuse an output folder that is a file or lies below one, before the work starts.
+    """Refuse an output folder that is a file or lies below one, or that cannot be written to, before the work starts.
 
     Raises:
-        SceneError: names the file.
+        SceneError: names the file, or the folder that is not writable.
     """
     there = _existing(path)
     if not there.is_dir():
         raise SceneError(f"{there} is a file: name a folder to write to")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise SceneError(f"{path} cannot be written: you may not write to {there}; name a folder elsewhere")
 
 
 def _existing(path: Path) -> Path:

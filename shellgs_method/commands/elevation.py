@@ -7,6 +7,7 @@ from typing import Annotated, Optional
 
 from shellgs_method.bounds import Bounds, bounded
 from shellgs_method.commands.common import RunConfig, console
+from shellgs_method.errors import check_output_folder
 
 
 @bounded
@@ -25,12 +26,14 @@ def elevation(
         output: Folder. If not set: elevation beside the config.
         pixel: Size of a pixel in metres. If not set: a third of the photographs' on the facade, or 5 mm.
     """
+    output = output or config.with_name("elevation")
+    check_output_folder(output)  # before views are rendered for minutes
     from shellgs_method.export.elevation import MARGIN, draw, shell_and_walls, usual_pixel, write_elevation
     from shellgs_method.export.runs import TrainedRun
     from shellgs_method.geometry.triangles import Triangles
     from shellgs_method.machine.progress import track
 
-    output, run = output or config.with_name("elevation"), TrainedRun.load(config)
+    run = TrainedRun.load(config)
     (shell, walls), mesh = shell_and_walls(run), run.surface(MARGIN)
     surface, pixel, facts = Triangles(mesh.vertices, mesh.faces), pixel or usual_pixel(run, walls), {}
     for number, wall in enumerate(track(walls, "Drawing wall", len(walls)), 1):

@@ -107,12 +107,29 @@ def test_a_demo_with_other_settings_is_refused_and_changes_nothing(demo, monkeyp
     assert {path: path.stat().st_mtime_ns for path in demo.rglob("*")} == before
 
 
-@pytest.mark.parametrize("words", [["demo", "FILE"], ["compare", "scene", "--output", "FILE/below"]])
+FOLDERS = [
+    ["demo", "FILE"],
+    ["compare", "scene", "--output", "FILE/below"],
+    ["elevation", "config.yml", "--output", "FILE"],
+]
+
+
+@pytest.mark.parametrize("words", FOLDERS)
 def test_a_file_in_place_of_an_output_folder_is_refused_by_its_name(tmp_path, monkeypatch, words):
     file = tmp_path / "notes.txt"
     file.touch()
     monkeypatch.setattr("sys.argv", ["shellgs", *(word.replace("FILE", str(file)) for word in words)])
     with pytest.raises(SystemExit, match=rf"^shellgs: {file} is a file: name a folder"):
+        main()
+
+
+@pytest.mark.parametrize("words", FOLDERS)
+def test_an_output_folder_that_cannot_be_written_to_is_refused_before_the_work(tmp_path, monkeypatch, words):
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    monkeypatch.setattr("os.access", lambda path, _: path != folder)  # to root, all folders are writable
+    monkeypatch.setattr("sys.argv", ["shellgs", *(word.replace("FILE", str(folder)) for word in words)])
+    with pytest.raises(SystemExit, match=rf"^shellgs: {folder}.* cannot be written: you may not write to {folder};"):
         main()
 
 
