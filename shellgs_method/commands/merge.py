@@ -54,9 +54,9 @@ def report_seams(config: Path, coarse: Path) -> None:
     # Its headings are short, to fit a terminal of 80 columns.
     near = f"within {NEAR:g} {'m' if run.model.metres_per_unit else 'scene unit'} of one"
     table = Table("", "Near", "Elsewhere", "Lost", "", title=f"Lost at the cuts (near: {near})")
-    for criterion, *values, lost in seams:
-        good = "good" if lost <= criterion.most else Text(f"more than {criterion.most:g}", "bold")
-        table.add_row(criterion.title, *(f"{value:.3f}" for value in (*values, lost)), good)
+    for seam in seams:
+        good = "good" if seam.good else Text(f"more than {seam.criterion.most:g}", "bold")
+        table.add_row(seam.criterion.title, *(f"{value:.3f}" for value in (seam.near, seam.elsewhere, seam.lost)), good)
     good = "good" if double["share"] <= DOUBLES else Text(f"more than {DOUBLES:.0%}", "bold")
     table.add_row("Doubled Gaussians", f"{double['count']:.0f}, {double['share']:.1%}", "", "", good)
     console.print(table)

@@ -15,7 +15,7 @@ import torch
 import trimesh
 import yourdfpy
 from PIL import Image
-from worlds import check_rays, frame_at, painted, some_splats, uneven, write_building, write_folder
+from worlds import check_rays, compliance_errors, frame_at, painted, some_splats, uneven, write_building, write_folder
 
 from benchmarks.engines import newton_lidar, newton_model
 from shellgs_method.errors import SceneError
@@ -24,7 +24,6 @@ from shellgs_method.sim.collision.collider import Collider
 from shellgs_method.sim.collision.parts import Part
 from shellgs_method.sim.formats.asset import FRICTION, write_parts
 from shellgs_method.sim.formats.mjcf import STIFF
-from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.front import Front
 from shellgs_method.sim.look.texture import TexturedMesh

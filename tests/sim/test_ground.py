@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from worlds import frame_at
+from worlds import compliance_errors, frame_at
 
 from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.building import MOST_GROUND, ground_step
 from shellgs_method.sim.formats.ground import MESH
-from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.formats.world import write_world
 from shellgs_method.sim.ground import AROUND, CELL, EXTENT, LEAST, LEVEL, Ground
 from shellgs_method.sim.trials.engine import lidar

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from scenes import cast
 from training_runs import trainer_of
-from worlds import LAYOUT, painted, write_folder
+from worlds import LAYOUT, compliance_errors, painted, write_folder
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method import cli
@@ -28,7 +28,6 @@ from shellgs_method.shell import Alignment, load_shell
 from shellgs_method.sim.building import Reconstruction
 from shellgs_method.sim.collision.collider import THINNEST, Collider, make_collider
 from shellgs_method.sim.collision.parts import Part, pieces
-from shellgs_method.sim.formats.usd import compliance_errors
 from shellgs_method.sim.front import Front
 from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import rendered

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from PIL import Image
 
 from shellgs_method.export.frame import Z
 from shellgs_method.files.splats import Splats
+from shellgs_method.files.usd import import_pxr
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.sim.collision.collider import Collider
@@ -93,3 +95,14 @@ def check_rays(measured: np.ndarray, surface: Triangles, ground: Ground, origins
     assert np.isfinite(met[0]).mean() > 0.5
     assert (measured >= np.min(met, axis=0) - 0.01).all()
     assert (measured <= np.max(met, axis=0) + 0.01).all()
+
+
+def compliance_errors(stage: Path | Any) -> list[str]:
+    """Errors that usd-core's own validators, those of ``usdchecker``, find in a stage or its file; a line each."""
+    pxr = import_pxr("sim")
+    registry = pxr.UsdValidation.ValidationRegistry()
+    validators = registry.GetOrLoadAllValidators()
+    if isinstance(stage, Path):
+        stage = pxr.Usd.Stage.Open(str(stage))
+    errors = pxr.UsdValidation.ValidationContext(validators).Validate(stage)
+    return [f"{error.GetName()}: {error.GetMessage()}" for error in errors]

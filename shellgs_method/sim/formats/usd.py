@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import torch
@@ -109,17 +108,6 @@ def _ground(pxr: SimpleNamespace, stage, ground: Ground, mesh: Triangles | None)
         make_collider(pxr, made, "none")
     made.CreatePurposeAttr(pxr.UsdGeom.Tokens.guide)
     _rub(pxr, made, _friction(pxr, stage, "/World/friction"))
-
-
-def compliance_errors(stage: Path | Any) -> list[str]:
-    """Errors that usd-core's own validators, those of ``usdchecker``, find in a stage or its file; a line each."""
-    pxr = import_pxr("sim")
-    registry = pxr.UsdValidation.ValidationRegistry()
-    validators = registry.GetOrLoadAllValidators()
-    if isinstance(stage, Path):
-        stage = pxr.Usd.Stage.Open(str(stage))
-    errors = pxr.UsdValidation.ValidationContext(validators).Validate(stage)
-    return [f"{error.GetName()}: {error.GetMessage()}" for error in errors]
 
 
 def _refer(stage, root, child: str):
