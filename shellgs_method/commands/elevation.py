@@ -28,7 +28,15 @@ def elevation(
     """
     output = output or config.with_name("elevation")
     check_output_folder(output)  # before views are rendered for minutes
-    from shellgs_method.export.elevation import MARGIN, draw, shell_and_walls, usual_pixel, write_elevation
+    from shellgs_method.export.elevation import (
+        MARGIN,
+        WALLS,
+        draw,
+        remove_earlier,
+        shell_and_walls,
+        usual_pixel,
+        write_elevation,
+    )
     from shellgs_method.export.runs import TrainedRun
     from shellgs_method.geometry.triangles import Triangles
     from shellgs_method.machine.progress import track
@@ -45,4 +53,5 @@ def elevation(
         width, height = wall.size[:2]
         line = f"{output / name}.pdf: {width:.2f} x {height:.2f} m, {1000 * pixel:.3g} mm a pixel."
         console.print(line, highlight=False, soft_wrap=True)
-    run.frame.describe(output / "walls.json", facts)
+    remove_earlier(output, facts)  # of a shell that was placed otherwise, say
+    run.frame.describe(output / WALLS, facts)

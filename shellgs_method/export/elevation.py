@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,13 +21,15 @@ from PIL import Image, TiffImagePlugin, TiffTags
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation.colours import depth_colours, deviation_colours
 from shellgs_method.export.runs import TrainedRun
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import atomic_write, read_json
 from shellgs_method.geometry.camera import positions
 from shellgs_method.geometry.similarity import scale_of, transformed
 from shellgs_method.geometry.triangles import Triangles
 from shellgs_method.geometry.walls import Wall, find_walls
 from shellgs_method.geometry.winding import outward
 
+WALLS = "walls.json"
+"""Where the elevations in a folder lie."""
 DISTANCE = 1000.0
 """Metres between the wall and the camera that stands for an orthographic one. What is a metre before the wall is then
 up to 2 mm off at a tile's edge, and float32 has steps of 0.06 mm."""
@@ -214,6 +217,19 @@ def write_elevation(folder: Path, name: str, elevation: Elevation) -> None:
     with atomic_write(folder / f"{name}.pdf") as file, PdfPages(file) as pages:
         for title, image in _drawings(elevation).items():
             pages.savefig(_sheet(elevation, f"{name}, {title}", image))
+
+
+def remove_earlier(folder: Path, names: Collection[str]) -> None:
+    """Remove the elevations that the :data:`WALLS` of an earlier drawing names, but those of ``names``."""
+    try:
+        earlier = read_json(folder / WALLS)
+    except (OSError, SceneError):  # none, or damaged: what is there may be the user's
+        return
+    for name in earlier.keys() - names:
+        if re.fullmatch(r"wall-\d+", name):
+            for ending in (".png", ".pgw", ".tif", ".tfw", ".pdf"):
+                for part in ("", "-depth", "-deviations"):
+                    (folder / f"{name}{part}{ending}").unlink(missing_ok=True)
 
 
 def _geotiff_tags(elevation: Elevation, called: str) -> TiffImagePlugin.ImageFileDirectory_v2:

@@ -13,7 +13,7 @@ from PIL import Image
 from training_runs import data_of, model_of, trainer_of
 
 from shellgs_method.export import elevation
-from shellgs_method.export.elevation import MARGIN, draw, shell_and_walls, usual_pixel
+from shellgs_method.export.elevation import MARGIN, draw, remove_earlier, shell_and_walls, usual_pixel
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.synthetic.building import Layout
@@ -89,6 +89,21 @@ def test_pixels_are_finer_than_the_photographs_but_not_too_many(run, monkeypatch
     assert usual_pixel(run, walls) == pytest.approx(resolved / 3)
     monkeypatch.setattr(elevation, "LARGEST", 20)
     assert np.ceil(max(wall.size[:2].max() for wall in walls) / usual_pixel(run, walls)) <= 20
+
+
+def test_elevations_of_walls_that_are_no_more_are_removed_and_nothing_else(tmp_path):
+    endings = [f"{part}{ending}" for part in ("", "-depth", "-deviations") for ending in (".tif", ".tfw")]
+    endings += [".png", ".pgw", ".pdf"]
+    for name in ("wall-1", "wall-2", "wall-3"):
+        for ending in endings:
+            (tmp_path / f"{name}{ending}").touch()
+    (tmp_path / "plan.pdf").touch()
+    remove_earlier(tmp_path, ["wall-1"])
+    assert len([*tmp_path.iterdir()]) == 3 * len(endings) + 1  # nobody knows whose they are
+    (tmp_path / "walls.json").write_text('{"frame": "shell", "wall-1": {}, "wall-2": {}, "plan": {}}')
+    remove_earlier(tmp_path, ["wall-1"])
+    kept = {f"{name}{ending}" for name in ("wall-1", "wall-3") for ending in endings}
+    assert {path.name for path in tmp_path.iterdir()} == kept | {"plan.pdf", "walls.json"}
 
 
 def test_the_command_writes_images_with_world_files_and_a_drawing(run, trained, shellgs, tmp_path, caplog):
