@@ -86,7 +86,7 @@ def launch_on_ray(runs: Sequence[JobT], cluster: Cluster, console: Console) -> d
         # On any node, which may be lost.
         stages = Queue(actor_options={"num_cpus": 0, "max_restarts": -1})
         with _marked(runs, launch) as marks, Display(console) as display:
-            in_place = marks and all(_on_each_node(_sees, marks))
+            in_place = _all_see(marks)
             tasks = _Tasks(launch, task, stages, marks if in_place else None, console, display, list(runs))
             # What must be sent is packed late, to save memory; one run waits for a node that may join.
             failures = tasks.finish(len(runs) if in_place else takes.room(nodes) + 1)
@@ -218,6 +218,12 @@ def _marked(runs: Sequence[Job], launch: str) -> Iterator[list[Path]]:
         for mark in marks:
             with suppress(OSError):
                 mark.unlink(missing_ok=True)
+
+
+def _all_see(marks: Sequence[Path]) -> bool:
+    """Whether nodes see files, and none does not: unknown, so no, if none answers, as where all are busy or start."""
+    answers = _on_each_node(_sees, marks) if marks else []
+    return len(answers) > 0 and all(answers)
 
 
 def _sees(files: Sequence[Path]) -> bool:

@@ -552,6 +552,13 @@ def test_ray_finishes_the_run_of_a_killed_worker_and_reports_one_that_fails(
     assert "mono-gs needs maps" in (mono_gs.folder / "log.txt").read_text()
 
 
+@pytest.mark.parametrize(("answers", "seen"), [([True, True], True), ([True, False], False), ([], False)])
+def test_folders_are_in_place_only_if_a_node_says_so(tmp_path, monkeypatch, answers, seen):
+    monkeypatch.setattr(cluster, "_on_each_node", lambda *_: answers)
+    assert cluster._all_see([tmp_path / ".mark"]) == seen
+    assert not cluster._all_see([])
+
+
 def test_a_node_that_joins_later_and_does_not_see_the_folders_says_so(pristine_scene, tmp_path):
     (run,) = fake_grid([pristine_scene], ["photo-gs"], tmp_path)
     folder, error = cluster._finish_on_node(run, "launch", run.key, [tmp_path / "elsewhere" / ".mark"], None)
