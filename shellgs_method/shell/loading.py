@@ -222,4 +222,4 @@ def _with_area(mesh: ShellMesh, path: Path | None = None) -> ShellMesh:
     if path is not None:
         notice(f"{path}: dropped {flat.sum()} of {len(flat)} triangles, which have no area.")
     vertices, faces = _referenced(mesh.vertices, mesh.faces[~flat])
-    return replace(mesh, vertices=vertices, faces=faces, classes=mesh.classes[~flat])
+    return replace(mesh, vertices=vertices, faces=faces, classes=mesh.classes[~flat], source=mesh.source[~flat])

@@ -260,6 +260,7 @@ def test_triangles_without_area_are_dropped_and_counted(
     mesh = load_shell(write_ply(tmp_path / "a.ply", [" ".join(map(repr, c)) for c in corners.tolist()], faces))
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], corners[[[0, 1, 2], [0, 1, 5]]])
     assert "dropped 4 of 6 triangles, which have no area" in caplog.text
+    assert len(mesh.faces) == len(mesh.classes) == len(mesh.source) == 2
 
 
 def test_a_vertex_far_away_makes_no_other_triangle_flat(tmp_path: Path):
