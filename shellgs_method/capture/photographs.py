@@ -27,6 +27,7 @@ from shellgs_method.files.paths import (
     captured_name,
     files_below,
     mask_names,
+    masks_among,
     photographs_in,
     tell_of_masks,
 )
@@ -279,14 +280,13 @@ def find_masks(photographs: Mapping[str, Path], folder: Path, masks: Path) -> di
     """
     if not masks.is_dir():
         raise FileNotFoundError(f"{masks} is not a folder of masks.")
-    there = set(photographs_in(masks, deep=True))
     paths = {name: [masks / p for p in mask_names(source.relative_to(folder))] for name, source in photographs.items()}
-    chosen = {name: next((path for path in each if path in there), None) for name, each in paths.items()}
+    chosen = masks_among(paths)
     found = {name: path for name, path in chosen.items() if path}
     if not found:
         first = next(iter(paths.values()))[0]
         raise SceneError(f"no photograph has a mask in {masks}: the first one's would be {first}; rename the masks")
-    tell_of_masks(chosen, there, masks)
+    tell_of_masks(chosen, set(photographs_in(masks, deep=True)), masks)
     return found
 
 

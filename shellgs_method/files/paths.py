@@ -172,6 +172,16 @@ def mask_names(photograph: PurePath) -> list[PurePath]:
     return [photograph.with_name(stem + suffix) for suffix in suffixes for stem in stems]
 
 
+def masks_among(candidates: Mapping[str, Sequence[Path]]) -> dict[str, Path | None]:
+    """The first of the files that may be a photograph's mask that is there, by the photograph's name.
+
+    A folder may be a link to that of another camera, whose masks both have.
+    """
+    folders = {path.parent for paths in candidates.values() for path in paths}
+    there = {path for folder in folders for path in photographs_in(folder, deep=False)}
+    return {name: next((path for path in paths if path in there), None) for name, paths in candidates.items()}
+
+
 def tell_of_masks(masks: Mapping[str, Path | None], there: Collection[Path], folder: Path) -> None:
     """Tell the user which photographs have no mask, if some have one, and which files of the folder are no masks."""
     without = sorted(name for name, path in masks.items() if path is None)
@@ -183,14 +193,20 @@ def tell_of_masks(masks: Mapping[str, Path | None], there: Collection[Path], fol
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Files in a folder and its sub-folders, also in those that are links; each folder once."""
+    """Files in a folder and its sub-folders, also in those that are links; each folder once, by its own path if it has
+    one there, whatever order the system lists them in.
+    """
     been: set[Path] = set()
-    for root, folders, files in os.walk(folder, followlinks=True):
-        if (real := Path(root).resolve()) in been:
-            folders.clear()
-        else:
-            been.add(real)
-            yield from (Path(root, name) for name in files)
+    own, links = [folder], []
+    while own or links:
+        here = own.pop() if own else links.pop()
+        if (real := here.resolve()) in been:
+            continue
+        been.add(real)
+        _, folders, files = next(os.walk(here), ("", [], []))  # none of one that cannot be read
+        yield from (here / name for name in files)
+        for path in sorted((here / name for name in folders), reverse=True):
+            (links if path.is_symlink() else own).append(path)
 
 
 def photographs_in(folder: Path, *, deep: bool) -> list[Path]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Optional
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import read_json
-from shellgs_method.files.paths import mask_names, photographs_in, tell_of_masks
+from shellgs_method.files.paths import mask_names, masks_among, photographs_in, tell_of_masks
 
 if TYPE_CHECKING:  # importing nerfstudio takes seconds, and the command line needs only the paths
     from shellgs_method.files.frames import Frame, Recording
@@ -187,7 +187,7 @@ class SceneLayout(ScenePaths):
         if folder.is_dir():
             there = set(photographs_in(folder, deep=True))
             candidates = {frame.name: list(self._candidates(folder, frame.name)) for frame in frames}
-            masks = {name: next((p for p in paths if p in there), None) for name, paths in candidates.items()}
+            masks = masks_among(candidates)
             named = {frame.mask for frame in frames}
             if any(folder.iterdir()) and not any(masks.values()) and not any(named):
                 first = next(iter(candidates.values()))[0]

@@ -18,6 +18,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import image, image_errors
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.masks import kept_pixels
+from shellgs_method.files.paths import masks_among, photographs_in
 from shellgs_method.files.photographs import load_mask, load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.gaussians.seeds import shell_seeds, view_of_shell
@@ -52,6 +53,26 @@ def test_masks_in_their_folder_are_found_without_a_flag(scene, kind, name):
         assert kept is not None
         assert not kept[:, :12].any()
         assert kept[:, 12:].all()
+
+
+def test_cameras_of_a_rig_share_their_masks_by_a_link(tmp_path):
+    cameras = ("a", "left", "z")
+    (tmp_path / "masks/left").mkdir(parents=True)
+    paint(tmp_path / "masks/left/1.png", left=12)
+    for camera in cameras:
+        if camera != "left":
+            (tmp_path / "masks" / camera).symlink_to("left")
+    candidates = {camera: [tmp_path / "masks" / camera / "1.png"] for camera in cameras}
+    assert masks_among(candidates) == {name: paths[0] for name, paths in candidates.items()}
+
+
+def test_a_folder_with_links_to_it_is_found_by_its_own_path(tmp_path):
+    (tmp_path / "images/m/deep").mkdir(parents=True)
+    (tmp_path / "images/m/deep/1.jpg").touch()
+    for name in "0abnz":
+        (tmp_path / "images" / name).symlink_to("m" if name > "a" else "m/deep")
+    (tmp_path / "images/m/loop").symlink_to("..")
+    assert photographs_in(tmp_path / "images", deep=True) == [tmp_path / "images/m/deep/1.jpg"]
 
 
 def test_a_photograph_without_a_mask_is_kept_whole_and_counted(scene, caplog):
