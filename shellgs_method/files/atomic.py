@@ -18,6 +18,7 @@ import psutil
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.headers import buffer_files
+from shellgs_method.files.paths import files_below
 from shellgs_method.machine.cache import cache_folder
 
 _LARGE = 1 << 24  # bytes, which are hashed in a moment
@@ -135,7 +136,9 @@ def _delete(path: Path) -> None:
 
 
 def content_hash(path: Path) -> str:
-    """sha256 of a file's bytes, or of the names and bytes of a folder's files; hidden files are ignored.
+    """sha256 of a file's bytes, or of the names and bytes of a folder's files, also in folders that it links to.
+
+    Hidden files are ignored.
 
     That of a glTF with buffers in files beside it is of these too.
 
@@ -143,7 +146,8 @@ def content_hash(path: Path) -> str:
     """
     if path.is_dir():
         digest = hashlib.sha256()
-        for file in sorted(file for file in path.rglob("[!.]*") if file.is_file()):
+        shown = (file for file in files_below(path) if file.is_file() and not file.name.startswith("."))
+        for file in sorted(shown):
             digest.update(f"{file.relative_to(path).as_posix()}\0{content_hash(file)}\n".encode())
         return digest.hexdigest()
     if path.suffix.lower() in (".gltf", ".glb") and (buffers := buffer_files(path)):
