@@ -85,14 +85,14 @@ def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mappin
     """
     image = inside(scene, name, where)
     where = f"{where}: the camera of {name}"
-    width, height = (_number(lens, key, where) for key in ("w", "h"))
+    width, height = (number(lens, key, where) for key in ("w", "h"))
     if not (width >= 1 and height >= 1 and width % 1 == height % 1 == 0):
         raise SceneError(f"{where} has {width:g}x{height:g} pixels: both must be whole numbers, at least 1")
     if width * height > MAX_PIXELS:
         raise SceneError(
             f"{where} has {width:.0f}x{height:.0f} pixels, more than can be read: make the photographs smaller"
         )
-    fx, fy, cx, cy = (_number(lens, key, where) for key in ("fl_x", "fl_y", "cx", "cy"))
+    fx, fy, cx, cy = (number(lens, key, where) for key in ("fl_x", "fl_y", "cx", "cy"))
     if fx <= 0 or fy <= 0:
         raise SceneError(f"{where} has the focal lengths {fx:g} and {fy:g}, which must be positive: calibrate it again")
     fisheye = _is_fisheye(lens, where)
@@ -102,7 +102,7 @@ def frame(scene: Path, name: str, pose: Float64[np.ndarray, "4 4"], lens: Mappin
             f"{where} has the focal lengths {fx:g} and {fy:g}, with which {width:g}x{height:g} pixels show "
             f"{angle:.0f}°: give them in pixels, not in millimetres or as a share of the width"
         )
-    distortion = tuple(_number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
+    distortion = tuple(number(lens, key, where) if key in lens else 0.0 for key in COEFFICIENTS)
     if not fisheye and distortion[3] != 0:
         raise SceneError(f"{where} has Brown's k4, which nerfstudio cannot undistort; {UNDISTORT}")
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
@@ -190,7 +190,12 @@ def _fault(pose: np.ndarray) -> str:
     return "it scales, shears or mirrors"
 
 
-def _number(lens: Mapping[str, Any], key: str, where: str) -> float:
+def number(lens: Mapping[str, Any], key: str, where: str) -> float:
+    """A finite number of a camera.
+
+    Raises:
+        SceneError: it is missing, or something else.
+    """
     if key not in lens:
         raise SceneError(f"{where} has no {key}: add it")
     try:

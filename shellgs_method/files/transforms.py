@@ -13,7 +13,7 @@ from jaxtyping import Float64, UInt8
 
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import read_json
-from shellgs_method.files.frames import FISHEYE, Frame, Recording, frame, in_order
+from shellgs_method.files.frames import FISHEYE, Frame, Recording, frame, in_order, number
 from shellgs_method.files.headers import read_ply_header
 from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
@@ -133,15 +133,16 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
     name = photograph.relative_to(files.scene).as_posix()
     if "fl_x" not in lens:
         angles = {key: source[key] for key in _ANGLES for source in (meta, entry) if key in source}
-        lens = _by_angles(angles, photograph, where) | lens
+        lens = _by_angles(angles, lens, photograph, where) | lens
     found = frame(files.scene, name, np.linalg.inv(applied) @ pose @ OPENGL, lens, where)
     if not entry.get("mask_path"):
         return found
     return replace(found, mask=files.other(str(entry["mask_path"]), where))
 
 
-def _by_angles(angles: Mapping[str, Any], photograph: Path, where: str) -> dict[str, Any]:
-    """The lens of NeRF's synthetic scenes and Blender: its angles of view, on pixels of a photograph; {} without any.
+def _by_angles(angles: Mapping[str, Any], given: Mapping[str, Any], photograph: Path, where: str) -> dict[str, Any]:
+    """The lens of NeRF's synthetic scenes and Blender: its angles of view, on pixels of the size that is given with
+    them, else of a photograph; {} without any.
 
     Raises:
         SceneError: an angle is none between 0 and 180 degrees, in radians, or the photograph cannot be read.
@@ -151,8 +152,11 @@ def _by_angles(angles: Mapping[str, Any], photograph: Path, where: str) -> dict[
     for name, angle in angles.items():
         if isinstance(angle, bool) or not isinstance(angle, (int, float)) or not 0 < angle < math.pi:
             raise SceneError(f"{where}: its {name} is {str(angle)[:40]}, not an angle between 0 and pi")
-    with opened(photograph, whole=False) as image:
-        width, height = image.size
+    if {"w", "h"} <= given.keys():
+        width, height = (number(given, side, where) for side in "wh")
+    else:
+        with opened(photograph, whole=False) as image:
+            width, height = image.size
     focal = width / 2 / math.tan(angles["camera_angle_x"] / 2)
     vertical = height / 2 / math.tan(angles["camera_angle_y"] / 2) if "camera_angle_y" in angles else focal
     return {"fl_x": focal, "fl_y": vertical, "cx": width / 2, "cy": height / 2, "w": width, "h": height}

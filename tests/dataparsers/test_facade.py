@@ -79,14 +79,20 @@ def test_the_rescaled_world_is_that_of_nerfstudios_own_parsers(scene, kind, meth
         torch.testing.assert_close(ours.metadata[name], theirs.metadata[name], atol=atol, rtol=0)
 
 
-def test_an_angle_of_view_is_a_focal_length(scene):
+@pytest.mark.parametrize("smaller", [False, True])
+def test_an_angle_of_view_is_a_focal_length(scene, smaller):
     """As in NeRF's synthetic scenes, which say nothing else of the lens, and name photographs without a suffix."""
     path = scene / "transforms.json"
     meta = json.loads(path.read_text())
     before = read_views(FacadeDataParserConfig(data=scene))
     angle = 2 * np.arctan(meta["w"] / 2 / meta["fl_x"])
     frames = [{**each, "file_path": f"./{each['file_path'].removesuffix('.png')}"} for each in meta["frames"]]
-    path.write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    if smaller:  # as of a data set that is scaled down, with the size that it had
+        for each in meta["frames"]:
+            with Image.open(scene / each["file_path"]) as image:
+                image.resize((meta["w"] // 2, meta["h"] // 2)).save(scene / each["file_path"])
+    size = {"w": meta["w"], "h": meta["h"]} if smaller else {}
+    path.write_text(json.dumps({"camera_angle_x": angle, **size, "frames": frames}))
     for view, same in zip(read_views(FacadeDataParserConfig(data=scene)), before, strict=True):
         assert (view.name, view.camera.width, view.camera.height) == (same.name, same.camera.width, same.camera.height)
         torch.testing.assert_close(view.camera.K, same.camera.K)
