@@ -65,7 +65,7 @@ class VoxelMeans:
         self._runs = [_Run(np.empty(0, np.int64), np.empty((0, 4 + values)))]
 
     def add(self, points: Float64[ndarray, "N 3"], values: Float[ndarray, "N C"] | None = None) -> Bool[ndarray, " N"]:
-        """Add points, and return which of them are in the lattice; those that are NaN are not."""
+        """Add points, and return which of them are in the lattice; those that are NaN are not. No values are zeros."""
         inside = np.empty(len(points), bool)
         for start in range(0, len(points), _PIECE):
             piece = slice(start, start + _PIECE)
@@ -79,8 +79,7 @@ class VoxelMeans:
             inside[piece] = kept
             rows = np.ones((len(kept), self._runs[0].sums.shape[1]))
             rows[:, 1:4] = local
-            if values is not None:
-                rows[:, 4:] = values[piece]
+            rows[:, 4:] = 0 if values is None else values[piece]
             self._append(_Run.of(cells, rows) if kept.all() else _Run.of(cells[:, kept], rows[kept]))
         return inside
 
