@@ -148,16 +148,18 @@ def read_splats(path: Path) -> Splats:
     lines = [line.split() for line in header.decode("ascii", "replace").splitlines()]
     names = [line[2] for line in lines if line[:2] == ["property", "float"]]
     count = next((int(line[2]) for line in lines if line[:2] == ["element", "vertex"] and line[2].isdigit()), 0)
+    rest = sum(name.startswith("f_rest_") for name in names)
     if (
         not found
+        or rest % 3
         or len(body) != 4 * count * len(names)
         or len(names) != sum(line[:1] == ["property"] for line in lines)
     ):
         raise SceneError(
             f"{path} is damaged, or no ply of Gaussians in binary floats: write it again by shellgs splats"
         )
-    table = dict(zip(names, torch.from_numpy(np.frombuffer(body, "<f4").reshape(count, -1).copy()).T, strict=True))
-    rest = sum(name.startswith("f_rest_") for name in names)
+    rows = np.frombuffer(body, "<f4").reshape(count, len(names)).copy()
+    table = dict(zip(names, torch.from_numpy(rows).T, strict=True))
     wanted = [("x", "y", "z"), *(tuple(f"{name}_{k}" for k in range(n)) for name, n in (("rot", 4), ("scale", 3)))]
     wanted += [("opacity",), tuple(f"f_dc_{k}" for k in range(3)), tuple(f"f_rest_{k}" for k in range(rest))]
     if missing := [name for group in wanted for name in group if name not in table]:
@@ -165,7 +167,7 @@ def read_splats(path: Path) -> Splats:
     means, quats, scales, opacities, first, others = (
         torch.stack([table[name] for name in group], dim=1) if group else torch.zeros(count, 0) for group in wanted
     )
-    harmonics = torch.cat([first[:, None], others.reshape(count, 3, -1).transpose(1, 2)], dim=1)
+    harmonics = torch.cat([first[:, None], others.reshape(count, 3, rest // 3).transpose(1, 2)], dim=1)
     return Splats(means, quats, scales, opacities, harmonics, discs=["comment", *DISCS.split()] in lines)
 
 

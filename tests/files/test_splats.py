@@ -75,9 +75,11 @@ def test_a_ply_of_discs_says_so_and_what_its_coordinates_are(tmp_path):
     ]
 
 
-@pytest.mark.parametrize(("degree", "discs"), [(0, False), (2, False), (3, True)])
-def test_a_ply_is_read_as_it_was_written(tmp_path, degree, discs):
-    splats = some(degree=degree, discs=discs)
+@pytest.mark.parametrize(
+    ("count", "degree", "discs"), [(400, 0, False), (400, 2, False), (400, 3, True), (0, 3, False)]
+)
+def test_a_ply_is_read_as_it_was_written(tmp_path, count, degree, discs):
+    splats = some(count, degree, discs=discs)
     write_splats(tmp_path / "a.ply", splats, ["unit: metre"])
     read = read_splats(tmp_path / "a.ply")
     assert read.discs == discs
@@ -93,6 +95,7 @@ def test_a_ply_is_read_as_it_was_written(tmp_path, degree, discs):
         (lambda content: b"solid", "is damaged"),
         (lambda content: content.replace(b"property float opacity", b"property float density"), "it has no opacity"),
         (lambda content: content.replace(b"property float x", b"property double x"), "is damaged, or no ply"),
+        (lambda content: content.replace(b"property float nx", b"property float f_rest_99"), "is damaged, or no ply"),
     ],
 )
 def test_a_file_that_is_no_ply_of_gaussians_is_refused(tmp_path, change, message):
