@@ -445,6 +445,13 @@ def test_a_drawing_of_lines_is_no_cloud_of_their_ends(tmp_path: Path, suffix: st
         read_geometry(path)
 
 
+def test_blank_lines_after_the_points_of_a_ply_are_no_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(ply, "_TEXT", 8)  # bytes read at once: blanks alone are
+    header = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {axis}" for axis in "xyz")]
+    (tmp_path / "a.ply").write_text("\n".join([*header, "end_header", "1 2 3", "4 5 6", *[" " * 9] * 3, ""]))
+    np.testing.assert_array_equal(read_geometry(tmp_path / "a.ply").vertices, [[1, 2, 3], [4, 5, 6]])
+
+
 def test_a_ply_without_a_coordinate_names_it(tmp_path: Path):
     header = ["element vertex 6", *XYZ[:2], "property double w"]
     with pytest.raises(SceneError, match="its vertices have x, y, w, but no z"):

@@ -99,6 +99,8 @@ def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
     Raises:
         ValueError: it holds something else, which is named.
     """
+    if text.isspace():  # numpy reads -1
+        return np.empty(0, kind)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy stops there, and warns
         try:
