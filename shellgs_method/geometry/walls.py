@@ -76,15 +76,18 @@ def find_walls(surface: Triangles, cameras: Sequence[Camera], up: Float64[np.nda
     while left.any():
         axes = wall_axes(main_direction(level[left], within=FLAT), up)
         facing = level @ axes[2]
-        members = left & (facing > np.cos(np.radians(ALIKE)))
+        flat, members = facing > np.cos(np.radians(FLAT)), left & (facing > np.cos(np.radians(ALIKE)))
+        free = members.copy()
+        free[members] = surface.cast(points[members] + CLEARANCE * axes[2], axes[2]).t > FREE
+        if not (free & flat).any():  # others that face nearly there may be a wall of their own
+            left &= ~flat
+            continue
         left &= ~members
-        members[members] = surface.cast(points[members] + CLEARANCE * axes[2], axes[2]).t > FREE
-        places = points[members] @ axes.T
+        places = points[free] @ axes.T
         if len(places) < LEAST * len(points):
             continue
         low, high = np.quantile(places, [STRAYS, 1 - STRAYS], axis=0)
-        flat = facing[members] > np.cos(np.radians(FLAT))
-        walls.append((len(places), Wall(axes, low, high, float(np.median(places[flat, 2])))))
+        walls.append((len(places), Wall(axes, low, high, float(np.median(places[flat[free], 2])))))
     return [wall for _, wall in sorted(walls, key=lambda counted: -counted[0])]
 
 

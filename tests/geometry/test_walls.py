@@ -69,3 +69,26 @@ def test_houses_that_face_one_direction_are_one_wall_and_those_across_the_street
     near_side, far_side = (next(wall for wall in walls if wall.axes[2, 1] * side > 0.999) for side in (-1, 1))
     assert (near_side.plane, far_side.plane) == pytest.approx((0, -14), abs=1e-6)
     assert (near_side.size[0], far_side.size[0]) == pytest.approx((28, 23), rel=0.01)
+
+
+def test_a_narrow_alley_takes_no_wall_that_faces_nearly_its_direction():
+    """The wall in the alley is the largest; in front of all of it, another is nearer than what counts as free."""
+    alley = [block([0, 0, 0], [24, 1, 6]), block([-1, -4, 0], [25, -3, 6])]
+    angles = {-30: 20.0, 32: -20.0}
+    turned = [
+        block([0, 0, 0], [5, 1, 6]).apply_transform(
+            trimesh.transformations.rotation_matrix(np.radians(angle), UP, [0, 0, 0])
+        )
+        for angle in angles.values()
+    ]
+    mesh = trimesh.util.concatenate(
+        [*alley, *(each.apply_translation([x, 0, 0]) for x, each in zip(angles, turned, strict=True))]
+    )
+    assert isinstance(mesh, trimesh.Trimesh)
+    places = [*((x, -2.9) for x in range(1, 24, 2)), (-28, -8), (34, -8)]
+    walls = walls_of(mesh, [([x, y, 2], [0, 1, 0]) for x, y in places])
+    across = np.radians(20) * np.array([[1], [-1]])
+    expected = np.hstack([np.sin(across), -np.cos(across)])
+    found = np.array([wall.axes[2, :2] for wall in sorted(walls, key=lambda wall: -wall.axes[2, 0])])
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert all(wall.low[2] - 0.1 < wall.plane < wall.high[2] + 0.1 for wall in walls)
