@@ -16,6 +16,7 @@ from shellgs_method.cues.normals import disagreement, facing, gradient_normals
 from shellgs_method.cues.source import Predictor
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.map_files import is_number
 from shellgs_method.files.photographs import View
@@ -84,7 +85,7 @@ def make_maps(
     fits = Fits.open(maps)
     written = skipped = 0
     for view in track(views, "Making monocular cues", len(views)):
-        if fits.problem(view.name) or (view.name in fits.views and maps.current(view.name, view.camera)):
+        if fits.has_no_map(view) or (view.name in fits.views and maps.current(view.name, view.camera)):
             skipped += 1
             continue
         fit, cue = align_view(view, points, predictor)
@@ -93,7 +94,7 @@ def make_maps(
         else:
             maps.write(view.name, cue, view.camera)
             written += 1
-        fits.add(view.name, fit)
+        fits.add(view, fit)
     problems = {view.name: problem for view in views if (problem := fits.problem(view.name))}
     residuals = [fit["residual"] for name, fit in fits.views.items() if fit and name not in problems]
     return MonoSummary(written, skipped, problems, float(np.median(residuals)), time.monotonic() - start)
@@ -139,7 +140,7 @@ class Fits:
     Attributes:
         path: the JSON file.
         sources: sources of the fits, as in the maps' manifest; fits of other sources are discarded.
-        views: numbers and problem of each view's fit, by name; None for a view without prediction.
+        views: numbers, problem and camera of each view's fit, by name; None for a view without prediction.
     """
 
     path: Path
@@ -159,16 +160,26 @@ class Fits:
             views = {}
         return cls(path, sources, views)
 
-    def add(self, name: str, fit: DisparityFit | None) -> None:
+    def add(self, view: View, fit: DisparityFit | None) -> None:
         """Add the fit of a view and save the file."""
-        self.views[name] = None if fit is None else {**asdict(fit), "problem": fit.problem}
+        known = None if fit is None else {**asdict(fit), "problem": fit.problem, "camera": _camera_of(view)}
+        self.views[view.name] = known
         with atomic_write(self.path) as file:
             file.write((json.dumps({"sources": self.sources, "views": self.views}, indent=1) + "\n").encode())
+
+    def has_no_map(self, view: View) -> bool:
+        """Whether it is known that a view has no map, by the camera that it has now."""
+        fit = self.views.get(view.name, {})
+        return fit is None or bool(fit.get("problem") and fit.get("camera") == _camera_of(view))
 
     def problem(self, name: str) -> str | None:
         """Why a view has no map; None if it has one or was not processed yet."""
         fit = self.views.get(name, {})
         return NO_PREDICTION if fit is None else fit.get("problem")
+
+
+def _camera_of(view: View) -> list[float]:
+    return BoundCameras.of([view]).to_json()[view.name]
 
 
 def _hash_of(points: SparsePoints) -> str:

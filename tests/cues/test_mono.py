@@ -20,6 +20,7 @@ from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.cli import main
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 from shellgs_method.cues.disparity import REACH, DisparityFit, aligned_depth, as_disparity, fit_disparity
+from shellgs_method.cues.maps import MonoSummary, make_maps
 from shellgs_method.cues.normals import Convention, decoded, disagreement, facing, gradient_normals, to_opencv
 from shellgs_method.cues.source import Prediction, Predictor
 from shellgs_method.datamanager import FacadeDataset
@@ -685,3 +686,19 @@ def test_an_unknown_licence_is_not_called_non_commercial():
     predictor = Predictor("a", "b", lambda view: None)
     assert not predictor.non_commercial
     assert replace(predictor, licence="cc-by-nc-sa-4.0").non_commercial
+
+
+def test_a_view_that_had_no_map_is_tried_again_with_another_camera(tmp_path: Path):
+    pixels, depth = points_on(plane_depth(), 200)
+    rays = np.concatenate([pixels, np.ones((200, 1))], axis=1) @ np.linalg.inv(K.numpy()).T
+    points = SparsePoints(depth[:, None] * rays)
+    predictor = Predictor("a", "b", lambda view: Prediction(disparity_of(plane_depth())))
+    right, wrong = CAMERA, Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])).double(), K, 64, 48)  # looks back
+
+    def make(camera: Camera) -> MonoSummary:
+        views = [view_of(), view_of(camera, "images/b.png")]
+        return make_maps(tmp_path, views, points, predictor, command="shellgs mono {scene}")
+
+    assert "SfM points" in make(wrong).problems["images/b.png"]
+    assert make(wrong).skipped == 2
+    assert (make(right).written, make(right).skipped) == (1, 2)
