@@ -29,6 +29,8 @@ DISCS = "SplatRenderMode: 2dgs"
 """Comment in the ply of discs, by which viewers render them as such."""
 LARGEST_PAGE = 300
 """Megabytes: a string has at most 512 in Chromium, and 9 million Gaussians take 1.2 GB of a graphics card."""
+_LARGEST_GLB = 2**32 - 1
+"""Bytes of a glb, whose header counts them in 32 bits: some 18 million Gaussians with harmonics of degree 3."""
 _EXTENSION = "KHR_gaussian_splatting"
 _ELLIPSE = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 
@@ -111,7 +113,7 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views
 
     Raises:
         SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format, or a
-            page would be too large.
+            page or a glb would be too large.
     """
     splats = splats.finite
     content = encoded(path, splats, comments, views)
@@ -132,6 +134,8 @@ def encoded(path: Path, splats: Splats, comments: Sequence[str] = (), views: Seq
     if suffix == ".ply":
         return _ply(splats, comments)
     if suffix == ".glb":
+        if _bytes_of_glb(splats) > _LARGEST_GLB - 2**16:
+            raise SceneError(f"{path} would have more than 4 GB, which no glb can: name a .ply")
         return _glb(splats, comments)
     spz = _spz(splats)
     return spz if suffix == ".spz" else splats_page(spz, splats.discs, comments, views)
@@ -250,6 +254,11 @@ def _glb(splats: Splats, comments: Sequence[str]) -> bytes:
         content += padding * (-len(content) % 4)
         chunks += struct.pack("<I4s", len(content), kind) + content
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _bytes_of_glb(splats: Splats) -> int:
+    """Bytes of a glb, without those that do not depend on the number of Gaussians."""
+    return len(splats) * (4 * (3 + 4 + 3 + 1) + 4 + 12 * splats.harmonics.shape[1])
 
 
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 3

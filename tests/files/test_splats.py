@@ -15,6 +15,7 @@ from splat_files import glb_attributes, psnr, some, unpacked
 
 from shellgs_method.errors import SceneError
 from shellgs_method.export.splats import moved
+from shellgs_method.files import splats as files_splats
 from shellgs_method.files.splats import DISCS, Splats, check_splats_format, read_splats, write_splats
 
 NODE = Path(os.environ["SHELLGS_NODE"]) / "node_modules" if "SHELLGS_NODE" in os.environ else None
@@ -51,6 +52,17 @@ def test_spz_renders_as_what_was_written(tmp_path):
     assert turned.magnitude().max() < 0.006
     assert psnr(read, splats) > 45
     assert (tmp_path / "a.spz").stat().st_size < 80 * len(splats)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_glb_of_more_bytes_than_its_header_counts_is_refused_before_it_is_made(tmp_path, monkeypatch, degree):
+    """By an estimate that is within the header's and the json's few kilobytes of what is written."""
+    splats = some(degree=degree)
+    write_splats(tmp_path / "a.glb", splats)
+    assert 0 <= (tmp_path / "a.glb").stat().st_size - files_splats._bytes_of_glb(splats) < 2**15
+    monkeypatch.setattr(files_splats, "_LARGEST_GLB", 2**16 + 1000)
+    with pytest.raises(SceneError, match=r"more than 4 GB, which no glb can: name a \.ply"):
+        write_splats(tmp_path / "b.glb", splats)
 
 
 def test_coordinates_that_spz_cannot_hold_are_refused(tmp_path):
