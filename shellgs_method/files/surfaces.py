@@ -107,7 +107,7 @@ def read_surface(path: Path) -> Geometry | Cloud:
         raise damaged(path, error) from error
     if len(geometry.faces) or not len(geometry.vertices):
         return geometry
-    return Cloud(path, lambda _: iter([Points(geometry.vertices)]))
+    return Cloud(path, lambda _: iter([Points(geometry.vertices, colours=geometry.colours)]))
 
 
 def read_geometry(path: Path) -> Geometry:

@@ -374,6 +374,17 @@ def test_of_a_property_that_a_ply_has_twice_the_first_is_read(tmp_path: Path, fo
     np.testing.assert_array_equal(read.colours, [[9, 8, 7]] * 6)
 
 
+def test_points_that_come_at_once_have_their_colours_too(tmp_path: Path):
+    """As those of a PLY with a list of each point, which is not read in pieces."""
+    columns = [*(f"property uchar {band}" for band in ("red", "green", "blue")), "property list uchar int seen_in"]
+    data = rows(HEXAGON).replace("\n", " 9 8 200 2 0 1\n")
+    cloud = read_surface(save_ply(tmp_path / "a.ply", ["element vertex 6", *XYZ, *columns], data, "ascii"))
+    assert isinstance(cloud, Cloud)
+    (piece,) = cloud.coloured()
+    assert piece.colours is not None
+    np.testing.assert_array_equal(piece.colours, [[9, 8, 200]] * 6)
+
+
 def test_a_list_of_a_ply_is_no_colour_and_no_coordinate(tmp_path: Path):
     bands = ["property list uchar uchar red", "property uchar green", "property uchar blue"]
     face, data = ["element face 1", INDICES], rows(HEXAGON).replace("\n", " 1 9 8 7\n") + "3 0 1 2\n"
