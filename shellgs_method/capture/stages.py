@@ -452,8 +452,8 @@ class _Capture:
                 masks=str(self.work.folder / "masks") if self.masked else None,
                 output=str(folder),
             )
-            for image in (folder / "images").rglob("*.*"):
-                keep_exposure(self.folder / image.relative_to(folder / "images"), image)
+            for name in _files(folder / "images"):
+                keep_exposure(self.folder / name, folder / "images" / name)
             (folder / "colmap" / "sparse").mkdir(parents=True)
             os.replace(folder / "sparse", folder / "colmap" / "sparse" / "0")
 

@@ -878,12 +878,13 @@ def without_colmap(monkeypatch) -> list[str]:
 
     def run_step(step: str, arguments: dict, **_):
         steps.append(step)
-        names = sorted(path.name for path in Path(arguments.get("photographs", "")).glob("*.jpg"))
+        folder = Path(arguments.get("photographs", "nowhere"))
+        names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.jpg"))
         if step == "undistort":
             output = Path(arguments["output"])
             (output / "sparse").mkdir()
-            (output / "images").mkdir()
             for name in names:
+                (output / "images" / name).parent.mkdir(parents=True, exist_ok=True)
                 (output / "images" / name).write_bytes(b"undistorted")
         return [{"names": names, "points": 900, "reprojection_error": 0.5, "track_length": 3.0}]
 
@@ -984,10 +985,10 @@ def test_an_undistorted_photograph_keeps_its_exposure_and_its_pixels(tmp_path, s
 
 
 def test_exposures_survive_capture(tmp_path, without_colmap, monkeypatch):
-    """Renamed, undistorted, one of them turned."""
-    (tmp_path / "photographs").mkdir()
+    """Renamed and undistorted, in a folder whose name has dots."""
+    (tmp_path / "photographs/1.5.2024").mkdir(parents=True)
     for k, seconds in enumerate((1 / 100, 1 / 200, 1 / 400)):
-        photograph(seed=k).save(tmp_path / "photographs" / f"IMG {k}.jpg", exif=exposure_of(seconds))
+        photograph(seed=k).save(tmp_path / "photographs/1.5.2024" / f"IMG {k}.jpg", exif=exposure_of(seconds))
     fake: Any = stages.run_step
 
     def run_step(step: str, arguments: dict, **_):
@@ -999,7 +1000,7 @@ def test_exposures_survive_capture(tmp_path, without_colmap, monkeypatch):
 
     monkeypatch.setattr(stages, "run_step", run_step)
     capture(tmp_path / "photographs", tmp_path / "scene")
-    paths = sorted((tmp_path / "scene" / "images").iterdir())
+    paths = sorted((tmp_path / "scene/images/1.5.2024").iterdir())
     assert [path.name for path in paths] == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"]
     np.testing.assert_allclose(exif_log_gains(paths) / np.log(2), [1, 0, -1], atol=1e-6)
 
