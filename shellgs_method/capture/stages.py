@@ -104,8 +104,8 @@ def capture(
 
     Raises:
         FileNotFoundError: the source or the folder of masks is missing.
-        SceneError: the source cannot be used, the scene holds cameras already, too few photographs are registered, or
-            they show too few points.
+        SceneError: the source cannot be used, it or the masks lie in ``scene/capture``, the scene holds cameras
+            already, too few photographs are registered, or they show too few points.
     """
     config = config or CaptureConfig()
     if not source.exists():
@@ -114,6 +114,9 @@ def capture(
         raise SceneError(f"{source} is one photograph: give a folder of them, or a video")
     if scene.resolve().is_relative_to(source.resolve()):
         raise SceneError(f"{scene} lies in the folder of the photographs, {source}: give a scene folder outside of it")
+    for given in filter(None, (source, config.masks)):
+        if given.resolve().is_relative_to((scene / CAPTURE).resolve()):  # whose folders are emptied
+            raise SceneError(f"{given} lies in {scene / CAPTURE}, where the capture keeps its own files: move it out")
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     try:
         with Progress(*columns, console=console) as progress:

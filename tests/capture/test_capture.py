@@ -806,6 +806,18 @@ def test_a_scene_inside_the_folder_of_photographs_is_refused(tmp_path):
         capture(tmp_path, tmp_path / "scene")
 
 
+@pytest.mark.parametrize("name", ["photographs", "masks"])
+def test_what_lies_where_the_capture_keeps_its_files_is_refused_and_undisturbed(tmp_path, name):
+    own = tmp_path / "scene/capture" / name / "a.tif"
+    for path in (own, tmp_path / "photographs/a.tif"):
+        path.parent.mkdir(parents=True)
+        photograph().save(path)
+    given = (own.parent, None) if name == "photographs" else (tmp_path / "photographs", own.parent)
+    with pytest.raises(SceneError, match=f"{name} lies in .*: move it out"):
+        capture(given[0], tmp_path / "scene", CaptureConfig(masks=given[1]))
+    assert [path for path in (tmp_path / "scene").rglob("*") if path.is_file()] == [own]
+
+
 @pytest.mark.parametrize("name", ["images", "colmap", "transforms.json"])
 def test_an_existing_scene_is_refused_and_undisturbed(tmp_path, name):
     (tmp_path / "photographs").mkdir()
