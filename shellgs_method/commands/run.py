@@ -292,7 +292,8 @@ def _settled(recipe: Recipe, file: Path) -> Recipe:
         return recipe
     stored = Recipe.load(file)
     given, known = (vars(each.located(Path.resolve)) for each in (recipe, stored))
-    typed = {word.partition("=")[0] for word in sys.argv}  # a value may be the default, and yet given
+    # A value may be the default, and yet given; tyro takes underscores and --no-sim too.
+    typed = {word.partition("=")[0].replace("_", "-").replace("--no-", "--", 1) for word in sys.argv}
     for field in fields(Recipe):
         named = recipe.sources if field.name == "sources" else _flag(field.name) in typed
         if named and given[field.name] != known[field.name]:

@@ -180,6 +180,9 @@ def test_settings_that_differ_from_the_files_are_refused(inputs, shellgs):
     settings = Path("scene.run")
     settings.write_text(settings.read_text() + "--iterations 5\n")
     assert "scene.run has other iterations" in shellgs("run", "--iterations", 30000)  # given, though it is the default
+    assert "has other max image size" in shellgs("run", "--max_image_size", 800)  # as tyro takes it too
+    settings.write_text(settings.read_text() + "--bundle-adjust\n")
+    assert "has other bundle adjust" in shellgs("run", "--no-bundle-adjust")
     settings.write_text(settings.read_text() + "--picks 'unclosed\n")
     assert "scene.run cannot be read (No closing quotation)" in shellgs("run")
     settings.write_text(f"{photographs} gone.ply")
