@@ -35,11 +35,11 @@ def scene_axes(
         SceneError: the points have no wall.
     """
     rng = np.random.default_rng(0)
-    size = float(np.linalg.norm(np.subtract(*np.percentile(points, [90, 10], axis=0))))
     left = points
     for _ in range(_WALLS):
         if len(left) < 50:
             break
+        size = float(np.linalg.norm(np.subtract(*np.percentile(points, [90, 10], axis=0))))
         members = largest_plane(left, _FLAT * size, rng)
         if not members.any():
             break

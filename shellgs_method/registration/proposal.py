@@ -88,9 +88,9 @@ def propose(
     spread = samples[:200]
     cameras = positions(view.camera for view in views)
     near = _most(points.positions)
+    axes = scene_axes(near, cameras, scene_up)
     sight = Sightlines.of(views, points)
     search = _Search.of(samples, near, sight)
-    axes = scene_axes(near, cameras, scene_up)
     turns = [to.T @ axes for to in shell_axes(normals)]
     starts: list[Candidate] = []
     for turn in track(turns, "Trying orientations", len(turns)):
@@ -164,7 +164,8 @@ class _Search:
         """The best candidates of an orientation: the rotation from the scene's axes to the survey's."""
         points, empty = self.points @ turn.T, self.empty @ turn.T
         boxes = [np.percentile(each, [3, 97], axis=0) for each in (self.samples, points)]
-        ratios = np.sort(np.ptp(boxes[0], axis=0) / np.maximum(np.ptp(boxes[1], axis=0), 1e-9))
+        extent = np.maximum(np.ptp(boxes[0], axis=0), 0.1 * self.cell)  # a shell may be one flat wall
+        ratios = np.sort(extent / np.maximum(np.ptp(boxes[1], axis=0), 1e-9))
         lowest, highest = 0.5 * ratios[0], 1.6 * ratios[2]
         steps = int(np.log(highest / lowest) / np.log(_SCALE_STEP)) + 1
         first = np.floor(self.samples.min(0) / self.cell).astype(int) - 1
@@ -256,6 +257,8 @@ def _displacement(one: Candidate, other: Candidate, spread: np.ndarray) -> float
 
 def _most(points: np.ndarray) -> np.ndarray:
     """The points that are near the others: a few far out would make large grids of empty cells."""
+    if len(points) == 0:
+        return points
     low, high = np.percentile(points, [5, 95], axis=0)
     margin = 0.35 * (high - low)
     return points[((points > low - margin) & (points < high + margin)).all(axis=1)]

@@ -369,6 +369,24 @@ def test_a_proposal_that_no_point_supports_is_refused_with_the_shells_size(mesh,
         place_by_guess(mesh, views, points, ("shell/facade.glb",), 1.0)
 
 
+@pytest.mark.parametrize("count", [0, 1, 20])
+def test_a_proposal_needs_points(mesh, views, points, count):
+    with pytest.raises(SceneError, match="no upright wall to start from: pick points"):
+        place_by_guess(mesh, views, SparsePoints(points.positions[:count]), ("facade.glb",), 1.0)
+
+
+def test_a_flat_wall_is_searched_for_in_about_its_size(views):
+    random = np.random.default_rng(0)
+    corners = np.array([[0.0, 0, 0], [15, 0, 0], [15, 0, 9], [0, 0, 9]])
+    samples, _ = ShellSurface(ShellMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))).samples(2000)
+    seen = samples + random.normal(0, 0.01, samples.shape)
+    sight: Any = SimpleNamespace(points=seen, origins=seen - [0.0, 8.0, 0.0])
+    found = proposal._Search.of(samples, seen, sight).placed(np.eye(3))
+    best = max(found, key=lambda candidate: candidate.score).survey_from_scene
+    np.testing.assert_allclose(best[:3, :3], np.eye(3), atol=0.1)
+    np.testing.assert_allclose(best[:3, 3], 0, atol=0.5)
+
+
 def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
     layout = Layout(5, 3)
     openings = [(o.x0, o.x1, o.z0, o.z1) for o in layout.openings if not o.is_door]
