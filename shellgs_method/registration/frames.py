@@ -24,6 +24,7 @@ _NARROW = 0.005  # extent of either, below which they are in another unit
 _SURELY = 0.5  # of these, once a slip is corrected
 # Sizes of the shell relative to what the cameras see, which is a part of a building, or more than that:
 _LARGEST = 20.0
+_FEW = 3  # points, fewer of which may be on one spot: a session of picking begins so, and they align nothing yet
 
 
 class ShellPlace:
@@ -54,7 +55,7 @@ class ShellPlace:
         self._surface = point_tree(points - self.middle)
 
     def check_picks(self, picks: Float64[np.ndarray, "N 3"], called: str) -> None:
-        """Refuse picks of which less than half are on the shell, or which are all on one spot of it.
+        """Refuse picks of which less than half are on the shell, or of which three or more are all on one spot of it.
 
         Raises:
             SceneError: they are not, and why.
@@ -96,7 +97,7 @@ class ShellPlace:
         )
 
     def _reaches(self, points: np.ndarray, reach: float) -> bool:
-        spread = np.linalg.norm(np.ptp(points, axis=0)) >= _NARROW * self.size or len(points) == 1
+        spread = np.linalg.norm(np.ptp(points, axis=0)) >= _NARROW * self.size or len(points) < _FEW
         return bool(spread and np.median(self._surface.query(points - self.middle)[0]) <= reach * self.size)
 
 

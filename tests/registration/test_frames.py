@@ -282,6 +282,13 @@ def test_picks_up_one_edge_are_not_taken_for_degrees(tmp_path):
     ShellPlace(tmp_path / "box.ply").check_picks(edge, "the picks")
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_first_picks_of_a_session_may_be_side_by_side_on_a_long_street(tmp_path, count):
+    trimesh.creation.box(extents=[300, 10, 12]).export(tmp_path / "street.ply")
+    sill = np.array([[10.0, 5, 1], [11.2, 5, 1]])
+    ShellPlace(tmp_path / "street.ply").check_picks(sill[:count], "the picks")
+
+
 def test_a_cloud_of_points_has_a_place_too(place, picks, pristine_scene, tmp_path):
     mesh = load_shell(pristine_scene / "shell/facade.ply")
     cloud = trimesh.sample.sample_surface(trimesh.Trimesh(mesh.vertices, mesh.faces), 3000, seed=0)[0]
