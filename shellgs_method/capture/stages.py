@@ -281,7 +281,8 @@ class _Capture:
                 shutil.copytree(self.work.folder / "coarse", folder, dirs_exist_ok=True)
             if self.rig and models:
                 models = self._mounted(database, folder)
-            found = {"photographs": self.names, "models": models, "apart": apart, "flat_pairs": _flat_pairs(database)}
+            found = {"photographs": self.names, "models": models, "apart": apart, "matching": matching}
+            found["flat_pairs"] = _flat_pairs(database)
             (folder / "models.json").write_text(json.dumps(found))
 
     def _close_loops(self, database: Path, pairs: list[Pair]) -> tuple[list[Any], list[Any] | None]:
@@ -389,8 +390,7 @@ class _Capture:
         if registered < max(LEAST_REGISTERED, LEAST_SHARE * len(names)):
             groups = f", in {len(models)} groups without enough overlap" if len(models) > 1 else ""
             shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
-            matching = choose_matching(self.config.matching, len(names), self.is_video)
-            untried = ["--matching exhaustive"] if matching == "sequential" else []
+            untried = ["--matching exhaustive"] if found.get("matching") == "sequential" else []
             untried += ["--quality high"] if self.config.quality == "fast" else []
             untried += ["more --frames"] if self.is_video else []
             advice = f"Try {' and '.join(untried)}; leave" if untried else "Leave"

@@ -932,6 +932,17 @@ def test_a_pass_that_did_not_join_is_told_with_the_reason(tmp_path, monkeypatch,
     assert "b/5.jpg to b/7.jpg, did not join the others, nobody knows why" in caplog.text
 
 
+def test_pairs_that_were_all_matched_are_not_advised_again(tmp_path, monkeypatch):
+    """A rig's photographs are more than those that are matched in order; its shots are not."""
+    for k in range(62):
+        path = tmp_path / "photographs" / "ab"[k % 2] / f"{k // 2}.jpg"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        photograph(seed=k).save(path)
+    monkeypatch.setattr(stages, "run_step", lambda *_, **__: [])
+    with pytest.raises(SceneError, match=r"only 0 of 62 .* Try --quality high;"):
+        capture(tmp_path / "photographs", tmp_path / "scene", CaptureConfig(cameras="rig"))
+
+
 def test_a_model_that_is_torn_from_what_its_photographs_share_is_told(tmp_path, monkeypatch, caplog):
     (tmp_path / "photographs").mkdir()
     for k in range(8):
