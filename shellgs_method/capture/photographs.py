@@ -63,7 +63,8 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
         among = masks.resolve()
         if folder.resolve() == among:
             raise SceneError(f"the masks lie among the photographs in {folder}: move them into a folder of their own")
-        photographs = [path for path in photographs if not path.parent.resolve().is_relative_to(among)]
+        if not folder.resolve().is_relative_to(among):
+            photographs = [path for path in photographs if not path.parent.resolve().is_relative_to(among)]
     found: dict[str, Path] = {}
     _tell_what_is_left_out(folder, photographs)
     for path in _without_copies(folder, photographs):
@@ -286,7 +287,8 @@ def find_masks(photographs: Mapping[str, Path], folder: Path, masks: Path) -> di
     if not found:
         first = next(iter(paths.values()))[0]
         raise SceneError(f"no photograph has a mask in {masks}: the first one's would be {first}; rename the masks")
-    tell_of_masks(chosen, set(photographs_in(masks, deep=True)), masks)
+    there = set(photographs_in(masks, deep=True)) - {*photographs.values()}  # which may lie below
+    tell_of_masks(chosen, there, masks)
     return found
 
 

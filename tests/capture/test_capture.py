@@ -706,6 +706,17 @@ def test_masks_below_the_folder_of_photographs_are_no_photographs(tmp_path):
         find_photographs(tmp_path, tmp_path)
 
 
+def test_masks_may_lie_in_the_folder_above_the_photographs(tmp_path, caplog):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for k in range(2):
+        photograph(seed=k).save(folder / f"{k}.jpg")
+        Image.new("L", (64, 48), 255).save(tmp_path / f"{k}.png")
+    found = find_photographs(folder, tmp_path)
+    assert find_masks(found, folder, tmp_path) == {f"{k}.jpg": tmp_path / f"{k}.png" for k in range(2)}
+    assert not caplog.text
+
+
 def test_masks_that_belong_to_no_photograph_are_refused(tmp_path):
     photographs = {"a.jpg": tmp_path / "a.jpg"}
     (tmp_path / "masks").mkdir()
