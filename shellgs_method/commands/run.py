@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -206,10 +207,13 @@ def _take(steps: _Steps, recipe: Recipe, scene: Path, results: Path, accept: boo
     """Take all steps that are not done, and return the config of what was trained."""
     video, *shell = recipe.sources
     steps.begin("cameras of the photographs")
-    of_another = "capture" in steps and steps.changed("capture", str(video.resolve()))
+    place, beside = str(video.resolve()), os.path.relpath(video.resolve(), scene.resolve())
+    # Where a project was copied to, its photographs are beside it as before.
+    of_another = "capture" in steps and steps.changed("capture", place) and steps.changed("capture beside", beside)
     if of_another or not any(cameras.exists() for cameras in _cameras(scene)):
         capture(video, scene)
-        steps.done("capture", str(video.resolve()))
+        steps.done("capture", place)
+        steps.done("capture beside", beside)
     else:  # captured with options of its own, perhaps
         console.print(f"{scene} has cameras.", highlight=False)
     steps.begin("the shell's place")

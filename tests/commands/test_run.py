@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,10 @@ def test_photographs_are_captured_where_there_are_no_cameras_and_again_if_they_a
     settings.write_text(settings.read_text().replace("scene/images", "others"))
     assert shellgs("run") == "refused: cast"
     assert calls == ["images", "others"]
+    copied = shutil.copytree(Path.cwd(), Path.cwd() / "../copied")
+    monkeypatch.chdir(copied)
+    assert shellgs("run") == "refused: cast"
+    assert calls == ["images", "others"]  # the same, though elsewhere
 
 
 def test_settings_are_read_as_they_were_written_wherever_the_folder_is(tmp_path):
