@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -276,6 +277,7 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
         f"Verdict: {validation.verdict}. Look at {report}: the shell's edges must lie on the photographed ones."
     )
     if placement.proposed:
-        console.print(f"This is a proposal. If the images agree: shellgs align {scene} --accept")
+        accept = f"shellgs align {shlex.quote(str(scene))} --accept"
+        console.print(f"This is a proposal. If the images agree: {accept}")
     else:
         console.print(f"Written: {target}.")

@@ -85,7 +85,7 @@ def pick(
     if "problem" in fit:
         console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
         return
-    options = f" --metres-per-shell-unit {metres_per_shell_unit:g}" if metres_per_shell_unit != 1 else ""
+    options = f" --metres-per-shell-unit {metres_per_shell_unit}" if metres_per_shell_unit != 1 else ""
     options += (f" --crs {shlex.quote(crs)}" if crs else "") + paths.flags
     files = " ".join(shlex.quote(str(path)) for path in (scene, *shell))
     console.print(

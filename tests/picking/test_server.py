@@ -103,9 +103,10 @@ def _shows(view: View, point: np.ndarray) -> bool:
 
 
 def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callable[..., str], free_port: int):
-    url, shell = f"http://127.0.0.1:{free_port}", scene / "shell/facade.ply"
+    url, shell = f"http://127.0.0.1:{free_port}", scene / "shell/facade[cleaned].ply"
+    shutil.copy(scene / "shell/facade.ply", shell)
     (scene / "my masks").mkdir()
-    chosen = ("--masks-path", "my masks")
+    chosen = ("--masks-path", "my masks", "--metres-per-shell-unit", 1.0000006)
 
     def user() -> None:
         for _ in range(600):
@@ -123,8 +124,13 @@ def test_the_command_takes_picks_and_tells_the_next(scene: Path, shellgs: Callab
     thread.join()
     assert f"Pick in a browser: {url}" in said
     assert "4 of 4 picks are used; their residual is 0.00" in said
-    assert f"Next: shellgs align {scene} {shell} --picks {scene / 'picks.txt'} --masks-path 'my masks'" in said
-    assert "4 of 4 picks are used" in shellgs("align", scene, shell, "--picks", scene / "picks.txt", *chosen)
+    options = "--metres-per-shell-unit 1.0000006 --masks-path 'my masks'"
+    assert f"Next: shellgs align {scene} '{shell}' --picks {scene / 'picks.txt'} {options}" in said
+    picks = scene / "picks.txt"
+    picks.write_text(picks.read_text().replace("p1", "p1[/left]"))
+    said = shellgs("align", scene, shell, "--picks", picks, *chosen)
+    assert "4 of 4 picks are used" in said
+    assert "p1[/left]" in said
 
 
 def test_a_port_that_is_taken_is_refused(server: PickServer, scene: Path, shellgs: Callable[..., str]):
