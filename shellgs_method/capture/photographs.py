@@ -26,6 +26,7 @@ from shellgs_method.files.paths import (
     RAW,
     captured_name,
     files_below,
+    is_hidden,
     mask_names,
     masks_among,
     photographs_in,
@@ -77,7 +78,8 @@ def find_photographs(folder: Path, masks: Path | None = None) -> dict[str, Path]
 
 def _tell_what_is_left_out(folder: Path, photographs: Sequence[Path]) -> None:
     """Tell the user how many files of a folder are no photographs, and refuse what should be some."""
-    files = [path for path in sorted(files_below(folder)) if path.is_file() and not path.name.startswith(".")]
+    below = (path for path in sorted(files_below(folder)) if not is_hidden(path.relative_to(folder)))
+    files = [path for path in below if path.is_file()]
     developed = {path.with_suffix("") for path in photographs}
     raw = [path for path in files if path.suffix.lower() in RAW and path.with_suffix("") not in developed]
     if raw:

@@ -212,12 +212,13 @@ def files_below(folder: Path) -> Iterator[Path]:
 def photographs_in(folder: Path, *, deep: bool) -> list[Path]:
     """Photographs in a folder, by their suffixes, or also in its sub-folders.
 
-    Hidden ones are left out, and thumbnails of network drives (Synology's @eaDir).
+    Hidden ones are left out; see :func:`is_hidden`.
     """
     found = sorted(files_below(folder) if deep else folder.glob("*"))
-    below = (
-        (path, path.relative_to(folder).parts)
-        for path in found
-        if path.suffix.lower() in PHOTOGRAPHS and not path.is_dir()
-    )
-    return [path for path, parts in below if not any(part.startswith(".") or part == "@eaDir" for part in parts)]
+    photographs = (path for path in found if path.suffix.lower() in PHOTOGRAPHS and not path.is_dir())
+    return [path for path in photographs if not is_hidden(path.relative_to(folder))]
+
+
+def is_hidden(path: PurePath) -> bool:
+    """Whether a path below a folder leads to what is hidden, or into the thumbnails of a network drive (Synology's)."""
+    return any(part.startswith(".") or part == "@eaDir" for part in path.parts)

@@ -391,6 +391,15 @@ def test_thumbnails_of_a_network_drive_are_no_photographs(tmp_path):
     assert list(find_photographs(tmp_path)) == ["a.jpg"]
 
 
+def test_raw_photographs_in_a_hidden_folder_are_left_alone(tmp_path, caplog):
+    """As in the trash of digiKam, in which photographs are none either."""
+    photograph().save(tmp_path / "1.jpg")
+    (tmp_path / ".dtrash").mkdir()
+    (tmp_path / ".dtrash/2.nef").write_bytes(b"raw")
+    assert list(find_photographs(tmp_path)) == ["1.jpg"]
+    assert not caplog.text
+
+
 def test_photographs_in_a_linked_folder_are_found_once(tmp_path):
     for name in ("photographs/front/1.jpg", "photographs/notes/a.txt", "side/2.jpg"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
