@@ -49,7 +49,12 @@ def _import(subject: str, module: str, remedy: str) -> Finding:
     try:
         return Finding(subject, True, importlib.import_module(module).__version__)
     except (ImportError, OSError, RuntimeError) as error:
-        return Finding(subject, False, f"{str(error).splitlines()[0]}; remedy: {remedy}")
+        return Finding(subject, False, f"{_first_line(error)}; remedy: {remedy}")
+
+
+def _first_line(error: Exception) -> str:
+    """What an error says first, or its kind if it comes without words."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def _compiler() -> Finding:
@@ -99,7 +104,7 @@ def _lpips() -> Finding:
     try:
         url, cached = lpips_weights()
     except (ImportError, OSError, RuntimeError) as error:  # a torchvision that does not load is reported above
-        return Finding("LPIPS weights", False, str(error).splitlines()[0], needed=False)
+        return Finding("LPIPS weights", False, _first_line(error), needed=False)
     works = os.path.exists(cached)
     detail = cached if works else f"fetched by the first evaluation; without network: put {url} at {cached}"
     return Finding("LPIPS weights", works, detail, needed=False)

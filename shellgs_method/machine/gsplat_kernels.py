@@ -74,7 +74,9 @@ def kept_in() -> Path:
 
 def compiling() -> str:
     """How long compiling takes here, and where the result is kept."""
-    cores = min(os.cpu_count() or 1, int(os.environ.get("MAX_JOBS") or 10))  # gsplat's own default is 10
+    cores, asked = os.cpu_count() or 1, os.environ.get("MAX_JOBS") or "10"  # gsplat's own default is 10
+    if asked.isdecimal() and int(asked):  # of 0 and of words, ninja takes all cores
+        cores = min(cores, int(asked))
     minutes = max(5, round(CORE_MINUTES / cores))
     return f"about {minutes} minutes on {cores} cores, and kept in {kept_in()} ($TORCH_EXTENSIONS_DIR)"
 

@@ -232,6 +232,16 @@ def test_doctor_lists_the_parts_of_this_machine(tmp_path):
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))
 
 
+def test_doctor_names_the_kind_of_an_error_without_words(monkeypatch):
+    def fail(*_) -> None:
+        raise ImportError
+
+    monkeypatch.setattr("importlib.import_module", fail)
+    monkeypatch.setattr(doctor, "lpips_weights", fail)
+    assert doctor._torch().detail == "ImportError; remedy: pip install torch"
+    assert doctor._lpips().detail == "ImportError"
+
+
 def test_doctor_ends_with_what_is_needed_and_missing(shellgs, monkeypatch):
     missing = doctor.Finding("Open3D", False, "no libGL: apt-get install libgl1")
     monkeypatch.setattr(doctor, "_open3d", lambda: missing)

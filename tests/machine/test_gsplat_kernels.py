@@ -76,6 +76,13 @@ def test_the_doctor_says_how_long_the_first_run_compiles_and_compiles_nothing(to
     assert str(on_cuda) in finding.detail
 
 
+@pytest.mark.parametrize(("jobs", "cores"), [("", 10), ("4", 4), ("0", 64), ("all", 64)])
+def test_jobs_that_are_no_number_are_all_cores(on_cuda, monkeypatch, jobs, cores):
+    monkeypatch.setenv("MAX_JOBS", jobs)
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    assert f"on {cores} cores" in gsplat_kernels.compiling()
+
+
 def test_the_doctor_says_why_kernels_do_not_load(tools, on_cuda, monkeypatch):
     assert "there is no nvcc on the PATH" in doctor._gsplat().detail
     compiled = gsplat_kernels.kept_in() / "gsplat_cuda.so"
