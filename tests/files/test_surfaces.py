@@ -820,6 +820,28 @@ def test_nan_is_read_as_windows_writes_it(tmp_path: Path, name: str, before: str
     np.testing.assert_array_equal(finite, np.arange(50) != 7)
 
 
+@pytest.mark.parametrize("written", ["-nan(ind)", "-1.#IND"])
+@pytest.mark.parametrize("name", ["cloud.ply", "mesh.ply", "a.stl", "a.off", "a.ptx", "a.pcd"])
+def test_nan_of_windows_spoils_the_first_point_and_no_other(tmp_path: Path, name: str, written: str):
+    corner = f"0.5 1.5 {written}"
+    ply = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    rows = f"{corner}\n1 0 0\n1 1 0\n0 1 0\n"
+    facets = "".join(f"facet\nvertex {each}\nvertex 1 0 0\nvertex 0 1 0\nendfacet\n" for each in (corner, "0 0 0"))
+    texts = {
+        "cloud.ply": f"{ply}end_header\n{rows}",
+        "mesh.ply": f"{ply}element face 1\nproperty list uchar int vertex_indices\nend_header\n{rows}3 1 2 3\n",
+        "a.stl": f"solid a\n{facets}endsolid a\n",
+        "a.off": f"OFF\n4 1 0\n{rows}3 1 2 3\n",
+        "a.ptx": "\n".join(
+            scan_of_ptx(POINTS[:10], np.eye(4))[:10] + [f"{row} 0.5" for row in [corner, *["1 1 0"] * 9]]
+        ),
+        "a.pcd": "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\nDATA ascii\n" + rows,
+    }
+    (tmp_path / name).write_text(texts[name])
+    read = read_geometry(tmp_path / name).vertices
+    np.testing.assert_array_equal(np.isfinite(read).all(axis=1), np.arange(len(read)) > 0)
+
+
 def scan_of_ptx(points: np.ndarray, matrix: np.ndarray, transposed: bool = True) -> list[str]:
     """A scan of 10 columns; the matrix is for columns, as everywhere but in PTX, where it stands transposed."""
     head = ["10", f"{len(points) // 10}", *(" ".join(map(str, row)) for row in (matrix[:3, 3], *np.eye(3)))]

@@ -94,13 +94,14 @@ def refuse_degrees(points: Float64[np.ndarray, "N 3"], path: Path) -> None:
 
 
 def numbers_in(text: str, kind: type = float) -> Shaped[np.ndarray, " N"]:
-    """The numbers of a text that holds nothing else.
+    """The numbers of a text that holds nothing else, NaN among them as Windows writes it.
 
     Raises:
         ValueError: it holds something else, which is named.
     """
     if text.isspace():  # numpy reads -1
         return np.empty(0, kind)
+    text = with_nan(text)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy stops there, and warns
         try:

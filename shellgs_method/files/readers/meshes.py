@@ -75,7 +75,7 @@ def read_stl(path: Path) -> Geometry:
     data = path.read_bytes()
     if b"\0" in data[:_STL_PROBE]:  # text has none
         return _binary_stl(path, data)
-    words = [line.split() for line in data.decode("latin-1").removeprefix(_BOM).lower().splitlines()]
+    words = [line.split() for line in with_nan(data.decode("latin-1")).removeprefix(_BOM).lower().splitlines()]
     solids, facets = (sum(line[:1] == [word] for line in words) for word in ("solid", "facet"))
     ends = sum("".join(line[:2]).startswith("endsolid") for line in words)  # end solid NAME, endsolidNAME
     if not solids:
@@ -111,7 +111,7 @@ def read_off(path: Path) -> Geometry:
         SceneError: it is binary, or has other than three coordinates.
         Exception: it is damaged; of any kind.
     """
-    text = re.sub(r"#.*", "", path.read_text("utf-8-sig", errors="replace"))
+    text = re.sub(r"#.*", "", with_nan(path.read_text("utf-8-sig", errors="replace")))
     form, _, rest = text.lstrip().partition("OFF")
     if not re.fullmatch(r"(ST)?C?N?", form) or re.match(r"\s+BINARY", rest):
         raise SceneError(f"the shell {path} is no OFF of text with three coordinates: export it as PLY or OBJ")

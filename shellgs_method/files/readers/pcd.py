@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from shellgs_method.errors import notice
+from shellgs_method.files.readers.contents import with_nan
 from shellgs_method.files.readers.points import PIECE, Points
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
@@ -78,7 +79,7 @@ _Tables = Iterator[Float64[np.ndarray, "N C"]]
 
 def _text(file: IO[bytes], columns: list[_Column], points: int, sizes: list[int]) -> _Tables:
     read, used = 0, [column.number for column in columns]
-    lines = (line for line in file if line.strip())
+    lines = (with_nan(line.decode("latin-1")) for line in file if line.strip())
     while some := list(islice(lines, PIECE)):
         table = np.loadtxt(some, usecols=used, ndmin=2, comments="#")
         read += len(table)

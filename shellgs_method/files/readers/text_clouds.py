@@ -79,7 +79,7 @@ def read_ptx(path: Path) -> Iterator[Points]:
     """
     misses = total = 0
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        lines = (line for line in file if line.strip())
+        lines = (with_nan(line) for line in file if line.strip())
         while size := next(lines, ""):
             rays = int(size) * int(next(lines, ""))
             rows = [np.array(line.split(), np.float64) for line in islice(lines, 8)]
