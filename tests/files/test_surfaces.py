@@ -130,6 +130,14 @@ def test_every_instance_of_a_glbs_mesh_is_placed(tmp_path: Path):
     assert_same_surface(read_geometry(gltf.save(tmp_path / "a.glb", box)), np.concatenate(placed), faces, atol=1e-4)
 
 
+def test_instances_of_a_glb_that_only_differ_in_attributes_of_their_own_are_in_one_place(tmp_path: Path):
+    gltf = Gltf(extensionsUsed=["EXT_mesh_gpu_instancing"])
+    own = {"attributes": {"_ID": gltf.accessor(np.arange(2, dtype=np.float32)[:, None])}}
+    gltf.json["nodes"] = [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": own}}]
+    read = read_geometry(gltf.save(tmp_path / "a.glb", gltf.box()))
+    assert_same_surface(read, np.tile(CORNERS, (2, 1)), np.concatenate([FACES, FACES + 8]))
+
+
 HEXAGON = np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3), np.zeros(6)], 1)
 ZIGZAG = np.array([0, 1, 5, 2, 4, 3])
 """The hexagon as one strip."""

@@ -176,7 +176,7 @@ class _Document:
         parts = {
             name: self.accessor(k) for name, k in attributes.items() if name in ("TRANSLATION", "ROTATION", "SCALE")
         }
-        count = max(len(part) for part in parts.values())
+        count = max(self.listed("accessors")[k]["count"] for k in attributes.values())  # of all the same
         still = {"TRANSLATION": (0, 0, 0), "ROTATION": (0, 0, 0, 1), "SCALE": (1, 1, 1)}
         return _poses(*(parts.get(name, np.tile(np.float64(value), (count, 1))) for name, value in still.items()))
 
