@@ -94,6 +94,7 @@ def read_picks(path: Path, views: Sequence[View], crs: str = "") -> list[Pick]:
 def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
     shell: dict[str, np.ndarray] = {}
     pixels: dict[str, dict[str, tuple[float, float]]] = {}
+    named: dict[tuple[float, ...], str] = {}  # of points without a name: as the first line writes them
     captured: list[str] = []
     convert, columns = table.to_shell(crs), table.columns({**PIXELS, "image": IMAGE, "name": NAME}, _COLUMNS)
     for where, row in table.rows(columns, "X Y Z of the shell, x y in the photograph, the image, a name"):
@@ -105,7 +106,7 @@ def _picks_of(table: Table, views: Sequence[View], crs: str) -> list[Pick]:
         names = {folded(name) for name in (PurePosixPath(view.name).name, view.image.name)}
         if folded(PureWindowsPath(row["image"]).name) not in names:
             captured.append(f"{row['image']} is {view.name}")
-        name = row["name"] or " ".join(coordinates)
+        name = row["name"] or named.setdefault(tuple(point), " ".join(coordinates))
         if not np.array_equal(shell.setdefault(name, point), point):
             raise SceneError(f"{where}: the point {name} has other coordinates in an earlier line: rename it")
         if view.name in pixels.setdefault(name, {}):

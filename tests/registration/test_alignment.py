@@ -562,6 +562,13 @@ def test_a_picks_file_is_read_in_opendronemaps_format(rigged, tmp_path):
     assert nameless.pixels["images/1.png"] == (70, 80)
 
 
+def test_picks_without_a_name_are_of_one_point_however_its_numbers_are_written(rigged, tmp_path):
+    (tmp_path / "picks.txt").write_text("1 2.50 -0 4 5 images/0.png\n1.0 2.5 0 6 7 images/1.png\n")
+    (pick,) = read_picks(tmp_path / "picks.txt", rigged[0])
+    assert pick.name == "1 2.50 -0"
+    assert pick.pixels == {"images/0.png": (4, 5), "images/1.png": (6, 7)}
+
+
 def test_names_from_before_the_capture_are_told_once_and_other_spellings_are_none(rigged, tmp_path, caplog):
     views = [replace(view, name=f"images/Façade {k}.png") for k, view in enumerate(rigged[0])]
     file = tmp_path / "picks.txt"
