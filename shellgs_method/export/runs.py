@@ -238,7 +238,8 @@ class TrainedRun:
     def log_gains(self) -> Float64[np.ndarray, "V 3"]:
         """Exposures of the photographs of all views, in the order of :meth:`views`, against the mean of the training's.
 
-        Those of training views are learned; held-out photographs are compared with their renders.
+        Those of training views are learned; held-out photographs are compared with their renders, where
+        they are not masked out.
 
         Returns:
             Logarithms of the gains in linear light; 0 in a run whose exposures are fixed.
@@ -250,7 +251,9 @@ class TrainedRun:
         for index in range(len(held_out)):
             render = self.model.get_outputs_for_camera(held_out.cameras[index : index + 1].to(self.model.device))["rgb"]
             photograph = held_out.get_numpy_image(index) / 255
-            colours = np.stack([render.cpu().double().numpy(), photograph]).reshape(-1, 3)
+            kept = load_mask(held_out.views[index])
+            both = np.stack([render.cpu().double().numpy(), photograph])
+            colours = (both if kept is None else both[:, kept]).reshape(-1, 3)
             view, point = np.indices((2, len(colours) // 2)).reshape(2, -1)
             of_both = log_gains(Sightings(view, point, colours), np.zeros(2))
             gains.append(of_both[1] - of_both[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +149,22 @@ def test_photographs_of_a_texture_are_brought_to_the_mean_exposure(trained):
     np.testing.assert_allclose(found[:8], log_gains(trained), atol=1e-6)
     mean = GAINS[[k for k in range(10) if k % 8]].mean(axis=0)
     np.testing.assert_allclose(found[8:], GAINS[[0, 8]] - mean, atol=0.5 * STOPS)
+
+
+def test_what_is_masked_out_does_not_change_the_exposure_of_a_held_out_photograph(trained, tmp_path, monkeypatch):
+    run, held_out = TrainedRun(model_of(trained), data_of(trained)), data_of(trained).eval_dataset
+    before, view = run.log_gains(), held_out.views[0]
+    image = held_out.get_numpy_image(0)
+    width = image.shape[1] * 2 // 3
+    car = image.copy()
+    car[:, :width] = 220
+    kept = np.full(image.shape[:2], 255, np.uint8)
+    kept[:, :width] = 0
+    Image.fromarray(car).save(tmp_path / "car.png")
+    Image.fromarray(kept).save(tmp_path / "mask.png")
+    masked = replace(view, image=tmp_path / "car.png", mask=tmp_path / "mask.png")
+    monkeypatch.setitem(held_out._dataparser_outputs.metadata, "views", [masked, *held_out.views[1:]])
+    np.testing.assert_allclose(run.log_gains()[8], before[8], atol=0.2 * STOPS)
 
 
 def test_a_resumed_run_has_the_same_exposures(changing, tmp_path, trained):
