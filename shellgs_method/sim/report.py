@@ -24,7 +24,7 @@ from shellgs_method.sim.front import Front, places_before
 from shellgs_method.sim.ground import Ground
 from shellgs_method.sim.look.renders import overlaid, rendered, shown
 from shellgs_method.sim.trials.engine import beams, lidar, warnings_kept
-from shellgs_method.sim.trials.trials import throw, walk
+from shellgs_method.sim.trials.trials import NoPlaceError, throw, walk
 
 IMAGES = 3
 """Number of photographs shown of each building."""
@@ -81,10 +81,14 @@ def write_report(
     if test:
         everything = Triangles(*joined([part for chapter in chapters for part in chapter.collider.parts]))
         eyes = np.concatenate([chapter.made.eyes for chapter in chapters])
-        with warnings_kept() as warnings:
-            thrown = throw(world, everything, ground, eyes)
-        summary += [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
-        metrics |= {"throws": asdict(thrown), "warnings": warnings}
+        try:
+            with warnings_kept() as warnings:
+                thrown = throw(world, everything, ground, eyes)
+        except NoPlaceError as error:
+            summary.append(f"Nothing was thrown: {error}")
+        else:
+            summary += [str(thrown), *(f"MuJoCo warns: {warning}" for warning in warnings)]
+            metrics |= {"throws": asdict(thrown), "warnings": warnings}
     sections: list[str] = []
     for chapter in chapters:
         made, sentences = _metrics(world, chapter, ground, test)

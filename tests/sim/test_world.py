@@ -225,6 +225,18 @@ def test_every_file_that_the_readme_names_is_there(made):
         assert (made / path).is_file()
 
 
+def test_a_world_with_no_place_to_throw_from_is_kept_and_says_so(config, tmp_path, monkeypatch):
+    from shellgs_method.sim import report
+
+    monkeypatch.setattr(report, "throw", lambda world, surface, _, eyes: throw(world, surface, Ground.level(99), eyes))
+    cli.sim((config, tmp_path / "sim"), replace(SMALL, test=True))
+    metrics = json.loads((tmp_path / "sim" / "metrics.json").read_text())
+    assert "throws" not in metrics
+    assert metrics["summary"][0] == (
+        "Nothing was thrown: there is no place in front of the building to throw from: are the cameras outside?"
+    )
+
+
 def test_trials_are_made_if_asked_for(made):
     metrics = json.loads((made / "metrics.json").read_text())
     assert metrics["throws"]["thrown"] == 8

@@ -29,6 +29,10 @@ GAIN = 0.02
 """Share of its energy that a body may gain from rounding."""
 
 
+class NoPlaceError(SceneError):
+    """There is nowhere to throw from: the world is whole all the same."""
+
+
 @dataclass(frozen=True)
 class Throws:
     """Results of throwing bodies at a world.
@@ -105,6 +109,9 @@ def throw(
         eyes: positions outside, such as those of cameras.
         count: number of bodies, which do not collide with each other.
         seconds: simulated time.
+
+    Raises:
+        NoPlaceError: there are fewer places to throw from.
     """
     mujoco, spec = import_mujoco(), read_spec(path)
     rng = np.random.default_rng(0)
@@ -263,5 +270,5 @@ def _launches(
             starts.append(start)
             velocities.append(rng.uniform(5, 15) * away / np.linalg.norm(away))
     if len(starts) < count:
-        raise SceneError("there is no place in front of the building to throw from: are the cameras outside?")
+        raise NoPlaceError("there is no place in front of the building to throw from: are the cameras outside?")
     return np.array(starts), np.array(velocities)
