@@ -215,7 +215,8 @@ class FacadeTrainer(Trainer):
             terms = [name for name, value in losses.items() if not bool(value.isfinite())]
             what = f"the loss ({', '.join(terms)})" if terms else "a gradient"
             count = f"{self._skipped} of at most {MAX_SKIPPED}"
-            CONSOLE.print(f"[yellow]Step {step} is skipped: {what} of {view} is not finite ({count}).")
+            told = f"Step {step} is skipped: {what} of {view} is not finite ({count})."
+            CONSOLE.print(told, style="yellow", markup=False)  # of the photograph's name, markup would take [brackets]
             if self._skipped > MAX_SKIPPED:
                 raise SceneError(
                     f"training stopped at step {step} after more than {MAX_SKIPPED} steps whose loss or gradient is "
@@ -283,7 +284,7 @@ class FacadeTrainer(Trainer):
             self.save_checkpoint(self.step)
             done += f": resume with --load-dir {self.checkpoint_dir}"
         writer.write_out_storage()
-        CONSOLE.print(f"Stopped after {done}.", soft_wrap=True, highlight=False)
+        CONSOLE.print(f"Stopped after {done}.", soft_wrap=True, highlight=False, markup=False)
         sys.exit(INTERRUPTED)
 
     def _load_checkpoint(self) -> None:
@@ -308,7 +309,7 @@ class FacadeTrainer(Trainer):
             words = " ".join(str(error).split())[:200]
             raise SceneError(f"{path} is not a checkpoint of this method with these settings ({words})") from error
         self._start_step = state["step"] + 1
-        CONSOLE.print(f"Resuming from {path}.")
+        CONSOLE.print(f"Resuming from {path}.", markup=False)
 
     def save_checkpoint(self, step: int) -> None:
         """Save a checkpoint so that a kill at any moment leaves a complete one.

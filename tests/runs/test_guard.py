@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import psutil
 import pytest
@@ -73,6 +75,14 @@ def test_a_view_that_is_not_finite_is_named_and_skipped_and_harms_nothing_else(p
     assert all_finite(trainer)
     assert render(trainer)["rgb"].isfinite().all()
     assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000008.ckpt"]
+
+
+def test_a_skipped_photograph_is_named_with_its_brackets(capsys):
+    trainer: Any = SimpleNamespace(_unread=[(3, "images/[left] 1.png", {})], _skipped=0, step=3)
+    trainer.optimizers = SimpleNamespace(skipped=lambda: [True])
+    trainer._remove_broken_gaussians = lambda step: None
+    FacadeTrainer._report_skipped(trainer)
+    assert "of images/[left] 1.png is not finite" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("what", SPOILED)
