@@ -8,12 +8,15 @@ from typing import Annotated, Optional
 from shellgs_method.bounds import Bounds, Length, bounded
 from shellgs_method.commands.common import RunConfig, console, place
 
+MOST_LEVELS = 32
+"""Most levels of detail that are written."""
+
 
 @bounded
 def splats(
     config: RunConfig,
     output: Optional[Path] = None,
-    levels: Annotated[int, Bounds(1, 32, int)] = 1,
+    levels: Annotated[int, Bounds(1, MOST_LEVELS, int)] = 1,
     megabytes: Optional[Length] = None,
 ) -> None:
     """Write the Gaussians of a trained run for splat viewers, in metres in the shell's frame.
@@ -56,6 +59,7 @@ def splats(
         count = write_splats(output, gaussians, comments, views)
         frame.describe(Path(f"{output}.json"), {"splats": count, **facts})
         console.print(f"{output}: {count} Gaussians. {where}")
+        _tell_of_others(output, levels)
         return
     level = Level.whole(run, gaussians)
     all_of_them, whole = len(level.splats), psnr_of(run, level.splats, frame)
@@ -71,3 +75,11 @@ def splats(
         taken = path.stat().st_size / 1e6
         console.print(f"{path}: {count} Gaussians, {taken:.1f} MB, {loss:.2f} dB of PSNR lost.", highlight=False)
     console.print(where)
+    _tell_of_others(output, levels)
+
+
+def _tell_of_others(output: Path, levels: int) -> None:
+    """Tell of files that are named as further levels: an earlier command's, or the user's, so they are kept."""
+    further = (output.with_stem(f"{output.stem}-{number}") for number in range(levels, MOST_LEVELS))
+    if others := ", ".join(path.name for path in further if path.exists()):
+        console.print(f"Not of these levels, and left as before: {others}.", style="yellow", highlight=False)

@@ -156,6 +156,17 @@ def test_levels_have_half_as_many_gaussians_each_and_lose_less_than_if_the_rest_
     assert losses[2] < pruned
 
 
+@pytest.mark.parametrize("levels", [1, 2])
+def test_files_named_as_further_levels_are_kept_and_told_of(trainer, tmp_path, capsys, levels):
+    names = ["splats-1.ply", "splats-2.ply"]
+    for name in names:
+        (tmp_path / name).write_text("of an earlier command")
+    cli.splats(trainer.base_dir / "config.yml", tmp_path / "splats.ply", levels=levels)
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"Not of these levels, and left as before: {', '.join(names[levels - 1 :])}." in said
+    assert (tmp_path / names[-1]).read_text() == "of an earlier command"
+
+
 def test_a_size_is_kept_to_the_byte(trainer, tmp_path):
     path = tmp_path / "splats.ply"
     cli.splats(trainer.base_dir / "config.yml", path)
