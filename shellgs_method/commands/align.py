@@ -278,6 +278,6 @@ def _show_alignment(scene: Path, target: Path, placement: Placement, validation:
     )
     if placement.proposed:
         accept = f"shellgs align {shlex.quote(str(scene))} --accept"
-        console.print(f"This is a proposal. If the images agree: {accept}")
+        console.print(f"This is a proposal. If the images agree: {accept}", soft_wrap=True)
     else:
         console.print(f"Written: {target}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import TYPE_CHECKING, Annotated, Optional
 
 from shellgs_method.blocks import WEAK
@@ -112,7 +113,7 @@ def _seen(layout: FacadeDataParserConfig, views: Sequence[View]) -> Sights:
         if points.observed is None:
             raise SceneError(
                 f"{scene} has neither maps of a shell nor tracks of its SfM points, which tell what each photograph "
-                f"shows: align a shell, and run `shellgs cast {scene}` first"
+                f"shows: align a shell, and run `shellgs cast {shlex.quote(str(scene))}` first"
             )
         shown = tracked(points, positions(view.camera for view in views).mean(axis=0))
     if not shown:

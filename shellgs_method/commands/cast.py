@@ -93,7 +93,8 @@ def cast(
         alignment = Alignment.load(scene / ALIGNMENT)
         if not alignment.cameras.cameras:
             unbound = f"{scene / ALIGNMENT} does not say which cameras it was found for"
-            console.print(f"{unbound}: `shellgs align {scene}` records them.")
+            records = f"`shellgs align {shlex.quote(str(scene))}` records them"
+            console.print(f"{unbound}: {records}.", soft_wrap=True)
     if truth:
         in_place = replace(alignment, shells=names, hashes=(), verdict="", metrics={})
         flags = _words(truth, matrix, global_shift, metres_per_shell_unit, crs) + paths.flags
@@ -102,7 +103,8 @@ def cast(
     aligned = alignment.meshed_by(mesher, spacing)
     if aligned != alignment and alignment.verdict:
         how = "mesher" if aligned.mesher != alignment.mesher else "spacing"
-        console.print(f"The alignment was validated with another {how}: run `shellgs align {scene}` again.")
+        again = f"run `shellgs align {shlex.quote(str(scene))}` again"
+        console.print(f"The alignment was validated with another {how}: {again}.", soft_wrap=True)
     start = time.monotonic()
     placed = PlacedShell.load(scene, views, aligned)
     for meshing in placed.mesh.meshing:

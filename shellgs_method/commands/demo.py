@@ -73,12 +73,13 @@ def demo(
     jobs = 1 if torch.cuda.is_available() else 2
     if compare(runs, partial(launch_locally, jobs=jobs, console=console), folder, console).failures:
         raise SystemExit("shellgs: a run of the demo failed; the end of its output is above.")
-    viewer = "ns-viewer" if shutil.which("ns-viewer") else BIN / "ns-viewer"
+    viewer = "ns-viewer" if shutil.which("ns-viewer") else str(BIN / "ns-viewer")
+    viewing = shlex.join([viewer, "--load-config", str(runs[-1].config)])
     console.print(
         "Look first at\n"
         f"  1. {folder / 'strip.png'}: a held-out view of each method, its normals and their error\n"
         f"  2. {folder / 'report.html'}: all held-out views with sliders between the methods\n"
-        f"  3. {viewer} --load-config {runs[-1].config}: walk around {runs[-1].variant.name} in a browser\n"
+        f"  3. {viewing}: walk around {runs[-1].variant.name} in a browser\n"
         f"The tables above are in {folder / 'results.md'}, a view's shell maps in {panel}.",
         highlight=False,
         soft_wrap=True,

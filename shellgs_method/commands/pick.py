@@ -57,7 +57,7 @@ def pick(
     from shellgs_method.registration.frames import ShellPlace
 
     if not shell:
-        raise SceneError(f"name the shell's file: shellgs pick {scene} scan.ply")
+        raise SceneError(f"name the shell's file: shellgs pick {shlex.quote(str(scene))} scan.ply")
     check_output(picks)
     picks.parent.mkdir(parents=True, exist_ok=True)
     views = read_views(paths.of(scene).unadjusted())

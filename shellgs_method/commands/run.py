@@ -189,7 +189,8 @@ def run(
             steps.done("all", *_state(recipe, scene, results))
     console.print(f"Done: {results / 'mesh.ply'}, {results / 'report.html'}.", highlight=False, soft_wrap=True)
     page = trained.with_name("splats.html")
-    console.print(f"Walk around: {page}, or ns-viewer --load-config {trained}", highlight=False, soft_wrap=True)
+    viewer = f"ns-viewer --load-config {shlex.quote(str(trained))}"
+    console.print(f"Walk around: {page}, or {viewer}", highlight=False, soft_wrap=True)
 
 
 def _state(recipe: Recipe, scene: Path, results: Path) -> list[object]:

@@ -227,6 +227,10 @@ def test_a_shell_without_its_matrix_is_refused(shellgs):
     )
 
 
+def test_a_command_to_be_typed_quotes_a_path_with_blanks(shellgs):
+    assert shellgs("pick", "my scene").endswith("name the shell's file: shellgs pick 'my scene' scan.ply")
+
+
 def test_doctor_lists_the_parts_of_this_machine(tmp_path):
     output = run("doctor", cwd=tmp_path)
     assert all(part in output for part in ("torch", "torchvision", "Open3D", "C++ compiler", "CUDA"))

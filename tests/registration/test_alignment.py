@@ -1272,7 +1272,9 @@ def test_an_alignment_of_an_older_version_is_cast_and_says_so(scene, shellgs):
     fields = json.loads((scene / ALIGNMENT).read_text())
     del fields["cameras"]
     (scene / ALIGNMENT).write_text(json.dumps(fields))
-    assert "does not say which cameras it was found for" in shellgs("cast", scene, "--no-check")
+    scene = scene.rename(scene.with_name("my scene"))
+    told = shellgs("cast", scene, "--no-check")
+    assert f"does not say which cameras it was found for: `shellgs align '{scene}'` records them" in told
     assert "Written" in shellgs("align", scene)
     assert "does not say" not in shellgs("cast", scene, "--no-check")
 
