@@ -317,13 +317,16 @@ def test_a_camera_behind_the_robot_sees_it_in_its_materials_colour_and_not_its_o
     assert not ((image[..., 1] > 100) & (image[..., [0, 2]].max(axis=-1) < 10)).any()
 
 
-def test_an_unknown_option_and_an_action_with_nan_are_refused(folder):
+def test_an_unknown_option_and_an_action_with_nan_or_of_another_shape_are_refused(folder):
     env = make(folder, depth=False)
     with pytest.raises(SceneError, match="no option gaol"):
         env.reset(options={"gaol": (9, -6)})
     env.reset(seed=0)
     with pytest.raises(SceneError, match=r"action \[nan +0\. +0\.\] cannot be"):
         env.step(np.array([np.nan, 0, 0]))
+    for action in ([0.5], 0.5, [0.5] * 4, [[0.5] * 3]):
+        with pytest.raises(SceneError, match="cannot be: give each actuator a number"):
+            env.step(np.array(action))
 
 
 @pytest.mark.parametrize(

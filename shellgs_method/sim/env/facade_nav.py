@@ -163,9 +163,10 @@ class FacadeNav(gymnasium.Env):
         """Drive for a fifth of a second.
 
         Raises:
-            SceneError: the action has NaN, which MuJoCo takes for 0.
+            SceneError: the action has NaN, which MuJoCo takes for 0, or another number of numbers, of which one would
+                be taken for all.
         """
-        if np.isnan(action).any():
+        if np.shape(action) != self.action_space.shape or np.isnan(action).any():
             raise SceneError(f"the action {action} cannot be: give each actuator a number from -1 to 1")
         low, high = self.model.actuator_ctrlrange.T
         self.data.ctrl[:] = low + (np.clip(action, -1, 1) + 1) / 2 * (high - low)
