@@ -10,6 +10,7 @@ import trimesh
 from scenes import house, scan
 
 from shellgs_method.files.clouds import Cloud
+from shellgs_method.files.readers.ply import ply_points, read_ply
 from shellgs_method.files.surfaces import read_surface
 from shellgs_method.picking import scan as module
 from shellgs_method.picking.scan import Blocks, Scan, thinned
@@ -224,6 +225,22 @@ def test_colours_of_a_cloud_are_scaled_by_what_is_there(tmp_path: Path, kind: st
     part = opened(cloud_of(tmp_path / "a.ply", scan(500) + NATIONAL, kind, colour)).cloud
     assert part is not None
     np.testing.assert_array_equal(np.unique(part.colours, axis=0), [[200, 100, 50, 255]])
+
+
+def test_colours_of_bytes_are_as_they_are_however_dark(tmp_path: Path):
+    """A first piece of a scan may be in the dark."""
+    text = cloud_of(tmp_path / "a.ply", scan(500), "uchar", (1, 0, 1))
+    binary = tmp_path / "b.ply"
+    header = text.read_bytes().split(b"end_header\n")[0].replace(b"ascii", b"binary_little_endian")
+    rows = np.zeros(500, [("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    rows["rgb"] = 1, 0, 1
+    binary.write_bytes(header + b"end_header\n" + rows.tobytes())
+    for path in (text, binary):
+        pieces = ply_points(path, coloured=True)
+        assert pieces is not None
+        for colours in (read_ply(path).colours, *(piece.colours for piece in pieces)):
+            assert colours is not None
+            np.testing.assert_array_equal(colours, [[1, 0, 1]] * 500)
 
 
 @pytest.mark.parametrize("colour", [(), (0, 0, 0)])

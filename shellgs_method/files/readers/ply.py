@@ -63,7 +63,7 @@ def read_ply(path: Path) -> Geometry:
         if element.name not in _KNOWN:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     bands = [columns[name] for name in _colours_among(columns)]
-    colours = Colours().of(np.stack(bands, axis=1)) if bands else None
+    colours = Colours(_types_of_colours(header)).of(np.stack(bands, axis=1)) if bands else None
     return Geometry(vertices, np.concatenate(faces), colours=colours)
 
 
@@ -92,7 +92,7 @@ def ply_points(path: Path, coloured: bool = False) -> Iterator[Points] | None:
     at = names.index("vertex")
     roles = "xyz", _NORMAL, _colours_among(columns) if coloured else ()
     used = [[columns.index(name) for name in names if {*names} <= {*columns}] for names in roles]
-    colours = Colours()
+    colours = Colours(_types_of_colours(header))
     if header.order is None:
         numbers = [element.count * len(element.properties) for element in there]
         tables = _text_tables(path, header.length, sum(numbers[:at]), there[at].count, len(columns), sum(numbers))
@@ -106,6 +106,11 @@ def ply_points(path: Path, coloured: bool = False) -> Iterator[Points] | None:
 def _colours_among(columns: Container[str]) -> tuple[str, ...]:
     """Names of red, green and blue; none if there are none."""
     return next((names for names in _COLOURS if all(name in columns for name in names)), ())
+
+
+def _types_of_colours(header: PlyHeader) -> list[str]:
+    types = {prop.name: prop.type for each in header.elements if each.name == "vertex" for prop in each.properties}
+    return [types[name] for name in _colours_among(types)]
 
 
 def _of_columns(parts: list[list[np.ndarray]], colours: Colours) -> Points:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,11 +33,14 @@ class Points:
 class Colours:
     """Scales a file's colours, piece by piece: white is the least of 1, 255 and 65535 that none so far exceeds.
 
-    Types do not tell: 8 bits are written as 16 or 32, and as floats.
+    Types do not tell, but for those of 8 bits: these are written as 16 or 32 too, and as floats.
+
+    Args:
+        types: numpy's names of the types that the file has them in.
     """
 
-    def __init__(self) -> None:
-        self._most = 0.0
+    def __init__(self, types: Collection[str] = ()) -> None:
+        self._most = 255.0 if {*types} == {"u1"} else 0.0
 
     def of(self, bands: Shaped[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:
         """Red, green and blue of a piece, of which NaN is black."""
