@@ -46,7 +46,7 @@ from shellgs_method.capture.photographs import (
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
-from shellgs_method.capture.work import Work, listing
+from shellgs_method.capture.work import Work, listing, refuse_foreign
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
 from shellgs_method.files.paths import PHOTOGRAPHS, RAW
@@ -167,7 +167,8 @@ class _Capture:
         return summary
 
     def _refuse_to_overwrite(self) -> None:
-        """Refuse a scene whose photographs or cameras are not those of this capture."""
+        """Refuse a scene whose photographs or cameras are not those of this capture, and a work folder of another's."""
+        refuse_foreign(self.scene / CAPTURE)
         if (self.scene / CAPTURE).is_dir() and Work(self.scene / CAPTURE).has("undistorted", self.model_key):
             return
         for name in ("transforms.json", "colmap", "sparse", "images", *(["masks"] if self.masked else [])):

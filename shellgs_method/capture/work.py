@@ -11,6 +11,9 @@ from pathlib import Path
 
 from shellgs_method.errors import SceneError
 from shellgs_method.files.atomic import atomic_write, read_json
+from shellgs_method.files.paths import is_hidden
+
+_RECORD = "record.json"
 
 
 class Work:
@@ -22,7 +25,7 @@ class Work:
     def __init__(self, folder: Path):
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self._file = folder / "record.json"
+        self._file = folder / _RECORD
         self._keys: dict[str, str] = {}
         with suppress(SceneError, FileNotFoundError):  # missing or damaged: everything is made again
             self._keys = read_json(self._file)
@@ -64,6 +67,20 @@ class Work:
             self._keys[product] = key
         with atomic_write(self._file) as file:
             file.write((json.dumps(self._keys, indent=1) + "\n").encode())
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Refuse a folder that something else keeps its files in, which products would replace.
+
+    Raises:
+        SceneError: it has files but no record, which is written before any product.
+    """
+    shown = folder.is_dir() and any(not is_hidden(path.relative_to(folder)) for path in folder.iterdir())
+    if shown and not (folder / _RECORD).exists():
+        raise SceneError(
+            f"{folder} has files, but no {_RECORD}: it is not of a capture, which would replace them; move it away, or "
+            "give another scene folder"
+        )
 
 
 def listing(files: Mapping[str, Path]) -> list[tuple[str, int, int]]:

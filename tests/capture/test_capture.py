@@ -838,6 +838,23 @@ def test_what_lies_where_the_capture_keeps_its_files_is_refused_and_undisturbed(
     assert [path for path in (tmp_path / "scene").rglob("*") if path.is_file()] == [own]
 
 
+def test_a_folder_of_another_in_the_place_of_the_captures_is_refused_and_undisturbed(tmp_path):
+    own = tmp_path / "scene/capture/photographs/a.jpg"
+    for k, path in enumerate((own, *(tmp_path / "photographs" / name for name in ("a.jpg", "b.jpg")))):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        photograph(seed=k).save(path)
+    with pytest.raises(SceneError, match=r"scene/capture has files, but no record\.json: .* move it away"):
+        capture(tmp_path / "photographs", tmp_path / "scene")
+    assert [path for path in (tmp_path / "scene").rglob("*") if path.is_file()] == [own]
+    own.unlink()
+    own.parent.rmdir()
+    (own.parents[1] / ".record.json.1.tmp").touch()  # as of one that was killed while it wrote its first record
+    with pytest.raises(SceneError, match="at least 3 photographs, not 2"):
+        capture(tmp_path / "photographs", tmp_path / "scene")
+    with pytest.raises(SceneError, match="at least 3 photographs, not 2"):  # now it is the capture's own
+        capture(tmp_path / "photographs", tmp_path / "scene")
+
+
 @pytest.mark.parametrize("name", ["images", "colmap", "transforms.json"])
 def test_an_existing_scene_is_refused_and_undisturbed(tmp_path, name):
     (tmp_path / "photographs").mkdir()
