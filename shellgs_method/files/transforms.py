@@ -47,6 +47,11 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
     listed_frames = meta.get("frames")
     if not isinstance(listed_frames, list):
         raise SceneError(f"{path} has no list of frames: make it again")
+    if (scale := meta.get("applied_scale", 1)) != 1:
+        notice(
+            f"{path} has an applied_scale of {scale}, which is not undone: poses and points are taken as they are "
+            "written, so that a --matrix must lead to these."
+        )
     applied, files = _applied(meta, scene), NamedFiles(scene, images_path, path)
     frames = [_frame(files, each, meta, applied, f"{path}, frame {k}") for k, each in enumerate(listed_frames, start=1)]
     named = {split: _names(meta.get(f"{split}_filenames", []), files, path) for split in _SPLITS}

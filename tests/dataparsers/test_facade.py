@@ -161,6 +161,16 @@ COLOURS: dict[str, tuple[tuple[str, ...], str, float]] = {
 }
 
 
+def test_an_applied_scale_is_told_and_changes_no_camera(scene, caplog):
+    path = scene / "transforms.json"
+    transforms, before = json.loads(path.read_text()), read_views(FacadeDataParserConfig(data=scene))
+    for scale in (1.0, 0.5):
+        path.write_text(json.dumps(transforms | {"applied_scale": scale}))
+        after = read_views(FacadeDataParserConfig(data=scene))
+        assert ("has an applied_scale of 0.5, which is not undone" in caplog.text) == (scale != 1)
+        assert [view.camera.viewmat.tolist() for view in after] == [view.camera.viewmat.tolist() for view in before]
+
+
 @pytest.mark.parametrize("kind", COLOURS)
 def test_colours_of_points_may_be_of_any_name_and_type(scene, kind):
     names, stored, factor = COLOURS[kind]
