@@ -183,13 +183,24 @@ def masks_among(candidates: Mapping[str, Sequence[Path]]) -> dict[str, Path | No
 
 
 def tell_of_masks(masks: Mapping[str, Path | None], there: Collection[Path], folder: Path) -> None:
-    """Tell the user which photographs have no mask, if some have one, and which files of the folder are no masks."""
+    """Tell the user which photographs have no mask, if some have one, which share one, by a name of both, and which
+    files of the folder are no masks.
+    """
     without = sorted(name for name, path in masks.items() if path is None)
     strays = sorted(path for path in there if path not in masks.values() and not path.name.startswith("."))
     if strays or 0 < len(without) < len(masks):
         stray = f"; {len(strays)} files there belong to no photograph, {strays[0].name} for example" if strays else ""
         kept = f", {without[0]} for example, and are kept whole" if without else ""
         notice(f"{len(without)} of {len(masks)} photographs have no mask in {folder}{kept}{stray}.")
+    of: dict[Path, list[str]] = {}
+    for name, path in sorted(masks.items()):
+        if path is not None:
+            of.setdefault(path, []).append(name)
+    if shared := [path for path, names in of.items() if len(names) > 1]:
+        notice(
+            f"{len(shared)} masks in {folder} are each of several photographs: {shared[0].name} is that of "
+            f"{' and '.join(of[shared[0]])}, for example; if it is not, name it {Path(of[shared[0]][0]).name}.png, say."
+        )
 
 
 def files_below(folder: Path) -> Iterator[Path]:

@@ -18,7 +18,7 @@ from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import image, image_errors
 from shellgs_method.files.cue_maps import CueMaps
 from shellgs_method.files.masks import kept_pixels
-from shellgs_method.files.paths import masks_among, photographs_in
+from shellgs_method.files.paths import mask_names, masks_among, photographs_in, tell_of_masks
 from shellgs_method.files.photographs import load_mask, load_photograph
 from shellgs_method.files.sparse_points import read_sparse_points
 from shellgs_method.gaussians.seeds import shell_seeds, view_of_shell
@@ -80,6 +80,21 @@ def test_a_photograph_without_a_mask_is_kept_whole_and_counted(scene, caplog):
     masks = [view.mask is not None for view in read_views(FacadeDataParserConfig(data=scene))]
     assert masks == [False, True, *[False] * 8]
     assert "9 of 10 photographs have no mask in" in caplog.text
+
+
+def test_photographs_of_one_stem_that_share_a_mask_are_told(tmp_path, caplog):
+    photographs = [Path("f0.jpg"), Path("f0.png"), Path("f1.jpg")]
+    candidates = {path.name: [tmp_path / name for name in mask_names(path)] for path in photographs}
+    for name in ("f0.png", "f1.png"):
+        paint(tmp_path / name, left=12)
+    tell_of_masks(masks_among(candidates), [], tmp_path)
+    assert "1 masks in" in caplog.text
+    assert "f0.png is that of f0.jpg and f0.png, for example; if it is not, name it f0.jpg.png, say" in caplog.text
+    caplog.clear()
+    (tmp_path / "f0.png").rename(tmp_path / "f0.jpg.png")  # then the other has none
+    tell_of_masks(masks_among(candidates), [], tmp_path)
+    assert "1 of 3 photographs have no mask" in caplog.text
+    assert "several" not in caplog.text
 
 
 def test_masks_that_belong_to_no_photograph_are_counted(scene, caplog):
