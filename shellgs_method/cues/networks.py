@@ -146,7 +146,7 @@ def fetch_weights(name: str, patterns: list[str]) -> Weights:
         files = sorted(path for pattern in patterns for path in folder.glob(pattern))
         if not files:
             raise SceneError(f"{folder} holds no weights: it has no {', '.join(patterns)}")
-        return Weights(folder, hash_of(files), _licence(folder))
+        return Weights(folder, hash_of([(path.name, path) for path in files]), _licence(folder))
     try:
         # In the hub's cache, a snapshot's folder is named by its commit.
         folder = Path(snapshot_download(name, allow_patterns=[*patterns, "README.md"]))

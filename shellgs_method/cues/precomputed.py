@@ -70,7 +70,7 @@ class Precomputed:
                 normal = _in_view(view, normal, np.abs(normal).sum(axis=-1) > 1e-3)
             return Prediction(_in_view(view, disparity[..., None], np.isfinite(disparity))[..., 0], normal)
 
-        files = [*maps.files, *(normals.files if normals else ())]
+        files = [*maps.named, *(normals.named if normals else ())]
         revision = hash_of(files, self.values, self.convention)
         return Predictor(
             str(self.folder.absolute()), revision, predict, convention=self.convention if normals else None
@@ -84,6 +84,9 @@ class MapFolder:
         folder: folder to search, with its sub-folders.
         keys: names of the array in an npz that holds several, in order of preference.
 
+    Attributes:
+        named: the files, by their paths below the folder, which say of which views they are.
+
     Raises:
         SceneError: the folder is missing or holds no map.
     """
@@ -91,13 +94,14 @@ class MapFolder:
     def __init__(self, folder: Path, keys: tuple[str, ...]) -> None:
         if not folder.is_dir():
             raise SceneError(f"{folder} is not a folder: give the folder of the maps")
-        self.files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
-        if not self.files:
+        files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+        if not files:
             raise SceneError(f"{folder} holds no maps: it has no {', '.join(SUFFIXES)} file")
+        self.named = [(path.relative_to(folder).as_posix(), path) for path in files]
         self._keys = keys
         self._by_name: dict[str, list[Path]] = {}
-        for path in self.files:
-            self._by_name.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
+        for name, path in self.named:
+            self._by_name.setdefault(PurePosixPath(name).with_suffix("").as_posix(), []).append(path)
         self._taken: dict[Path, str] = {}
 
     def read(self, view: View, channels: int) -> Shaped[np.ndarray, "H W channels"] | None:

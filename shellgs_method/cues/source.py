@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,9 +72,9 @@ class Source(Protocol):
         ...
 
 
-def hash_of(files: Sequence[Path], *words: str) -> str:
-    """SHA-256 of words and files, including the files' names."""
+def hash_of(files: Sequence[tuple[str, Path]], *words: str) -> str:
+    """SHA-256 of words and files, including the files' names, which come before each."""
     digest = hashlib.sha256("\0".join(words).encode())
-    for path in files:
-        digest.update(b"\0" + path.name.encode() + b"\0" + content_hash(path).encode())
+    for name, path in files:
+        digest.update(b"\0" + os.fsencode(name) + b"\0" + content_hash(path).encode())
     return digest.hexdigest()

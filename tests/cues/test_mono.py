@@ -323,6 +323,20 @@ def test_maps_are_matched_to_photographs_by_name(tmp_path: Path):
     assert [None if p is None else p.disparity[0, 0] for p in found] == [2, 1, 3, None]
 
 
+def test_maps_that_change_places_are_another_revision(tmp_path: Path):
+    paths = [tmp_path / "left/0001.npy", tmp_path / "right/0001.npy"]
+    for path in paths:
+        path.parent.mkdir()
+    revisions = set()
+    for depths in ((5, 7), (7, 5)):
+        for path, depth in zip(paths, depths, strict=True):
+            np.save(path, plane_depth(distance=depth))
+        revisions.add(Precomputed(tmp_path).load().revision)
+    paths[1].rename(tmp_path / "0001.npy")
+    revisions.add(Precomputed(tmp_path).load().revision)
+    assert len(revisions) == 3
+
+
 def two_files(folder: Path) -> None:
     np.save(folder / "a.npy", plane_depth())
     np.savez(folder / "a.npz", plane_depth())
