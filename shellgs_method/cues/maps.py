@@ -15,7 +15,7 @@ from shellgs_method.cues.disparity import DisparityFit, aligned_depth, fit_dispa
 from shellgs_method.cues.normals import disagreement, facing, gradient_normals
 from shellgs_method.cues.source import Predictor
 from shellgs_method.errors import SceneError
-from shellgs_method.files.atomic import atomic_write
+from shellgs_method.files.atomic import atomic_write, content_hash
 from shellgs_method.files.bound_cameras import BoundCameras
 from shellgs_method.files.cue_maps import CueMap, CueMaps
 from shellgs_method.files.map_files import is_number
@@ -58,7 +58,7 @@ def make_maps(
 
     Each view's disparity is aligned separately (:func:`fit_disparity`). A view whose fit cannot be trusted gets no
     map and is trained on its photograph alone. ``cues/mono/fits.json`` holds the numbers of every fit; existing maps
-    of the same predictor and points are kept.
+    of the same predictor, points and photographs are kept.
 
     Args:
         scene: the scene's folder.
@@ -85,7 +85,7 @@ def make_maps(
     fits = Fits.open(maps)
     written = skipped = 0
     for view in track(views, "Making monocular cues", len(views)):
-        if fits.has_no_map(view) or (view.name in fits.views and maps.current(view.name, view.camera)):
+        if fits.has_no_map(view) or (fits.is_of(view) and maps.current(view.name, view.camera)):
             skipped += 1
             continue
         fit, cue = align_view(view, points, predictor)
@@ -140,7 +140,8 @@ class Fits:
     Attributes:
         path: the JSON file.
         sources: sources of the fits, as in the maps' manifest; fits of other sources are discarded.
-        views: numbers, problem and camera of each view's fit, by name; None for a view without prediction.
+        views: numbers, problem, camera and hash of the photograph of each view's fit, by name; None for a view without
+            prediction.
     """
 
     path: Path
@@ -162,15 +163,21 @@ class Fits:
 
     def add(self, view: View, fit: DisparityFit | None) -> None:
         """Add the fit of a view and save the file."""
-        known = None if fit is None else {**asdict(fit), "problem": fit.problem, "camera": _camera_of(view)}
-        self.views[view.name] = known
+        bound = {"camera": _camera_of(view), "photograph": content_hash(view.image)}
+        self.views[view.name] = None if fit is None else {**asdict(fit), "problem": fit.problem, **bound}
         with atomic_write(self.path) as file:
             file.write((json.dumps({"sources": self.sources, "views": self.views}, indent=1) + "\n").encode())
 
+    def is_of(self, view: View) -> bool:
+        """Whether the fit of a view is of the photograph that it has now: another may have taken its name."""
+        return (self.views.get(view.name) or {}).get("photograph") == content_hash(view.image)
+
     def has_no_map(self, view: View) -> bool:
-        """Whether it is known that a view has no map, by the camera that it has now."""
+        """Whether it is known that a view has no map, by the camera and the photograph that it has now."""
         fit = self.views.get(view.name, {})
-        return fit is None or bool(fit.get("problem") and fit.get("camera") == _camera_of(view))
+        if fit is None:
+            return True
+        return bool(fit.get("problem")) and fit.get("camera") == _camera_of(view) and self.is_of(view)
 
     def problem(self, name: str) -> str | None:
         """Why a view has no map; None if it has one or was not processed yet."""

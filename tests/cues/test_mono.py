@@ -708,11 +708,35 @@ def test_a_view_that_had_no_map_is_tried_again_with_another_camera(tmp_path: Pat
     points = SparsePoints(depth[:, None] * rays)
     predictor = Predictor("a", "b", lambda view: Prediction(disparity_of(plane_depth())))
     right, wrong = CAMERA, Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])).double(), K, 64, 48)  # looks back
+    image = tmp_path / "a.png"
+    image.touch()
 
     def make(camera: Camera) -> MonoSummary:
-        views = [view_of(), view_of(camera, "images/b.png")]
+        views = [view_of(image=image), view_of(camera, "images/b.png", image)]
         return make_maps(tmp_path, views, points, predictor, command="shellgs mono {scene}")
 
     assert "SfM points" in make(wrong).problems["images/b.png"]
     assert make(wrong).skipped == 2
     assert (make(right).written, make(right).skipped) == (1, 2)
+
+
+def test_a_photograph_in_the_place_of_another_is_predicted_again(tmp_path: Path):
+    pixels, depth = points_on(plane_depth(), 200)
+    rays = np.concatenate([pixels, np.ones((200, 1))], axis=1) @ np.linalg.inv(K.numpy()).T
+    points, views = SparsePoints(depth[:, None] * rays), [view_of(name=name, image=tmp_path / name) for name in "abc"]
+
+    def predict(view: View) -> Prediction:
+        wall = plane_depth()
+        return Prediction(disparity_of(wall if view.image.read_bytes() != b"a street" else wall[::-1, ::-1]))
+
+    def shown(*photographs: bytes) -> tuple[int, int, set[str]]:
+        for view, photograph in zip(views, photographs, strict=True):
+            view.image.write_bytes(photograph)
+        made = make_maps(tmp_path, views, points, Predictor("a", "b", predict), command="shellgs mono {scene}")
+        return made.written, made.skipped, {*made.problems}
+
+    assert shown(b"a wall", b"a wall", b"a street") == (2, 0, {"c"})
+    assert shown(b"a wall", b"a wall", b"a street") == (0, 3, {"c"})
+    assert shown(b"a wall", b"a street", b"a street") == (0, 2, {"b", "c"})
+    assert shown(b"a wall", b"a street", b"its wall") == (1, 2, {"b"})
+    assert CueMaps.open(tmp_path, "mono").names == ["a", "c"]
