@@ -34,6 +34,7 @@ AMBIGUOUS = 0.90
 _SAMPLES = 20_000  # points of the shell's surface
 _CELLS = 20_000  # of the shell's grid
 _SCALE_STEP = 1.06
+_THINNEST = 1e-3  # of SfM points, relative to their extent: by what is exactly flat, scales would have no end
 _LARGEST = 2_000_000  # cells of a grid that the shell is shifted in
 _PEAKS = 3  # shifts kept per orientation and scale
 _EMPTY = 0.5  # weight of cells that sightlines pass through, against those with points
@@ -165,7 +166,8 @@ class _Search:
         points, empty = self.points @ turn.T, self.empty @ turn.T
         boxes = [np.percentile(each, [3, 97], axis=0) for each in (self.samples, points)]
         extent = np.maximum(np.ptp(boxes[0], axis=0), 0.1 * self.cell)  # a shell may be one flat wall
-        ratios = np.sort(extent / np.maximum(np.ptp(boxes[1], axis=0), 1e-9))
+        seen = np.ptp(boxes[1], axis=0)
+        ratios = np.sort(extent / np.maximum(seen, max(_THINNEST * seen.max(), 1e-9)))
         lowest, highest = 0.5 * ratios[0], 1.6 * ratios[2]
         steps = int(np.log(highest / lowest) / np.log(_SCALE_STEP)) + 1
         first = np.floor(self.samples.min(0) / self.cell).astype(int) - 1

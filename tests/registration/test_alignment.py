@@ -33,7 +33,7 @@ from shellgs_method.geometry.axes import facade_axes, turn
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.lens import Lens
 from shellgs_method.geometry.precision import mesh_step
-from shellgs_method.geometry.similarity import fit_similarity, transformed
+from shellgs_method.geometry.similarity import fit_similarity, scale_of, transformed
 from shellgs_method.registration import proposal
 from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
 from shellgs_method.registration.geotags import GeoTags
@@ -385,6 +385,15 @@ def test_a_flat_wall_is_searched_for_in_about_its_size(views):
     best = max(found, key=lambda candidate: candidate.score).survey_from_scene
     np.testing.assert_allclose(best[:3, :3], np.eye(3), atol=0.1)
     np.testing.assert_allclose(best[:3, 3], 0, atol=0.5)
+
+
+def test_points_exactly_in_a_plane_are_placed_on_a_shell_with_depth(mesh):
+    samples, _ = ShellSurface(mesh).samples(5000)
+    wall = samples[np.abs(samples[:, 1] - np.median(samples[:, 1])) < 0.1] * [1, 0, 1] / 3
+    sight: Any = SimpleNamespace(points=wall, origins=wall - [0.0, 3.0, 0.0])
+    found = list(proposal._Search.of(samples, wall, sight).placed(np.eye(3)))
+    assert min(abs(scale_of(candidate.survey_from_scene) / 3 - 1) for candidate in found) < 0.03
+    assert len(found) < 3 * 150
 
 
 def test_a_proposal_names_other_bays_if_the_points_show_no_end_of_the_facade(mesh, views):
