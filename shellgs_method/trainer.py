@@ -173,6 +173,8 @@ class FacadeTrainer(Trainer):
                 super().train()
 
     def _stop(self) -> None:
+        if self.training_state == "completed":  # nerfstudio keeps the viewer open until Ctrl-C
+            raise KeyboardInterrupt
         CONSOLE.print("[yellow]Stopping after this iteration, to save it; Ctrl-C again stops at once.")
         self._stopped = self.stop_training = True
 

@@ -357,6 +357,12 @@ def test_ctrl_c_saves_the_iteration_and_the_run_resumes_there(whole, pristine_sc
     assert ends_alike(resumed, whole)
 
 
+def test_ctrl_c_ends_the_viewer_of_a_finished_run_at_once(trained, monkeypatch):
+    monkeypatch.setattr(trained, "training_state", "completed")
+    with pytest.raises(KeyboardInterrupt):
+        trained._stop()
+
+
 def test_a_resumed_run_keeps_which_gaussians_are_behind_the_shell(pristine_scene, tmp_path):
     """As the run did that was stopped: those that passed the shell since are told at the next densification."""
     first = trainer_of(pristine_scene, tmp_path / "first", "shellgs_metric", iterations=4)
