@@ -16,6 +16,7 @@ from shellgs_method.evaluation.regions import references, regions
 from shellgs_method.evaluation.view import OPAQUE, geometry_errors
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.blocks import BLOCKS, Blocks, Cell
+from shellgs_method.gaussians.seeds import photograph_of
 from shellgs_method.gaussians.surroundings import Region
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.nearest import point_tree
@@ -126,7 +127,7 @@ def along_cuts(run: TrainedRun) -> dict[str, dict[str, float]]:
         near = _near(camera, shell.depth, cells, NEAR / metres)
         rgb, normal = outputs["rgb"], colours_to_normals(outputs["normal"])
         rendering = Rendering(rgb, outputs["depth"], outputs["accumulation"], normal)
-        target = batch["image"][..., :3] / (255 if batch["image"].dtype == torch.uint8 else 1)
+        target = photograph_of(batch)
         on_shell = shell.mask & regions(batch, model.metres_per_unit, near.device).get("on_shell", shell.mask)
         for part, pixels in zip(PARTS, (near, ~near), strict=True):
             mask = on_shell & pixels & kept_pixels(batch, target)

@@ -29,6 +29,7 @@ from shellgs_method.export.surveyed import REACH, at_surveyed, read_surveyed
 from shellgs_method.files.atomic import atomic_write
 from shellgs_method.files.cue_maps import find_cues
 from shellgs_method.files.scene import SceneLayout
+from shellgs_method.gaussians.seeds import photograph_of
 from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.depth_normals import normals_from_depth
 from shellgs_method.machine.progress import track
@@ -113,7 +114,7 @@ def measure(config_path: Path, half: Half | None = None, renders: Path | None = 
     for index, (cameras, batch) in enumerate(track(views, "Evaluating view", len(views))):
         camera = pinhole_camera(cameras)
         outputs = model.get_outputs_for_camera(cameras.to(model.device))
-        rendering, photograph = _rendering(model, outputs, camera), _photograph(batch, model.device)
+        rendering, photograph = _rendering(model, outputs, camera), photograph_of(batch, model.device)
         metrics.append(
             masked_image_errors(rendering.rgb, photograph, batch, metres_per_unit)
             | reference_errors(rendering, camera, batch, metres_per_unit)
@@ -172,11 +173,6 @@ def _rendering(model: Model, outputs: dict[str, Tensor], camera: Camera) -> Rend
         depth = depth / camera.rays().to(depth).norm(dim=-1, keepdim=True)
     normal = colours_to_normals(outputs["normal"]) if isinstance(model, FacadeModel) else None
     return Rendering(outputs["rgb"], depth, outputs["accumulation"], normal)
-
-
-def _photograph(batch: dict, device: torch.device) -> Float[Tensor, "H W 3"]:
-    image = batch["image"].to(device)
-    return image / 255 if image.dtype == torch.uint8 else image
 
 
 def _snapshot(

@@ -96,9 +96,9 @@ def view_behind_shell(camera: Camera, batch: dict) -> SeededView:
     return SeededView(camera, image, Reference(depth, _towards(camera), behind))
 
 
-def photograph_of(batch: dict) -> Float[Tensor, "H W 3"]:
-    """The photograph of a batch in [0, 1], on the CPU."""
-    image = batch["image"][..., :3].to(_CPU)
+def photograph_of(batch: dict, device: torch.device = _CPU) -> Float[Tensor, "H W 3"]:
+    """The photograph of a batch in [0, 1], on a device."""
+    image = batch["image"][..., :3].to(device)
     return image / (255 if image.dtype == torch.uint8 else 1)
 
 
