@@ -77,8 +77,7 @@ def check_output(path: Path) -> None:
     above = _existing(path.absolute().parent)
     if not above.is_dir():
         raise SceneError(f"{path} cannot be written: {above} is a file, not a folder")
-    if not os.access(above, os.W_OK | os.X_OK):
-        raise SceneError(f"{path} cannot be written: you may not write to {above}; name a file elsewhere")
+    _check_writable(above, path, "name a file elsewhere")
 
 
 def check_output_folder(path: Path) -> None:
@@ -90,8 +89,12 @@ def check_output_folder(path: Path) -> None:
     there = _existing(path)
     if not there.is_dir():
         raise SceneError(f"{there} is a file: name a folder to write to")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise SceneError(f"{path} cannot be written: you may not write to {there}; name a folder elsewhere")
+    _check_writable(there, path, "name a folder elsewhere")
+
+
+def _check_writable(folder: Path, path: Path, remedy: str) -> None:
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise SceneError(f"{path} cannot be written: you may not write to {folder}; {remedy}")
 
 
 def _existing(path: Path) -> Path:

@@ -35,11 +35,11 @@ def scene_axes(
         SceneError: the points have no wall.
     """
     rng = np.random.default_rng(0)
-    left = points
+    spread = np.percentile(points, [10, 90], axis=0) if len(points) else np.zeros((2, 3))
+    size, left = float(np.linalg.norm(np.ptp(spread, axis=0))), points
     for _ in range(_WALLS):
         if len(left) < 50:
             break
-        size = float(np.linalg.norm(np.subtract(*np.percentile(points, [90, 10], axis=0))))
         members = largest_plane(left, _FLAT * size, rng)
         if not members.any():
             break
