@@ -100,6 +100,13 @@ def image_with(view: ShellView, mask: np.ndarray, colour: list[int]) -> ShellVie
     return replace(view, image=torch.from_numpy(image))
 
 
+def stored(folder: Path, number: int, image: np.ndarray, camera: Camera) -> View:
+    """A photograph in a file."""
+    name = f"{number}.png"
+    Image.fromarray(image).save(folder / name)
+    return View(name, folder / name, camera)
+
+
 CAMERAS = [camera_at(x) for x in np.linspace(-2.5, 2.5, 9)]
 
 
@@ -415,10 +422,8 @@ def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
         image[sky] = 250
         if index == MIDDLE:
             image[:20, 60:80] = image[20:40, 60:80]
-        name = f"{index}.png"
-        Image.fromarray(image).save(tmp_path / name)
-        views.append(View(name, tmp_path / name, view.camera))
-        shell.write(name, CueMap(wall, np.zeros((HEIGHT, WIDTH, 3), np.float16), wall > 0), view.camera)
+        views.append(stored(tmp_path, index, image, view.camera))
+        shell.write(views[-1].name, CueMap(wall, np.zeros((HEIGHT, WIDTH, 3), np.float16), wall > 0), view.camera)
     assert check_views(tmp_path, views, []).contradicted == pytest.approx(6 / 50, abs=0.03)
     checked, inside = CueMaps.open(tmp_path, "checked"), wall > 0
     inside[sky] = False
@@ -430,11 +435,8 @@ def test_a_shell_that_reaches_into_the_sky_is_left_out_there(tmp_path: Path):
 
 
 def test_an_interrupted_check_does_not_go_on_with_another_shell(tmp_path: Path, monkeypatch):
-    views, file = [], tmp_path / "shell.ply"
-    for index, (view, _) in enumerate(street(CAMERAS)):
-        name = f"{index}.png"
-        Image.fromarray(view.image.numpy()).save(tmp_path / name)
-        views.append(View(name, tmp_path / name, view.camera))
+    photographs, file = [view for view, _ in street(CAMERAS)], tmp_path / "shell.ply"
+    views = [stored(tmp_path, k, view.image.numpy(), view.camera) for k, view in enumerate(photographs)]
 
     def cast(depth: float) -> CueMaps:
         file.write_text(f"a wall at {depth}")
@@ -466,13 +468,11 @@ def test_where_the_model_has_windows_only_they_show_what_is_behind(tmp_path: Pat
     wall, normal = np.full((HEIGHT, WIDTH), WALL, np.float32), np.zeros((HEIGHT, WIDTH, 3), np.float16)
     shell, views, windows = CueMaps.create(tmp_path, "shell", command="cast"), [], []
     for index, (view, _) in enumerate(street(CAMERAS, mirror=1 / 0.6)):
-        name = f"{index}.png"
-        Image.fromarray(view.image.numpy()).save(tmp_path / name)
-        views.append(View(name, tmp_path / name, view.camera))
+        views.append(stored(tmp_path, index, view.image.numpy(), view.camera))
         x = (view.camera.position.numpy() + WALL * view.camera.rays().numpy())[..., 0]
         windows.append((x > -1.5) & (x < 0))
         classes = np.where(windows[-1], SurfaceClass.WINDOW, SurfaceClass.WALL).astype(np.uint8) if known else None
-        shell.write(name, CueMap(wall, normal, wall > 0, classes), view.camera)
+        shell.write(views[-1].name, CueMap(wall, normal, wall > 0, classes), view.camera)
     check_views(tmp_path, views, [])
     name, camera = views[MIDDLE].name, views[MIDDLE].camera
     found = Findings.of(CueMaps.open(tmp_path, "checked").require(name, camera), shell.require(name, camera)).behind
