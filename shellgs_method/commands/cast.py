@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Optional
 
 from shellgs_method.bounds import FromOne, Length, bounded
-from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console
+from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, shell_words
 from shellgs_method.commands.panels import save_panel, views_with_maps
 from shellgs_method.errors import SceneError
 
@@ -175,9 +175,7 @@ def _words(truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], u
     words = ["--truth", *(path.resolve() for path in truth)]
     words += ["--matrix", matrix.resolve()] if matrix else []
     words += ["--global-shift", *shift] if any(shift) else []
-    words += ["--metres-per-shell-unit", unit] if unit != 1 else []
-    words += ["--crs", crs] if crs else []
-    return f" {shlex.join(map(str, words))}"
+    return f" {shlex.join(map(str, words + shell_words(unit, crs)))}"
 
 
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:

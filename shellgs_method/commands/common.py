@@ -47,6 +47,12 @@ def launch(
     return partial(launch_locally, jobs=jobs, console=console)
 
 
+def shell_words(metres_per_shell_unit: float, crs: str | None) -> list[str]:
+    """Words of a further command on the same shell: its unit and system, as far as they were given."""
+    unit = ["--metres-per-shell-unit", str(metres_per_shell_unit)] if metres_per_shell_unit != 1 else []
+    return unit + (["--crs", crs] if crs else [])
+
+
 def open_page(path: Path) -> None:
     """Open an HTML file in the user's browser."""
     if not webbrowser.open(path.resolve().as_uri()):

@@ -10,7 +10,7 @@ from typing import Annotated, Optional
 import tyro
 
 from shellgs_method.bounds import Length, Port, bounded
-from shellgs_method.commands.common import PATHS, Paths, Scene, console
+from shellgs_method.commands.common import PATHS, Paths, Scene, console, shell_words
 from shellgs_method.errors import SceneError
 
 
@@ -85,11 +85,6 @@ def pick(
     if "problem" in fit:
         console.print(f"{picks}: {fit['problem']}. The same command goes on.", highlight=False, soft_wrap=True)
         return
-    options = f" --metres-per-shell-unit {metres_per_shell_unit}" if metres_per_shell_unit != 1 else ""
-    options += (f" --crs {shlex.quote(crs)}" if crs else "") + paths.flags
-    files = " ".join(shlex.quote(str(path)) for path in (scene, *shell))
-    console.print(
-        f"{fit['words']}\nNext: shellgs align {files} --picks {shlex.quote(str(picks))}{options}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    words = [scene, *shell, "--picks", picks, *shell_words(metres_per_shell_unit, crs)]
+    align = f"shellgs align {shlex.join(map(str, words))}{paths.flags}"
+    console.print(f"{fit['words']}\nNext: {align}", highlight=False, soft_wrap=True)
