@@ -19,6 +19,9 @@ from shellgs_method.geometry.triangles import Triangles
 REACH = 0.5
 """Distance in metres from a surveyed point within which the surface must be for the point to count."""
 
+MOST = 1000
+"""Most surveyed points, of which all pairs are compared."""
+
 
 @dataclass(frozen=True)
 class Surveyed:
@@ -51,7 +54,7 @@ def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 
     Raises:
         FileNotFoundError: the file does not exist.
         SceneError: a line cannot be read, two points have the same name, there are none, or their system is unknown to
-            PROJ, or in degrees while the shell's is not known.
+            PROJ, or in degrees while the shell's is not known; or they are a scan.
     """
     table = Table.read(path, "surveyed points")
     convert, usual = table.to_shell(crs), {"name": 0, "X": 1, "Y": 2, "Z": 3}
@@ -68,6 +71,11 @@ def read_surveyed(path: Path, crs: str = "") -> dict[str, Float64[np.ndarray, " 
         points[name] = np.array([row[axis] for axis in "XYZ"], dtype=np.float64)
     if not points:
         raise SceneError(f"{path} holds no points")
+    if len(points) > MOST:
+        raise SceneError(
+            f"{path} holds {len(points)} points, and pairs of at most {MOST} are compared: cast a scan that was "
+            "held apart with `shellgs cast --truth`, and metrics are against it"
+        )
     return dict(zip(points, convert(np.stack([*points.values()])), strict=True))
 
 

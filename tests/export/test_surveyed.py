@@ -38,6 +38,13 @@ def test_points_before_and_behind_the_surface_are_measured_in_metres(run):
         at_surveyed(run, surface, {"c": points[2]})
 
 
+def test_a_scan_is_not_taken_for_surveyed_points(tmp_path):
+    path = tmp_path / "scan.xyz"
+    np.savetxt(path, np.random.default_rng(0).uniform(0, 9, (1001, 3)), "%.3f")
+    with pytest.raises(SceneError, match=r"holds 1001 points.*--truth"):
+        read_surveyed(path)
+
+
 @pytest.mark.parametrize(
     ("text", "points"),
     [
