@@ -20,11 +20,11 @@ _SAMPLES = 100_000
 # Distances from the shell, relative to its size:
 _ON = 0.05  # of picks, which are on it
 _AROUND = 20.0  # of cameras, which photograph it
-_NARROW = 0.005  # extent of either, below which they are in another unit
+_NARROW, _WIDE = 0.005, 0.05  # extent of either, below which they may be in another unit, in which it is this at least
 _SURELY = 0.5  # of these, once a slip is corrected
 # Sizes of the shell relative to what the cameras see, which is a part of a building, or more than that:
 _LARGEST = 20.0
-_FEW = 3  # points, fewer of which may be on one spot: a session of picking begins so, and they align nothing yet
+_FEW = 3  # points, fewer of which say nothing of their unit
 
 
 class ShellPlace:
@@ -55,7 +55,7 @@ class ShellPlace:
         self._surface = point_tree(points - self.middle)
 
     def check_picks(self, picks: Float64[np.ndarray, "N 3"], called: str) -> None:
-        """Refuse picks of which less than half are on the shell, or of which three or more are all on one spot of it.
+        """Refuse picks of which less than half are on the shell, or that are on one spot of it by their unit.
 
         Raises:
             SceneError: they are not, and why.
@@ -79,10 +79,14 @@ class ShellPlace:
                 f"longitude and latitude; write EPSG:4326 above them and give the system of {self.named} with --crs, "
                 f"or convert them to its coordinates, which are around {_numbers(self.middle)}"
             )
-        if self._reaches(points, reach):
+        near = self._near(points, reach)
+        if near and (len(points) < _FEW or self._extent(points) >= _NARROW):
             return
         apart = np.median(points, axis=0) - self.middle
-        slip = first_slip(points, lambda corrected: self._reaches(corrected, _SURELY * reach))
+        wide = _WIDE if near else _NARROW  # near and narrow: on one facade of a city, if no other unit explains it
+        slip = first_slip(points, lambda p: self._near(p, _SURELY * reach) and self._extent(p) >= wide)
+        if near and slip is None:
+            return
         if slip:
             why = f"they {slip.words}"
         elif np.linalg.norm(apart) > self.size:
@@ -96,9 +100,11 @@ class ShellPlace:
             f"{why}: correct the coordinates"
         )
 
-    def _reaches(self, points: np.ndarray, reach: float) -> bool:
-        spread = np.linalg.norm(np.ptp(points, axis=0)) >= _NARROW * self.size or len(points) < _FEW
-        return bool(spread and np.median(self._surface.query(points - self.middle)[0]) <= reach * self.size)
+    def _near(self, points: np.ndarray, reach: float) -> bool:
+        return bool(np.median(self._surface.query(points - self.middle)[0]) <= reach * self.size)
+
+    def _extent(self, points: np.ndarray) -> float:
+        return float(np.linalg.norm(np.ptp(points, axis=0))) / self.size
 
 
 def apart(shell: Float64[np.ndarray, "V 3"], seen: Float64[np.ndarray, "N 3"]) -> str | None:

@@ -282,11 +282,11 @@ def test_picks_up_one_edge_are_not_taken_for_degrees(tmp_path):
     ShellPlace(tmp_path / "box.ply").check_picks(edge, "the picks")
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_the_first_picks_of_a_session_may_be_side_by_side_on_a_long_street(tmp_path, count):
-    trimesh.creation.box(extents=[300, 10, 12]).export(tmp_path / "street.ply")
-    sill = np.array([[10.0, 5, 1], [11.2, 5, 1]])
-    ShellPlace(tmp_path / "street.ply").check_picks(sill[:count], "the picks")
+@pytest.mark.parametrize(("count", "length"), [(1, 300), (2, 300), (4, 2000)])
+def test_picks_may_be_side_by_side_on_a_long_street(tmp_path, count, length):
+    trimesh.creation.box(extents=[length, 10, 12]).export(tmp_path / "street.ply")
+    window = np.array([[10.0, 5, 1], [11.2, 5, 1], [10.0, 5, 2.5], [11.2, 5, 2.5]])
+    ShellPlace(tmp_path / "street.ply").check_picks(window[:count], "the picks")
 
 
 def test_a_cloud_of_points_has_a_place_too(place, picks, pristine_scene, tmp_path):
