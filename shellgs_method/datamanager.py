@@ -24,6 +24,7 @@ from torch import Tensor
 from dataparsers.cameras import pinhole_camera, pinhole_cameras, scene_to_world
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
 from shellgs_method.bounds import Length
+from shellgs_method.cues.maps import Fits
 from shellgs_method.errors import SceneError, notice, refusals_end_the_program
 from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.evaluation.holdout import Holdout, facade_holdout
@@ -304,13 +305,19 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         held_out.kinds = [kind for kind in held_out.cues if self._can_be_measured(kind)]
 
     def _tell_of_other_photographs(self) -> None:
-        """Tell if the photographs that the shell was compared with are not those of this run."""
-        checked, scene = self.train_dataset.sets.get("checked"), self.config.dataparser
+        """Tell if the photographs that maps were made from are not those of this run."""
+        checked, mono = map(self.train_dataset.sets.get, ("checked", "mono"))
+        scene = self.config.dataparser
         assert isinstance(scene, FacadeDataParserConfig)
         if checked and compared_others(checked, read_views(scene), held_out_names(scene)):
             notice(
                 f"photographs of {scene.data}, their cameras, or which are held out have changed since they were "
                 f"compared with the shell, which counts as before: run `{checked.command}`, to compare them again."
+            )
+        if mono and (replaced := Fits.open(mono).replaced(read_views(scene))):
+            notice(
+                f"photographs of {scene.data}, such as {replaced[0]}, have changed since their monocular maps were "
+                f"made: run `{mono.command}`, to make these again."
             )
 
     @property

@@ -172,6 +172,11 @@ class Fits:
         """Whether the fit of a view is of the photograph that it has now: another may have taken its name."""
         return (self.views.get(view.name) or {}).get("photograph") == content_hash(view.image)
 
+    def replaced(self, views: Sequence[View]) -> list[str]:
+        """Names of views whose photographs are others than those that their fits are of."""
+        known = [view for view in views if "photograph" in (self.views.get(view.name) or {})]
+        return [view.name for view in known if not self.is_of(view)]
+
     def has_no_map(self, view: View) -> bool:
         """Whether it is known that a view has no map, by the camera and the photograph that it has now."""
         fit = self.views.get(view.name, {})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,12 +16,13 @@ import pytest
 import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from training_runs import trainer_of
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.cli import main
 from shellgs_method.cues import DepthAnything, MoGe2, Precomputed
 from shellgs_method.cues.disparity import REACH, DisparityFit, aligned_depth, as_disparity, fit_disparity
-from shellgs_method.cues.maps import MonoSummary, make_maps
+from shellgs_method.cues.maps import Fits, MonoSummary, make_maps
 from shellgs_method.cues.normals import Convention, decoded, disagreement, facing, gradient_normals, to_opencv
 from shellgs_method.cues.source import Prediction, Predictor
 from shellgs_method.datamanager import FacadeDataset
@@ -612,6 +614,19 @@ def test_batches_hold_the_monocular_maps(scene: Path, tmp_path: Path, monkeypatc
     assert batch["mono_normal"].shape == (32, 48, 3)
 
 
+def test_a_training_tells_of_photographs_that_have_replaced_those_of_the_maps(
+    scene: Path, tmp_path: Path, monkeypatch, capsys, caplog
+):
+    write_cloud(scene, exact_points(scene))
+    write_maps(scene, tmp_path / "maps")
+    run(monkeypatch, capsys, scene, "from", tmp_path / "maps", "--values", "depth")
+    trainer_of(scene, tmp_path / "same", "mono_gs")
+    assert "monocular maps were made" not in caplog.text
+    shutil.copy(scene / "images/frame_00002.png", scene / "images/frame_00003.png")
+    trainer_of(scene, tmp_path / "other", "mono_gs")
+    assert f"photographs of {scene}, such as images/frame_00003.png, have changed since their mono" in caplog.text
+
+
 def test_wrong_axes_are_refused_with_the_view_and_the_right_ones(scene: Path, tmp_path: Path, monkeypatch, capsys):
     write_cloud(scene, exact_points(scene))
     write_maps(scene, tmp_path / "maps", "opengl")
@@ -737,6 +752,8 @@ def test_a_photograph_in_the_place_of_another_is_predicted_again(tmp_path: Path)
 
     assert shown(b"a wall", b"a wall", b"a street") == (2, 0, {"c"})
     assert shown(b"a wall", b"a wall", b"a street") == (0, 3, {"c"})
+    (tmp_path / "b").write_bytes(b"a street")
+    assert Fits.open(CueMaps.open(tmp_path, "mono")).replaced(views) == ["b"]
     assert shown(b"a wall", b"a street", b"a street") == (0, 2, {"b", "c"})
     assert shown(b"a wall", b"a street", b"its wall") == (1, 2, {"b"})
     assert CueMaps.open(tmp_path, "mono").names == ["a", "c"]
