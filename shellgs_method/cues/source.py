@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -53,23 +52,6 @@ class Predictor:
     def non_commercial(self) -> bool:
         """Whether the licence forbids commercial use, as CC-BY-NC-4.0 does."""
         return self.licence is not None and ("nc" in self.licence.split("-") or "non-commercial" in self.licence)
-
-
-class Source(Protocol):
-    """Settings of a predictor."""
-
-    @property
-    def command(self) -> str:
-        """Command-line arguments that select this source."""
-        ...
-
-    def load(self) -> Predictor:
-        """Load the predictor.
-
-        Raises:
-            SceneError: a package, the weights or the maps are missing.
-        """
-        ...
 
 
 def hash_of(files: Sequence[tuple[str, Path]], *words: str) -> str:
