@@ -115,6 +115,11 @@ def test_a_prj_that_is_not_the_shells_system_is_told_and_not_kept(tmp_path, capl
         ("urn:adv:crs:ETRS89_UTM33", "EPSG:25833"),
         ("urn:adv:crs:DE_DHDN_3GK3*DE_DHHN92_NH", "EPSG:31467"),
         ("http://www.opengis.net/gml/srs/epsg.xml#25832", UTM),
+        (
+            "http://www.opengis.net/def/crs-compound?1=http://www.opengis.net/def/crs/EPSG/0/25832&amp;"
+            "2=http://www.opengis.net/def/crs/EPSG/0/5783",
+            "EPSG:5555",
+        ),
         ("EPSG: 25832", UTM),
         ("EPSG25832", UTM),
         ("EPSG:25832+5783", "EPSG:5555"),

@@ -189,6 +189,24 @@ def test_each_version_of_citygml_is_cast_to_a_millimetre(tmp_path: Path, version
     assert_cast_as(save(tmp_path / "a.gml", text), faces)
 
 
+def test_what_a_web_service_answers_is_read(tmp_path: Path):
+    faces = moved(house())
+    text = made.citygml(made.surfaces_gml(faces, "2.0")).replace("core:cityObjectMember", "wfs:member")
+    text = text.replace("core:CityModel", "wfs:FeatureCollection").replace(
+        " ", ' xmlns:wfs="http://opengis.net/wfs/2.0" ', 1
+    )
+    assert_cast_as(save(tmp_path / "a.gml", text), faces)
+
+
+def test_coordinates_may_have_other_signs_between_and_in_their_numbers(tmp_path: Path):
+    faces = moved(house())
+    text = made.citygml(made.surfaces_gml(faces, "2.0", positions="coordinates"))
+    between = re.compile("<gml:coordinates>(.*?)</gml:coordinates>")
+    signs = '<gml:coordinates decimal="," cs=" " ts=";">{}</gml:coordinates>'
+    text = between.sub(lambda m: signs.format(m[1].translate(str.maketrans(" ,.", "; ,"))), text)
+    assert_cast_as(save(tmp_path / "a.gml", text), faces)
+
+
 def test_a_solid_that_links_to_the_surfaces_adds_nothing(tmp_path: Path):
     faces = moved(house())
     surfaces = [made.surfaces_gml([face], "2.0", name=f"p{k}") for k, face in enumerate(faces[:-1])]
@@ -273,7 +291,8 @@ BOMB = '<!DOCTYPE a [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>'
     [
         (lambda text: text[: len(text) // 2], "may be cut off or damaged"),
         (lambda text: BOMB + text, "it declares a document type"),
-        (lambda text: text.replace("CityModel", "FeatureCollection"), "is XML, but no CityGML"),
+        (lambda text: text.replace("CityModel", "Model"), "is XML, but no CityGML"),
+        (lambda text: '<a:FeatureCollection xmlns:a="b"><a:member/></a:FeatureCollection>', "is XML, but no CityGML"),
         (lambda text: text.replace("410000.0 ", "", 1), "no positions of 3 coordinates"),
         (lambda text: text.replace("bldg:Building", "veg:PlantCover"), "has no surface of a building"),
     ],

@@ -19,6 +19,7 @@ from shellgs_method.files.readers.contents import Geometry, numbers_in
 _OURS = re.compile(r"\{http://www\.opengis\.net/(citygml|gml)\b[^}]*\}")
 _HREF = "{http://www.w3.org/1999/xlink}href"
 _LEVEL = re.compile(r"lod([0-4])(?!TerrainIntersection|MultiCurve|Point)")
+_MEMBERS = ("cityObjectMember", "featureMember", "featureMembers", "member")
 _FACES = ("Polygon", "PolygonPatch", "Triangle", "Rectangle")
 _RINGS = {"exterior": 0, "outerBoundaryIs": 0, "interior": 1, "innerBoundaryIs": 1}
 _CURVED = ("Arc", "ArcString", "Circle", "CircleByCenterPoint", "ArcByCenterPoint", "CubicSpline", "BSpline", "Bezier")
@@ -34,7 +35,8 @@ def read_citygml(path: Path) -> Geometry:
         Exception: it is damaged; of any kind.
     """
     root = _parsed(path)
-    if _name(root) != "CityModel":
+    of_service = root.tag.endswith("}FeatureCollection") and any("/citygml/" in each.tag for each in root.iter())  # WFS
+    if _name(root) != "CityModel" and not of_service:
         raise SceneError(f"the shell {path} is XML, but no CityGML: export it as CityGML, CityJSON, IFC or a mesh")
     model = _Model(root)
     return outside(list(model.objects()), path, model.missing)
@@ -71,7 +73,7 @@ class _Model:
     def objects(self) -> Iterator[CityObject]:
         """The objects of the model, with their parts."""
         for member in self.root:
-            if _name(member) in ("cityObjectMember", "featureMember", "featureMembers"):
+            if _name(member).rpartition("}")[2] in _MEMBERS:
                 for feature in member:
                     made = self._object(feature)
                     yield from made.parts if _name(feature) == "ReliefFeature" else [made]
@@ -186,7 +188,9 @@ class _Model:
             if name in ("posList", "pos"):
                 found.append(numbers_in(text))
             elif name == "coordinates":
-                found.append(numbers_in(text.replace(",", " ")))
+                for sign, usual, read in (("cs", ",", " "), ("ts", " ", " "), ("decimal", ".", ".")):
+                    text = text.replace(each.get(sign) or usual, read)
+                found.append(numbers_in(text))
             elif name == "pointProperty" and (point := self.linked(each)) is not None:
                 found.append(self._points(point).ravel())
         numbers = np.concatenate(found) if found else np.empty(0)
