@@ -20,7 +20,7 @@ from shellgs_method.bounds import FromOne, Length, check_bounds
 from shellgs_method.commands.align import align
 from shellgs_method.commands.capture import capture
 from shellgs_method.commands.cast import cast
-from shellgs_method.commands.common import console, open_page
+from shellgs_method.commands.common import console, open_page, shell_words
 from shellgs_method.commands.mesh import mesh
 from shellgs_method.commands.sim import check_packages
 from shellgs_method.commands.sim import sim as simulate
@@ -329,7 +329,8 @@ def _align(recipe: Recipe, scene: Path, shell: tuple[Path, ...], steps: _Steps, 
     accepted = not steps.changed("accepted", *inputs)
     written = scene / (PROPOSAL if proposed and not accepted else ALIGNMENT)
     refinement = "" if recipe.refine or proposed else "add --refine 0.3, or "
-    pick = f"shellgs pick {named} {shlex.join(map(str, shell))}"
+    words = *map(str, shell), *shell_words(recipe.metres_per_shell_unit, recipe.crs)
+    pick = f"shellgs pick {named} {shlex.join(words)}"
     remedy = f"{refinement}pick {'more ' if recipe.picks else ''}points ({pick}) and have --picks picks.txt"
     try:
         if steps.changed("align", *inputs) or not _is_there(written, scene):

@@ -83,8 +83,9 @@ def test_a_proposal_stops_the_run_until_it_is_accepted(inputs, shellgs, monkeypa
     monkeypatch.setattr(run_command, "align", align)
     earlier = scene_alignment(inputs)
     earlier.save(Path("scene") / ALIGNMENT)  # of another shell, perhaps: it must not pass for the proposal
-    told = shellgs("run", photographs, shell, "--accept")
+    told = shellgs("run", photographs, shell, "--accept", "--crs", "EPSG:25832")
     assert "is a proposal: if the images in scene/shell/report/index.html agree" in told  # it was not seen yet
+    assert "shell.ply --crs EPSG:25832) and have --picks picks.txt" in told
     assert Alignment.load(Path("scene") / ALIGNMENT) == earlier
     assert "is a proposal" in shellgs("run")
     assert calls == [False]  # not proposed again
