@@ -37,6 +37,8 @@ _WIDTHS = re.compile(rb"GPano:(?:FullPano|CroppedAreaImage)WidthPixels\s*(?:=\s*
 # rendered panoramas, 3.6 and more in 61 photographs that were cropped to the same shape, 11 in the median.
 _CLOSED = 3.0
 _NOISE = 1.0  # of colours
+_PLAIN = 4.0  # deviation of the colours of a column that shows nothing, as of a black border: sky and ground are apart
+_DARK, _SMALL = 24, 64  # levels of what lies around the circle of a fisheye lens; pixels of its image's side
 _COMPARED = 9  # photographs
 
 
@@ -128,6 +130,9 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
         folder: photographs.
         names: their names.
         said: those whose metadata say so.
+
+    Raises:
+        SceneError: some are two circles side by side, which a 360° camera records before it stitches them.
     """
     sizes = {name: _size(folder / name) for name in names if name not in said}
     twice = sorted((name for name, (width, height) in sizes.items() if width == 2 * height), key=sizes.__getitem__)
@@ -135,7 +140,13 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
     for size, group in groupby(twice, key=sizes.__getitem__):
         alike = list(group)
         what = f"{len(alike)} photographs of {size[0]}x{size[1]} pixels, {alike[0]} for example,"
-        if np.median([_seam(folder / name) for name in alike[:: -(-len(alike) // _COMPARED)]]) < _CLOSED:
+        some = [folder / name for name in alike[:: -(-len(alike) // _COMPARED)]]
+        if np.mean([_are_circles(photograph) for photograph in some]) > 0.5:
+            raise SceneError(
+                f"{what} are two circles side by side, which a 360° camera records before it stitches them: export "
+                "them as equirectangular with the camera's program"
+            )
+        if np.median([_seam(photograph) for photograph in some]) < _CLOSED:
             found.update(alike)
             notice(
                 f"{what} go on at the left where they end at the right: they are taken for panoramas of 360°. If they "
@@ -154,11 +165,26 @@ def _size(photograph: Path) -> tuple[int, int]:
         return image.size
 
 
+def _are_circles(photograph: Path) -> bool:
+    """Whether an image is two circles on black, side by side: those of two fisheye lenses, back to back."""
+    with Image.open(photograph) as image:
+        small = np.asarray(image.convert("L").resize((2 * _SMALL, _SMALL), Image.Resampling.BOX), np.float32)
+    y, x = np.mgrid[-1 : 1 : _SMALL * 1j, -1 : 1 : _SMALL * 1j]
+    radius = np.hypot(x, y)
+    around, within = radius > 1.15, (np.abs(x) < 0.4) & (radius > 0.6) & (radius < 0.9)  # above and below the middle
+    halves = small[:, :_SMALL], small[:, _SMALL:]
+    return all(np.quantile(half[around], 0.95) < _DARK and half[within].mean() > 2 * _DARK for half in halves)
+
+
 def _seam(photograph: Path) -> float:
-    """How much the first column of an image differs from the last, in differences of neighbouring columns."""
+    """How much the first column of an image differs from the last, in differences of neighbouring columns; infinitely
+    where one of them shows nothing.
+    """
     with Image.open(photograph) as image:
         pixels = np.asarray(image.convert("RGB"), np.float32)
     first, second, before, last = pixels[:, 0], pixels[:, 1], pixels[:, -2], pixels[:, -1]
+    if min(column.std(axis=0).max() for column in (first, last)) < _PLAIN:
+        return np.inf
     inside = (np.abs(first - second).mean() + np.abs(last - before).mean()) / 2
     return float(np.abs(first - last).mean() / (inside + _NOISE))
 

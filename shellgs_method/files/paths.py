@@ -24,7 +24,7 @@ RAW = frozenset(
     f".{kind}"
     for kind in (
         *("3fr", "arw", "cr2", "cr3", "crw", "dcr", "dng", "erf", "fff", "gpr", "iiq", "kdc", "mef", "mos", "mrw"),
-        *("nef", "nrw", "orf", "pef", "raf", "raw", "rw2", "rwl", "sr2", "srf", "srw", "x3f"),
+        *("insp", "nef", "nrw", "orf", "pef", "raf", "raw", "rw2", "rwl", "sr2", "srf", "srw", "x3f"),
     )
 )
 """Suffixes of what sensors recorded, in lower case: Pillow reads a thumbnail of some, and nothing of others."""

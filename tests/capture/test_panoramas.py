@@ -142,6 +142,30 @@ def test_what_says_nothing_is_a_panorama_if_it_goes_around_and_this_is_told(tmp_
     assert "3 photographs of 128x64 pixels, wide0.jpg for example, are twice as wide as high, but do not go" in wide
 
 
+def circles(size: int, seed: int) -> Image.Image:
+    """What a 360° camera records: the circle of each of its two lenses, on black."""
+    pixels = np.random.default_rng(seed).normal(0, 1.5, (size, 2 * size, 3))
+    pixels += np.asarray(panorama(2 * size, seed=seed))
+    y, x = np.mgrid[-1 : 1 : size * 1j, -1 : 1 : size * 1j]
+    pixels[np.tile(np.hypot(x, y) > 0.97, (1, 2))] /= 40
+    return Image.fromarray(pixels.round().clip(0, 255).astype(np.uint8))
+
+
+def test_two_circles_side_by_side_are_refused(tmp_path):
+    for k in range(3):
+        circles(128, seed=k).save(tmp_path / f"{k}.jpg", quality=85)
+    with pytest.raises(SceneError, match=r"3 photographs of 256x128 pixels, 0.jpg .*two circles side by side.*export"):
+        find_panoramas(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], [])
+
+
+def test_a_picture_between_black_borders_does_not_go_around(tmp_path, caplog):
+    bordered = Image.new("RGB", (256, 128))
+    bordered.paste(photograph(200, 128), (28, 0))
+    bordered.save(tmp_path / "a.jpg")
+    assert find_panoramas(tmp_path, ["a.jpg"], []) == []
+    assert "do not go around" in caplog.text
+
+
 # Which videos are
 
 
