@@ -1019,16 +1019,19 @@ def test_a_scan_of_an_e57_without_a_pose_tells_no_scanner(tmp_path: Path):
     assert len(read.vertices) == 600
 
 
-def test_spherical_coordinates_of_an_e57_become_cartesian_without_misses(tmp_path: Path):
+def save_e57_columns(path: Path, columns: dict[str, np.ndarray], pose: dict[str, dict[str, float]]) -> Path:
+    """Write a scan of an E57 by libe57 itself: any fields, and a pose with its numbers in any order."""
     libe57 = pytest.importorskip("pye57").libe57
-    ranges = np.linalg.norm(POINTS, axis=1).astype(np.float64)
-    elevations = np.arcsin(POINTS[:, 2] / ranges)
-    columns = {"Range": ranges, "Azimuth": np.arctan2(POINTS[:, 1], POINTS[:, 0]), "Elevation": elevations}
-    columns = {f"spherical{name}": np.append(column, np.zeros(20)) for name, column in columns.items()}
-    file = libe57.ImageFile(str(tmp_path / "a.e57"), "w")
+    file = libe57.ImageFile(str(path), "w")
     scan, fields, scans = libe57.StructureNode(file), libe57.StructureNode(file), libe57.VectorNode(file, True)
     file.root().set("data3D", scans)
     scans.append(scan)
+    if pose:
+        scan.set("pose", placed := libe57.StructureNode(file))
+        for part, numbers in pose.items():
+            placed.set(part, node := libe57.StructureNode(file))
+            for axis, value in numbers.items():
+                node.set(axis, libe57.FloatNode(file, value))
     buffers = libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
         fields.set(name, libe57.FloatNode(file, 0.0, libe57.E57_DOUBLE, -1e7, 1e7))
@@ -1036,10 +1039,29 @@ def test_spherical_coordinates_of_an_e57_become_cartesian_without_misses(tmp_pat
     points = libe57.CompressedVectorNode(file, fields, libe57.VectorNode(file, True))
     scan.set("points", points)
     writer = points.writer(buffers)
-    writer.write(len(ranges) + 20)
+    writer.write(len(next(iter(columns.values()))))
     writer.close()
     file.close()
-    np.testing.assert_allclose(read_geometry(tmp_path / "a.e57").vertices, POINTS, atol=1e-5)
+    return path
+
+
+def test_spherical_coordinates_of_an_e57_become_cartesian_without_misses(tmp_path: Path):
+    ranges = np.linalg.norm(POINTS, axis=1).astype(np.float64)
+    elevations = np.arcsin(POINTS[:, 2] / ranges)
+    columns = {"Range": ranges, "Azimuth": np.arctan2(POINTS[:, 1], POINTS[:, 0]), "Elevation": elevations}
+    columns = {f"spherical{name}": np.append(column, np.zeros(20)) for name, column in columns.items()}
+    path = save_e57_columns(tmp_path / "a.e57", columns, {})
+    np.testing.assert_allclose(read_geometry(path).vertices, POINTS, atol=1e-5)
+
+
+@pytest.mark.parametrize(("quaternion", "axes"), [("wxyz", "xyz"), ("xyzw", "zyx"), ("", "yxz"), ("zyxw", "")])
+def test_the_pose_of_an_e57_is_read_by_its_names(tmp_path: Path, quaternion: str, axes: str):
+    turn, shift = dict(zip("xyzw", TURNED.as_quat().tolist(), strict=True)), dict(zip("xyz", NATIONAL, strict=True))
+    parts = {"rotation": {name: turn[name] for name in quaternion}, "translation": {axis: shift[axis] for axis in axes}}
+    columns = {f"cartesian{axis}": POINTS[:, k].astype(np.float64) for k, axis in enumerate("XYZ")}
+    path = save_e57_columns(tmp_path / "a.e57", columns, {name: part for name, part in parts.items() if part})
+    expected = (TURNED.apply(POINTS) if quaternion else POINTS) + (NATIONAL if axes else 0)
+    np.testing.assert_allclose(read_geometry(path).vertices, expected, atol=1e-5)
 
 
 def test_a_las_that_counts_its_points_as_before_1_4_alone_is_refused_as_such(tmp_path: Path):

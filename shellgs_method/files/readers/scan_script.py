@@ -94,11 +94,22 @@ def read_e57(path: str, coloured: bool, left_out: Counter[str]) -> Iterator[Piec
 
 
 def _pose(header) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation matrix and translation of a scan; the identity where they are not set."""
-    if not header.has_pose():
-        return np.eye(3), np.zeros(3)
-    turned = np.any(header.rotation)
-    return header.rotation_matrix if turned else np.eye(3), np.asarray(header.translation, np.float64)
+    """Rotation matrix and translation of a scan; the identity where they are not set.
+
+    Read by their names: pye57 takes the numbers of both in the order in which the file has them, which is any.
+    """
+    from pyquaternion import Quaternion
+
+    rotation, translation = _named(header, "rotation", "wxyz"), _named(header, "translation", "xyz")
+    return Quaternion(rotation).rotation_matrix if rotation.any() else np.eye(3), translation
+
+
+def _named(header, part: str, axes: str) -> np.ndarray:
+    """The numbers of a part of a scan's pose; 0 where it has none."""
+    if not header.has_pose() or not header.node["pose"].isDefined(part):
+        return np.zeros(len(axes))
+    numbers = header.node["pose"][part]
+    return np.array([numbers[axis].value() for axis in axes], np.float64)
 
 
 def _colour_scale(header) -> float:
