@@ -34,6 +34,7 @@ _SMALL = 128  # pixels, the width at which motion is measured
 _PACE = 0.2  # seconds between the frames that motion is measured between: pixels, not fractions of one
 _UNTAGGED = 2  # a colour space that is not said (H.273)
 _SQUARE = 0.01  # by which a pixel's sides may differ: programs round them
+_PAUSE = 10.0  # seconds between two frames that are no step, but a break, as where files were joined
 _BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
 
@@ -50,11 +51,15 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         transfer, aspect = _hdr(video, stream), _pixel_aspect(stream)
         is_around = round(stream.width * aspect) == 2 * stream.height
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
-        sharpnesses, times, marks, shifts, before = [], [], [], [], None
+        usual = 1 / float(stream.average_rate or 30)
+        sharpnesses, times, marks, shifts, before, last = [], [], [], [], None, None
         for frame in _frames(container, stream):
             half = frame.reformat(frame.width // 2, frame.height // 2, format="gray")
             sharpnesses.append(sharpness(half.to_ndarray()))
-            times.append(frame.time if frame.time is not None else len(times) / float(stream.average_rate or 30))
+            step = usual if frame.time is None or last is None else frame.time - last
+            # Times begin anew where files were joined, and jump after a break.
+            times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
+            last = frame.time
             if not marks or times[-1] >= marks[-1] + _PACE:
                 height = max(1, round(_SMALL * frame.height / frame.width))
                 small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
@@ -64,8 +69,8 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
             progress.update(task, completed=len(times))
         if not times:
             raise SceneError(f"{video} holds no frames: is it a complete video?")
-    since = np.array(times) - min(times)
-    moved = np.interp(times, marks, travelled(np.array(shifts)))
+    since = np.array(times)
+    moved = np.interp(since, marks, travelled(np.array(shifts)))
     if is_around:  # the picture of a panorama moves to all sides at once
         moved = PANORAMAS_PER_SECOND * STEP * since
     chosen = sharpest(np.array(sharpnesses), *stretches(moved, since, count))

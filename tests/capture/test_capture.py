@@ -119,6 +119,29 @@ def test_a_damaged_packet_of_a_video_is_left_out_and_this_is_told(tmp_path, capl
     assert "walk.mp4 is damaged, and is left out" in caplog.text
 
 
+def test_times_that_begin_anew_or_jump_in_a_video_change_nothing(tmp_path):
+    wide = photograph(640, 96)
+    frames = [wide.crop((8 * k, 0, 8 * k + 160, 96)) for k in range(60)]
+    write_video(tmp_path / "whole.ts", frames)
+    for name, part in (("1.ts", frames[:30]), ("2.ts", frames[30:])):
+        write_video(tmp_path / name, part)
+    (tmp_path / "joined.ts").write_bytes(b"".join((tmp_path / name).read_bytes() for name in ("1.ts", "2.ts")))
+    with av.open(str(tmp_path / "broken.mkv"), "w") as container:  # recorded on an hour later
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 160, 96, "yuv420p", 8_000_000
+        for k, frame in enumerate(map(av.VideoFrame.from_image, frames)):
+            frame.pts, frame.time_base = 100 * k + 3_600_000 * (k >= 30), Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    taken = []
+    for video in ("whole.ts", "joined.ts", "broken.mkv"):
+        (tmp_path / video[:-3]).mkdir()
+        extract_frames(tmp_path / video, tmp_path / video[:-3], 200, QUIET)
+        taken.append(len(numbers(tmp_path / video[:-3])))
+    assert taken[0] > 15
+    np.testing.assert_allclose(taken, taken[0], atol=1)
+
+
 def test_a_video_gives_between_one_and_five_frames_a_second():
     since = np.arange(60) / 30
     assert stretches(np.linspace(0, 9, 60), since, 200)[1] == 10
