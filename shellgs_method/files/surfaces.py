@@ -18,7 +18,7 @@ from shellgs_method.files.readers.gltf import read_gltf
 from shellgs_method.files.readers.ifc import read_ifc
 from shellgs_method.files.readers.meshes import read_obj, read_off, read_stl
 from shellgs_method.files.readers.pcd import read_pcd
-from shellgs_method.files.readers.ply import ply_points, read_ply
+from shellgs_method.files.readers.ply import holds_splats, ply_points, read_ply
 from shellgs_method.files.readers.points import NO_POINTS, Points
 from shellgs_method.files.readers.scans import read_e57, read_las
 from shellgs_method.files.readers.text_clouds import read_ptx, read_text_cloud
@@ -98,6 +98,8 @@ def read_surface(path: Path) -> Geometry | Cloud:
             f"the shell {path} is neither a mesh, a building's model nor a point cloud that can be read: {advice}"
         )
     try:
+        if suffix == ".ply" and holds_splats(path):
+            raise splats(path)
         if suffix == ".ply" and ply_points(path) is not None:
             return Cloud(path, ply_points, partial(ply_points, coloured=True))
         geometry = read(path)

@@ -14,12 +14,10 @@ from jaxtyping import Float64, UInt8
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import read_json
 from shellgs_method.files.frames import FISHEYE, Frame, Recording, frame, in_order, number
-from shellgs_method.files.headers import read_ply_header
 from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
 from shellgs_method.files.readers.ply import ply_points, read_ply
 from shellgs_method.files.readers.points import NO_POINTS, Points
-from shellgs_method.files.splats import read_splats
 from shellgs_method.geometry.camera import OPENGL
 from shellgs_method.geometry.lens import COEFFICIENTS
 
@@ -100,10 +98,6 @@ def read_cloud(scene: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarra
 
 def _points_of(path: Path) -> tuple[Float64[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:
     """Positions of the vertices of a PLY, which may be a mesh's or splats, and their colours if it has any."""
-    columns = {prop.name for element in read_ply_header(path).elements for prop in element.properties}
-    if {"f_dc_0", "opacity", "scale_0"} <= columns:
-        gaussians = read_splats(path)
-        return gaussians.means.double().numpy(), (255 * gaussians.colours).round().numpy().astype(np.uint8)
     pieces = ply_points(path, coloured=True)
     if pieces is None:
         mesh = read_ply(path)

@@ -198,6 +198,39 @@ def test_splats_are_points_of_their_mean_colours(scene):
     np.testing.assert_array_equal(points.colours, [[128, 199, 56], [255, 0, 135]])
 
 
+SHAPE = [f"scale_{k}" for k in range(3)] + [f"rot_{k}" for k in range(4)] + ["opacity"]
+MEANS = [f"f_dc_{k}" for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("names", "order", "more"),
+    [
+        (["red", "green", "blue", *SHAPE], "<", ""),  # ns-export --ply-color-mode rgb
+        ([*MEANS, *SHAPE, "red", "green", "blue"], "<", ""),
+        ([*MEANS, *[name for name in SHAPE if name != "scale_2"]], "<", ""),  # discs
+        ([*MEANS, *SHAPE], "<", "element intrinsic 0\nproperty float intrinsic\n"),
+        ([*MEANS, *SHAPE], None, ""),
+    ],
+)
+def test_splats_of_other_programs_are_points_too(scene, names, order, more):
+    kinds = {name: ("u1", "uchar") if name in ("red", "green", "blue") else ("<f4", "float") for name in names}
+    rows = np.zeros(2, [*((axis, "<f4") for axis in "xyz"), *((name, kinds[name][0]) for name in names)])
+    for name, value in (("x", [1, 0]), ("y", [0, 1]), ("f_dc_1", [1, -9]), ("green", [199, 0])):
+        if name in ("x", "y", *names):
+            rows[name] = value
+    for name in {"red", "blue"} & {*names}:
+        rows[name] = 128
+    header = ["ply", "format ascii 1.0" if order is None else "format binary_little_endian 1.0", "element vertex 2"]
+    header += [*(f"property float {axis}" for axis in "xyz"), *(f"property {kinds[name][1]} {name}" for name in names)]
+    text = "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode()
+    content = text if order is None else rows.tobytes()
+    (scene / "sparse_pc.ply").write_bytes(("\n".join([*header, f"{more}end_header\n"])).encode() + content)
+    points = find_sparse_points(FacadeDataParserConfig(data=scene))
+    np.testing.assert_array_equal(points.positions, [[1, 0, 0], [0, 1, 0]])
+    assert points.colours is not None
+    np.testing.assert_array_equal(points.colours, [[128, 199, 128], [128, 0, 128]])
+
+
 def test_scene_cameras_undo_nerfstudios_rescaling(pristine_scene):
     frames = {f["file_path"]: f for f in json.loads((pristine_scene / "transforms.json").read_text())["frames"]}
     for view in read_views(FacadeDataParserConfig(data=pristine_scene)):

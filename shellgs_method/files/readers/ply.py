@@ -17,31 +17,39 @@ from shellgs_method.files.readers.contents import (
     left_out,
     numbers_in,
     polygon_triangles,
-    splats,
     strip_triangles,
 )
 from shellgs_method.files.readers.points import PIECE, Colours, Points
+from shellgs_method.files.splats import DEGREE_0
 
 _KNOWN = ("vertex", "face", "tristrips", "edge", "range_grid", "material", "camera")
 _SPLAT = ({"opacity", "scale_0", "rot_0"}, {"packed_position", "packed_rotation"})
 _NORMAL = ("nx", "ny", "nz")
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """What programs call colours."""
+_HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
 _STRIP_END = -1
 _TEXT = 1 << 25  # bytes of text read at once
 
 
-def read_ply(path: Path) -> Geometry:
-    """Read the vertices, and the triangles of its faces and strips.
+def holds_splats(path: Path) -> bool:
+    """Whether a PLY holds Gaussian splats.
 
     Raises:
-        SceneError: it holds Gaussian splats, or edges without faces.
+        Exception: it is damaged; of any kind.
+    """
+    names = {prop.name for element in read_ply_header(path).elements for prop in element.properties}
+    return any(splat <= names for splat in _SPLAT)
+
+
+def read_ply(path: Path) -> Geometry:
+    """Read the vertices, and the triangles of its faces and strips; of splats their centres and mean colours.
+
+    Raises:
+        SceneError: it holds edges without faces.
         Exception: it is damaged; of any kind.
     """
     header = read_ply_header(path)
-    names = {prop.name for element in header.elements for prop in element.properties}
-    if any(splat <= names for splat in _SPLAT):
-        raise splats(path)
     read = {element.name: columns for element, columns in _elements(path, header) if element.count}
     if "edge" in read and not read.keys() & {"face", "tristrips"}:
         raise drawing(path)
@@ -64,6 +72,9 @@ def read_ply(path: Path) -> Geometry:
             left_out(path, element.count, element.count, f"of the element {element.name!r}, which is not known")
     bands = [columns[name] for name in _colours_among(columns)]
     colours = Colours(_types_of_colours(header)).of(np.stack(bands, axis=1)) if bands else None
+    if {*_HARMONICS} <= columns.keys():
+        mean = 0.5 + DEGREE_0 * np.stack([columns[name] for name in _HARMONICS], axis=1)
+        colours = (255 * np.nan_to_num(mean)).round().clip(0, 255).astype(np.uint8)
     return Geometry(vertices, np.concatenate(faces), colours=colours)
 
 
