@@ -44,6 +44,7 @@ _SYSTEM = re.compile(
     re.IGNORECASE,
 )
 """What a header holds that is meant to name a system."""
+_QUOTED = re.compile(r"""^(["'])(.*)\1$""")
 _DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*\d,\d+,?")
 
 
@@ -290,7 +291,7 @@ def cells_of(words: Sequence[str]) -> list[str]:
     if _has_decimal_commas(line):
         return []
     separator = next((sign for sign in ";," if sign in line), None)
-    cells = [cell.strip() for cell in line.split(separator)] if separator else [*words]
+    cells = [_QUOTED.sub(r"\2", cell.strip()) for cell in line.split(separator)] if separator else [*words]
     return cells if any(cells[-1:]) else cells[:-1]
 
 
@@ -335,6 +336,6 @@ def _is_header(words: Sequence[str]) -> bool:
     Definitions (+zone=32, WKT) may hold some, and names of systems what begins with a digit (UTM 32N).
     """
     names = [word for word in words if "=" not in word and "[" not in word]
-    pieces = [piece for word in names for piece in re.split("[,;]", word)]
+    pieces = [_QUOTED.sub(r"\2", piece) for word in names for piece in re.split("[,;]", word)]
     begins = not _SYSTEM.search(" ".join(words)) and any(re.match(r"[+-]?\.?\d", piece) for piece in pieces)
     return not begins and not any(are_numbers([piece]) for piece in pieces)

@@ -1493,6 +1493,10 @@ def test_picks_in_another_zone_are_converted_and_those_in_the_shells_own_are_kep
         ("x y z X Y image", "410000.5 5413000.25 251 30 40 images/1.png"),
         ("E N H x y image", "410000.5 5413000.25 251 30 40 images/1.png"),
         ("image image_x image_y x y z", "images/1.png 30 40 410000.5 5413000.25 251"),
+        ('"X","Y","Z","photo","u","v"', '"410000.5","5413000.25","251","images/1.png","30","40"'),
+        ('"";"X";"Y";"Z";"photo";"u";"v"', '"1";"410000.5";"5413000.25";"251";"images/1.png";30;40'),  # of R
+        ("'X'\t'Y'\t'Z'\t'photo'\t'u'\t'v'", "'410000.5'\t5413000.25\t251\t'images/1.png'\t'30'\t'40'"),
+        ("", '"410000.5","5413000.25","251","30","40","images/1.png"'),
         ("# name X Y Z image u v", "a 410000.5 5413000.25 251 images/1.png 30 40"),
         ("EPSG:25832\nimage u v Y X Z", "images/1.png 30 40 5413000.25 410000.5 251"),
         ("# X Y Z of the shell   x y in the photograph   image   name", "410000.5 5413000.25 251 30 40 images/1.png a"),
