@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -278,7 +279,7 @@ class Alignment:
         metres_per_shell_unit: float = 1.0,
         global_shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> Alignment:
-        """Read a row-major 4x4 matrix from a file: text as CloudCompare saves it, json or npy.
+        """Read a row-major 4x4 matrix from a file: text as CloudCompare, NumPy and others print it, json or npy.
 
         Args:
             path: the file.
@@ -317,6 +318,10 @@ def _strings(value: str | Sequence[object]) -> tuple[str, ...]:
     return (value,) if isinstance(value, str) else tuple(map(str, value))
 
 
+_AROUND_NUMBERS = re.compile(r"\[\d+:\d+:\d+\]|#.*|[\[\](),;]")
+"""What programs write beside the numbers of a matrix: the times of CloudCompare's console, comments, brackets."""
+
+
 def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
     try:
         if path.suffix == ".npy":
@@ -324,15 +329,14 @@ def _read_matrix(path: Path) -> Float64[np.ndarray, "4 4"]:
         elif path.suffix == ".json":
             matrix = json.loads(path.read_bytes())
         else:
-            matrix = [line.replace(",", " ").split() for line in path.read_text().splitlines() if line.strip()]
-            if len({len(line) for line in matrix}) > 1:
-                raise ValueError("its lines differ in their number of words")
+            matrix = _AROUND_NUMBERS.sub(" ", path.read_text("utf-8-sig")).split()
         matrix = np.array(matrix, dtype=np.float64)
     except Exception as error:  # each format's reader raises errors of its own for a damaged file
         raise SceneError(f"this is not a 4x4 matrix ({' '.join(str(error).split())})") from error
-    if matrix.shape != (4, 4):
-        raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers")
-    return matrix
+    if matrix.shape not in ((4, 4), (16,)):
+        decimal = ": are its commas decimal?" if matrix.shape == (32,) else ""
+        raise SceneError(f"this is not a 4x4 matrix but {' x '.join(map(str, matrix.shape))} numbers{decimal}")
+    return matrix.reshape(4, 4)
 
 
 def _direction(vector: np.ndarray) -> Float64[np.ndarray, " 3"]:

@@ -217,7 +217,7 @@ def test_a_folder_in_place_of_a_shell_is_refused(tmp_path: Path):
 
 def test_picks_in_place_of_a_matrix_are_refused_in_plain_words(tmp_path: Path):
     (tmp_path / "picks.txt").write_text("# X Y Z x y image name\n1 2 3 4 5 a.jpg top\n")
-    with pytest.raises(SceneError, match=r"picks\.txt: this is not a 4x4 matrix \(its lines differ"):
+    with pytest.raises(SceneError, match=r"picks\.txt: this is not a 4x4 matrix \(could not convert"):
         Alignment.from_matrix_file(tmp_path / "picks.txt", ("shell.ply",))
 
 
@@ -352,6 +352,33 @@ def test_a_matrix_is_read_from_each_format(tmp_path: Path, suffix: str):
         "npy": lambda: np.save(path, matrix),
     }[suffix]()
     np.testing.assert_array_equal(Alignment.from_matrix_file(path, ("shell.ply",)).shell_to_scene, matrix)
+
+
+def rows(matrix: np.ndarray, separator: str = " ") -> list[str]:
+    return [separator.join(map(repr, row)) for row in matrix.tolist()]
+
+
+@pytest.mark.parametrize(
+    "printed",
+    [
+        lambda m: "\n".join(f"[12:30:05] {row}" for row in rows(m)),  # CloudCompare's console
+        lambda m: "\ufeff# scan to scene\n" + "\n".join(rows(m, "\t")),
+        lambda m: np.array2string(m, precision=17, separator=", "),
+        lambda m: "[" + "; ".join(rows(m)) + "]",
+        lambda m: " ".join(rows(m)),
+    ],
+)
+def test_a_matrix_is_read_as_programs_print_it(tmp_path: Path, printed: Callable[[np.ndarray], str]):
+    matrix = similarity(0.3, TURN, GEOREFERENCE)
+    (tmp_path / "matrix.txt").write_text(printed(matrix), encoding="utf-8")
+    read = Alignment.from_matrix_file(tmp_path / "matrix.txt", ("shell.ply",))
+    np.testing.assert_allclose(read.shell_to_scene, matrix, rtol=1e-15)
+
+
+def test_a_matrix_of_decimal_commas_is_refused_as_such(tmp_path: Path):
+    (tmp_path / "matrix.txt").write_text("\n".join(rows(similarity(0.3, TURN, GEOREFERENCE))).replace(".", ","))
+    with pytest.raises(SceneError, match=r"matrix\.txt: this is not a 4x4 matrix but 32 numbers: are its commas decimal"):
+        Alignment.from_matrix_file(tmp_path / "matrix.txt", ("shell.ply",))
 
 
 def test_a_global_shift_is_applied_before_the_matrix(tmp_path: Path):
