@@ -46,8 +46,8 @@ class EmptySpaceLoss:
         tolerance: float = 0.0,
     ):
         mask = trust > 0
-        slope = (unit(target_normal) * rays).sum(dim=-1, keepdim=True).abs()
-        self._slope = (metres_per_unit * slope).where(mask, 0.0)
+        slope = metres_per_unit * (unit(target_normal) * rays).sum(dim=-1, keepdim=True)
+        self._slope = slope.where(mask, 0.0)  # squared in the loss: its sign is of no account
         self._weights = trust * mean_weights(mask, like=target_depth)
         self._tolerance = target_depth.new_tensor([tolerance])
 

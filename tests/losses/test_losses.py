@@ -25,6 +25,8 @@ from shellgs_method.losses import (
     normal_consistency_loss,
     vid2sim_ncc_loss,
 )
+from shellgs_method.losses.normal import unit
+from shellgs_method.losses.reduction import weighted_mean
 from shellgs_method.losses.ssim import SsimTarget, ssim
 
 HEIGHT, WIDTH = 14, 17
@@ -170,6 +172,15 @@ def test_normal_loss_of_a_known_angle_is_signed(degrees, expected):
     assert loss.item() == pytest.approx(expected, abs=1e-6)
 
 
+def test_normals_shorter_than_a_thousandth_stay_shorter_than_one():
+    short, long = torch.tensor([0.0, 6e-5, -8e-5]), torch.tensor([0.0, 6e-3, -8e-3])
+    torch.testing.assert_close(unit(short), 1000 * short)
+    torch.testing.assert_close(unit(long), 100 * long)
+    # As they are where they are composited, against a unit target: a cosine of 0.1.
+    target = torch.tensor([[[0.0, 0.6, -0.8]]])
+    assert NormalLoss(target, torch.ones(1, 1, 1, dtype=torch.bool))(short[None, None]).item() == pytest.approx(0.9)
+
+
 def test_normal_loss_of_a_missing_normal_has_a_finite_gradient():
     normal = torch.zeros(2, 3, 3, requires_grad=True)
     target = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3, 3)
@@ -229,6 +240,13 @@ def test_smoothness_is_free_at_the_strongest_depth_edge():
     flat = SmoothnessLoss(depth, mask)(normal)
     depth[:, WIDTH // 2 :] = 5.01
     assert SmoothnessLoss(depth, mask)(normal).item() < 0.01 * flat.item()
+
+
+def test_smoothness_does_not_weigh_by_rounding_errors_of_the_depth(random):
+    normal, mask = some_normals(random), torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    noise = torch.rand(HEIGHT, WIDTH, 1, generator=random, dtype=torch.float64)
+    flat, rough = (SmoothnessLoss(5 + size * noise, mask)(normal) for size in (0, 1e-7))
+    torch.testing.assert_close(rough, flat, rtol=1e-2, atol=0)
 
 
 def test_smoothness_does_not_depend_on_the_unit_of_length(random):
@@ -390,6 +408,13 @@ def test_flattening_shrinks_only_the_thinnest_axis_of_visible_gaussians():
     assert loss.item() == 2.5
     (gradient,) = torch.autograd.grad(loss, scales)
     assert gradient.tolist() == [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0]]
+
+
+def test_a_weighted_mean_is_over_the_sum_of_its_weights():
+    values = torch.tensor([1.0, 3.0, torch.nan], requires_grad=True)
+    mean = weighted_mean(values, torch.tensor([0.1, 0.3, 0.0]))
+    assert mean.item() == pytest.approx(2.5)
+    assert torch.autograd.grad(mean, values)[0].tolist() == pytest.approx([0.25, 0.75, 0])
 
 
 def losses_of_a_view(height: int, width: int, random: torch.Generator) -> dict[str, tuple]:
