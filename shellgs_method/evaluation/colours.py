@@ -71,5 +71,5 @@ def deviation_colours(distance: Shaped[np.ndarray, "*shape"], full: float) -> UI
 def _scale_colours(
     name: str, share: Float[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    colours = np.rint(255 * colormaps[name](share.clip(0, 1))[..., :3])
+    colours = np.rint(255 * colormaps[name](share)[..., :3])
     return np.where(mask[..., None], colours, GREY).astype(np.uint8)
