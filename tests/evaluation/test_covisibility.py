@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from scipy.spatial.transform import Rotation
 
 from shellgs_method.evaluation.covisibility import Covisibility
 from shellgs_method.geometry.camera import Camera
@@ -10,12 +11,16 @@ from shellgs_method.geometry.camera import Camera
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 WIDTH, HEIGHT = 80, 60
 NO_POINTS = torch.zeros(0, 3)
+WORLD = torch.eye(4)
+WORLD[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.4, -1.2, 2.0]).as_matrix())
+WORLD[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
+"""From the world to the camera at x = 0."""
 
 
 def camera(x: float) -> Camera:
-    """A camera that looks along z at walls parallel to the image plane."""
-    viewmat = torch.eye(4)
-    viewmat[0, 3] = -x
+    """A camera moved sideways, before walls parallel to the image plane."""
+    viewmat = WORLD.clone()
+    viewmat[0, 3] -= x
     return Camera(viewmat, K, WIDTH, HEIGHT)
 
 
@@ -43,7 +48,7 @@ def test_pixels_hidden_by_the_shell_in_a_training_view_are_not_seen():
 
 def test_a_pixel_off_the_shell_has_the_depth_of_the_nearest_sfm_point():
     """The left is at depth 5, where a sideways step of 5 is 40 pixels; the right at 100, where it is 2."""
-    points = torch.tensor([[-2.5, 0.0, 5.0], [50.0, 0.0, 100.0]])
+    points = (torch.tensor([[-2.5, 0.0, 5.0], [50.0, 0.0, 100.0]]) - WORLD[:3, 3]) @ WORLD[:3, :3]
     nothing = torch.zeros(HEIGHT, WIDTH, 1)
     seen = Covisibility([camera(5), camera(5)], [nothing[..., 0]] * 2, points).mask(camera(0), nothing)
     assert not seen[:, :35].any()
@@ -56,7 +61,7 @@ def test_sky_without_points_is_seen_by_all_views_that_look_there():
 
 
 def test_visibility_of_large_images_is_computed_on_a_thinned_grid():
-    large = Camera(torch.eye(4), torch.tensor([[500.0, 0, 500], [0, 500, 375], [0, 0, 1]]), 1001, 751)
+    large = Camera(WORLD, torch.tensor([[500.0, 0, 500], [0, 500, 375], [0, 0, 1]]), 1001, 751)
     aside = Camera(camera(5).viewmat, large.K, 1001, 751)
     depth = torch.full((751, 1001, 1), 10.0)
     covisibility = Covisibility.of([(aside, depth), (aside, None)], NO_POINTS)
