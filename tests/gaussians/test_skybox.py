@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of, trainer_of
 
 from shellgs_method.gaussians.densification import SkyboxStrategy
@@ -13,13 +14,15 @@ from shellgs_method.geometry.camera import Camera
 
 FOCAL, WIDTH, HEIGHT = 60.0, 80, 60
 K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
-VIEWMAT = torch.tensor([[1.0, 0, 0, -1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+TURNED = Rotation.from_euler("xyz", [0.2, -0.4, 0.6]).as_matrix()
+VIEWMAT = torch.eye(4, dtype=torch.float64)
+VIEWMAT[:3, :3], VIEWMAT[:3, 3] = torch.from_numpy(TURNED), -torch.from_numpy(TURNED[:, 0])
 CAMERA = Camera(VIEWMAT, K, WIDTH, HEIGHT)
-"""At (1, 0, 0)."""
+"""At (1, 0, 0), turned about each axis."""
 
 
 def sky_view(mask: torch.Tensor | None = None) -> SkyView:
-    """A view along z, red above and blue below."""
+    """A view that is red above and blue below."""
     image = torch.zeros(HEIGHT, WIDTH, 3)
     image[: HEIGHT // 2, :, 0] = image[HEIGHT // 2 :, :, 2] = 1
     return SkyView(CAMERA, image, torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool) if mask is None else mask)
@@ -46,7 +49,7 @@ def test_a_skybox_is_spread_evenly_over_a_sphere_around_the_cameras():
 
 def test_a_skybox_has_the_colours_of_the_directions_that_views_show():
     seeds = skybox_of([sky_view()], 2000)
-    x, y, z = (seeds.points - [1, 0, 0]).T / (RADIUS * 3)
+    x, y, z = TURNED @ (seeds.points - [1, 0, 0]).T / (RADIUS * 3)
     visible = (z > 0.5) & (abs(x / z) < 0.5 * WIDTH / FOCAL) & (abs(y / z) < 0.5 * HEIGHT / FOCAL)
     assert visible.sum() > 20
     np.testing.assert_allclose(seeds.colours[visible & (y < -0.1)], [[1, 0, 0]] * (visible & (y < -0.1)).sum())

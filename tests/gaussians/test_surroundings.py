@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from scenes import parse
+from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of
 from two_blocks import HALVES, block_run, coarse_run, copied, cut_in_two
 
@@ -174,7 +175,10 @@ def test_the_bound_on_seeds_is_one_on_those_of_the_block_whatever_else_its_photo
         torch.tensor([0.0, 0, -1], dtype=torch.float64).expand(60, 80, 3),
         torch.ones(60, 80, 1, dtype=torch.bool),
     )
-    view = SeededView(Camera(torch.eye(4, dtype=torch.float64), K, 80, 60), torch.zeros(60, 80, 3), wall)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 0.1, 0.2]).as_matrix())
+    viewmat[:3, 3] = torch.tensor([-0.5, 0.5, 1.0])
+    view = SeededView(Camera(viewmat, K, 80, 60), torch.zeros(60, 80, 3), wall)
     everywhere, shown = (shell_seeds([each], 80 * 60, 1.0, 60).points for each in (view, region.shown(view)))
     inside = region.extended(torch.from_numpy(everywhere)).numpy()
     assert region.extended(torch.from_numpy(shown)).all()

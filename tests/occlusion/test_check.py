@@ -15,6 +15,7 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
 from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of, small_disk, trainer_of
 from viser import SceneApi
 
@@ -121,6 +122,14 @@ def agreed(views: list[ShellView], judged: int = MIDDLE) -> tuple[Sweep, Agreeme
     return sweeps[judged], agreement(views[judged], sweeps[judged], [views[k] for k in beside], found_there)
 
 
+def turned(camera: Camera) -> Camera:
+    """The same camera in a world that is turned and moved."""
+    world = torch.eye(4, dtype=torch.float64)
+    world[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.4, -1.2, 2.0]).as_matrix())
+    world[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
+    return replace(camera, viewmat=camera.viewmat @ world)
+
+
 def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Sweep score, agreed score and depth of the middle view."""
     found, both = agreed(views)
@@ -130,7 +139,7 @@ def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Te
 @pytest.mark.parametrize("depth", [7.0, 5.0, 3.5])
 def test_a_post_in_front_of_the_wall_is_found_at_its_depth(depth: float):
     views = street(CAMERAS, post=depth)
-    _, score, found = scores([view for view, _ in views])
+    _, score, found = scores([replace(view, camera=turned(view.camera)) for view, _ in views])
     before, contradicted = views[len(views) // 2][1], score.numpy() > CONTRADICTED
     both = (before & contradicted).sum()
     assert both / before.sum() > 0.9
@@ -347,8 +356,10 @@ def test_tried_depths_are_as_close_as_what_moves_from_one_to_the_next():
 
 def test_cameras_at_the_views_own_position_are_on_no_side():
     """As the photographs of a panorama are: nothing moves between them."""
-    view = camera_at(0.0)
-    assert sides(view, [camera_at(0.0), camera_at(1e-9), camera_at(1.0)], WALL) == ([], [(1.0, 2)])
+    view, *others = (turned(camera_at(x)) for x in (0.0, 0.0, 1e-9, 1.0, -2.0))
+    left, right = sides(view, others, WALL)
+    assert left == [(pytest.approx(2.0), 3)]
+    assert right == [(pytest.approx(1.0), 2)]
 
 
 @pytest.mark.parametrize("offset", [0.034, 0.18])
