@@ -132,6 +132,17 @@ def test_without_gaussians_densification_has_nothing_to_do(kind):
     assert len(params["means"]) == 0
 
 
+def test_the_largest_gaussian_that_is_kept_grows_with_its_distance_from_that_at_one():
+    params = gaussians(4, opacity=0.9)
+    params["means"].data = torch.tensor([[0.1, 0, 0], [0, -0.1, 0], [3, 0, 4], [0, 5, 0]])
+    params["scales"].data = torch.tensor([0.09, 0.11, 0.45, 0.55])[:, None].repeat(1, 3).log()
+    optimizers, strategy = stepped(params), SkyboxStrategy(prune_scale3d=0.1, reset_every=10)
+    state, means = strategy.initialize_state(2.0), params["means"].detach().clone()
+    assert strategy._prune_gs(params, optimizers, state, step=11) == 2
+    assert torch.equal(params["means"], means[[0, 2]])
+    assert state["scene_scale"] == 2.0
+
+
 @pytest.mark.parametrize(("factor", "split"), [(1.0, [1]), (4.0, [1, 2])])
 def test_wide_gaussians_split_at_a_lower_gradient(factor, split):
     """Gradients of 2, 12, 4 and 4 tenths of the limit, where all but the last were wide in one of two views."""
@@ -141,7 +152,8 @@ def test_wide_gaussians_split_at_a_lower_gradient(factor, split):
     state = strategy.initialize_state()
     for radii in [(9, 9, 9, 4), (1, 1, 1, 4)]:
         info = rendering(4, radii)
-        info["means2d"].grad = torch.tensor([[[0.2, 0], [1.2, 0], [0.4, 0], [0.4, 0]]]) / 50  # of half its width
+        tenths = torch.tensor([[[0.2, 0], [0, 1.2], [0.24, 0.32], [0.4, 0]]])
+        info["means2d"].grad = tenths / torch.tensor([50.0, 30])  # halves of the image
         strategy._gather(params, state, info)
     assert strategy._grow_gs(params, optimizers, state, step=1) == (0, len(split))
     kept = [i for i in range(4) if i not in split]

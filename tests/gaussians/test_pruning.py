@@ -52,5 +52,6 @@ def test_a_gaussian_with_any_parameter_that_is_not_finite_is_broken():
     gaussians = nn.ParameterDict({"means": torch.zeros(4, 3), "features_rest": torch.zeros(4, 15, 3)})
     assert not broken(gaussians).any()
     gaussians["means"].data[1, 2] = torch.inf
+    assert broken(gaussians).tolist() == [False, True, False, False]
     gaussians["features_rest"].data[3, 7, 0] = torch.nan
     assert broken(gaussians).tolist() == [False, True, False, True]

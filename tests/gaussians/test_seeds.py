@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from functools import partial
 
@@ -14,8 +15,16 @@ from scipy.spatial.transform import Rotation
 from training_runs import data_of, model_of, trainer_of
 
 from shellgs_method.errors import SceneError
+from shellgs_method.evaluation import pixels
 from shellgs_method.gaussians.initial import MAX_SEEDS, OPACITY, SEED_SPACING, SKYBOX_SEEDS, sfm_points
-from shellgs_method.gaussians.seeds import SeededView, Seeds, shell_seeds, view_of_surface
+from shellgs_method.gaussians.seeds import (
+    SeededView,
+    Seeds,
+    shell_seeds,
+    view_behind_shell,
+    view_of_shell,
+    view_of_surface,
+)
 from shellgs_method.gaussians.skybox import skybox_seeds, view_of_sky
 from shellgs_method.gaussians.surface_weights import WEIGHT_BEHIND, SurfaceWeights
 from shellgs_method.geometry.camera import Camera
@@ -89,13 +98,51 @@ def test_gaussians_behind_the_wall_hardly_count_for_its_geometry():
 def test_masked_and_grazing_pixels_give_no_seeds():
     masked = view()
     masked.shell.mask[:, : WIDTH // 2] = False
-    pixels, _ = masked.camera.project(torch.from_numpy(seeds_of([masked]).points))
-    assert pixels[:, 0].min() > WIDTH / 2
+    places, _ = masked.camera.project(torch.from_numpy(seeds_of([masked]).points))
+    assert places[:, 0].min() > WIDTH / 2
     assert len(seeds_of([masked]).points) < 0.7 * len(seeds_of([view()]).points)
     grazing = torch.tensor([1.0, 0.0, -0.05], dtype=torch.float64)
     edge_on = view(normal=grazing / grazing.norm())
     edge_on = edge_on._replace(shell=edge_on.shell._replace(mask=edge_on.shell.depth > 5))
     assert len(seeds_of([edge_on]).points) == 0
+    oblique = TURNED.T @ torch.tensor([math.sin(1.2), 0.0, -math.cos(1.2)], dtype=torch.float64)  # a cosine of 0.36
+    assert len(seeds_of([view(normal=oblique)]).points) > 50
+
+
+def pixel_by_pixel(**maps: list) -> dict:
+    """A batch of a view of 1 x 5 pixels, all on the shell at 10."""
+    batch = {"image": torch.arange(15, dtype=torch.uint8).view(1, 5, 3), "shell_depth": torch.full((1, 5, 1), 10.0)}
+    batch |= {"shell_normal": torch.tensor([0.0, 0.6, -0.8]).half().expand(1, 5, 3)}
+    batch |= {"shell_mask": torch.ones(1, 5, 1, dtype=torch.bool)}
+    return batch | {name: torch.tensor(values).view(1, 5, 1) for name, values in maps.items()}
+
+
+@pytest.mark.parametrize("margin", [0, 1])
+def test_seeds_are_on_what_photographs_show_before_the_shell_or_behind_it(monkeypatch, margin):
+    """In the first two pixels something before it, masked in the second, and in the last two something behind it."""
+    monkeypatch.setattr(pixels, "MARGIN", margin)
+    kept = [True, False, True, True, False]
+    batch = pixel_by_pixel(other_depth=[4.0, 4, 0, 25, 25], mask=kept)
+    here = Camera(torch.eye(4), torch.tensor([[3.0, 0, 2.5], [0, 3, 0.5], [0, 0, 1]]), 5, 1)
+    towards = -here.rays() / here.rays().norm(dim=-1, keepdim=True)
+    shell = torch.tensor([0.0, 0.6, -0.8]).half().float()
+    on_shell, surface, behind = (make(here, batch) for make in (view_of_shell, view_of_surface, view_behind_shell))
+    for made in (on_shell, surface, behind):
+        torch.testing.assert_close(made.image, torch.arange(15).view(1, 5, 3) / 255)
+    assert on_shell.shell.mask.flatten().tolist() == kept
+    assert (on_shell.shell.depth == 10).all()
+    assert surface.shell.mask.flatten().tolist() == [True, False, not margin, True, False]
+    assert surface.shell.depth.flatten().tolist()[::2] == [4, 10, 10]
+    torch.testing.assert_close(surface.shell.normal[0, 0], towards[0, 0])
+    torch.testing.assert_close(surface.shell.normal[0, 2:], shell.expand(3, 3))
+    assert behind.shell.mask.flatten().tolist() == [False, False, False, True, False]
+    assert behind.shell.depth[0, 3] == 25
+    torch.testing.assert_close(behind.shell.normal, towards)
+    unseen = pixel_by_pixel(mask=kept)
+    assert view_of_surface(here, unseen).shell.mask.flatten().tolist() == kept
+    assert not view_behind_shell(here, unseen).shell.mask.any()
+    bright = unseen | {"image": torch.full((1, 5, 4), 0.5)}
+    assert torch.equal(view_of_shell(here, bright).image, torch.full((1, 5, 3), 0.5))
 
 
 def test_seeds_are_spread_more_widely_if_there_are_too_many():
@@ -133,6 +180,8 @@ def test_a_run_starts_with_the_sfm_points_and_flat_gaussians_on_shell_and_skybox
 def test_too_few_sfm_points_are_counted(count, found):
     with pytest.raises(SceneError, match=f"{found} to start from, of at least 4"):
         sfm_points((torch.zeros(count, 3), torch.zeros(count, 3)))
+    with pytest.raises(SceneError, match="has no SfM points"):
+        sfm_points(None)
 
 
 def test_without_shell_maps_in_any_training_view_there_are_no_seeds():
