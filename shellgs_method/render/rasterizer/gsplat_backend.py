@@ -26,6 +26,7 @@ from gsplat import (
 )
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import embedding
 
 from shellgs_method.errors import notice
 from shellgs_method.geometry.camera import Camera
@@ -379,19 +380,32 @@ def _composite_with_maps(
 ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
     """Features, alpha, and the maps of one camera, see :class:`Renders`."""
     n_features = features.shape[1]
-    numbers = torch.arange(len(features), dtype=features.dtype, device=features.device)[:, None]
     # A power of two: gsplat would pad with uninitialised memory. The kernel returns the last feature of the median disc
-    # as its depth: the disc's index here, to look it up.
+    # as its depth: the disc's number here, to look it up.
     size = 1 << (n_features + 6).bit_length()
-    (channels,) = elementwise(_with_products(size), features, discs.inverse_planes, numbers)
+    (channels,) = elementwise(_with_products(size), features, discs.inverse_planes, _numbers(features))
     composited, alpha, inverse_plane, median = (
         each.squeeze(0) for each in _run_discs(discs, bins, opacities, channels, camera)
     )
     rays = camera.rays()
     rendered, inverse_depth, square = elementwise(_maps(n_features), composited, inverse_plane, rays)
-    (median_depth,) = elementwise(_median, discs.inverse_planes[0, median[..., 0].long()], rays, alpha)
+    (median_depth,) = elementwise(_median, embedding(_numbered(median[..., 0]), discs.inverse_planes[0]), rays, alpha)
     rendered, alpha, *maps = (each[None] for each in (rendered, alpha, inverse_depth, square, median_depth))
     return rendered, alpha, tuple(maps)
+
+
+_BITS_OF_TWO = 1 << 30
+
+
+def _numbers(features: Float[Tensor, "N C"]) -> Float[Tensor, "N 1"]:
+    """A number for each disc: in the bits of floats from 2 on, as float32 has only 16.8 million whole numbers."""
+    bits = torch.arange(_BITS_OF_TWO, _BITS_OF_TWO + len(features), dtype=torch.int32, device=features.device)
+    return bits.view(torch.float32)[:, None].to(features)
+
+
+def _numbered(medians: Float[Tensor, "height width"]) -> Int[Tensor, "height width"]:
+    """The discs of such numbers; the first where there is none, which is 0."""
+    return medians.float().view(torch.int32) & (_BITS_OF_TWO - 1)
 
 
 def _run_discs(

@@ -93,6 +93,14 @@ def test_gsplat_densifies_by_the_radii_of_the_torch_backend(primitive, make):
     assert set((gsplat_radii - torch_radii)[seen & kept].tolist()) <= {0, 1}
 
 
+def test_more_discs_than_float32_counts_have_a_number_each_and_none_is_the_first():
+    one = torch.zeros(1, 1)
+    numbers = gsplat_backend._numbers(one.expand(2**24 + 5, 1))
+    assert numbers.isfinite().all()
+    assert torch.equal(gsplat_backend._numbered(numbers[:, 0]), torch.arange(2**24 + 5, dtype=torch.int32))
+    assert gsplat_backend._numbered(one) == 0
+
+
 @pytest.mark.parametrize("axes", ["one radius, of 1.4", "two radii, of 1.5"])
 def test_sizes_are_those_of_gsplats_radii_also_of_needles_and_of_undefined_memory(axes):
     generator = torch.Generator().manual_seed(0)
