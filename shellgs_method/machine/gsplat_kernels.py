@@ -47,7 +47,7 @@ def _uninterrupted(function: Callable[[], _Result]) -> Callable[[], _Result]:
 @_uninterrupted
 def kernels_fault() -> str | None:
     """Why gsplat's kernels do not load, None if they do; the first call may compile them, which takes minutes."""
-    if not are_compiled() and shutil.which("nvcc"):
+    if _nvcc() and not are_compiled():
         notice(f"gsplat's kernels are compiled now, once: {compiling()}.")
     try:
         kernels = importlib.import_module("gsplat.cuda._backend")._C
@@ -86,7 +86,7 @@ def lacking_to_compile() -> list[str]:
     import torch
     from torch.utils.cpp_extension import is_ninja_available
 
-    lacking, nvcc, cuda = [], shutil.which("nvcc"), torch.version.cuda
+    lacking, nvcc, cuda = [], _nvcc(), torch.version.cuda
     if cuda is None:
         lacking.append("torch is built without CUDA: install a build with it from https://pytorch.org")
     if nvcc is None:
@@ -100,6 +100,15 @@ def lacking_to_compile() -> list[str]:
     if not is_ninja_available():
         lacking.append("there is no ninja: pip install ninja")
     return lacking
+
+
+def _nvcc() -> str | None:
+    """CUDA's compiler on the PATH, where alone gsplat 1.4 looks; the toolkit that torch finds elsewhere is added."""
+    from torch.utils.cpp_extension import CUDA_HOME
+
+    if CUDA_HOME and not shutil.which("nvcc"):
+        os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", os.defpath), os.path.join(CUDA_HOME, "bin")])
+    return shutil.which("nvcc")
 
 
 def _release(nvcc: str) -> str | None:

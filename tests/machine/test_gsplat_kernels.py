@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ def tools(tmp_path, monkeypatch) -> Path:
     folder.mkdir()
     monkeypatch.setenv("PATH", str(folder))
     monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", None)
     monkeypatch.setattr(system, "compiler", lambda: "g++")
     monkeypatch.setattr("torch.utils.cpp_extension.is_ninja_available", lambda: True)
     return folder
@@ -49,6 +51,16 @@ def add_nvcc(tools: Path, release: str, refusal: str = "") -> None:
 def test_a_machine_with_all_tools_lacks_nothing(tools):
     add_nvcc(tools, "13.2")  # of another minor version
     assert gsplat_kernels.lacking_to_compile() == []
+
+
+def test_a_toolkit_that_is_not_on_the_path_is_put_there(tools, monkeypatch):
+    home = tools.parent / "cuda"
+    (home / "bin").mkdir(parents=True)
+    add_nvcc(home / "bin", "13.0")
+    assert gsplat_kernels.lacking_to_compile() == ["there is no nvcc on the PATH: install CUDA's toolkit 13.0"]
+    monkeypatch.setattr("torch.utils.cpp_extension.CUDA_HOME", str(home))
+    assert gsplat_kernels.lacking_to_compile() == []
+    assert shutil.which("nvcc") == str(home / "bin" / "nvcc")
 
 
 def test_what_is_missing_to_compile_is_named_with_its_remedy(tools, monkeypatch):
