@@ -26,7 +26,10 @@ from typing import Annotated, Optional
 
 import tyro
 
+from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.errors import SceneError, refusals_end_the_program
+from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
+from shellgs_method.synthetic import FacadeConfig, write_scene
 
 ROOT = Path(__file__).parents[1]
 TORCH = ("torch", "numpy", "scipy")
@@ -49,7 +52,7 @@ cd "$(dirname "$0")" || exit 1
 python=${PYTHON:-python3}
 cat kit.tar.part-* | tar x || exit 1
 [ -d site ] || $python -m pip install -q --no-index --no-deps --target site wheels/*.whl || exit 1
-export PYTHONPATH="$PWD/site:$PWD/code"
+export PYTHONPATH="$PWD/site:$PWD/code" SHELLGS_SMOKE_SCENE="$PWD/facade"
 {
     $python -c 'import sys, torch; print(sys.version, torch.__version__, torch.version.cuda)'
     $python -c 'import torch; print(torch.cuda.is_available() and torch.cuda.get_device_name())'
@@ -87,6 +90,7 @@ def main(
         build_own(folder / "wheels")
         copy_code(folder / "code")
         copy_scene(scene, folder / "scene")
+        write_facade(folder / "facade")
         kit.mkdir(parents=True, exist_ok=True)
         parts = pack(folder, kit, megabytes)
     (kit / "run.sh").write_text(RUN)
@@ -149,6 +153,13 @@ def copy_code(folder: Path) -> None:
 def copy_scene(scene: Path, folder: Path) -> None:
     """A scene without the folder of its capture, which training does not read."""
     shutil.copytree(scene, folder, ignore=lambda path, names: {"capture"} & {*names} if Path(path) == scene else set())
+
+
+def write_facade(scene: Path) -> None:
+    """Write the scene of the tests, which takes Open3D: 10 views of 48 x 32 pixels, with shell and truth maps."""
+    write_scene(scene, FacadeConfig(width=48, height=32, views=10, points=300, supersampling=1))
+    views = read_views(FacadeDataParserConfig(data=scene))
+    cast_views(PlacedShell.load(scene, views, Alignment.load(scene / ALIGNMENT)))
 
 
 def pack(folder: Path, kit: Path, megabytes: int) -> int:

@@ -13,12 +13,10 @@ from typing import Any
 
 import pytest
 
-from dataparsers.facade import FacadeDataParserConfig, read_views
+from benchmarks.gpu_kit import write_facade
 from shellgs_method.errors import notice
 from shellgs_method.machine import system
 from shellgs_method.machine.open3d import load_libusb
-from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
-from shellgs_method.synthetic import FacadeConfig, write_scene
 
 load_libusb()  # for tests, and modules of nerfstudio, that import Open3D themselves
 os.environ.setdefault("SHELLGS_COMPILE", "0")  # kernels take longer to compile than these tests to run
@@ -34,9 +32,7 @@ def nothing_told() -> None:
 def pristine_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene of 10 views of 48 x 32 pixels with shell and truth maps; not to be changed."""
     scene = tmp_path_factory.mktemp("facade") / "scene"
-    write_scene(scene, FacadeConfig(width=48, height=32, views=10, points=300, supersampling=1))
-    views = read_views(FacadeDataParserConfig(data=scene))
-    cast_views(PlacedShell.load(scene, views, Alignment.load(scene / ALIGNMENT)))
+    write_facade(scene)
     return scene
 
 

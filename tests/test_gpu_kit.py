@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import tarfile
 from pathlib import Path
@@ -37,6 +38,21 @@ def test_parts_put_together_are_the_archive_and_none_is_larger_than_was_said(tmp
         file = tar.extractfile("wheels/a.whl")
         assert file is not None
         assert file.read() == contents
+
+
+def test_the_facade_of_the_tests_is_packed_where_the_script_says_it_is(machine: Path, monkeypatch):
+    """There, nothing could make it."""
+    folder = machine.parent
+    for name in ("imported", "download", "build_own", "copy_scene"):
+        monkeypatch.setattr(gpu_kit, name, lambda *_: [])
+    gpu_kit.main(folder / "kit", folder, there=machine)
+    for part in sorted((folder / "kit").glob("kit.tar.part-*")):
+        with (folder / "kit.tar").open("ab") as file:
+            file.write(part.read_bytes())
+    with tarfile.open(folder / "kit.tar") as tar:
+        names = tar.getnames()
+    (said,) = re.findall(r'SHELLGS_SMOKE_SCENE="\$PWD/(\w+)"', gpu_kit.RUN)
+    assert {f"{said}/cues/{kind}/manifest.json" for kind in ("shell", "truth")} <= {*names}
 
 
 def test_the_script_is_one_that_sh_can_read(tmp_path: Path):

@@ -14,6 +14,7 @@ import pytest
 import torch
 from training_runs import model_of, trainer_of
 
+from shellgs_method.machine import cpp
 from shellgs_method.machine.gsplat_kernels import kernels_fault
 from shellgs_method.trainer import FacadeTrainer
 
@@ -23,6 +24,13 @@ if not torch.cuda.is_available():
 METHODS = ("photo_gs", "shellgs", "shellgs_metric", "mono_gs", "two_dgs")
 TOLERANCES = {"psnr": 0.7, "ssim": 0.03, "truth_depth_mae_m": 0.3, "truth_normal_deg": 4.0}
 """Two runs drift apart by more than rounding: in 20 steps that all densify, a Gaussian more or less is split."""
+
+
+@pytest.fixture(autouse=True)
+def _compiled_on_the_gpu_alone(monkeypatch) -> None:
+    """Run kernels of our own, which the other tests do without, on the GPU; a CPU's take longer to compile."""
+    monkeypatch.setenv("SHELLGS_COMPILE", "1")
+    monkeypatch.setattr(cpp, "compiler_works", lambda: False)
 
 
 @pytest.fixture(scope="module")
