@@ -337,11 +337,12 @@ def grid(
     If a variant holds out half of the facade, all others are measured on that half too.
 
     Raises:
-        SceneError: two scenes share a name, or a method does not exist.
+        SceneError: nothing is given, two scenes share a name, or a method does not exist.
         FileNotFoundError: a scene does not exist.
     """
-    if not names or not seeds:
-        raise SceneError(f"there is nothing to compare: give {'methods' if seeds else 'seeds'}")
+    for what, given in {"scenes": scenes, "methods": names, "seeds": seeds}.items():
+        if not given:
+            raise SceneError(f"there is nothing to compare: give {what}")
     for scene in scenes:
         if not scene.is_dir():
             raise FileNotFoundError(f"{scene} is not a folder; `shellgs compare` takes scene folders.")

@@ -205,6 +205,13 @@ def test_an_unknown_method_is_refused_with_the_names_of_the_known_ones(pristine_
         fake_grid([pristine_scene], ["shelgs"], tmp_path)
 
 
+@pytest.mark.parametrize("what", ["scenes", "methods", "seeds"])
+def test_a_comparison_of_nothing_is_refused(pristine_scene, tmp_path, what):
+    given: dict[str, list] = {"scenes": [pristine_scene], "methods": ["shellgs"], "seeds": [0]} | {what: []}
+    with pytest.raises(SceneError, match=f"nothing to compare: give {what}"):
+        grid(given["scenes"], given["methods"], given["seeds"], 20, tmp_path)
+
+
 def test_a_name_that_leaves_its_folder_is_refused(pristine_scene, tmp_path):
     with pytest.raises(SceneError, match="cannot name a folder"):
         fake_grid([pristine_scene], ["../mine=shellgs"], tmp_path)
