@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ def some(count: int = 400, degree: int = 3, *, discs: bool = False) -> Splats:
     return Splats(means, quats, scales, opacities, harmonics, discs=discs)
 
 
-def image(splats: Splats, camera: Camera = CAMERA) -> torch.Tensor:
+def image(splats: Splats, camera: Camera = CAMERA, background: Sequence[float] = (0, 0, 0)) -> torch.Tensor:
     """What a camera sees of Gaussians."""
     gaussians = {
         "means": splats.means.float(),
@@ -42,7 +43,7 @@ def image(splats: Splats, camera: Camera = CAMERA) -> torch.Tensor:
         "features_rest": splats.harmonics[:, 1:].float(),
     }
     renderer = ViewRenderer("2d" if splats.discs else "3d", "expected")
-    return renderer(gaussians, camera, torch.zeros(3), splats.degree, False, False)[0].clamp(0, 1)
+    return renderer(gaussians, camera, torch.tensor(background).float(), splats.degree, False, False)[0].clamp(0, 1)
 
 
 def psnr(one: Splats, other: Splats) -> float:

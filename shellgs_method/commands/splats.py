@@ -43,20 +43,22 @@ def splats(
     check_splats_format(output)
     check_splats_format(output, discs=getattr(open_run(config).pipeline.model, "primitive", None) == "2d")
     run = TrainedRun.load(config)
-    gaussians, frame, facts = run.splats(), run.frame, {}
+    gaussians, frame, background = run.splats(), run.frame, run.model.background_color.tolist()
+    facts: dict[str, object] = {"background": background}
     where = place(frame)
     if output.suffix.lower() in Y_UP:
         where += " Turned, so that y is up."
         frame, motion = frame.turned(Y)
-        gaussians, facts = moved(gaussians, motion), {"turned": motion[:3, :3].tolist()}
+        gaussians = moved(gaussians, motion)
+        facts["turned"] = motion[:3, :3].tolist()
     comments = [f"{name}: {value}" for name, value in frame.properties.items()]
     views = [frame.camera(view.camera) for dataset in run.datasets for view in dataset.views]
 
     def size(some: Splats) -> int:
-        return len(encoded(output, some, comments, views))
+        return len(encoded(output, some, comments, views, background))
 
     if levels == 1 and (megabytes is None or size(gaussians.finite) <= 1e6 * megabytes):
-        count = write_splats(output, gaussians, comments, views)
+        count = write_splats(output, gaussians, comments, views, background)
         frame.describe(Path(f"{output}.json"), {"splats": count, **facts})
         console.print(f"{output}: {count} Gaussians. {where}")
         _tell_of_others(output, levels)
@@ -69,7 +71,7 @@ def splats(
             level = level.reduced(max(1, len(level.splats) // 2))
         elif megabytes is not None:
             level = level.within(megabytes, size)
-        count = write_splats(path, level.splats, comments, views)
+        count = write_splats(path, level.splats, comments, views, background)
         loss = whole - psnr_of(run, level.splats, frame) if count < all_of_them else 0.0
         frame.describe(Path(f"{path}.json"), {"splats": count, "psnr_loss": round(loss, 3), **facts})
         taken = path.stat().st_size / 1e6

@@ -187,10 +187,10 @@ def psnr_of(run: TrainedRun, splats: Splats, frame: Frame) -> float:
         "features_rest": splats.harmonics[:, 1:],
     }
     gaussians = {name: values.float().to(model.device) for name, values in gaussians.items()}
-    black = torch.zeros(3, device=model.device)
+    background = model.background_color.to(model.device)
     for index in track(range(len(views)), "Rendering a level", len(views)):
         camera = frame.camera(views.views[index].camera).to(model.device, torch.float32)
-        image = model.renderer(gaussians, camera, black, splats.degree, geometry=False).rgb.clamp(0, 1)
+        image = model.renderer(gaussians, camera, background, splats.degree, geometry=False).rgb.clamp(0, 1)
         errors.append(_psnr(image.cpu(), views.get_data(index, "uint8")))
     return sum(errors) / len(errors)
 

@@ -102,7 +102,16 @@ def check_splats_format(path: Path, discs: bool = False) -> None:
         raise SceneError(f"{path}: spz has no discs, which have no thickness: name a .ply, .glb or .html")
 
 
-def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views: Sequence[Camera] = ()) -> int:
+BLACK = (0.0, 0.0, 0.0)
+
+
+def write_splats(
+    path: Path,
+    splats: Splats,
+    comments: Sequence[str] = (),
+    views: Sequence[Camera] = (),
+    background: Sequence[float] = BLACK,
+) -> int:
     """Write the finite ones of some Gaussians in the format that the path's suffix names; return their number.
 
     Args:
@@ -110,13 +119,14 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views
         splats: Gaussians; of :data:`Y_UP` formats in a frame whose y axis points up.
         comments: lines that say what the coordinates are, where the format has a place for them.
         views: cameras from which a page shows them.
+        background: colour behind them in a page, from 0 to 1.
 
     Raises:
         SceneError: as :func:`check_splats_format`, or the coordinates are too far from the origin for the format, or a
             page or a glb would be too large.
     """
     splats = splats.finite
-    content = encoded(path, splats, comments, views)
+    content = encoded(path, splats, comments, views, background)
     if path.suffix.lower() == ".html" and len(content) > 1e6 * LARGEST_PAGE:
         raise SceneError(
             f"{path} would have {len(content) / 1e6:.0f} MB, more than browsers read: give --megabytes {LARGEST_PAGE}"
@@ -127,7 +137,13 @@ def write_splats(path: Path, splats: Splats, comments: Sequence[str] = (), views
     return len(splats)
 
 
-def encoded(path: Path, splats: Splats, comments: Sequence[str] = (), views: Sequence[Camera] = ()) -> bytes:
+def encoded(
+    path: Path,
+    splats: Splats,
+    comments: Sequence[str] = (),
+    views: Sequence[Camera] = (),
+    background: Sequence[float] = BLACK,
+) -> bytes:
     """Content of the file that :func:`write_splats` writes of finite Gaussians."""
     check_splats_format(path, splats.discs)
     suffix = path.suffix.lower()
@@ -138,7 +154,7 @@ def encoded(path: Path, splats: Splats, comments: Sequence[str] = (), views: Seq
             raise SceneError(f"{path} would have more than 4 GB, which no glb can: name a .ply")
         return _glb(splats, comments)
     spz = _spz(splats)
-    return spz if suffix == ".spz" else splats_page(spz, splats.discs, comments, views)
+    return spz if suffix == ".spz" else splats_page(spz, splats.discs, comments, views, background)
 
 
 def read_splats(path: Path) -> Splats:

@@ -12,7 +12,9 @@ from shellgs_method.geometry.camera import Camera
 _TEMPLATE = Path(__file__).with_name("splats_page.html")
 
 
-def splats_page(spz: bytes, discs: bool, comments: Sequence[str], views: Sequence[Camera]) -> bytes:
+def splats_page(
+    spz: bytes, discs: bool, comments: Sequence[str], views: Sequence[Camera], background: Sequence[float]
+) -> bytes:
     """A self-contained page of HTML, drawn by WebGL 2.
 
     Args:
@@ -20,8 +22,10 @@ def splats_page(spz: bytes, discs: bool, comments: Sequence[str], views: Sequenc
         discs: whether they are drawn as discs, of their first two axes.
         comments: lines that say what the coordinates are.
         views: cameras in that frame between which one can go; the middle one is shown first.
+        background: colour behind the Gaussians, from 0 to 1.
     """
-    scene = {"discs": discs, "comments": list(comments), "views": [_view(camera) for camera in views]}
+    shown = {"views": [_view(camera) for camera in views], "background": list(background)}
+    scene = {"discs": discs, "comments": list(comments), **shown}
     parts = {"scene": json.dumps(scene).replace("<", "\\u003c").encode(), "spz": base64.b64encode(spz)}
     page = _TEMPLATE.read_bytes()
     for name, content in parts.items():

@@ -156,6 +156,21 @@ def test_levels_have_half_as_many_gaussians_each_and_lose_less_than_if_the_rest_
     assert losses[2] < pruned
 
 
+def test_levels_are_measured_and_pages_drawn_over_the_background_of_the_run(trainer, tmp_path, monkeypatch):
+    run = TrainedRun(model_of(trainer), data_of(trainer))
+    monkeypatch.setattr(run.model, "background_color", torch.tensor([1.0, 0.5, 0.0]))
+    views, errors = run.datasets[1], []
+    for k in range(len(views)):
+        image = run.model.get_outputs_for_camera(views.cameras[k : k + 1])["rgb"]
+        errors.append((image - torch.from_numpy(views.get_numpy_image(k) / 255)).square().mean())
+    expected = -10 * torch.stack(errors).log10().mean()
+    assert psnr_of(run, run.splats(), run.frame) == pytest.approx(float(expected), abs=0.02)
+    monkeypatch.setattr(TrainedRun, "load", lambda config: run)
+    cli.splats(trainer.base_dir / "config.yml", tmp_path / "splats.html")
+    assert '"background": [1.0, 0.5, 0.0]' in (tmp_path / "splats.html").read_text()
+    assert json.loads((tmp_path / "splats.html.json").read_text())["background"] == [1, 0.5, 0]
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_files_named_as_further_levels_are_kept_and_told_of(trainer, tmp_path, capsys, levels):
     names = ["splats-1.ply", "splats-2.ply"]

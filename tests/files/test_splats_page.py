@@ -35,8 +35,10 @@ def show(tmp_path: Path, browser: Any) -> Iterator[Show]:
     context = browser.new_context(viewport={"width": CAMERA.width, "height": CAMERA.height}, offline=True)
     wrong: list[str] = []
 
-    def opened(splats: Splats, views: Sequence[Camera], first: str = "") -> Any:
-        write_splats(tmp_path / "a page.html", splats, ["unit: metre </script>"], views)
+    def opened(
+        splats: Splats, views: Sequence[Camera], first: str = "", background: Sequence[float] = (0, 0, 0)
+    ) -> Any:
+        write_splats(tmp_path / "a page.html", splats, ["unit: metre </script>"], views, background)
         page = context.new_page()
         page.add_init_script(first)
         page.on("pageerror", lambda error: wrong.append(str(error)))
@@ -73,6 +75,14 @@ def test_what_is_brighter_than_white_shines_through_what_is_before_it(show: Show
     colours = torch.tensor([3.0, 0])[:, None, None].expand(2, 1, 3)  # 1.35, behind grey of half the opacity
     splats = Splats(means, torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4), torch.zeros(2, 3), opacities, colours)
     assert -10 * (shown(show(splats, [CAMERA])) - image(splats)).square().mean().log10() > 45
+
+
+@pytest.mark.parametrize("first", ["", "WebGL2RenderingContext.prototype.getExtension = () => null"])
+def test_behind_the_splats_is_the_colour_of_the_run(show: Show, first: str):
+    splats, colour = some(degree=0), (1.0, 0.5, 0.25)
+    splats.harmonics[:, 0] = splats.harmonics[:, 0].clamp(-1.7, 1.7)
+    page = show(splats, [CAMERA], first, colour)
+    assert -10 * (shown(page) - image(splats, background=colour)).square().mean().log10() > 35
 
 
 def test_a_browser_that_blends_no_half_floats_shows_what_is_no_brighter_than_white(show: Show):
