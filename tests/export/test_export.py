@@ -171,6 +171,16 @@ def test_levels_are_measured_and_pages_drawn_over_the_background_of_the_run(trai
     assert json.loads((tmp_path / "splats.html.json").read_text())["background"] == [1, 0.5, 0]
 
 
+def test_a_page_goes_through_the_photographs_in_the_order_of_their_names(trainer, tmp_path):
+    cli.splats(trainer.base_dir / "config.yml", tmp_path / "splats.html")
+    run = TrainedRun(model_of(trainer), data_of(trainer))
+    frame, _ = run.frame.turned(np.array([0.0, 1.0, 0.0]))
+    cameras = {view.name: frame.camera(view.camera) for dataset in run.datasets for view in dataset.views}
+    page = (tmp_path / "splats.html").read_text().split('type="application/json">')[1].split("</script>")[0]
+    eyes = [view["eye"] for view in json.loads(page)["views"]]
+    np.testing.assert_allclose(eyes, [cameras[name].position for name in sorted(cameras)])
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_files_named_as_further_levels_are_kept_and_told_of(trainer, tmp_path, capsys, levels):
     names = ["splats-1.ply", "splats-2.ply"]

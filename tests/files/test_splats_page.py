@@ -145,6 +145,17 @@ def test_the_mouse_turns_around_what_is_ahead_and_keys_walk(show: Show):
     walked, turn, _ = state()
     assert (walked - before) @ turn[2] > 0
     assert walked[1] == before[1]
+    for key, axis, sign in (("ArrowRight", 0, 1), ("ArrowUp", 1, -1)):
+        (eye, turn, _), ahead = (
+            state(),
+            "before => camera.turn.slice(6).some((value, k) => Math.abs(value - before[k]) > 0.05)",
+        )
+        page.keyboard.down(key)
+        page.wait_for_function(ahead, arg=turn[2].tolist())
+        page.keyboard.up(key)
+        stood, turned_by, _ = state()
+        assert sign * (turn @ turned_by[2])[axis] > 0.04  # looks to the right, and up
+        np.testing.assert_allclose(stood, eye, atol=1e-9)
 
 
 def test_without_photographs_all_is_seen_upright(show: Show):
