@@ -98,10 +98,14 @@ class FacadeModelConfig(SplatfactoModelConfig):
     refuses to start where they do not; a trained run is rendered there too."""
 
     background_color: Literal["random", "black", "white"] = "black"
+    """Colour behind the Gaussians; random: another in each training step, and black outside training."""
     sh_degree: Annotated[int, Bounds(0, 3, int)] = 3
     warmup_length: Count = 500
+    """Iteration after which Gaussians are densified, of a run of 30 000: it scales with the length of the run."""
     stop_split_at: Count = 15_000
+    """Iteration from which they no longer are, of a run of 30 000: it scales with the length of the run."""
     refine_every: FromOne = 100
+    """Iterations from one densification to the next, in a run of any length."""
     cull_alpha_thresh: Annotated[float, Bounds(0, 0.5)] = 0.005
     cull_scale_thresh: Weight = 0.1
     densify_grad_thresh: Weight = 0.0002

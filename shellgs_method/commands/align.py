@@ -49,9 +49,9 @@ def align(
     """Align the shell to the scene, validate this, and write scene/shell/alignment.json unless it is refused.
 
     The report, scene/shell/report/index.html, shows the shell's edges on photographs and the numbers behind the
-    verdict. Without --matrix, --picks and --positions, an alignment is proposed, near the photographs' geo-tags if the
-    shell's --crs is known: look at the report, then accept the proposal with --accept. Without a shell, the existing
-    alignment is validated again, or refined.
+    verdict. Without --matrix, --picks, --positions and --same-frame, an alignment is proposed, near the photographs'
+    geo-tags if the shell's --crs is known: look at the report, then accept the proposal with --accept. Without a shell,
+    the existing alignment is validated again, or refined.
 
     Args:
         scene: Scene folder.
@@ -67,7 +67,7 @@ def align(
         metres_per_shell_unit: Length of the shell's unit in metres. If not set: that of its coordinate reference
             system, else a metre.
         same_frame: The shell is in the frame and unit of the cameras: both are of one project of Metashape, RealityScan
-            or OpenDroneMap. Instead of --matrix.
+            or OpenDroneMap.
         crs: Coordinate reference system of the shell, such as EPSG:25832. Picks and positions whose first line names
             another one, such as EPSG:4326 for degrees, are converted. If not set: as the shell's file says, or a .prj
             beside it, else that in which the same files were aligned before.

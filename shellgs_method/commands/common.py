@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import webbrowser
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 # Without a terminal rich assumes 80 columns, which cut the tables of a log. Its markup would swallow a folder's [name].
 console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else 160, markup=False)
 
+# tyro takes an empty list of files too, and its help would say (default: ).
+required = partial(tyro.conf.arg, help_behavior_hint="(required)")
 Scene = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 RunConfig = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG")]
 Paths = Annotated[ScenePaths, tyro.conf.arg(name="")]
@@ -36,8 +39,6 @@ def launch(
     launcher: Literal["local", "ray"], jobs: int, cluster: Cluster
 ) -> Callable[[Sequence[Run]], Mapping[Run, str]]:
     """What finishes runs, ``jobs`` at once on this machine or on a cluster, and returns those that failed."""
-    from functools import partial
-
     if launcher == "ray":
         from shellgs_method.launch.cluster import launch_on_ray
 

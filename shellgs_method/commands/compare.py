@@ -9,13 +9,13 @@ from typing import Annotated, Literal, Optional
 import tyro
 
 from shellgs_method.bounds import Count, FromOne, Jobs, Seed, bounded
-from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, console, launch, open_page
+from shellgs_method.commands.common import CLUSTER, PATHS, ClusterFlags, Paths, console, launch, open_page, required
 from shellgs_method.errors import check_output_folder
 
 
 @bounded
 def compare(
-    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENE [SCENE ...]")],
+    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional, required(metavar="SCENE [SCENE ...]")],
     methods: tuple[str, ...] = ("photo-gs", "mono-gs", "2dgs", "shellgs"),
     seeds: tuple[Seed, ...] = (0,),
     iterations: FromOne = 30_000,
@@ -34,8 +34,9 @@ def compare(
 
     Args:
         scenes: Scene folders; the first is set beside the paper's primary scene, the others beside its second.
-        methods: Methods to compare: those of ShellGS, its ablations (docs/methods.md), other nerfstudio methods that
-            render depth (splatfacto), NAME='METHOD FLAGS' for your own, or paper for all of the paper's tables.
+        methods: Methods to compare: those of ShellGS, or all of them (all), its ablations (docs/methods.md), other
+            nerfstudio methods that render depth (splatfacto), NAME='METHOD FLAGS' for your own, or paper for all of the
+            paper's tables.
         seeds: Seeds; each method is trained once with each. Tables show mean ± standard deviation.
         iterations: Training iterations of each run.
         output: Folder for the runs, tables, images and report.html.

@@ -10,12 +10,12 @@ import tyro
 from rich.table import Table
 from rich.text import Text
 
-from shellgs_method.commands.common import console
+from shellgs_method.commands.common import console, required
 from shellgs_method.machine.progress import tell
 
 
 def merge(
-    configs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG [CONFIG ...]")],
+    configs: Annotated[tuple[Path, ...], tyro.conf.Positional, required(metavar="CONFIG [CONFIG ...]")],
     output: Path = Path("merged"),
 ) -> None:
     """Merge the runs of all blocks of a scene into one run, and report how it is along the cuts.

@@ -10,14 +10,14 @@ from typing import Annotated, Optional
 import tyro
 
 from shellgs_method.bounds import Length, Port, bounded
-from shellgs_method.commands.common import PATHS, Paths, Scene, console, shell_words
+from shellgs_method.commands.common import PATHS, Paths, Scene, console, required, shell_words
 from shellgs_method.errors import SceneError
 
 
 @bounded
 def pick(
     scene: Scene,
-    shell: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SHELL ...")],
+    shell: Annotated[tuple[Path, ...], tyro.conf.Positional, required(metavar="SHELL [SHELL ...]")],
     picks: Path = Path("picks.txt"),
     metres_per_shell_unit: Length = 1.0,
     crs: Optional[str] = None,

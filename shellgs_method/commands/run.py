@@ -47,17 +47,17 @@ class Recipe:
     picks: Optional[Path] = None
     """Text file of picked points, as `shellgs align` takes it."""
     matrix: Optional[Path] = None
-    """File of the 4x4 similarity from the shell's frame to the scene's."""
+    """File of the 4x4 similarity from the shell's frame to the scene's (CloudCompare text, json or npy)."""
     positions: Optional[Path] = None
-    """Text file of RTK camera positions."""
+    """Text file of RTK camera positions, as `shellgs align` takes it."""
     same_frame: bool = False
-    """The shell is in the frame and unit of the cameras."""
+    """The shell is in the frame and unit of the cameras: both are of one project of photogrammetry."""
     refine: Optional[Length] = None
     """Then refine by fitting the SfM points to the shell; how far off the alignment may be, in metres."""
     bundle_adjust: bool = False
     """Then adjust the cameras to the shell."""
     metres_per_shell_unit: Length = 1.0
-    """Length of the shell's unit in metres."""
+    """Length of the shell's unit in metres. If not set: that of its coordinate reference system, else a metre."""
     crs: Optional[str] = None
     """Coordinate reference system of the shell, such as EPSG:25832. If not set: as the shell's file says."""
     max_image_size: Optional[FromOne] = None

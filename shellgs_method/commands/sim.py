@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from shellgs_method.commands.common import console
+from shellgs_method.commands.common import console, required
 from shellgs_method.sim.settings import SimSettings
 
 _SIM = SimSettings()
@@ -15,7 +15,7 @@ _PACKAGES = {"pxr.UsdGeom": "usd-core", "xatlas": "xatlas", "shapely": "shapely"
 
 
 def sim(
-    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG [CONFIG ...] FOLDER")],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, required(metavar="CONFIG [CONFIG ...] FOLDER")],
     settings: Annotated[SimSettings, tyro.conf.arg(name="")] = _SIM,
 ) -> None:
     """Write assets for MuJoCo, Isaac Sim and Gazebo: convex colliders, a textured mesh, splats, and a report.

@@ -68,7 +68,7 @@ class ExtraLossConfig:
     """Weight of the normal consistency of 2DGS: composited normals against those of the rendered depth (2DGS: 0.05).
     Only of pixels without a cue, so that walls continue beyond the shell, but not what photographs show before it."""
     normal_consistency_from: Count = 7000
-    """First iteration of that term."""
+    """First iteration of that term, of a run of 30 000: it scales with the length of the run."""
     distortion: Weight = 0.0
     """Weight of the depth distortion of 2DGS; discs only."""
     depth_normal: Weight = 0.0

@@ -264,3 +264,10 @@ def test_a_command_that_is_stopped_by_its_user_says_so_without_a_traceback(monke
         cli.main()
     assert end.value.code == INTERRUPTED
     assert capsys.readouterr().err.splitlines() == ["shellgs: stopped"]
+
+
+@pytest.mark.parametrize("command", ["compare", "merge", "pick", "sim"])
+def test_help_says_that_files_are_required(shellgs, command):
+    told = shellgs(command, "--help")
+    assert "(default: )" not in told.split(" options ")[0]
+    assert "(required)" in told
