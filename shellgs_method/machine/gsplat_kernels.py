@@ -10,9 +10,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
+
+from filelock import FileLock
 
 from shellgs_method.errors import notice
 from shellgs_method.machine import system
@@ -47,10 +50,12 @@ def _uninterrupted(function: Callable[[], _Result]) -> Callable[[], _Result]:
 @_uninterrupted
 def kernels_fault() -> str | None:
     """Why gsplat's kernels do not load, None if they do; the first call may compile them, which takes minutes."""
-    if _nvcc() and not are_compiled():
+    if not _come_compiled() and _nvcc() and not are_compiled():
         notice(f"gsplat's kernels are compiled now, once: {compiling()}.")
     try:
-        kernels = importlib.import_module("gsplat.cuda._backend")._C
+        # Another run waits: gsplat would remove what this one has compiled so far.
+        with nullcontext() if _come_compiled() else FileLock(f"{kept_in()}.lock"):
+            kernels = importlib.import_module("gsplat.cuda._backend")._C
     except Exception as error:  # of nvcc, of the C++ compiler, of a library for another CUDA or torch, …
         reason = next(iter(str(error).strip().splitlines()), "")
         lacking = "".join(f"; {each}" for each in lacking_to_compile())
@@ -62,7 +67,11 @@ def kernels_fault() -> str | None:
 
 def are_compiled() -> bool:
     """Whether the kernels came with gsplat, or were compiled before."""
-    return find_spec("gsplat.csrc") is not None or any(kept_in().glob("gsplat_cuda.*"))
+    return _come_compiled() or any(kept_in().glob("gsplat_cuda.*"))
+
+
+def _come_compiled() -> bool:
+    return find_spec("gsplat.csrc") is not None
 
 
 def kept_in() -> Path:
@@ -104,9 +113,11 @@ def lacking_to_compile() -> list[str]:
 
 def _nvcc() -> str | None:
     """CUDA's compiler on the PATH, where alone gsplat 1.4 looks; the toolkit that torch finds elsewhere is added."""
+    if found := shutil.which("nvcc"):
+        return found
     from torch.utils.cpp_extension import CUDA_HOME
 
-    if CUDA_HOME and not shutil.which("nvcc"):
+    if CUDA_HOME:
         os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", os.defpath), os.path.join(CUDA_HOME, "bin")])
     return shutil.which("nvcc")
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -116,6 +118,25 @@ def test_a_first_run_says_before_it_compiles_how_long_it_takes(tools, on_cuda, m
     (record,) = caplog.records
     assert "compiled now, once: about" in record.getMessage()
     assert str(on_cuda) in record.getMessage()
+
+
+def test_runs_that_begin_at_once_compile_one_after_the_other(tools, on_cuda, monkeypatch):
+    """Gsplat removes the folder in which another run is compiling."""
+    compiling, found = threading.Lock(), []
+
+    def load(_: str) -> SimpleNamespace:
+        found.append(compiling.acquire(blocking=False))
+        time.sleep(0.5)
+        compiling.release()
+        return SimpleNamespace(_C=object())
+
+    monkeypatch.setattr(gsplat_kernels, "importlib", SimpleNamespace(import_module=load))
+    runs = [threading.Thread(target=gsplat_kernels.kernels_fault) for _ in range(3)]
+    for run in runs:
+        run.start()
+    for run in runs:
+        run.join()
+    assert found == [True, True, True]
 
 
 def test_training_with_gsplat_alone_is_refused_where_it_cannot_run(monkeypatch):

@@ -37,7 +37,7 @@ def _twins(monkeypatch) -> None:
 @pytest.fixture
 def kernels(monkeypatch) -> Iterator[ModuleType]:
     """Replace gsplat's module that loads the kernels by one without kernels."""
-    monkeypatch.setattr(gsplat_kernels, "are_compiled", lambda: True)
+    monkeypatch.setattr(gsplat_kernels, "_come_compiled", lambda: True)
     module = ModuleType("gsplat.cuda._backend")
     setattr(module, "_C", None)  # noqa: B010
     monkeypatch.setitem(sys.modules, module.__name__, module)
