@@ -103,6 +103,7 @@ def check_splats_format(path: Path, discs: bool = False) -> None:
 
 
 BLACK = (0.0, 0.0, 0.0)
+"""Background of a page, unless another is given."""
 
 
 def write_splats(
