@@ -6,7 +6,9 @@ import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import tyro
 
 from shellgs_method.bounds import FromOne, Length, bounded
 from shellgs_method.commands.common import PATHS, Mesher, Paths, Scene, console, shell_words
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from shellgs_method.files.photographs import View
     from shellgs_method.shell import Alignment
 
+# None if not given: of a variable that is empty, tyro makes an empty tuple.
+Files = Annotated[Optional[tuple[Path, ...]], tyro.conf.arg(metavar="PATH [PATH ...]")]
 SELDOM = 0.01
 """Share of all pixels that show the shell, below which it is hardly where the photographs show it."""
 LITTLE, FAR_OFF = 0.2, 0.5
@@ -29,12 +33,12 @@ LITTLE, FAR_OFF = 0.2, 0.5
 @bounded
 def cast(
     scene: Scene,
-    shell: tuple[Path, ...] = (),
+    shell: Files = None,
     matrix: Optional[Path] = None,
     global_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     metres_per_shell_unit: Length = 1.0,
     crs: Optional[str] = None,
-    truth: tuple[Path, ...] = (),
+    truth: Files = None,
     max_image_size: Optional[FromOne] = None,
     mesher: Optional[Mesher] = None,
     spacing: Optional[Length] = None,
@@ -76,7 +80,9 @@ def cast(
     from shellgs_method.registration.align import frame_of_matrix, in_its_system, names_in, system_and_unit
     from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
 
-    files = truth or shell
+    if () in (truth, shell):
+        raise SceneError(f"--{'truth' if truth == () else 'shell'} names no file: give one or more, or leave it out")
+    files = truth or shell or ()
     if truth and shell:
         raise SceneError("the truth is cast after the shell: give --shell or --truth")
     if (matrix and not files) or (shell and not matrix):

@@ -150,6 +150,8 @@ def test_the_command_that_a_changed_truth_is_refused_with_casts_it_again_in_its_
     ("words", "why"),
     [
         (["--truth", "no.ply"], "no.ply"),
+        (["--truth"], "--truth names no file: give one or more, or leave it out"),
+        (["--shell"], "--shell names no file"),
         (["--truth", "{shell}"], "is the shell itself, and proves nothing"),
         (["--truth", "{shell}", "--shell", "{shell}", "--matrix", "m.npy"], "give --shell or --truth"),
         (["--truth", "{shell}", "--metres-per-shell-unit", "0.001"], "go with --matrix"),
