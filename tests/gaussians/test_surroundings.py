@@ -167,6 +167,17 @@ def test_seeds_of_a_block_lie_in_it_where_it_has_no_gaussian_as_near():
     np.testing.assert_array_equal(lacking.points, points[:2])
 
 
+def test_what_is_far_from_the_cameras_is_of_no_block():
+    """A cell from x = 6, which is trained from 5; what is far begins at 0.8 of 1.5 times the SfM points' distance."""
+    cell = Cell(Block("east", ()), ((Cut((1.0, 0.0, 0.0), 6.0), True),), 1.0)
+    centre = np.array([4.0, 3, -2])
+    region = Region.of(cell, centre, centre + 10 * np.eye(3)[[0, 1, 2] * 40])
+    means = torch.tensor([[7.0, 3, -2], [5.5, 3, -2], [3, 3, -2], [15.9, 3, -2], [16.1, 3, -2], [-8.1, 3, -2]])
+    assert region.core(means).tolist() == [True, False, False, True, False, False]
+    assert region.extended(means).tolist() == [True, True, False, True, False, False]
+    assert region.near(means).tolist() == [True, True, True, True, False, False]
+
+
 def test_the_bound_on_seeds_is_one_on_those_of_the_block_whatever_else_its_photographs_show():
     region = Region(Cell(Block("east", ()), ((Cut((1.0, 0.0, 0.0), 6.0), True),), 1.0), np.zeros(3), 100.0)
     K = torch.tensor([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]], dtype=torch.float64)

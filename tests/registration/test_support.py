@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -106,10 +107,12 @@ def test_representative_views_are_spread_from_one_end_to_the_other(view):
 
 
 def sightlines(view: View, depth: float, columns: float) -> Sightlines:
-    """Those to points all over the left columns of a view, a cell each."""
+    """Those to points all over the left columns of a view, a cell each, twice, and between them a view away from it."""
     u, v = (np.indices((14, 10)).reshape(2, -1).T + 0.5).T * [[WIDTH / 14], [HEIGHT / 10]]
     pixels = np.stack([u, v], axis=-1)[u < columns]
-    return Sightlines.of([view], SparsePoints(at(view, pixels, np.full(len(pixels), depth))))
+    behind = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64)) @ view.camera.viewmat
+    away = replace(view, camera=replace(view.camera, viewmat=behind))
+    return Sightlines.of([view, away, view], SparsePoints(at(view, pixels, np.full(len(pixels), depth))))
 
 
 @pytest.mark.parametrize(
