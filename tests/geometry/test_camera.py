@@ -75,6 +75,13 @@ def test_a_point_is_at_the_same_place_of_a_resized_photograph():
     assert here.shrunk(1000) is here.shrunk(None) is here.resized(1000, 750) is here
 
 
+def test_a_camera_is_cast_as_a_whole_and_is_itself_if_it_is_so_already():
+    single = camera().to(torch.float32)
+    assert (single.viewmat.dtype, single.K.dtype, single.rays().dtype) == (torch.float32,) * 3
+    assert camera().to("cpu", torch.float64).viewmat.dtype == torch.float64
+    assert single.to("cpu") is single
+
+
 @pytest.mark.parametrize(("width", "height", "most", "stride"), [(640, 9, 320, 2), (641, 9, 320, 3), (9, 90, 100, 1)])
 def test_the_stride_leaves_at_most_so_many_pixels(width, height, most, stride):
     assert camera(width=width, height=height).thinning(most) == stride

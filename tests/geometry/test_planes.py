@@ -26,6 +26,15 @@ def test_the_largest_plane_has_all_points_within_the_tolerance():
     assert not found[off > 0.025].any()
 
 
+def test_no_plane_through_what_was_found_has_more_points():
+    points = np.concatenate([on_plane(300, noise=0.05), RNG.uniform(-6, 6, (900, 3))])
+    for seed in range(5):
+        found = largest_plane(points, 0.05, np.random.default_rng(seed))
+        centre, normal = fitted_plane(points[found])
+        assert (np.abs((points - centre) @ normal) <= 0.05).sum() <= found.sum()
+        assert found[:300].sum() > 170  # 68 % lie within a standard deviation
+
+
 def test_points_whose_normals_disagree_are_not_on_it():
     """Two crossing walls: where they meet, each point is on the one that its normal is of."""
     points = np.concatenate([on_plane(400), 5 * NORMAL + RNG.uniform(-2, 2, (200, 2)) @ np.stack([NORMAL, UP])])
