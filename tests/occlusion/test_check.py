@@ -27,6 +27,7 @@ from shellgs_method.evaluation.regions import reference_errors, regions
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings, Manifest
 from shellgs_method.files.photographs import View
 from shellgs_method.geometry.camera import Camera, positions
+from shellgs_method.geometry.similarity import transformed
 from shellgs_method.geometry.surface_classes import SurfaceClass
 from shellgs_method.losses.objective import ExtraLossConfig, GeometryLossConfig, Objective, Trust
 from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
@@ -52,6 +53,7 @@ from shellgs_method.occlusion.contradiction import (
     sweep_behind,
 )
 from shellgs_method.occlusion.exposure import exposed
+from shellgs_method.occlusion.verdicts import Verdicts
 from shellgs_method.viewer import ContradictedShell
 
 WIDTH, HEIGHT = 144, 64
@@ -122,12 +124,14 @@ def agreed(views: list[ShellView], judged: int = MIDDLE) -> tuple[Sweep, Agreeme
     return sweeps[judged], agreement(views[judged], sweeps[judged], [views[k] for k in beside], found_there)
 
 
+WORLD = np.eye(4)
+WORLD[:3, :3], WORLD[:3, 3] = Rotation.from_euler("xyz", [0.4, -1.2, 2.0]).as_matrix(), [3.0, -2, 5]
+"""From a world that is turned and moved to that of the wall."""
+
+
 def turned(camera: Camera) -> Camera:
-    """The same camera in a world that is turned and moved."""
-    world = torch.eye(4, dtype=torch.float64)
-    world[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", [0.4, -1.2, 2.0]).as_matrix())
-    world[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
-    return replace(camera, viewmat=camera.viewmat @ world)
+    """The same camera in that world."""
+    return replace(camera, viewmat=camera.viewmat @ torch.from_numpy(WORLD))
 
 
 def scores(views: list[ShellView]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -606,7 +610,7 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
 
 def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
     """A wall at z = 8; 8 of 10 cameras show a box 1 m in front of its middle."""
-    views = [View(f"{k}.png", tmp_path / f"{k}.png", camera_at(0.1 * k)) for k in range(10)]
+    views = [View(f"{k}.png", tmp_path / f"{k}.png", turned(camera_at(0.1 * k))) for k in range(10)]
     shell, checked = (CueMaps.create(tmp_path, kind, command="cast") for kind in ("shell", "checked"))
     normal = np.zeros((HEIGHT, WIDTH, 3), np.float16)
     for k, view in enumerate(views):
@@ -616,18 +620,20 @@ def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
         shell.write(view.name, CueMap(wall, normal, wall > 0), view.camera)
         checked.write(view.name, CueMap(np.where(box, 7, 0).astype(np.float32), normal, box), view.camera)
     places = np.array([[0.0, 0, WALL], [1.0, 0, WALL], [0.0, 0, 7.0], [0.0, 100.0, WALL]])
-    verdicts = shell_verdicts(tmp_path, views, places)
+    verdicts = shell_verdicts(tmp_path, views, transformed(places, np.linalg.inv(WORLD)))
     assert verdicts.seen.tolist() == [10, 10, 0, 0]  # one is not on the shell, one is in no image
     assert verdicts.contradicted.tolist() == [8, 0, 0, 0]
     slant = np.hypot(1, 0.35 / WALL)  # of the median camera's ray
     assert verdicts.distance[0] == pytest.approx(slant, rel=1e-3)
     assert np.isnan(verdicts.distance[1:]).all()
     assert verdicts.share == 0.5
-    assert verdicts.witness in [view.name for view in views[:8]]
     assert verdicts.contradicted[0] >= MANY
 
     spread = shell_verdicts(tmp_path, views)
-    contradicted = np.abs(spread.places[:, 0]) < 0.35
+    on_wall = transformed(spread.places, WORLD)
+    np.testing.assert_allclose(on_wall[:, 2], WALL, rtol=1e-6)
+    contradicted = np.abs(on_wall[:, 0]) < 0.35
+    assert contradicted.any()
     assert (spread.contradicted[contradicted] > 0).all()
     spread.write(tmp_path / "places.ply")
     cloud = trimesh.load(tmp_path / "places.ply")
@@ -664,6 +670,14 @@ def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scen
     assert len(points) == len(views)
     assert distance.max() < 1e-3
     assert not settings["visible"]
+
+
+def test_verdicts_name_the_view_that_contradicts_most_and_those_in_which_much_moved():
+    nothing = np.zeros(0)
+    by_view, moved = np.array([3, 9, 4]), np.array([0.0039, 0.01, 0.2])
+    verdicts = Verdicts(np.zeros((0, 3)), nothing, nothing, nothing, ["a", "b", "c"], nothing, by_view, moved)
+    assert verdicts.witness == "b"
+    assert verdicts.moved_in == ["c", "b"]
 
 
 def test_surfaces_are_measured_on_the_shell_and_in_front_of_it():
