@@ -6,6 +6,7 @@ Of glTF, find the files beside it.
 from __future__ import annotations
 
 import json
+import re
 import struct
 from contextlib import suppress
 from dataclasses import dataclass
@@ -79,11 +80,10 @@ def read_ply_header(path: Path) -> PlyHeader:
     """
     with path.open("rb") as file:
         start = file.read(_LONGEST_HEADER)
-    text, found, rest = start.partition(b"end_header")
-    if not start.startswith(b"ply") or not found:
+    end = re.search(rb"[\r\n]end_header[ \t]*(\r\n|.|$)", start, re.DOTALL)
+    if not start.startswith(b"ply") or not end:
         raise ValueError("it does not begin with the header of a PLY")
-    line_end = rest.lstrip(b" \t")
-    length = len(start) - len(line_end) + (2 if line_end.startswith(b"\r\n") else 1)
+    text, length = start[: end.start()], end.end()
     order, elements = "", []
     for words in (line.split() for line in text.decode("latin-1").splitlines()):
         match words:
@@ -91,10 +91,10 @@ def read_ply_header(path: Path) -> PlyHeader:
                 order = _ORDERS[form]
             case ["element", name, count]:
                 elements.append(PlyElement(name, int(count), []))
-            case ["property", "list", counted, kind, name]:
-                elements[-1].properties.append(PlyProperty(name.lower(), _TYPES[kind], _TYPES[counted]))
-            case ["property", kind, name]:
-                elements[-1].properties.append(PlyProperty(name.lower(), _TYPES[kind]))
+            case ["property", "list", counted, kind, *name] if name:
+                elements[-1].properties.append(PlyProperty(" ".join(name).lower(), _TYPES[kind], _TYPES[counted]))
+            case ["property", kind, *name] if name:  # with blanks, as of scalar fields
+                elements[-1].properties.append(PlyProperty(" ".join(name).lower(), _TYPES[kind]))
             case ["element" | "property", *_]:
                 raise ValueError(f"its header has the line {' '.join(words)!r}")
     for element in elements:

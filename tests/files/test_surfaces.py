@@ -368,6 +368,15 @@ def test_faces_of_two_corners_and_unknown_elements_of_a_ply_are_counted(tmp_path
     assert "left out 3 of 3 of the element 'blob'" in caplog.text
 
 
+def test_a_ply_may_have_names_with_blanks_and_comments_of_its_end(tmp_path: Path):
+    header = ["comment no end_header yet", "element vertex 6", "property float X error", *XYZ, "element face 1"]
+    header += [INDICES, "property list uchar float texture coordinates"]
+    data = rows(np.column_stack([np.arange(6), HEXAGON])) + "3 0 1 2 2 0 0"
+    read = read_geometry(save_ply(tmp_path / "a.ply", header, data, "ascii"))
+    np.testing.assert_array_equal(read.vertices, HEXAGON)
+    assert len(read.faces) == 1
+
+
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 def test_of_a_property_that_a_ply_has_twice_the_first_is_read(tmp_path: Path, form: str):
     bands = [f"property uchar {name}" for name in ("red", "green", "blue", "red")]
