@@ -108,6 +108,15 @@ def test_levels_of_detail_may_be_called_so_and_objects_have_no_geometry(tmp_path
     assert_cast_as(made.save_json(tmp_path / "a.json", document), moved(house()))
 
 
+@pytest.mark.parametrize("level", [None, ...])
+def test_a_geometry_without_a_level_of_detail_is_no_footprint(tmp_path: Path, level: Any):
+    document = made.cityjson(house())
+    document["CityObjects"]["a"]["geometry"][0]["lod"] = level
+    if level is ...:
+        del document["CityObjects"]["a"]["geometry"][0]["lod"]
+    assert_cast_as(made.save_json(tmp_path / "a.json", document), moved(house()))
+
+
 def test_the_highest_level_of_detail_is_read_and_said(tmp_path: Path, caplog):
     document = made.cityjson(house())
     low = {"type": "MultiSurface", "lod": "1.2", "boundaries": [[[0, 1, 2]]]}
@@ -327,6 +336,17 @@ def test_a_window_drawn_on_a_wall_is_a_window(tmp_path: Path):
 def turned(faces: Sequence[Face], degrees: float, shift: np.ndarray) -> list[Face]:
     turn = Rotation.from_euler("z", degrees, degrees=True)
     return [Face([turn.apply(ring) + shift for ring in face.rings], face.surface) for face in faces]
+
+
+def test_what_projects_from_a_wall_of_an_ifc_is_read(tmp_path: Path):
+    file = made.Ifc()
+    wall, cornice = (
+        file.block("IfcWall", (0, 0, 0), (6, 0.3, 3)),
+        file.block("IfcProjectionElement", (0, -1, 2), (6, 0, 3)),
+    )
+    file.add("IfcRelProjectsElement", file.new(), None, None, None, wall, cornice)
+    read = read_geometry(file.save(tmp_path / "a.ifc"))
+    np.testing.assert_allclose(read.vertices.min(axis=0), [0, -1, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("schema", ["IFC2X3", "IFC4", "IFC4X3"])

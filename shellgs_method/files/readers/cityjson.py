@@ -105,7 +105,10 @@ class _Document:
     def _level(self, geometry: dict[str, Any]) -> float:
         if "template" in geometry:
             geometry = self.templates[geometry["template"]]
-        return float(str(geometry.get("lod", 0)).lower().removeprefix("lod"))
+        level = geometry.get("lod")
+        if level is None:  # a footprint says that it is one
+            return 1.0
+        return float(str(level).lower().removeprefix("lod"))
 
     def _polygons(self, geometry: dict[str, Any]) -> Iterator[Polygon]:
         if geometry["type"] != "GeometryInstance":

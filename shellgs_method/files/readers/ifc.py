@@ -37,7 +37,7 @@ _PREDEFINED = {
 }
 _SEEN = (
     *("IfcBuildingElement", "IfcBuiltElement", "IfcBuildingElementPart", "IfcElementAssembly", "IfcSite"),
-    *("IfcGeographicElement", "IfcCivilElement"),
+    *("IfcGeographicElement", "IfcCivilElement", "IfcProjectionElement"),
 )
 _UNSEEN = {
     "IfcCovering": ("CEILING", "FLOORING", "SKIRTINGBOARD", "INSULATION", "MEMBRANE", "SLEEVING", "WRAPPING"),
