@@ -33,14 +33,15 @@ _SPELT: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = tup
         (r"(urn:adv:crs:)?DE_DHDN_3GK([2-5])(_\w+)?(\*.*)?", lambda m: f"EPSG:{31464 + int(m[2])}"),
         (r"https?://www\.opengis\.net/gml/srs/epsg\.xml#(\d+)", lambda m: f"EPSG:{m[1]}"),
         (
-            r"https?://www\.opengis\.net/def/crs-compound\?1=\S+/EPSG/[\d.]+/(\d+)&(?:amp;)?2=\S+/EPSG/[\d.]+/(\d+)",
+            r"https?://www\.opengis\.net/def/crs-compound\?1=.*/(\d+)&(?:amp;)?2=.*/(\d+)",
             lambda m: f"EPSG:{m[1]}+{m[2]}",
         ),
         (r"EPSG[:\s]*(\d{4,}(\+\d{4,})?)", lambda m: f"EPSG:{m[1]}"),
+        (r"(.+) \(EPSG:+\d+\)", lambda m: m[1]),
     )
 )
 """Names that PROJ does not know, and their codes: OpenDroneMap's, those of German surveys (their heights are left out),
-GML 2's, OGC's of two systems, and EPSG's without a colon or with a blank."""
+GML 2's, OGC's of two, EPSG's without a colon or with a blank, and PROJ's names before a code, as Metashape has them."""
 _IN_FILES = {
     **dict.fromkeys((".ifc",), re.compile(rb"IFCPROJECTEDCRS\s*\(\s*'([^']+)'", re.IGNORECASE)),
     **dict.fromkeys((".gml", ".xml", ".citygml"), re.compile(rb"srsName\s*=\s*[\"']([^\"']+)")),

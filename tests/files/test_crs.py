@@ -102,6 +102,14 @@ def test_a_prj_that_is_not_the_shells_system_is_told_and_not_kept(tmp_path, capl
         ("WGS84 UTM 32N", "EPSG:32632"),
         ("ETRS89 / UTM zone 32N", UTM),
         ("CRS: EPSG:25832", UTM),
+        ("WGS 84 / UTM zone 32N (EPSG::32632)", "EPSG:32632"),
+        ("WGS 84 (EPSG:4326)", "EPSG:4326"),
+        ("name X Y Z (EPSG:25832)", None),
+        (
+            "http://www.opengis.net/def/crs-compound?1=http://www.opengis.net/def/crs/EPSG/0/25832"
+            "&2=http://www.opengis.net/def/crs/EPSG/0/5783",
+            "EPSG:5555",
+        ),
         ("UTM 32N", None),
         ("EPSG:99999", None),
         ("EPSG:5783", None),  # heights only
