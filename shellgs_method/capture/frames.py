@@ -35,12 +35,13 @@ _PACE = 0.2  # seconds between the frames that motion is measured between: pixel
 _UNTAGGED = 2  # a colour space that is not said (H.273)
 _SQUARE = 0.01  # by which a pixel's sides may differ: programs round them
 _PAUSE = 10.0  # seconds between two frames that are no step, but a break, as where files were joined
+_BLACK = 32  # levels that compressed black reaches
 _BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
 
 def extract_frames(video: Path, folder: Path, count: int, progress: Progress) -> None:
-    """Write the sharpest frame of each of at most ``count`` stretches of equal motion of a video, upright and with
-    square pixels, as JPEG.
+    """Write the sharpest frame of each of at most ``count`` stretches of equal motion of a video, upright, with square
+    pixels and without black borders, as JPEG.
 
     Files are numbered by their frames in the video. Of several videos in a file, the largest is used, and told.
 
@@ -53,9 +54,11 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         usual = 1 / float(stream.average_rate or 30)
         sharpnesses, times, marks, shifts, before, last = [], [], [], [], None, None
+        brightest = np.zeros((1, 1), np.uint8)
         for frame in _frames(container, stream):
-            half = frame.reformat(frame.width // 2, frame.height // 2, format="gray")
-            sharpnesses.append(sharpness(half.to_ndarray()))
+            half = frame.reformat(frame.width // 2, frame.height // 2, format="gray").to_ndarray()
+            sharpnesses.append(sharpness(half))
+            brightest = np.maximum(brightest, half) if brightest.shape in ((1, 1), half.shape) else brightest
             step = usual if frame.time is None or last is None else frame.time - last
             # Times begin anew where files were joined, and jump after a break.
             times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
@@ -74,6 +77,12 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
     if is_around:  # the picture of a panorama moves to all sides at once
         moved = PANORAMAS_PER_SECOND * STEP * since
     chosen = sharpest(np.array(sharpnesses), *stretches(moved, since, count))
+    down, right = (0, 0) if is_around else (2 * width for width in borders(brightest))
+    if down or right:
+        notice(
+            f"{video} has black borders, of {down} pixels above and below and {right} at the left and the right, which "
+            "are cut off."
+        )
     task = progress.add_task("keeping the sharpest", total=len(chosen))
     with _opened(video) as (container, stream):
         for number, frame in enumerate(_frames(container, stream)):
@@ -83,7 +92,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
                         f"{video} is interlaced: where it moves, every other line of a frame is interpolated, as it is "
                         "of another moment; record it progressive (25p, not 50i) if you can."
                     )
-                image = _upright(frame, transfer, aspect)
+                image = _upright(frame, transfer, aspect, (right, down, frame.width - right, frame.height - down))
                 image.save(folder / f"frame_{number:06d}.jpg", quality=95, subsampling=0)
                 progress.advance(task)
 
@@ -217,7 +226,26 @@ def _pixel_aspect(stream: VideoStream) -> float:
     return aspect if 0.25 < aspect < 4 and abs(aspect - 1) > _SQUARE else 1.0
 
 
-def _upright(frame: av.VideoFrame, transfer: Transfer | None, aspect: float) -> Image.Image:
+def borders(brightest: UInt8[np.ndarray, "H W"]) -> tuple[int, int]:
+    """Rows above and below, and columns at the left and the right, that are black borders: as wide on both sides.
+
+    Args:
+        brightest: of each pixel the brightest that any frame shows.
+    """
+    shown = brightest > _BLACK
+    widths = []
+    for axis in (1, 0):
+        lines = np.flatnonzero(shown.any(axis=axis))
+        size = shown.shape[1 - axis]
+        before, after = (lines[0], size - 1 - lines[-1]) if len(lines) else (0, 0)
+        whole = before > 1 and abs(int(before) - int(after)) <= 1 and len(lines) > size / 4
+        widths.append(int(max(before, after)) + 1 if whole else 0)  # and the line in which both are mixed
+    return widths[0], widths[1]
+
+
+def _upright(
+    frame: av.VideoFrame, transfer: Transfer | None, aspect: float, kept: tuple[int, int, int, int]
+) -> Image.Image:
     if transfer is None:
         hd = frame.width >= 1280 or frame.height > 576
         # FFmpeg takes what does not say so for BT.601, where players take HD for BT.709.
@@ -227,6 +255,7 @@ def _upright(frame: av.VideoFrame, transfer: Transfer | None, aspect: float) -> 
         image = Image.fromarray(tone_mapped(frame.to_ndarray(format="rgb48le"), transfer))
     if frame.interlaced_frame and _is_combed(pixels := np.asarray(image)):
         image = Image.fromarray(_first_field(pixels))
+    image = image.crop(kept)
     if aspect != 1:
         image = image.resize((round(image.width * aspect), image.height), Image.Resampling.BICUBIC)
     angle = frame.rotation

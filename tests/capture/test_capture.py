@@ -119,6 +119,32 @@ def test_a_damaged_packet_of_a_video_is_left_out_and_this_is_told(tmp_path, capl
     assert "walk.mp4 is damaged, and is left out" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("kept", "size"),
+    [
+        ((0, 24, 160, 72), (160, 44)),  # a wide film in a frame of 5:3
+        ((50, 0, 110, 96), (56, 96)),  # one held upright
+        ((40, 20, 120, 76), (76, 52)),
+        ((0, 40, 160, 96), (160, 96)),  # a dark sky
+        ((0, 0, 160, 96), (160, 96)),
+    ],
+)
+def test_black_borders_of_a_video_are_cut_off_and_this_is_told(tmp_path, caplog, kept, size):
+    wide = photograph(480, 96).point([60 + level // 2 for level in range(256)] * 3)
+    frames = [Image.new("RGB", (160, 96)) for _ in range(20)]
+    for k, frame in enumerate(frames):
+        frame.paste(wide.crop((8 * k, 0, 8 * k + 160, 96)).crop(kept), kept[:2])
+    write_video(tmp_path / "walk.mp4", frames)
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 4, QUIET)
+    with Image.open(next((tmp_path / "frames").iterdir())) as image:
+        assert image.size == size
+        edges = np.asarray(image.convert("L"))
+    assert ("walk.mp4 has black borders" in caplog.text) == (size != (160, 96))
+    if size != (160, 96):
+        assert min(edges[0].mean(), edges[-1].mean(), edges[:, 0].mean(), edges[:, -1].mean()) > 50
+
+
 def test_times_that_begin_anew_or_jump_in_a_video_change_nothing(tmp_path):
     wide = photograph(640, 96)
     frames = [wide.crop((8 * k, 0, 8 * k + 160, 96)) for k in range(60)]
