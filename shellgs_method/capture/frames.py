@@ -54,11 +54,14 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         usual = 1 / float(stream.average_rate or 30)
         sharpnesses, times, marks, shifts, before, last = [], [], [], [], None, None
-        brightest = np.zeros((1, 1), np.uint8)
+        brightest: UInt8[np.ndarray, "H W"] | None = None
         for frame in _frames(container, stream):
             half = frame.reformat(frame.width // 2, frame.height // 2, format="gray").to_ndarray()
             sharpnesses.append(sharpness(half))
-            brightest = np.maximum(brightest, half) if brightest.shape in ((1, 1), half.shape) else brightest
+            if brightest is None or brightest.shape == half.shape:
+                brightest = half if brightest is None else np.maximum(brightest, half)
+            else:  # files of several sizes were joined
+                brightest = np.full((1, 1), 255, np.uint8)
             step = usual if frame.time is None or last is None else frame.time - last
             # Times begin anew where files were joined, and jump after a break.
             times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
@@ -67,10 +70,10 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
                 height = max(1, round(_SMALL * frame.height / frame.width))
                 small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
                 marks.append(times[-1])
-                shifts.append(shift(small if before is None else before, small))
+                shifts.append(shift(small if before is None or before.shape != small.shape else before, small))
                 before = small
             progress.update(task, completed=len(times))
-        if not times:
+        if brightest is None:
             raise SceneError(f"{video} holds no frames: is it a complete video?")
     since = np.array(times)
     moved = np.interp(since, marks, travelled(np.array(shifts)))

@@ -168,6 +168,17 @@ def test_times_that_begin_anew_or_jump_in_a_video_change_nothing(tmp_path):
     np.testing.assert_allclose(taken, taken[0], atol=1)
 
 
+def test_a_video_of_frames_of_several_sizes_is_read(tmp_path):
+    wide = photograph(480, 160)
+    for name, (width, height) in (("1.ts", (160, 96)), ("2.ts", (96, 160))):
+        write_video(tmp_path / name, [wide.crop((8 * k, 0, 8 * k + width, height)) for k in range(20)])
+    (tmp_path / "joined.ts").write_bytes(b"".join((tmp_path / name).read_bytes() for name in ("1.ts", "2.ts")))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "joined.ts", tmp_path / "frames", 10, QUIET)
+    sizes = [Image.open(path).size for path in sorted((tmp_path / "frames").iterdir())]
+    assert {*sizes} == {(160, 96), (96, 160)}
+
+
 def test_a_video_gives_between_one_and_five_frames_a_second():
     since = np.arange(60) / 30
     assert stretches(np.linspace(0, 9, 60), since, 200)[1] == 10
