@@ -21,6 +21,11 @@ from shellgs_method.shell.alignment import Alignment
 MAX_ERROR = 0.15
 """Residual in metres from which a point is an outlier: five times the scatter of careful picks (1 cm on a scan, 3 cm
 from photographs) and of RTK positions (2 to 3 cm)."""
+LEFT_HANDED = (
+    "the shell's coordinates are left-handed, as two axes are swapped or one has the wrong sign; export it again"
+)
+"""Why a shell fits in a mirror only, and what to do."""
+_MOST = 0.75  # of the points, which agree by no chance
 _THIN = 0.02  # breadth over length below which points are on one line
 _MAX_TRIPLES = 2000
 
@@ -87,12 +92,19 @@ def fit_robustly(
         remedy: advice if they lie on one line, for messages.
 
     Raises:
-        SceneError: fewer than 3 points, or only points on one line, agree.
+        SceneError: fewer than 3 points, or only points on one line, agree, or most do in a mirror.
     """
     survey_from_shell = centred(shell.mean(axis=0), metres_per_shell_unit)
     shell = transformed(shell, survey_from_shell)
     _check_spread(scene[candidates], shell[candidates], called, remedy)
     used = _consensus(scene, shell, candidates)
+    if used.sum() < _MOST * candidates.sum():
+        mirrored = _consensus(scene, shell * [-1.0, 1.0, 1.0], candidates)
+        if mirrored.sum() >= _MOST * candidates.sum():
+            raise SceneError(
+                f"{mirrored.sum()} of {candidates.sum()} {called} agree with the photographs once they are mirrored, "
+                f"and {used.sum()} as they are: {LEFT_HANDED}"
+            )
     if used.sum() < 3:
         raise SceneError(
             f"only {used.sum()} of {candidates.sum()} {called} agree with the photographs within {MAX_ERROR} m: are "

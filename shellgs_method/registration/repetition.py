@@ -1,7 +1,8 @@
 """The repetition test: with repeated windows, a shell may fit as well one bay further along, or one storey higher.
 
 Distances between points and surface do not reveal a displacement by exactly one bay; only the ends of the facade and
-interruptions of its rhythm do. So the test shifts the shell along the points and compares the fit at each shift.
+interruptions of its rhythm do. So the test shifts the shell along the points and compares the fit at each shift. Nor do
+picks on a plane wall reveal a shell that is mirrored front to back: it is compared with its mirror image as well.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ BETTER = 1.02
 """Fit relative to that in place from which a shift is better, beyond noise."""
 _NEAR = 1.0  # metres: points farther away at every shift are not of the shell
 _STEP = 0.1
+_DEPTHS = np.arange(-0.4, 0.41, 0.05)  # metres: shifts along the normal, as the wall's plane is not known better
+_CLEAR = 0.3  # fit below which a shell is elsewhere, and its mirror image tells nothing
 _SHORTEST = 1.0  # metres: shortest bay
 _MAX_POINTS = 3000
 _MAX_STEPS = 250  # 25 m each way
@@ -83,9 +86,32 @@ def scan_shifts(
         # Shifting the shell is shifting the points the other way.
         distances = np.stack([surface.distance(points - shift * direction) for shift in shifts])
         eligible = distances.min(axis=0) < _NEAR
-        fits = np.maximum(1 - (distances[:, eligible] / FIT) ** 2, 0.0) ** 2
-        scans.append(ShiftScan(name, shifts, fits.mean(axis=1) if eligible.any() else np.zeros(len(shifts)), period))
+        fits = _fits(distances[:, eligible]) if eligible.any() else np.zeros(len(shifts))
+        scans.append(ShiftScan(name, shifts, fits, period))
     return scans
+
+
+def mirrored_fit(surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes: Float64[np.ndarray, "3 3"]) -> float:
+    """Fit of the shell mirrored front to back, relative to its own: more than 1 where its file is left-handed.
+
+    Args:
+        surface: the shell.
+        points: points near it, in the survey frame.
+        axes: right, up and out of the facade, as rows.
+    """
+    points = np.random.default_rng(0).permutation(points)[:_MAX_POINTS]
+    heights = points @ axes[2]
+    mirrored = points - 2 * (heights - np.median(heights))[:, None] * axes[2]
+    own, other = (
+        _fits(np.stack([surface.distance(each + depth * axes[2]) for depth in _DEPTHS])).max()
+        for each in (points, mirrored)
+    )
+    return float(other / max(own, _CLEAR))
+
+
+def _fits(distances: Float64[np.ndarray, "S N"]) -> Float64[np.ndarray, " S"]:
+    """Mean fit of points at some shifts."""
+    return (np.maximum(1 - (distances / FIT) ** 2, 0.0) ** 2).mean(axis=1)
 
 
 def _relief(surface: ShellSurface, axes: np.ndarray) -> tuple[Float64[np.ndarray, "V U"], float]:

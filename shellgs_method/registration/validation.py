@@ -21,9 +21,9 @@ from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.precision import COARSEST, FINE, REMEDY, Step, camera_step
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.registration.adjustment import Adjustment
-from shellgs_method.registration.correspondences import Correspondence
+from shellgs_method.registration.correspondences import LEFT_HANDED, Correspondence
 from shellgs_method.registration.refinement import Refinement, refine
-from shellgs_method.registration.repetition import BETTER, RIVALRY, ShiftScan, scan_shifts
+from shellgs_method.registration.repetition import BETTER, RIVALRY, ShiftScan, mirrored_fit, scan_shifts
 from shellgs_method.registration.support import NEAR, OCCLUDING, ViewSupport, look
 from shellgs_method.shell.alignment import Alignment
 from shellgs_method.shell.mesh import ShellMesh
@@ -70,6 +70,7 @@ LIMITS = {
     ),
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
+    "mirrored": Limit(1.1, 1.25, LEFT_HANDED),
     "agreement": Limit(
         0.65, 0.55, "a shell elsewhere shows walls where photographs show none, and hides what they show"
     ),
@@ -109,6 +110,7 @@ class Validation:
         signed: signed distances in metres of the SfM points within :data:`NEAR`, positive in front of the shell.
         near: share of these among all SfM points.
         scans: fit at shifts along the facade and upwards.
+        mirrored: fit of the shell mirrored front to back, relative to its own.
         test: test refinement of the alignment; None if too few points are near the shell.
         correspondences: picks or camera positions and their residuals, if any.
         steps: steps of the coordinates in metres, by what they are of.
@@ -123,6 +125,7 @@ class Validation:
     signed: Float64[np.ndarray, " N"] = field(default_factory=lambda: np.empty(0))
     near: float = 0.0
     scans: Sequence[ShiftScan] = ()
+    mirrored: float = 0.0
     test: Refinement | None = None
     correspondences: Sequence[Correspondence] = ()
     steps: Mapping[str, Step] = field(default_factory=dict)
@@ -252,6 +255,7 @@ def validate(
         signed=signed[near],
         near=float(near.mean()),
         scans=scan_shifts(surface, placed, axes),
+        mirrored=mirrored_fit(surface, placed[near], axes) if near.any() else 0.0,
         test=test,
         correspondences=correspondences,
         steps=steps,
@@ -305,6 +309,7 @@ def _checks(measured: Validation) -> Iterator[Check]:
     for scan in measured.scans if len(measured.signed) else ():
         shift, fit = scan.elsewhere
         yield _check("rival", fit, f"Relative fit, shifted {shift:+.1f} m {scan.name}", "{:.3f}")
+    yield _check("mirrored", measured.mirrored, "Relative fit, mirrored front to back", "{:.2f}")
     if held_out := [p.residual for p in measured.correspondences if p.held_out]:
         yield _check("check", float(np.median(held_out)), "Check points, median residual", "{:.3f} m")
 

@@ -499,6 +499,13 @@ def test_noisy_picks_give_the_alignment(rigged):
     assert all(point.left_out_residual > point.residual for point in points)  # a fit without it misses it by more
 
 
+def test_picks_that_agree_in_a_mirror_are_of_a_left_handed_shell(rigged):
+    views, projections = rigged
+    picks = [replace(pick, shell=pick.shell[[1, 0, 2]]) for pick in picked(projections)[0]]  # northing before easting
+    with pytest.raises(SceneError, match=r"8 of 8 picks agree .* once they are mirrored.*left-handed"):
+        align_picks(picks, views)
+
+
 def test_a_pick_that_is_2_m_off_is_left_out_and_comes_first(rigged):
     views, projections = rigged
     picks, truth = picked(projections)
@@ -908,6 +915,17 @@ def test_the_verdict_names_what_is_wrong(mesh, views, points, alignment, verdict
     validation = validate(mesh, alignment, views, points)
     assert validation.verdict == verdict, validation.reasons
     assert reason is None or any(reason in sentence for sentence in validation.reasons)
+
+
+def test_a_shell_that_is_mirrored_front_to_back_is_refused_and_a_flat_one_is_not(mesh, views, points):
+    # Picks on the wall's plane place the mirror image as they do the shell.
+    mirror = SHELL_FROM_BUILDING @ np.diag([1.0, -1, 1, 1]) @ np.linalg.inv(SHELL_FROM_BUILDING)
+    left_handed = replace(mesh, vertices=transformed(mesh.vertices, mirror))
+    refused = [check for check in validate(left_handed, shifted(), views, points).checks if check.verdict == "refused"]
+    assert any("mirrored" in check.name and "left-handed" in check.why for check in refused)
+    corners = np.array([[0.0, 0, 0], [15, 0, 0], [15, 0, 11], [0, 0, 11]])
+    wall = ShellMesh(transformed(corners, SHELL_FROM_BUILDING), np.array([[0, 1, 2], [0, 2, 3]]))
+    assert not any("mirrored" in reason for reason in validate(wall, shifted(), views, points).reasons)
 
 
 def test_limits_work_from_both_sides_and_refuse_nan():
