@@ -13,6 +13,7 @@ from shellgs_method.files.readers.contents import Geometry
 from shellgs_method.files.surfaces import read_surface
 from shellgs_method.geometry.nearest import point_tree
 from shellgs_method.geometry.outliers import inliers
+from shellgs_method.geometry.precision import NO_STEP, REMEDY, Step, cloud_step, mesh_step
 from shellgs_method.geometry.triangles import area_vectors, sampled
 from shellgs_method.registration.sfm_frame import first_slip, in_degrees
 
@@ -82,6 +83,12 @@ class ShellPlace:
         near = self._near(points, reach)
         if near and (len(points) < _FEW or self._extent(points) >= _NARROW):
             return
+        step = max((_step(surface) for surface in self.surfaces), key=lambda step: step.coarsest)
+        if step.rounded and step.coarsest > reach * self.size:
+            raise SceneError(
+                f"the coordinates of the shell {self.named} are stored in steps of {step.in_words('units')}, so "
+                f"{called} are not {where}: {REMEDY}"
+            )
         apart = np.median(points, axis=0) - self.middle
         wide = _WIDE if near else _NARROW  # near and narrow: on one facade of a city, if no other unit explains it
         slip = first_slip(points, lambda p: self._near(p, _SURELY * reach) and self._extent(p) >= wide)
@@ -138,6 +145,12 @@ def _spread(surface: Geometry | Cloud) -> Float64[np.ndarray, "N 3"]:
         if np.isfinite(areas).all() and areas.any():
             points = sampled(points, surface.faces, areas, _SAMPLES)[0]
     return np.random.default_rng(0).permutation(points)[:_SAMPLES]
+
+
+def _step(surface: Geometry | Cloud) -> Step:
+    if isinstance(surface, Cloud):
+        return cloud_step(surface.whole.sample)
+    return NO_STEP if surface.drawn else mesh_step(surface.vertices, surface.faces)
 
 
 def _box(points: np.ndarray) -> np.ndarray:

@@ -268,6 +268,17 @@ def test_a_shell_in_another_unit_than_picks_and_positions_is_named(pristine_scen
         ShellPlace(tmp_path / "mm.ply").check_positions(stood - middle, "the positions")
 
 
+def test_a_shell_that_was_rounded_is_named_where_picks_are_off_it(picks, pristine_scene, tmp_path):
+    mesh = load_shell(pristine_scene / "shell/facade.ply")
+    corners = (f"v {x:.6g} {y:.6g} {z:.6g}" for x, y, z in mesh.vertices)  # as Open3D writes an obj: steps of 10 m
+    faces = (f"f {a} {b} {c}" for a, b, c in mesh.faces + 1)
+    (tmp_path / "six.obj").write_text("\n".join([*corners, *faces]))
+    with pytest.raises(
+        SceneError, match=r"of the shell .*six\.obj are stored in steps of 1 x 10 .* so the picks are not"
+    ):
+        ShellPlace(tmp_path / "six.obj").check_picks(picks, "the picks")
+
+
 def test_picks_on_the_shell_and_cameras_around_it_are_accepted(place, picks, stood):
     rng = np.random.default_rng(0)
     place.check_picks(picks + rng.normal(0, 0.05, picks.shape), "the picks")
