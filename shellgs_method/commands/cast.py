@@ -187,7 +187,7 @@ def _words(truth: Sequence[Path], matrix: Path | None, shift: Sequence[float], u
 def _check(scene: Path, config: FacadeDataParserConfig) -> None:
     """Compare the photographs, and print where and how much they contradict the shell."""
     from dataparsers.facade import held_out_names, read_views
-    from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, check_views, shell_verdicts
+    from shellgs_method.occlusion import CONTRADICTED_PLACES, MANY, UNCLEAR, check_views, shell_verdicts
 
     views = read_views(config)
     found = check_views(scene, views, held_out_names(config))
@@ -207,6 +207,12 @@ def _check(scene: Path, config: FacadeDataParserConfig) -> None:
         console.print(
             f"Views in which something hides the shell that no other photograph shows, such as a passer-by or a car: "
             f"{len(verdicts.moved_in)}, mostly {verdicts.moved_in[0]}; shellgs-metric ignores it."
+        )
+    if verdicts.unclear > UNCLEAR:
+        console.print(
+            f"Photographs tell little of {verdicts.unclear:.0%} of these pixels, as where they are dark or noisy: the "
+            "shell is doubted there, and supervises with less weight.",
+            style="yellow",
         )
     panel = _save_check_panel(scene, views)
     console.print(

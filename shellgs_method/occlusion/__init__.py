@@ -1,11 +1,12 @@
 """What photographs say against the shell."""
 
 from shellgs_method.occlusion.check import check_views, compared_others
-from shellgs_method.occlusion.verdicts import CONTRADICTED_PLACES, MANY, shell_verdicts
+from shellgs_method.occlusion.verdicts import CONTRADICTED_PLACES, MANY, UNCLEAR, shell_verdicts
 
 __all__ = [
     "CONTRADICTED_PLACES",
     "MANY",
+    "UNCLEAR",
     "check_views",
     "compared_others",
     "shell_verdicts",

@@ -24,6 +24,9 @@ MANY = 6
 there. An occluder farther in front of the shell hides different points in each photograph."""
 MOVED = 0.004
 """Share of a view's shell above which what moved is worth mentioning."""
+UNCLEAR = 0.25
+"""Share of the shell's pixels that is doubted from which photographs tell too little: a tenth at most by day, half and
+more in the noise of the night."""
 _STEP = 4  # stride in pixels of the lifted points
 _ACROSS = 300  # points along the longest side of the shell
 _SAME = 0.01  # relative difference of depth within which a point is visible in a view's shell map
@@ -42,6 +45,7 @@ class Verdicts:
         differs: mask of the points where the building differs from the shell, by :data:`MANY`.
         by_view: number of these points that each view contradicts.
         moved: share of each view's shell that is hidden by something that moved, since no other view shows it.
+        doubted: share of each view's shell that something may stand in front of.
     """
 
     places: Float64[np.ndarray, "N 3"]
@@ -52,6 +56,7 @@ class Verdicts:
     differs: Bool[np.ndarray, " N"]
     by_view: Int64[np.ndarray, " V"]
     moved: Float64[np.ndarray, " V"]
+    doubted: Float64[np.ndarray, " V"]
 
     @property
     def share(self) -> float:
@@ -67,6 +72,11 @@ class Verdicts:
     def moved_in(self) -> list[str]:
         """Names of the views in which more than :data:`MOVED` of the shell is hidden by what moved, the most first."""
         return [self.views[i] for i in np.argsort(-self.moved) if self.moved[i] > MOVED]
+
+    @property
+    def unclear(self) -> float:
+        """Share of a view's shell that is doubted, in the mean."""
+        return float(self.doubted.mean()) if len(self.doubted) else 0.0
 
     def write(self, path: Path) -> None:
         """Write the points as a ply, redder where a larger share of the views contradicts them."""
@@ -94,7 +104,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     if places is None:
         places = _seen_places(sized, shell)
     seen, distances = np.zeros(len(places), np.int64), np.full((len(sized), len(places)), np.nan, np.float32)
-    moved = []
+    moved, doubted = [], []
     for distance, view in zip(distances, sized, strict=True):
         camera = view.camera.shrunk(shell.manifest.max_image_size)
         cue, check = shell.require(view.name, camera), checked.require(view.name, camera)
@@ -105,6 +115,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         seen[k] += visible
         found = Findings.of(check, cue)
         moved.append(found.moved.sum() / max((cue.depth > 0).sum(), 1))
+        doubted.append(found.doubtful.sum() / max((cue.depth > 0).sum(), 1))
         occluded = visible & found.occluder[rows, columns]
         along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]
@@ -115,7 +126,7 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
     differs = (contradicted >= MANY) & (2 * contradicted >= seen)
     by_view = np.isfinite(distances[:, differs]).sum(axis=1)
     names = [view.name for view in sized]
-    return Verdicts(places, seen, contradicted, median, names, differs, by_view, np.array(moved))
+    return Verdicts(places, seen, contradicted, median, names, differs, by_view, np.array(moved), np.array(doubted))
 
 
 def _seen_places(views: Sequence[View], shell: CueMaps) -> Float64[np.ndarray, "N 3"]:

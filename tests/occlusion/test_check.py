@@ -20,6 +20,7 @@ from training_runs import data_of, model_of, small_disk, trainer_of
 from viser import SceneApi
 
 from dataparsers.facade import FacadeDataParserConfig, held_out_names, read_views
+from shellgs_method import occlusion
 from shellgs_method.evaluation import Rendering, pixels
 from shellgs_method.evaluation.panels import check_panel
 from shellgs_method.evaluation.pixels import DOUBTED, reference_maps, shell_trust
@@ -608,6 +609,12 @@ def test_what_moved_is_left_out_of_the_photometric_loss_but_not_of_the_shell(she
     assert model._view(batch).photometric.mask is None
 
 
+def test_photographs_that_tell_little_are_told(shellgs, scene: Path, monkeypatch):
+    assert "tell little of" not in shellgs("cast", scene)
+    monkeypatch.setattr(occlusion, "UNCLEAR", 0.0)  # some pixels of any scene are doubted
+    assert "of these pixels, as where they are dark or noisy" in " ".join(shellgs("cast", scene).split())
+
+
 def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
     """A wall at z = 8; 8 of 10 cameras show a box 1 m in front of its middle."""
     views = [View(f"{k}.png", tmp_path / f"{k}.png", turned(camera_at(0.1 * k))) for k in range(10)]
@@ -618,7 +625,8 @@ def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
         box = (np.abs(x) < 0.4) & (k < 8)
         wall = np.full((HEIGHT, WIDTH), WALL, np.float32)
         shell.write(view.name, CueMap(wall, normal, wall > 0), view.camera)
-        checked.write(view.name, CueMap(np.where(box, 7, 0).astype(np.float32), normal, box), view.camera)
+        found = np.where(box, 7, np.where(wall > 0 if k == 9 else box, 7.5, 0))  # the last one is unsure of it all
+        checked.write(view.name, CueMap(found.astype(np.float32), normal, box), view.camera)
     places = np.array([[0.0, 0, WALL], [1.0, 0, WALL], [0.0, 0, 7.0], [0.0, 100.0, WALL]])
     verdicts = shell_verdicts(tmp_path, views, transformed(places, np.linalg.inv(WORLD)))
     assert verdicts.seen.tolist() == [10, 10, 0, 0]  # one is not on the shell, one is in no image
@@ -627,6 +635,7 @@ def test_verdicts_count_the_views_that_see_a_place(tmp_path: Path):
     assert verdicts.distance[0] == pytest.approx(slant, rel=1e-3)
     assert np.isnan(verdicts.distance[1:]).all()
     assert verdicts.share == 0.5
+    assert verdicts.unclear == pytest.approx(0.1)
     assert verdicts.contradicted[0] >= MANY
 
     spread = shell_verdicts(tmp_path, views)
