@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 Files = Annotated[Optional[tuple[Path, ...]], tyro.conf.arg(metavar="PATH [PATH ...]")]
 SELDOM = 0.01
 """Share of all pixels that show the shell, below which it is hardly where the photographs show it."""
+HOLES = 0.005
+"""Share of the shell's pixels that show what is behind holes in a scan's mesh, above which it is told."""
 LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
 
@@ -79,6 +81,7 @@ def cast(
     from shellgs_method.files.cue_maps import CueMaps
     from shellgs_method.registration.align import frame_of_matrix, in_its_system, names_in, system_and_unit
     from shellgs_method.shell import ALIGNMENT, Alignment, PlacedShell, cast_views
+    from shellgs_method.shell.cast import seen_through
 
     if () in (truth, shell):
         raise SceneError(f"--{'truth' if truth == () else 'shell'} names no file: give one or more, or leave it out")
@@ -129,6 +132,15 @@ def cast(
             f"Hardly any pixel shows the shell: is it in its place? `shellgs align` validates that"
             f"{f'; {hint}' if hint else ''}.",
             style="yellow",
+        )
+    if placed.mesh.meshing and (through := seen_through(scene, views)) > HOLES:
+        poisson = f"`shellgs align {shlex.quote(str(scene))} … --mesher poisson` closes most"
+        remedy = "a denser scan is needed" if aligned.mesher == "poisson" else poisson
+        console.print(
+            f"{through:.1%} of these pixels show what is far behind, through holes of a few pixels in the mesh. Where "
+            f"the building has none, as in a round wall, {remedy}.",
+            style="yellow",
+            soft_wrap=True,
         )
     if check:
         _check(scene, config)

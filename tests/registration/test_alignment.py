@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
 from shellgs_method.capture.photographs import find_photographs
+from shellgs_method.commands import cast as casting
 from shellgs_method.errors import SceneError
 from shellgs_method.export.runs import TrainedRun
 from shellgs_method.files.bound_cameras import BoundCameras
@@ -1315,6 +1316,15 @@ def scanned(scene: Path) -> Path:
     np.savetxt(scene / "shell" / "scan.xyz", transformed(samples, np.linalg.inv(survey)), fmt="%.4f")
     np.save(scene / "matrix.npy", alignment.shell_to_scene)
     return scene
+
+
+def test_holes_in_the_mesh_of_a_scan_are_told(scanned, shellgs, monkeypatch):
+    monkeypatch.setattr(casting, "HOLES", -1.0)
+    command = ("cast", scanned, "--shell", scanned / "shell/scan.xyz", "--matrix", scanned / "matrix.npy", "--no-check")
+    told = " ".join(shellgs(*command).split())
+    assert "far behind, through holes of a few pixels in the mesh" in told
+    assert "--mesher poisson` closes most" in told
+    assert "a denser scan is needed" in " ".join(shellgs(*command, "--mesher", "poisson").split())
 
 
 def test_the_mesher_belongs_to_the_alignment(scanned, shellgs, monkeypatch):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from dataparsers.facade import FacadeDataParserConfig, read_views
@@ -17,8 +18,10 @@ from shellgs_method.errors import SceneError
 from shellgs_method.files.cue_maps import CueMap, CueMaps, Findings
 from shellgs_method.files.photographs import View
 from shellgs_method.files.scene import SceneLayout
+from shellgs_method.geometry.camera import Camera
 from shellgs_method.geometry.similarity import transformed
 from shellgs_method.shell import ALIGNMENT, TRUTH, Alignment
+from shellgs_method.shell.cast import seen_through
 from shellgs_method.synthetic.geometry import Material
 from shellgs_method.synthetic.scene import UNITS_PER_METRE, Facade, FacadeConfig, scene_camera, settings_of
 
@@ -165,3 +168,17 @@ def test_what_cannot_be_cast_as_truth_is_refused_and_nothing_changes(scene, shel
     assert why in said
     assert (scene / "cues/truth/manifest.json").read_bytes() == before
     assert not (scene / TRUTH).exists()
+
+
+def test_holes_of_a_mesh_are_told_from_windows(tmp_path):
+    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), 64, 48)
+    view, depth = View("0.png", tmp_path / "0.png", camera), np.full((48, 64), 8.0, np.float32)
+    depth[:, :10] = 0  # nothing
+    depth[20:32, 30:44] = 10  # a deep window
+    shell = CueMaps.create(tmp_path, "shell", command="cast")
+    normal = np.zeros((48, 64, 3), np.float16)
+    shell.write(view.name, CueMap(depth, normal, depth > 0), camera)
+    assert seen_through(tmp_path, [view]) == 0
+    depth[5:7, 20] = depth[40, 50:53] = 14
+    shell.write(view.name, CueMap(depth, normal, depth > 0), camera)
+    assert seen_through(tmp_path, [view]) == 5 / (48 * 54)
