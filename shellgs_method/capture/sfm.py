@@ -149,6 +149,8 @@ def match(database: str, pairs: list[list[str]]) -> None:
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
+    # A time stamp or the bonnet of a car stands at the same pixels, and says that the camera stood still.
+    verification.filter_stationary_matches = True
     with pycolmap.Database.open(database) as opened:
         has_rigs = _has_rigs(opened)
     pycolmap.match_image_pairs(

@@ -46,7 +46,6 @@ from shellgs_method.capture.photographs import (
 )
 from shellgs_method.capture.process import run_step
 from shellgs_method.capture.rigs import folders, taken_at_once, tell_of_a_rig
-from shellgs_method.capture.standing import leave_out_what_stands
 from shellgs_method.capture.work import Work, listing, refuse_foreign
 from shellgs_method.errors import SceneError, notice
 from shellgs_method.files.atomic import fingerprint, read_json
@@ -259,8 +258,6 @@ class _Capture:
             camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
         )
         _tidy(database)
-        if _rows(database, "descriptors") and not _rows(database, "matches"):
-            leave_out_what_stands(database)
         return database
 
     def _model(self, database: Path) -> None:

@@ -684,7 +684,7 @@ def test_the_viewer_shows_contradicted_places_in_nerfstudios_world(pristine_scen
 def test_verdicts_name_the_view_that_contradicts_most_and_those_in_which_much_moved():
     nothing = np.zeros(0)
     by_view, moved = np.array([3, 9, 4]), np.array([0.0039, 0.01, 0.2])
-    verdicts = Verdicts(np.zeros((0, 3)), nothing, nothing, nothing, ["a", "b", "c"], nothing, by_view, moved)
+    verdicts = Verdicts(np.zeros((0, 3)), nothing, nothing, nothing, ["a", "b", "c"], nothing, by_view, moved, nothing)
     assert verdicts.witness == "b"
     assert verdicts.moved_in == ["c", "b"]
 

@@ -377,7 +377,7 @@ def test_a_matrix_is_read_as_programs_print_it(tmp_path: Path, printed: Callable
 
 def test_a_matrix_of_decimal_commas_is_refused_as_such(tmp_path: Path):
     (tmp_path / "matrix.txt").write_text("\n".join(rows(similarity(0.3, TURN, GEOREFERENCE))).replace(".", ","))
-    with pytest.raises(SceneError, match=r"matrix\.txt: this is not a 4x4 matrix but 32 numbers: are its commas decimal"):
+    with pytest.raises(SceneError, match=r"matrix\.txt: .* but 32 numbers: are its commas decimal"):
         Alignment.from_matrix_file(tmp_path / "matrix.txt", ("shell.ply",))
 
 
