@@ -48,11 +48,11 @@ def test_pixels_hidden_by_the_shell_in_a_training_view_are_not_seen():
 
 def test_a_pixel_off_the_shell_has_the_depth_of_the_nearest_sfm_point():
     """The left is at depth 5, where a sideways step of 5 is 40 pixels; the right at 100, where it is 2."""
-    points = (torch.tensor([[-2.5, 0.0, 5.0], [50.0, 0.0, 100.0]]) - WORLD[:3, 3]) @ WORLD[:3, :3]
+    points = (torch.tensor([[-3.75, 0.0, 5.0], [25.0, 0.0, 100.0]]) - WORLD[:3, 3]) @ WORLD[:3, :3]
     nothing = torch.zeros(HEIGHT, WIDTH, 1)
     seen = Covisibility([camera(5), camera(5)], [nothing[..., 0]] * 2, points).mask(camera(0), nothing)
-    assert not seen[:, :35].any()
-    assert seen[:, 45:].all()
+    assert not seen[:, :29].any()
+    assert seen[:, 31:].all()  # the points are in columns 10 and 50
 
 
 def test_sky_without_points_is_seen_by_all_views_that_look_there():
