@@ -100,7 +100,7 @@ def fit_robustly(
     used = _consensus(scene, shell, candidates)
     if used.sum() < _MOST * candidates.sum():
         mirrored = _consensus(scene, shell * [-1.0, 1.0, 1.0], candidates)
-        if mirrored.sum() >= _MOST * candidates.sum():
+        if mirrored.sum() >= max(_MOST * candidates.sum(), used.sum() + 2):  # one more may agree by chance
             raise SceneError(
                 f"{mirrored.sum()} of {candidates.sum()} {called} agree with the photographs once they are mirrored, "
                 f"and {used.sum()} as they are: {LEFT_HANDED}"

@@ -25,7 +25,7 @@ BETTER = 1.02
 """Fit relative to that in place from which a shift is better, beyond noise."""
 _NEAR = 1.0  # metres: points farther away at every shift are not of the shell
 _STEP = 0.1
-_DEPTHS = np.arange(-0.4, 0.41, 0.05)  # metres: shifts along the normal, as the wall's plane is not known better
+_DEPTHS = np.arange(-0.4, 0.41, 0.02)  # metres: shifts along the normal, as the wall's plane is not known better
 _CLEAR = 0.3  # fit below which a shell is elsewhere, and its mirror image tells nothing
 _SHORTEST = 1.0  # metres: shortest bay
 _MAX_POINTS = 3000
@@ -94,18 +94,23 @@ def scan_shifts(
 def mirrored_fit(surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes: Float64[np.ndarray, "3 3"]) -> float:
     """Fit of the shell mirrored front to back, relative to its own: more than 1 where its file is left-handed.
 
+    Of what is seen from the front, and of points that are not before it, where railings and plants are as well.
+
     Args:
         surface: the shell.
         points: points near it, in the survey frame.
         axes: right, up and out of the facade, as rows.
     """
+    out = axes[2]
     points = np.random.default_rng(0).permutation(points)[:_MAX_POINTS]
-    heights = points @ axes[2]
-    mirrored = points - 2 * (heights - np.median(heights))[:, None] * axes[2]
-    own, other = (
-        _fits(np.stack([surface.distance(each + depth * axes[2]) for depth in _DEPTHS])).max()
-        for each in (points, mirrored)
-    )
+    heights, front = points @ out, (surface.vertices @ out).max() + 1.0
+    walls = front - surface.cast(points + (front - heights)[:, None] * out, -out).t
+    told = np.isfinite(walls) & (heights - walls < FIT)
+    if not told.any():
+        return 0.0
+    heights, walls = heights[told], walls[told]
+    mirrored = 2 * np.median(heights) - heights
+    own, other = (_fits(each - walls + _DEPTHS[:, None]).max() for each in (heights, mirrored))
     return float(other / max(own, _CLEAR))
 
 

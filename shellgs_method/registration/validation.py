@@ -70,7 +70,7 @@ LIMITS = {
     ),
     "weak": Limit(0, 7, "points of a bare wall do not determine shifts along it: only images or picked points do"),
     "rival": Limit(RIVALRY, BETTER, "with repeated windows, the shell fits almost as well one bay further along"),
-    "mirrored": Limit(1.1, 1.25, LEFT_HANDED),
+    "mirrored": Limit(1.05, 1.2, LEFT_HANDED),
     "agreement": Limit(
         0.65, 0.55, "a shell elsewhere shows walls where photographs show none, and hides what they show"
     ),

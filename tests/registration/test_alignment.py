@@ -37,13 +37,14 @@ from shellgs_method.geometry.precision import mesh_step
 from shellgs_method.geometry.similarity import fit_similarity, scale_of, transformed
 from shellgs_method.registration import proposal
 from shellgs_method.registration.align import PROPOSAL, REPORT, Placement, place_by_guess, refined
+from shellgs_method.registration.correspondences import fit_robustly
 from shellgs_method.registration.geotags import GeoTags
 from shellgs_method.registration.orientations import scene_axes
 from shellgs_method.registration.picks import Pick, align_picks, read_picks, triangulate
 from shellgs_method.registration.positions import SurveyedPositions, align_positions, read_positions
 from shellgs_method.registration.proposal import Candidate
 from shellgs_method.registration.refinement import refine
-from shellgs_method.registration.repetition import scan_shifts
+from shellgs_method.registration.repetition import mirrored_fit, scan_shifts
 from shellgs_method.registration.report import shell_edges, write_report
 from shellgs_method.registration.validation import LIMITS, Limit, validate
 from shellgs_method.shell import ALIGNMENT, Alignment, ShellMesh, load_shell
@@ -507,6 +508,13 @@ def test_picks_that_agree_in_a_mirror_are_of_a_left_handed_shell(rigged):
         align_picks(picks, views)
 
 
+def test_one_pick_more_that_agrees_in_a_mirror_does_so_by_chance():
+    random = np.random.default_rng(2)  # of 5 careless picks on a wall, 3 agree as they are, and 4 in a mirror
+    shell = random.uniform(0, [12, 0.1, 9], (5, 3))
+    careless = shell + random.normal(scale=0.1, size=(5, 3))
+    assert fit_robustly(shell, careless, np.ones(5, bool), 1.0, "picks", "").used.sum() == 3
+
+
 def test_a_pick_that_is_2_m_off_is_left_out_and_comes_first(rigged):
     views, projections = rigged
     picks, truth = picked(projections)
@@ -927,6 +935,23 @@ def test_a_shell_that_is_mirrored_front_to_back_is_refused_and_a_flat_one_is_not
     corners = np.array([[0.0, 0, 0], [15, 0, 0], [15, 0, 11], [0, 0, 11]])
     wall = ShellMesh(transformed(corners, SHELL_FROM_BUILDING), np.array([[0, 1, 2], [0, 2, 3]]))
     assert not any("mirrored" in reason for reason in validate(wall, shifted(), views, points).reasons)
+
+
+@pytest.mark.parametrize(
+    ("panes", "railings"), [(0.2, 400), (0.1, 0)], ids=["railings before windows", "windows 10 cm before their panes"]
+)
+def test_neither_what_stands_before_a_shell_nor_its_inner_side_tells_that_it_is_mirrored(panes, railings):
+    # A wall of 30 cm with two sides, whose strips take turns with panes in its depth.
+    corners = np.array([[x, y, z] for x in range(10) for y in (0, panes, 0.3) for z in (0, 3)], np.float64)
+    strips = [6 * x + 2 * y for x in range(9) for y in ((1,) if x % 2 else (0, 2))]
+    faces = np.array([[[k, k + 6, k + 7], [k, k + 7, k + 1]] for k in strips]).reshape(-1, 3)
+    surface, rng = ShellSurface(ShellMesh(corners, faces)), np.random.default_rng(0)
+    points = [
+        np.stack([2 * rng.integers(4, size=n) + strip + rng.random(n), np.full(n, behind), 3 * rng.random(n)], axis=1)
+        for n, strip, behind in ((500, 0, 0.0), (400 - railings // 2, 1, 0.2), (railings, 1, -0.2))
+    ]
+    placed = transformed(np.concatenate(points), surface.survey_from_shell)
+    assert mirrored_fit(surface, placed, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])) < 1
 
 
 def test_limits_work_from_both_sides_and_refuse_nan():
