@@ -60,6 +60,7 @@ LEAST_SEEN = 30
 """Points that a photograph shows in the mean: COLMAP places none by fewer. Of 960 x 540 pixels they are 750."""
 
 _HOMOGRAPHIES = (4, 5, 6)  # COLMAP's PLANAR, PANORAMIC, PLANAR_OR_PANORAMIC
+_MATCHED = 100  # features, of a pair that shows the same: of others they were 31 at most
 _NO_PARALLAX = 0.95  # share of such pairs: all of a camera on a tripod, a sixth of a walk along the synthetic facade
 
 _SIFT = {
@@ -491,9 +492,12 @@ def _rows(database: Path, table: str) -> int:
 
 
 def _flat_pairs(database: Path) -> float:
-    """Share of the verified pairs that a homography explains: of a turning camera, or of a plane."""
+    """Share of the pairs that a homography explains: of a turning camera, of a plane, or of a camera that stood."""
     counts = {kind: _rows(database, f"two_view_geometries WHERE rows > 0 AND config = {kind}") for kind in range(2, 9)}
-    return sum(counts[kind] for kind in _HOMOGRAPHIES) / max(1, sum(counts.values()))
+    # COLMAP leaves out all matches of what stands at the same pixels.
+    pairs = "matches JOIN two_view_geometries AS kept USING (pair_id)"
+    stood = _rows(database, f"{pairs} WHERE matches.rows >= {_MATCHED} AND kept.rows = 0")
+    return (stood + sum(counts[kind] for kind in _HOMOGRAPHIES)) / max(1, stood + sum(counts.values()))
 
 
 def _tidy(database: Path) -> None:

@@ -937,7 +937,8 @@ def test_photographs_that_do_not_belong_together_are_refused_with_advice(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_camera_that_only_turns_is_refused_for_its_lack_of_parallax(tmp_path):
+@pytest.mark.parametrize("swing", [1, 0], ids=["turns", "stands"])
+def test_a_camera_that_only_turns_or_stands_is_refused_for_its_lack_of_parallax(tmp_path, swing):
     """Photographs related by K R K⁻¹ alone, as of a tripod, with a sensor's noise."""
     (tmp_path / "turned").mkdir()
     random = np.random.default_rng(0)
@@ -945,7 +946,8 @@ def test_a_camera_that_only_turns_is_refused_for_its_lack_of_parallax(tmp_path):
     scene = Image.fromarray((128 + np.asarray(blobs)).clip(0, 255).astype(np.uint8)).convert("RGB")
     K_scene, K = (np.array([[900.0, 0, w / 2], [0, 900, h / 2], [0, 0, 1]]) for w, h in ((1600, 900), (640, 480)))
     for k, yaw in enumerate(np.linspace(-12, 12, 9)):
-        H = K_scene @ Rotation.from_euler("yx", [yaw, 4 * np.sin(k)], degrees=True).as_matrix() @ np.linalg.inv(K)
+        rotation = Rotation.from_euler("yx", [swing * yaw, swing * 4 * np.sin(k)], degrees=True)
+        H = K_scene @ rotation.as_matrix() @ np.linalg.inv(K)
         turned = scene.transform(
             (640, 480), Image.Transform.PERSPECTIVE, (H / H[2, 2]).ravel()[:8], Image.Resampling.BICUBIC
         )
