@@ -25,7 +25,7 @@ BETTER = 1.02
 """Fit relative to that in place from which a shift is better, beyond noise."""
 _NEAR = 1.0  # metres: points farther away at every shift are not of the shell
 _STEP = 0.1
-_DEPTHS = np.arange(-0.4, 0.41, 0.02)  # metres: shifts along the normal, as the wall's plane is not known better
+_DEPTHS = np.arange(-0.8, 0.81, 0.02)  # metres: shifts along the normal, as the wall's plane is not known better
 _CLEAR = 0.3  # fit below which a shell is elsewhere, and its mirror image tells nothing
 _SHORTEST = 1.0  # metres: shortest bay
 _MAX_POINTS = 3000
@@ -103,8 +103,10 @@ def mirrored_fit(surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes
     """
     out = axes[2]
     points = np.random.default_rng(0).permutation(points)[:_MAX_POINTS]
-    heights, front = points @ out, (surface.vertices @ out).max() + 1.0
-    walls = front - surface.cast(points + (front - heights)[:, None] * out, -out).t
+    heights = points @ out
+    walls = (
+        heights + _NEAR - surface.cast(points + _NEAR * out, -out).t
+    )  # not what is farther before, as across a street
     told = np.isfinite(walls) & (heights - walls < FIT)
     if not told.any():
         return 0.0

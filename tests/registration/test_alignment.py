@@ -929,11 +929,16 @@ def test_the_verdict_names_what_is_wrong(mesh, views, points, alignment, verdict
 def test_a_shell_that_is_mirrored_front_to_back_is_refused_and_a_flat_one_is_not(mesh, views, points):
     # Picks on the wall's plane place the mirror image as they do the shell.
     mirror = SHELL_FROM_BUILDING @ np.diag([1.0, -1, 1, 1]) @ np.linalg.inv(SHELL_FROM_BUILDING)
-    left_handed = replace(mesh, vertices=transformed(mesh.vertices, mirror))
+    corners, faces = np.array([[0.0, 0, 0], [15, 0, 0], [15, 0, 11], [0, 0, 11]]), np.array([[0, 1, 2], [0, 2, 3]])
+    wall, opposite = (
+        ShellMesh(transformed(corners - [0, distance, 0], SHELL_FROM_BUILDING), faces) for distance in (0, 30)
+    )
+    left_handed = ShellMesh(
+        np.concatenate([transformed(mesh.vertices, mirror), opposite.vertices]),
+        np.concatenate([mesh.faces, faces + len(mesh.vertices)]),
+    )
     refused = [check for check in validate(left_handed, shifted(), views, points).checks if check.verdict == "refused"]
     assert any("mirrored" in check.name and "left-handed" in check.why for check in refused)
-    corners = np.array([[0.0, 0, 0], [15, 0, 0], [15, 0, 11], [0, 0, 11]])
-    wall = ShellMesh(transformed(corners, SHELL_FROM_BUILDING), np.array([[0, 1, 2], [0, 2, 3]]))
     assert not any("mirrored" in reason for reason in validate(wall, shifted(), views, points).reasons)
 
 
