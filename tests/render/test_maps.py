@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import permutations
 
 import pytest
 import torch
@@ -140,6 +141,8 @@ def test_what_is_behind_the_surface_does_not_move_its_depth_and_normals():
     assert (geometry.alpha - geometry.surface).mean() > 0.1
     seen = alone.alpha[..., 0] > 0.1
     torch.testing.assert_close(geometry.depth[seen], alone.depth[seen], rtol=1e-4, atol=1e-4)
+    as_long = alone.normal[seen] * (geometry.alpha / alone.alpha)[seen]  # as all that is seen is opaque
+    torch.testing.assert_close(geometry.normal[seen], as_long, rtol=1e-3, atol=1e-4)
     facing = torch.nn.functional.normalize(geometry.normal[seen], dim=-1)
     torch.testing.assert_close(facing, normal.expand_as(facing), rtol=1e-4, atol=1e-4)
     spread = geometry.moments.about(geometry.depth, geometry.solid)[seen]
@@ -187,6 +190,46 @@ def test_only_plane_depth_depends_on_the_rotation_of_gaussians(depth, moves):
     assert geometry_channels(gaussians, CAMERA, depth)[1].requires_grad == moves
 
 
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_the_normal_is_along_the_shortest_axis(order):
+    scales = torch.tensor([0.1, 0.2, 0.3])[list(order)].log()[None]
+    gaussian = {"means": torch.tensor([[0.5, 0.6, 5.0]]), "quats": torch.tensor([[1.0, 0, 0, 0]]), "scales": scales}
+    normal, _ = geometry_channels(gaussian, CAMERA, "expected")
+    torch.testing.assert_close(normal[0], -torch.eye(3)[order.index(0)])
+
+
+def before_another(opacity: float) -> dict[str, torch.Tensor]:
+    """A wall at depth 5 of some opacity before an opaque one at depth 10."""
+    near, far = (wall(0.0)[0] for _ in range(2))
+    far["means"] = far["means"] * 2
+    both = {name: torch.cat([near[name], far[name]]) for name in near}
+    opacities = torch.tensor([opacity, 0.999]).repeat_interleave(len(near["means"]))
+    colours = {"features_dc": torch.zeros(len(opacities), 3), "features_rest": torch.zeros(len(opacities), 0, 3)}
+    return both | {"opacities": opacities.logit()[:, None]} | colours
+
+
+def seen_in_the_middle(renderer: ViewRenderer, gaussians: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Depths of a view outside training."""
+    geometry = renderer(gaussians, CAMERA, torch.zeros(3), degree=0).geometry
+    assert geometry is not None
+    return renderer.view_of_geometry(geometry, gaussians, CAMERA)[0][10:20, 15:25]
+
+
+def test_the_median_depth_is_of_one_wall_and_the_expected_depth_between_two():
+    two_walls = before_another(0.2)
+    median, expected = (seen_in_the_middle(ViewRenderer("2d", kind), two_walls) for kind in ("median", "expected"))
+    assert (expected < 9).all()
+    assert (torch.minimum((median - 5).abs(), (median - 10).abs()) < 0.01).all()
+
+
+@pytest.mark.parametrize(("opacity", "weight", "depth"), [(0.05, 1.0, 10.0), (0.05, 1e-6, 5.0), (0.005, 1e-6, 10.0)])
+def test_the_mode_is_of_what_a_pixel_shows_most_of_in_the_surface_if_it_shows_this(opacity, weight, depth):
+    two_walls = before_another(opacity)
+    two_walls["surface"] = torch.where(two_walls["means"][:, 2:] > 7, weight, 1.0)
+    seen = seen_in_the_middle(ViewRenderer("3d", "mode"), two_walls)
+    torch.testing.assert_close(seen, torch.full_like(seen, depth), rtol=5e-3, atol=0.0)
+
+
 def test_a_faint_disc_without_median_depth_has_its_expected_depth():
     gaussians, _ = wall(0.0)
     one = {name: value[430:431] for name, value in gaussians.items()}  # the middle one
@@ -231,3 +274,24 @@ def test_a_view_past_the_surface_has_the_depth_of_what_it_shows(kind):
     assert (directions[8:22, past] @ turned > 0.99).all()
     torch.testing.assert_close(depth[8:22, 4:14], torch.full((14, 10, 1), 5.0), rtol=0.02, atol=0.0)
     assert (directions[8:22, 4:14] @ normal > 0.99).all()
+
+
+def test_colours_are_over_the_background_and_depend_on_the_direction_from_the_camera():
+    """One opaque Gaussian below the axis, by the harmonics of degree 0 and 1."""
+    gaussians = {
+        "means": torch.tensor([[0.0, 0.8, 5.0]]),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "scales": torch.full((1, 3), 0.2).log(),
+        "opacities": torch.full((1, 1), 20.0),
+        "features_dc": torch.full((1, 3), 3.0),
+        "features_rest": torch.tensor([-1.0, 0.0, 0.0])[None, :, None].repeat(1, 1, 3),
+    }
+    down = 0.8 / math.hypot(0.8, 5.0)
+    own = 0.5 + 3 / math.sqrt(4 * math.pi) + math.sqrt(3 / (4 * math.pi)) * down  # brighter than white
+    background = torch.tensor([0.1, 0.2, 0.3])
+    rgb, alpha, *_ = ViewRenderer("3d", "expected")(gaussians, CAMERA, background, degree=1)
+    torch.testing.assert_close(rgb, alpha * own + (1 - alpha) * background)
+    assert alpha.max() > 0.9
+    dark = gaussians | {"features_dc": torch.full((1, 3), -9.0)}
+    rgb, alpha, *_ = ViewRenderer("3d", "expected")(dark, CAMERA, background, degree=1)
+    torch.testing.assert_close(rgb, (1 - alpha) * background)

@@ -16,7 +16,7 @@ from training_runs import model_of, trainer_of
 from dataparsers.cameras import pinhole_camera
 from shellgs_method.errors import SceneError
 from shellgs_method.evaluation import colours_to_normals, normals_to_colours
-from shellgs_method.render.panorama import render_around
+from shellgs_method.render.panorama import is_pinhole, render_around
 from shellgs_method.trainer import FacadeTrainer
 
 POSE = torch.from_numpy(Rotation.from_euler("xyz", [70, 20, -130], degrees=True).as_matrix()).float()
@@ -64,6 +64,7 @@ def in_a_ball(pinhole: Cameras) -> dict[str, Tensor]:
     [
         (CameraType.EQUIRECTANGULAR, 128, 64, None),
         (CameraType.EQUIRECTANGULAR, 90, 45, None),
+        (CameraType.EQUIRECTANGULAR, 100, 50, None),  # the edge of a face is near the centre of a pixel
         (CameraType.FISHEYE, 80, 60, 20.0),  # some 230 degrees in the corners
         (CameraType.FISHEYE, 80, 60, 200.0),
     ],
@@ -79,6 +80,13 @@ def test_each_pixel_shows_what_it_looks_at(kind, width, height, focal):
     torch.testing.assert_close(outputs["rgb"], 0.5 + 0.5 * direction, atol=2e-3, rtol=0)
     torch.testing.assert_close(outputs["depth"][..., 0], distance, atol=5e-3, rtol=0)
     torch.testing.assert_close(colours_to_normals(outputs["normal"]), inwards @ axes.T, atol=4e-3, rtol=0)
+
+
+def test_a_distorted_image_is_no_pinhole_image():
+    straight = camera_of(CameraType.PERSPECTIVE, 40, 30, 60.0)[0]
+    assert is_pinhole(straight)
+    straight.distortion_params = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert not is_pinhole(straight)
 
 
 def test_a_narrow_fisheye_renders_one_face():
