@@ -26,7 +26,7 @@ from shellgs_method.registration.bundle import (
     intersected,
     reprojection_errors,
 )
-from shellgs_method.registration.bundle_model import adjusted_model, bundle_of
+from shellgs_method.registration.bundle_model import adjusted_model, bundle_of, with_distortion, with_finite_points
 
 LENS = np.array([500.0, 510, 320, 240, 0.02, -0.01, 0.001, -0.002, 0.003, 0.001])
 
@@ -185,6 +185,125 @@ def as_model(bundle: Bundle, seen: Observations) -> Model:
     colours = np.zeros((points, 3), np.uint8)
     known = Points(bundle.points, colours, observers, keypoints, np.arange(1, points + 1))
     return adjusted_model(Model(cameras, images, known), bundle, np.eye(4))
+
+
+def two_lenses() -> Model:
+    """Two photographs by lenses of two models, in closed form; each has a keypoint less than the tracks say."""
+    random = np.random.default_rng(5)
+    points = random.uniform([-2, -1, 5], [2, 1, 8], (20, 3))
+    turns = Rotation.from_rotvec(random.normal(0, 0.1, (2, 3)))
+    shifts = random.normal(0, 0.3, (2, 3))
+    cameras = {
+        7: ColmapCamera("SIMPLE_RADIAL", 640, 480, (500.0, 320, 240, 0.05)),
+        3: ColmapCamera("OPENCV_FISHEYE", 640, 480, (400.0, 410, 321, 239, 0.02, -0.01, 0.003, 0.001)),
+    }
+    images = {}
+    for number, lens, turn, shift in zip((9, 4), (3, 7), turns, shifts, strict=True):
+        x, y, z = (turn.apply(points) + shift).T
+        u, v = x / z, y / z
+        r = np.hypot(u, v)
+        features = np.empty(19, KEYPOINT)
+        if lens == 7:
+            f, cx, cy, k = cameras[7].params
+            xy = np.stack([f * u * (1 + k * r**2) + cx, f * v * (1 + k * r**2) + cy], axis=1)
+        else:
+            fx, fy, cx, cy, *ks = cameras[3].params
+            angle = np.arctan(r)
+            bent = angle * (1 + sum(k * angle ** (2 * i + 2) for i, k in enumerate(ks))) / r
+            xy = np.stack([fx * u * bent + cx, fy * v * bent + cy], axis=1)
+        features["xy"], features["point"] = xy[:19], np.arange(1, 20)
+        quaternion = tuple(turn.as_quat()[[3, 0, 1, 2]].tolist())
+        images[number] = ColmapImage(quaternion, tuple(shift.tolist()), lens, f"{number}.png", features)
+    observers, keypoints = [np.array([4, 9])] * 20, [np.full(2, k) for k in range(20)]
+    known = Points(points, np.zeros((20, 3), np.uint8), observers, keypoints, np.arange(1, 21))
+    return Model(cameras, images, known)
+
+
+def test_a_model_in_another_frame_projects_as_before_and_comes_back():
+    model, placed = two_lenses(), np.eye(4)
+    placed[:3, :3] = 2.5 * Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
+    placed[:3, 3] = [10, -20, 3]
+    bundle, seen = bundle_of(model, placed)
+    error, front = reprojection_errors(bundle, seen)
+    assert len(error) == 38
+    assert front.all()
+    np.testing.assert_allclose(error, 0, atol=1e-9)
+    np.testing.assert_allclose(bundle.points, transformed(model.points.positions, placed))
+    adjusted = [{PARAMETERS[k] for k in np.flatnonzero(free.any(axis=1))} for free in seen.free]
+    assert adjusted == [{"fx", "fy", "k1"}, {"fx", "fy", "k1", "k2", "k3", "k4"}]
+    np.testing.assert_allclose((seen.limits[1] - seen.limits[0])[1], [40, 41, 40, 41, *[0.1] * 6])
+    back = adjusted_model(model, bundle, placed)
+    np.testing.assert_allclose(back.points.positions, model.points.positions)
+    for number, image in model.images.items():
+        other = back.images[number]
+        np.testing.assert_allclose(np.abs(np.dot(other.quaternion, image.quaternion)), 1)
+        np.testing.assert_allclose(other.translation, image.translation)
+    for number, camera in model.cameras.items():
+        np.testing.assert_allclose(back.cameras[number].params, camera.params)
+
+
+def test_lenses_of_different_numbers_of_parameters_are_adjusted_together():
+    bundle, seen = bundle_of(two_lenses(), np.eye(4))
+    start, objective = disturbed(bundle, 0.01), Objective(seen)
+    assert objective.cost(start) > 10
+    assert objective.cost(adjust(objective, start)[0]) < 1e-3
+
+
+def test_an_adjustment_is_the_same_in_a_turned_world():
+    bundle, seen = problem()
+    start, objective = disturbed(bundle), Objective(seen, 0.5)
+    turn = Rotation.from_rotvec([1, 2, -1.5]).as_matrix()
+    turned = Bundle(start.rotations @ turn.T, start.centres @ turn.T, start.lenses, start.points @ turn.T)
+    costs = [objective.cost(adjust(objective, each, steps=4)[0]) for each in (start, turned)]
+    assert costs[1] == pytest.approx(costs[0], rel=1e-3)
+
+
+def test_pinhole_lenses_of_many_photographs_may_distort_and_those_of_none_are_left_out():
+    model = two_lenses()
+    shared = {1: 10, 2: 9, 3: 1, 4: 10, 5: 0}
+    params = (500.0, 510.0, 320.0, 240.0)
+    cameras = {number: ColmapCamera("PINHOLE", 640, 480, params) for number in shared}
+    cameras[4] = ColmapCamera("SIMPLE_PINHOLE", 640, 480, (500.0, 320.0, 240.0))
+    cameras[3] = model.cameras[3]
+    numbers = [number for number, count in shared.items() for _ in range(count)]
+    images = {k: model.images[9]._replace(camera=number) for k, number in enumerate(numbers)}
+    found = with_distortion(replace(model, cameras=cameras, images=images)).cameras
+    assert found == {
+        1: ColmapCamera("OPENCV", 640, 480, (*params, 0.0, 0.0, 0.0, 0.0)),
+        2: cameras[2],
+        3: cameras[3],
+        4: ColmapCamera("OPENCV", 640, 480, (500.0, 500.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0)),
+    }
+
+
+def test_points_that_are_not_finite_begin_amidst_the_others():
+    model = two_lenses()
+    positions = np.array([[1.0, 2, 3], [np.nan, 5, 6], [3, 4, 9], [50, 6, 5]])
+    found = with_finite_points(replace(model, points=replace(model.points, positions=positions))).points.positions
+    np.testing.assert_array_equal(found[1], [3, 4, 5])
+    np.testing.assert_array_equal(found[[0, 2, 3]], positions[[0, 2, 3]])
+
+
+def test_joined_planes_cost_what_both_do():
+    bundle, seen = problem()
+    walls = [
+        Planes(np.arange(k, k + 5), np.tile([0.0, 0, 1], (5, 1)), np.zeros((5, 3)), np.linspace(0.2, 1, 5), sigma)
+        for k, sigma in ((0, 0.05), (10, 0.02))
+    ]
+    none, *each, both = (Objective(seen, planes=p).cost(bundle) for p in (Planes(), *walls, walls[0].joined(walls[1])))
+    assert both - none == pytest.approx(sum(each) - 2 * none)
+    assert min(each) > none
+
+
+def test_what_is_behind_a_camera_does_not_count():
+    bundle, seen = problem()
+    points = bundle.points.copy()
+    points[3, 2] = -30
+    behind, others = replace(bundle, points=points), np.arange(len(points)) != 3
+    error, front = reprojection_errors(behind, seen)
+    assert not error[seen.points == 3].any()
+    np.testing.assert_array_equal(front, seen.points != 3)
+    assert Objective(seen).cost(behind) == pytest.approx(Objective(seen.of_points(others)).cost(behind))
 
 
 def test_what_nothing_determines_stays():

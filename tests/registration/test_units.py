@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
-import pytest
+from dataclasses import replace
+from pathlib import Path
 
-from shellgs_method.registration.units import doubted
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from shellgs_method.files.photographs import View
+from shellgs_method.geometry.camera import Camera
+from shellgs_method.geometry.similarity import transformed
+from shellgs_method.registration.repetition import ShiftScan
+from shellgs_method.registration.support import ViewSupport
+from shellgs_method.registration.units import doubted, unit_doubted
+from shellgs_method.registration.validation import Validation
+from shellgs_method.shell import Alignment, ShellMesh
 
 HOUSE = (11.0, 10.5, 1.6, 3.3)  # metres: distance, height, eyes, storeys
 WORDS = (
@@ -41,3 +54,36 @@ def test_metres_given_as_millimetres_are_doubted():
     said = doubted({word: 0.001 * length for word, length in zip(WORDS, HOUSE, strict=True)}, 0.001)
     assert said is not None
     assert "the metre, not the millimetre" in said
+
+
+def test_lengths_of_a_shell_in_its_place_are_doubted():
+    """A house in metres given as feet: between z = 5 and 17, with eyes at 6.6, in a turned scene of another unit."""
+    foot, unknown = 0.3048, float("nan")
+    corners = np.array([[x, y, z] for z in (5, 17) for x in (0, 9) for y in (0, 7)], dtype=np.float64)
+    mesh = ShellMesh(np.repeat(corners, 30, axis=0), np.array([[0, 30, 60], [120, 150, 180]]))
+    placed = np.eye(4)
+    placed[:3, :3] = 3 * Rotation.from_rotvec([0.5, 0.4, -0.9]).as_matrix()
+    placed[:3, 3] = [4, 5, 6]
+    views = []
+    for eye in transformed(np.array([[1.0, -14, 6.6], [5, -14, 6.6], [9, -14, 9]]), placed):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, 3] = -torch.from_numpy(eye)
+        views.append(View(f"{len(views)}.png", Path("none.png"), Camera(viewmat, torch.eye(3), 10, 10)))
+    one, none = np.zeros((1, 3)), np.zeros((0, 3))
+    supports = [ViewSupport(views[0], 0.5, one, one, 14 * foot, np.empty(0))]
+    supports += [ViewSupport(view, 0.0, none, none, unknown, np.empty(0)) for view in views[1:]]
+    at = np.array([0.0])
+    scans = [ShiftScan("along the facade", at, at, 4 * foot), ShiftScan("upwards", at, at, 3.3 * foot)]
+    alignment = Alignment(placed, ("house.ply",), foot, up=np.array([0.0, 0, 1]))
+    validation = Validation(alignment, [], supports, scans=scans)
+    lengths = {word: length * foot for word, length in zip(WORDS, (14, 12, 1.6, 3.3), strict=True)}
+    said = unit_doubted(validation, mesh, views)
+    assert said is not None
+    assert "the metre, not the foot" in said
+    assert said == doubted(lengths, foot)
+    del lengths[WORDS[2]]
+    above = ShellMesh(mesh.vertices + np.array([0, 0, 10]), mesh.faces)  # eyes below the lower edge tell nothing
+    assert unit_doubted(validation, above, views) == doubted(lengths, foot)
+    assert doubted(lengths, 0.5) is None  # a unit without a name
+    assert unit_doubted(replace(validation, views=supports[1:]), mesh, views) is None
+    assert unit_doubted(replace(validation, alignment=replace(alignment, up=None)), mesh, views) is None
