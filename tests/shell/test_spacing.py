@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from shellgs_method.files import clouds
 from shellgs_method.geometry.camera import Camera
@@ -162,3 +163,56 @@ def test_a_cloud_is_meshed_again_where_its_unit_is_corrected(tmp_path: Path):
     for metres_per_unit in (1.0, 0.5, 1.0):
         (meshing,) = load_shell(path, cache=tmp_path, spacing=0.3, metres_per_unit=metres_per_unit).meshing
         assert meshing.voxel == 0.3 / metres_per_unit
+
+
+def looking_along_z(focal: float = 100.0, x: float = 0.0, yaw: float = 0.0) -> Camera:
+    """100 x 100 pixels."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", yaw).as_matrix())
+    viewmat[:3, 3] = viewmat[:3, :3] @ torch.tensor([-x, 0, 0], dtype=torch.float64)
+    return Camera(viewmat, torch.tensor([[focal, 0, 50], [0, focal, 50], [0, 0, 1]]), 100, 100)
+
+
+WALL = np.stack([*np.meshgrid(np.linspace(-30, 30, 241), np.linspace(-4, 4, 33)), np.full((33, 241), 10.0)], -1)
+"""10 before the camera."""
+
+
+@pytest.mark.parametrize(("spacing", "far_too"), [(0.1, False), (1.0, True)])
+def test_cells_are_where_a_camera_looks_and_its_pixels_are_not_too_large(spacing, far_too):
+    wall = WALL.reshape(-1, 3)
+    behind, far = wall * [0.01, 0.1, -1], wall * [0.5, 1, 10]
+    cells = Sights.of([looking_along_z()], wall).cells(np.concatenate([wall, behind, far]), 0.5, spacing)
+    inside = cells.contains(wall)
+    across = np.abs(wall[:, 0])
+    assert inside[across < 10 * np.sqrt(0.5) + 1].all()  # the corners of the image, and 1 for a turn
+    assert not inside[across > 10 * np.sqrt(0.5) + 6].any()
+    assert not cells.contains(behind).any()
+    assert cells.contains(far).all() == far_too
+    assert cells.contains(far).any() == far_too
+
+
+@pytest.mark.parametrize(
+    ("other", "covered"),
+    [
+        ({"x": 0.4}, True),
+        ({"x": 0.6}, False),
+        ({"yaw": 0.04}, True),
+        ({"yaw": 0.06}, False),
+        ({"focal": 130.0}, False),
+        ({"focal": 115.0}, True),
+        ({"focal": 75.0}, False),
+    ],
+)
+def test_a_camera_is_covered_by_one_that_sees_the_same_as_finely(other, covered):
+    known, asked = (
+        Sights.of([camera], WALL.reshape(-1, 3)) for camera in (looking_along_z(), looking_along_z(**other))
+    )
+    assert known.covers(asked) == covered
+
+
+def test_the_footprint_is_that_of_near_cameras_that_see_the_cloud():
+    cameras = [looking_along_z(), looking_along_z(200.0), looking_along_z(50.0), looking_along_z(1000.0, yaw=np.pi)]
+    sights = Sights.of(cameras, WALL.reshape(-1, 3))
+    np.testing.assert_array_equal(sights.blind, [False, False, False, True])
+    np.testing.assert_allclose(sights.depths, 10)
+    assert sights.footprint == pytest.approx(0.05 + 0.2 * 0.05)  # a tenth of the way from the least to the greatest
