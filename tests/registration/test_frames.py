@@ -18,7 +18,7 @@ from shellgs_method.files.photographs import View
 from shellgs_method.files.sparse_points import SparsePoints, find_sparse_points
 from shellgs_method.geometry.camera import in_view
 from shellgs_method.registration.frames import ShellPlace, apart
-from shellgs_method.registration.sfm_frame import _Sight, check_points, slips
+from shellgs_method.registration.sfm_frame import _Sight, check_points, in_degrees, slips
 from shellgs_method.shell import ALIGNMENT, Alignment, load_shell
 
 MILLIMETRES = "are in millimetres instead of metres"
@@ -317,7 +317,9 @@ def test_an_alignment_that_puts_the_shell_elsewhere_is_described():
     seen = rng.uniform([0, 0, 0], [20, 10, 8], (500, 3))
     turned = Rotation.from_euler("z", 30, degrees=True).apply(seen)
     assert apart(turned, seen) is None
-    assert "80.7 away from what the cameras see: a shift" in (apart(np.add(seen, [100.0, 0, 0]), seen) or "")
+    for shift in (100.0, -100.0):
+        assert "80.7 away from what the cameras see: a shift" in (apart(np.add(seen, [shift, 0, 0]), seen) or "")
+    assert apart(np.add(seen, [60.0, 0, 0]), seen) is None  # a house across the street
     assert "look for another unit" in (apart(1000 * seen, seen) or "")
     assert "look for another unit" in (apart(seen / 1000, seen) or "")
 
@@ -330,3 +332,13 @@ def test_a_matrix_without_its_global_shift_is_refused_with_the_distance(scene, s
     refusal = shellgs("align", scene, scene / true.shells[0], "--matrix", scene / "matrix.npy")
     assert "is refused" in refusal
     assert "away from what the cameras see: a shift (such as CloudCompare's --global-shift) is missing" in refusal
+
+
+def test_degrees_are_within_their_range_and_close_together_beside_a_large_shell():
+    house = np.array([[11.57, 48.13, 5], [11.5701, 48.1301, 9], [11.5702, 48.13, 7]])
+    assert in_degrees(house, 20.0)
+    assert in_degrees(house[:, [1, 0, 2]], 20.0)
+    assert not in_degrees(house, 1e-3)  # a model of that size, in units of its own
+    assert not in_degrees(np.add(house, [90, 60, 0]), 20.0)  # no latitude is above 90, in either order
+    assert not in_degrees(np.add(house, [170, 0, 0]), 20.0)
+    assert not in_degrees(house * [100, 1, 1], 20.0)
