@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Files = Annotated[Optional[tuple[Path, ...]], tyro.conf.arg(metavar="PATH [PATH ...]")]
 SELDOM = 0.01
 """Share of all pixels that show the shell, below which it is hardly where the photographs show it."""
-HOLES = 0.005
+HOLES = 0.01
 """Share of the shell's pixels that show what is behind holes in a scan's mesh, above which it is told."""
 LITTLE, FAR_OFF = 0.2, 0.5
 """Share of the shell that a truth covers, and metres between the two, that make a person look."""
