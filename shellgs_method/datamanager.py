@@ -309,12 +309,15 @@ class FacadeDataManager(FullImageDatamanager[FacadeDataset]):
         checked, mono = map(self.train_dataset.sets.get, ("checked", "mono"))
         scene = self.config.dataparser
         assert isinstance(scene, FacadeDataParserConfig)
-        if checked and compared_others(checked, read_views(scene), held_out_names(scene)):
+        if not (checked or mono):
+            return
+        views = read_views(scene)
+        if checked and compared_others(checked, views, held_out_names(scene)):
             notice(
                 f"photographs of {scene.data}, their cameras, or which are held out have changed since they were "
                 f"compared with the shell, which counts as before: run `{checked.command}`, to compare them again."
             )
-        if mono and (replaced := Fits.open(mono).replaced(read_views(scene))):
+        if mono and (replaced := Fits.open(mono).replaced(views)):
             notice(
                 f"photographs of {scene.data}, such as {replaced[0]}, have changed since their monocular maps were "
                 f"made: run `{mono.command}`, to make these again."

@@ -29,6 +29,8 @@ DISCS = "SplatRenderMode: 2dgs"
 """Comment in the ply of discs, by which viewers render them as such."""
 LARGEST_PAGE = 300
 """Megabytes: a string has at most 512 in Chromium, and 9 million Gaussians take 1.2 GB of a graphics card."""
+BLACK = (0.0, 0.0, 0.0)
+"""Background of a page, unless another is given."""
 _LARGEST_GLB = 2**32 - 1
 """Bytes of a glb, whose header counts them in 32 bits: some 18 million Gaussians with harmonics of degree 3."""
 _EXTENSION = "KHR_gaussian_splatting"
@@ -100,10 +102,6 @@ def check_splats_format(path: Path, discs: bool = False) -> None:
         raise SceneError(f"{path}: splats are written as ply, glb, spz or html: name a file that ends in one of these")
     if discs and suffix == ".spz":
         raise SceneError(f"{path}: spz has no discs, which have no thickness: name a .ply, .glb or .html")
-
-
-BLACK = (0.0, 0.0, 0.0)
-"""Background of a page, unless another is given."""
 
 
 def write_splats(

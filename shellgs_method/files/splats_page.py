@@ -24,8 +24,12 @@ def splats_page(
         views: cameras in that frame between which one can go; the middle one is shown first.
         background: colour behind the Gaussians, from 0 to 1.
     """
-    shown = {"views": [_view(camera) for camera in views], "background": list(background)}
-    scene = {"discs": discs, "comments": list(comments), **shown}
+    scene = {
+        "discs": discs,
+        "comments": list(comments),
+        "views": [_view(camera) for camera in views],
+        "background": list(background),
+    }
     parts = {"scene": json.dumps(scene).replace("<", "\\u003c").encode(), "spz": base64.b64encode(spz)}
     page = _TEMPLATE.read_bytes()
     for name, content in parts.items():

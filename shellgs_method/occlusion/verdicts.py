@@ -114,8 +114,9 @@ def shell_verdicts(scene: Path, views: Sequence[View], places: Float64[np.ndarra
         visible = np.abs(cue.depth[rows, columns] / z - 1) < _SAME
         seen[k] += visible
         found = Findings.of(check, cue)
-        moved.append(found.moved.sum() / max((cue.depth > 0).sum(), 1))
-        doubted.append(found.doubtful.sum() / max((cue.depth > 0).sum(), 1))
+        on_shell = max((cue.depth > 0).sum(), 1)
+        moved.append(found.moved.sum() / on_shell)
+        doubted.append(found.doubtful.sum() / on_shell)
         occluded = visible & found.occluder[rows, columns]
         along = np.linalg.norm(places[k] - camera.position.double().numpy(), axis=1) / z  # per unit of depth
         distance[k[occluded]] = ((cue.depth - check.depth)[rows, columns] * along)[occluded]

@@ -104,9 +104,8 @@ def mirrored_fit(surface: ShellSurface, points: Float64[np.ndarray, "N 3"], axes
     out = axes[2]
     points = np.random.default_rng(0).permutation(points)[:_MAX_POINTS]
     heights = points @ out
-    walls = (
-        heights + _NEAR - surface.cast(points + _NEAR * out, -out).t
-    )  # not what is farther before, as across a street
+    # From so near, since what is farther in front is another house, across the street.
+    walls = heights + _NEAR - surface.cast(points + _NEAR * out, -out).t
     told = np.isfinite(walls) & (heights - walls < FIT)
     if not told.any():
         return 0.0
