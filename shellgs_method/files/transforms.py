@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,20 @@ from shellgs_method.files.paths import NamedFiles
 from shellgs_method.files.photographs import opened
 from shellgs_method.files.readers.ply import ply_points, read_ply
 from shellgs_method.files.readers.points import NO_POINTS, Points
+from shellgs_method.files.undistortion import distort_pixels
 from shellgs_method.geometry.camera import OPENGL
-from shellgs_method.geometry.lens import COEFFICIENTS
+from shellgs_method.geometry.lens import COEFFICIENTS, Lens
 
 NAME = "transforms.json"
 GREY = 128
 """Colour of points whose file has none."""
 # Applied to COLMAP's frame by old versions of ns-process-data, without being recorded.
 _UNRECORDED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+# Applied by ns-process-data to poses of Metashape, and to no others.
+_METASHAPE = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]]
+_OPENDRONEMAP = "reconstruction.ply"
+"""Name of the point cloud that ns-process-data makes of OpenDroneMap's."""
+_SHARE = 0.05  # of the longer side, by which a principal point is off the middle at most
 _ANGLES = ("camera_angle_x", "camera_angle_y")
 _LENS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model")
 
@@ -58,7 +64,28 @@ def read_recording(scene: Path, images_path: Path) -> Recording:
     orientation = meta.get("orientation_override")
     if orientation not in (None, "pca", "up", "vertical", "none"):
         raise SceneError(f"{path} has {orientation!r} as its orientation_override: use pca, up, vertical or none")
+    if np.array_equal(applied[:3], _METASHAPE):
+        _tell_of_metashape([each.lens for each in frames if each.lens and not each.lens.fisheye], path)
     return Recording(in_order(frames, str(path)), applied, listed, orientation)
+
+
+def _tell_of_metashape(lenses: Sequence[Lens], path: Path) -> None:
+    """Tell the user of p1 and p2 of Metashape, of which OpenCV's are the other way round, if pixels show it.
+
+    As nerfstudio copies them (its issue 3714, in 1.1.5); nothing tells whether they have been exchanged since.
+    """
+    off = 0.0
+    for lens in {lens.distortion: lens for lens in lenses}.values():
+        *radial, p1, p2 = lens.distortion
+        corners, K = np.array([[0.0, 0.0], [lens.width, 0.0]]), lens.K.numpy()
+        exchanged = distort_pixels(replace(lens, distortion=(*radial, p2, p1)), corners, K)
+        off = max(off, float(np.linalg.norm(distort_pixels(lens, corners, K) - exchanged, axis=1).max()))
+    if off > 1:
+        notice(
+            f"{path} was made of Metashape's cameras, whose p1 and p2 nerfstudio 1.1.5 takes for each other: if so, "
+            f"corners of the photographs are up to {off:.0f} pixels off. Exchange the two there, or export undistorted "
+            "photographs; nothing, if that is done."
+        )
 
 
 _SPLITS = ("train", "val", "test")
@@ -128,6 +155,8 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
         raise SceneError(
             f"{where}: is_fisheye is set, which counts only with the camera_model OPENCV_FISHEYE: set it too"
         )
+    if meta.get("ply_file_path") == _OPENDRONEMAP and {"w", "h", "cx", "cy"} <= lens.keys():
+        lens = _in_pixels(lens, where, files.where)
     photograph = files.photograph(entry["file_path"], where)
     name = photograph.relative_to(files.scene).as_posix()
     if "fl_x" not in lens:
@@ -137,6 +166,23 @@ def _frame(files: NamedFiles, entry: Any, meta: Mapping[str, Any], applied: np.n
     if not entry.get("mask_path"):
         return found
     return replace(found, mask=files.other(str(entry["mask_path"]), where))
+
+
+def _in_pixels(lens: dict[str, Any], where: str, path: Path) -> dict[str, Any]:
+    """The lens of an OpenDroneMap project, its principal point in pixels.
+
+    ns-process-data adds shares of the longer side to the middle of the pixels (nerfstudio 1.1.5).
+    """
+    width, height = sides = [number(lens, side, where) for side in "wh"]
+    shares = [number(lens, f"c{axis}", where) - (side - 1) / 2 for axis, side in zip("xy", sides, strict=True)]
+    if not any(shares) or max(map(abs, shares)) > _SHARE:
+        return lens
+    cx, cy = (side / 2 + share * max(sides) for side, share in zip(sides, shares, strict=True))
+    notice(
+        f"{path} has OpenDroneMap's principal points as shares of the longer side, which ns-process-data adds to the "
+        f"middle as pixels: {cx:.1f} {cy:.1f} is taken of {width:g}x{height:g} pixels, for example."
+    )
+    return lens | {"cx": cx, "cy": cy}
 
 
 def _by_angles(angles: Mapping[str, Any], given: Mapping[str, Any], photograph: Path, where: str) -> dict[str, Any]:

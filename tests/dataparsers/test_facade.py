@@ -171,6 +171,38 @@ def test_an_applied_scale_is_told_and_changes_no_camera(scene, caplog):
         assert [view.camera.viewmat.tolist() for view in after] == [view.camera.viewmat.tolist() for view in before]
 
 
+@pytest.mark.parametrize(("p1", "p2", "told"), [(0.02, -0.03, True), (0.02, 0.02, False)])
+def test_p1_and_p2_of_metashape_are_told_where_pixels_show_them_exchanged(scene, caplog, p1, p2, told):
+    """As ns-process-data metashape copies them; the pixels are those of Metashape's manual."""
+    path = scene / "transforms.json"
+    meta, applied = json.loads(path.read_text()), np.eye(4)[[2, 0, 1, 3]]
+    for frame in meta["frames"]:
+        frame["transform_matrix"] = (applied @ frame["transform_matrix"]).tolist()
+    path.write_text(json.dumps(meta | {"applied_transform": applied[:3].tolist(), "p1": p1, "p2": p2}))
+    read_views(FacadeDataParserConfig(data=scene))
+    x, y = meta["w"] / 2 / meta["fl_x"] * np.array([-1, 1]), -meta["h"] / 2 / meta["fl_x"]
+    along_x, along_y, across = 3 * x**2 + y**2, x**2 + 3 * y**2, 2 * x * y
+    in_metashape = np.stack([p1 * along_x + p2 * across, p2 * along_y + p1 * across])
+    in_opencv = np.stack([p1 * across + p2 * along_x, p1 * along_y + p2 * across])
+    off = meta["fl_x"] * np.linalg.norm(in_metashape - in_opencv, axis=0).max()
+    assert ("p1 and p2" in caplog.text) == told == (off > 1)
+    if told:
+        assert f"up to {off:.0f} pixels off" in caplog.text
+
+
+def test_principal_points_of_opendronemap_are_read_in_pixels(scene, caplog):
+    """ns-process-data odm adds shares of the longer side to (w - 1) / 2 and (h - 1) / 2."""
+    path = scene / "transforms.json"
+    meta = json.loads(path.read_text())
+    (scene / meta["ply_file_path"]).rename(scene / "reconstruction.ply")
+    shares = {"cx": (meta["w"] - 1) / 2 + 0.01, "cy": (meta["h"] - 1) / 2 - 0.004}
+    path.write_text(json.dumps(meta | shares | {"ply_file_path": "reconstruction.ply"}))
+    camera = read_views(FacadeDataParserConfig(data=scene))[0].camera
+    assert camera.K[0, 2] == pytest.approx(meta["w"] / 2 + 0.01 * meta["w"])
+    assert camera.K[1, 2] == pytest.approx(meta["h"] / 2 - 0.004 * meta["w"])
+    assert "OpenDroneMap's principal points" in caplog.text
+
+
 @pytest.mark.parametrize("kind", COLOURS)
 def test_colours_of_points_may_be_of_any_name_and_type(scene, kind):
     names, stored, factor = COLOURS[kind]
