@@ -7,10 +7,9 @@ import json
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
@@ -245,19 +244,20 @@ class _Capture:
                 tell_of_unknown_lenses(self.folder, ordinary)
         self.rig = folders(ordinary) if self.config.cameras == "rig" else []
         lenses = [*group_by_lens(self.folder, ordinary, self.config.cameras), *face_lenses(self.folder, faces)]
-        self._step(
-            "extract",
-            "finding features",
-            len(self.names),
-            partial(_rows, database, "descriptors"),
-            database=str(database),
-            photographs=str(self.folder),
-            lenses=[asdict(lens) for lens in lenses],
-            rigs=[face_rig()] if faces else [],
-            masks=str(self.work.folder / "masks") if self.masked else None,
-            sift=_SIFT[self.config.quality],
-            camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
-        )
+        with _counting(database, "descriptors") as done:
+            self._step(
+                "extract",
+                "finding features",
+                len(self.names),
+                done,
+                database=str(database),
+                photographs=str(self.folder),
+                lenses=[asdict(lens) for lens in lenses],
+                rigs=[face_rig()] if faces else [],
+                masks=str(self.work.folder / "masks") if self.masked else None,
+                sift=_SIFT[self.config.quality],
+                camera_model="RADIAL" if self.is_video else "OPENCV",  # pixels of a video are square
+            )
         _tidy(database)
         return database
 
@@ -334,8 +334,8 @@ class _Capture:
         return self._step("follow", "following the walk", 1, None, database=str(database), passes=order)
 
     def _match(self, database: Path, pairs: list[Pair], description: str) -> None:
-        done = partial(_rows, database, "two_view_geometries")
-        self._step("match", description, len(pairs), done, database=str(database), pairs=pairs)
+        with _counting(database, "two_view_geometries") as done:
+            self._step("match", description, len(pairs), done, database=str(database), pairs=pairs)
 
     def _reconstruct(self, database: Path, folder: Path, description: str) -> list[dict[str, Any]]:
         arguments = {"database": str(database), "photographs": str(self.folder), "output": str(folder)}
@@ -483,12 +483,31 @@ def _files(folder: Path) -> list[str]:
 
 
 def _rows(database: Path, table: str) -> int:
-    """Number of rows of a table that another process is writing."""
-    try:
-        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection:
-            return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
-    except sqlite3.Error:  # does not exist yet, or is busy
+    """Number of rows of a table."""
+    with _counting(database, table) as rows:
+        return rows()
+
+
+@contextmanager
+def _counting(database: Path, table: str) -> Iterator[Callable[[], int]]:
+    """What counts the rows of a table that another process is writing.
+
+    It keeps one connection: where one ends, SQLite locks the database for a moment, and COLMAP cannot open it.
+    """
+    kept: list[sqlite3.Connection] = []
+
+    def count() -> int:
+        with suppress(sqlite3.Error):  # does not exist yet, or is busy
+            if not kept:
+                kept.append(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True))
+            return kept[0].execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
         return 0
+
+    try:
+        yield count
+    finally:
+        for connection in kept:
+            connection.close()
 
 
 def _flat_pairs(database: Path) -> float:

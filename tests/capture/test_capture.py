@@ -849,6 +849,23 @@ def test_counting_rows_leaves_no_files_beside_the_database(tmp_path):
     assert list(tmp_path.iterdir()) == [database]
 
 
+def test_rows_that_are_being_written_are_counted_over_one_connection(tmp_path, monkeypatch):
+    """Each that ends locks the database for a moment, in which COLMAP fails to open it."""
+    database, opened, connect = tmp_path / "database.db", [], sqlite3.connect
+    monkeypatch.setattr(stages.sqlite3, "connect", lambda *a, **k: opened.append(connect(*a, **k)) or opened[-1])
+    with stages._counting(database, "cameras") as rows:
+        assert rows() == 0  # it does not exist yet
+        with closing(connect(database)) as writing:
+            writing.executescript("PRAGMA journal_mode = WAL; CREATE TABLE cameras (id)")
+            for k in range(3):
+                writing.execute("INSERT INTO cameras VALUES (?)", [k])
+                writing.commit()
+                assert rows() == k + 1
+    assert len(opened) == 1
+    with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+        opened[0].execute("SELECT 1")
+
+
 def test_a_growing_product_is_kept_only_for_the_same_key(tmp_path):
     (Work(tmp_path).growing("features", "old") / "database").touch()
     assert (Work(tmp_path).growing("features", "old") / "database").exists()
