@@ -414,6 +414,14 @@ class _Capture:
                 f"neighbours have in common: what is on one side of them may be metres off. Look at the cameras' path; "
                 f"{slower}."
             )
+        if zoomed := largest.pop("zoomed", None):
+            change, short, long = zoomed
+            notice(
+                f"The focal length of {self.source} seems to change by {change:.0%}, between {short} and {long} for "
+                "example, where one camera is taken for all: by zooming, another lens, or cropping, as stabilisation "
+                "does. Cameras may be metres off. Record without these; photographs of two lenses go into a folder "
+                "each, with --cameras folder."
+            )
         for model in models[1:]:
             if len(model["names"]) >= LEAST_REGISTERED:
                 only = sorted(set(model["names"]) - set(largest["names"]), key=along_the_walk)

@@ -1076,6 +1076,57 @@ def test_a_model_that_is_torn_from_what_its_photographs_share_is_told(tmp_path, 
     assert "contradict nearly all that 4.jpg and 5.jpg and their neighbours have in common" in caplog.text
 
 
+_ZOOM = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import sfm  # first: it imports what must come before pycolmap
+import numpy as np
+import pycolmap
+
+pycolmap.set_random_seed(0)
+options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=200)
+model = pycolmap.synthesize_dataset(options)
+pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model)
+found = [sfm._zoomed(model)]
+images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+for image in images[6:]:
+    camera = model.camera(image.camera_id)
+    for point in image.points2D:
+        ray = camera.cam_from_img(point.xy)
+        point.xy = pycolmap.Camera(camera.todict() | {"params": camera.params * [1.3, 1, 1, 1]}).img_from_cam([*ray, 1])
+found.append(sfm._zoomed(model))
+print(json.dumps([found, [image.name for image in images]]))
+"""
+
+
+def test_a_zoom_among_photographs_of_one_camera_is_noticed():
+    """Half of them are enlarged by 1.3."""
+    command = [sys.executable, "-c", _ZOOM, Path(stages.__file__).parent]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    (plain, (change, short, long)), names = json.loads(printed.splitlines()[-1])
+    assert plain is None
+    assert change == pytest.approx(0.3, abs=0.03)
+    assert short in names[:6]
+    assert long in names[6:]
+
+
+def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
+    (tmp_path / "photographs").mkdir()
+    for k in range(8):
+        photograph(seed=k).save(tmp_path / "photographs" / f"{k}.jpg")
+    model = {"names": [f"{k}.jpg" for k in range(8)], "points": 900, "reprojection_error": 0.5, "track_length": 3.0}
+
+    def run_step(step: str, arguments: dict, **_):
+        if step == "undistort":
+            for name in ("images", "sparse"):
+                (Path(arguments["output"]) / name).mkdir()
+        return [model | {"zoomed": [0.3, "4.jpg", "5.jpg"]}] if step == "reconstruct" else []
+
+    monkeypatch.setattr(stages, "run_step", run_step)
+    capture(tmp_path / "photographs", tmp_path / "scene")
+    assert "seems to change by 30%, between 4.jpg and 5.jpg" in caplog.text
+
+
 @pytest.mark.parametrize(("points", "message"), [(49, "only 49 points, each in 3.0 of 5 photographs"), (50, "")])
 def test_a_model_of_a_few_points_is_no_scene(tmp_path, monkeypatch, points, message):
     (tmp_path / "photographs").mkdir()
