@@ -19,12 +19,12 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Shaped
-from PIL import Image
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
 from shellgs_method.capture.photographs import Lens
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.exif import exif_of
+from shellgs_method.files.exif import exif_of, tags_of
 
 UNSTITCHED = {".insv", ".360"}
 """Suffixes of what 360° cameras record, in lower case: two circles or an unfolded cube."""
@@ -37,6 +37,8 @@ _WIDTHS = re.compile(rb"GPano:(?:FullPano|CroppedAreaImage)WidthPixels\s*(?:=\s*
 # rendered panoramas, 3.6 and more in 61 photographs that were cropped to the same shape, 11 in the median.
 _CLOSED = 3.0
 _NOISE = 1.0  # of colours
+_SWEPT = 6  # EXIF's CustomRendered of a panorama, as Apple writes it
+_WIDE = 2.5  # times as wide as high, or as high as wide: more than of any camera
 _PLAIN = 4.0  # deviation of the colours of a column that shows nothing, as of a black border: sky and ground are apart
 _DARK, _SMALL = 24, 64  # levels of what lies around the circle of a fisheye lens; pixels of its image's side
 _COMPARED = 9  # photographs
@@ -79,18 +81,30 @@ def says_panorama(photograph: Path) -> bool:
     """Whether XMP metadata (Google's Photo Sphere XMP) say that a photograph is a panorama.
 
     Raises:
-        SceneError: it is a part of one, or of another projection.
+        SceneError: it is a part of one, or of another projection; or it cannot be read.
     """
     with photograph.open("rb") as file:
         header = file.read(_HEADER)
-    if (projection := _PROJECTION.search(header)) is None:
-        return False
-    if projection[1].lower() != b"equirectangular" or len(set(_WIDTHS.findall(header))) > 1:
+    projection = _PROJECTION.search(header)
+    if projection is None:
+        is_part = _is_swept(photograph)
+    else:
+        is_part = projection[1].lower() != b"equirectangular" or len(set(_WIDTHS.findall(header))) > 1
+    if is_part:
         raise SceneError(
             f"{photograph} is a panorama, but not one of 360° by 180° (equirectangular), and no camera fits it: leave "
             "it out, or export it whole"
         )
-    return True
+    return projection is not None
+
+
+def _is_swept(photograph: Path) -> bool:
+    """Whether a photograph is of an iPhone's panorama mode, which says so in EXIF data alone."""
+    from shellgs_method.files.photographs import opened  # imports torch, which is slow
+
+    with opened(photograph, whole=False) as image:
+        tags = tags_of(image)
+    return tags.get(ExifTags.Base.Make) == "Apple" and tags.get(ExifTags.Base.CustomRendered) == _SWEPT
 
 
 def video_says_panorama(video: Path) -> bool:
@@ -135,6 +149,11 @@ def find_panoramas(folder: Path, names: Sequence[str], said: Collection[str]) ->
         SceneError: some are two circles side by side, which a 360° camera records before it stitches them.
     """
     sizes = {name: _size(folder / name) for name in names if name not in said}
+    if wide := [name for name, size in sizes.items() if max(size) > _WIDE * min(size)]:
+        notice(
+            f"{len(wide)} photographs of {len(names)}, {wide[0]} for example, are more than {_WIDE:g} times as wide as "
+            "high: if they are panoramas, no camera fits them, and others are bent to them: leave them out."
+        )
     twice = sorted((name for name, (width, height) in sizes.items() if width == 2 * height), key=sizes.__getitem__)
     found = set(said)
     for size, group in groupby(twice, key=sizes.__getitem__):

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from scenes import photograph, write_video
 from scipy.spatial.transform import Rotation
 
@@ -128,6 +128,27 @@ def test_a_part_of_a_panorama_is_refused(tmp_path, xmp):
     panorama().save(tmp_path / "a.jpg", xmp=xmp)
     with pytest.raises(SceneError, match=r"a.jpg is a panorama, but not one of 360° by 180°"):
         says_panorama(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(("make", "rendered"), [("Apple", 6), ("Apple", 8), ("Another", 6)])
+def test_a_panorama_of_an_iphone_is_refused(tmp_path, make, rendered):
+    """EXIF alone says that it is one: CustomRendered is 6, where 8 is a portrait, and others mean other things."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = make
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.CustomRendered] = rendered
+    photograph(300, 100).save(tmp_path / "a.jpg", exif=exif)
+    if (make, rendered) != ("Apple", 6):
+        assert not says_panorama(tmp_path / "a.jpg")
+        return
+    with pytest.raises(SceneError, match=r"a\.jpg is a panorama, but not one of 360° by 180°"):
+        says_panorama(tmp_path / "a.jpg")
+
+
+def test_photographs_wider_than_cameras_take_them_are_told(tmp_path, caplog):
+    for name, size in {"wide": (300, 100), "high": (100, 300), "cinema": (240, 100)}.items():
+        photograph(*size).save(tmp_path / f"{name}.png")
+    assert not find_panoramas(tmp_path, ["cinema.png", "high.png", "wide.png"], set())
+    assert "2 photographs of 3, high.png for example, are more than 2.5 times as wide as high" in caplog.text
 
 
 def test_what_says_nothing_is_a_panorama_if_it_goes_around_and_this_is_told(tmp_path, caplog):
