@@ -8,11 +8,13 @@ import shutil
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 from PIL import ExifTags, Image, ImageOps
 
 from shellgs_method.capture.config import Cameras
@@ -45,6 +47,8 @@ _LENS_TAGS = (
     ExifTags.Base.FocalLengthIn35mmFilm,
 )
 
+_MOMENT = (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal)
+_SMALL, _ALIKE = 32, 4.0  # pixels of a side, and mean difference of levels, by which photographs are compared
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
 
 
@@ -107,6 +111,7 @@ def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
         original = originals.setdefault((size, _excerpt(path, size)), path)
         if original != path and filecmp.cmp(original, path, shallow=False):
             copies[path] = original
+    copies |= _smaller_copies([path for path in photographs if path not in copies])
     if copies:
         copy, original = min(copies.items())
         notice(
@@ -121,7 +126,60 @@ def _without_copies(folder: Path, photographs: Sequence[Path]) -> list[Path]:
             f"{twins[1]}, for example): if they are one photograph in two formats, move one of the two away, or "
             "metrics of held-out photographs are too good."
         )
+    _tell_of_versions(folder, [path for path in kept if stems[path.with_suffix("")] == 1])
     return kept
+
+
+def _smaller_copies(photographs: Sequence[Path]) -> dict[Path, Path]:
+    """Photographs that are scaled down from another of the same name, as nerfstudio's images_2 are, and that one."""
+    named: dict[str, list[Path]] = {}
+    for path in photographs:
+        named.setdefault(path.stem, []).append(path)
+    copies: dict[Path, Path] = {}
+    for paths in (paths for paths in named.values() if len(paths) > 1):
+        sizes = {path: _size(path) for path in paths}
+        largest = max(paths, key=lambda path: sizes[path])
+        width, height = sizes[largest]
+        for path, (across, down) in sizes.items():
+            if across < width and abs(across * height - down * width) <= max(width, height):
+                with suppress(Exception):  # whatever a damaged one leads to, which is told where it is read
+                    if np.abs(_small(path) - _small(largest)).mean() < _ALIKE:
+                        copies[path] = largest
+    return copies
+
+
+def _size(photograph: Path) -> tuple[int, int]:
+    """Width and height as a photograph is shown; 0 where it cannot be read, which is told where it is."""
+    with suppress(Exception), Image.open(photograph) as image:
+        return image.size[::-1] if orientation_of(image) > 4 else image.size
+    return 0, 0
+
+
+def _small(photograph: Path) -> Float32[np.ndarray, "H W"]:
+    with Image.open(photograph) as image:
+        image.draft("L", (8 * _SMALL, 8 * _SMALL))
+        upright = ImageOps.exif_transpose(image).convert("L")
+        return np.asarray(upright.resize((_SMALL, _SMALL), Image.Resampling.BOX), np.float32)
+
+
+def _tell_of_versions(folder: Path, photographs: Sequence[Path]) -> None:
+    """Tell the user of photographs of one moment, as of one and what an editor made of it (IMG_0001, IMG_E0001)."""
+    moments: dict[tuple, list[Path]] = {}
+    for path in photographs:
+        with suppress(Exception), Image.open(path) as image:
+            tags = tags_of(image)
+            when, fraction = (str(tags.get(tag, "")).strip() for tag in _MOMENT)
+            if when and fraction.strip("0"):  # many cameras write no fraction of a second, or 00
+                moment = (path.parent, when, fraction, *(str(tags.get(tag)) for tag in _LENS_TAGS[:2]))
+                moments.setdefault(moment, []).append(path)
+    if versions := [paths for paths in moments.values() if len(paths) > 1]:
+        first, second = sorted(versions[0])[:2]
+        count = sum(map(len, versions)) - len(versions)
+        notice(
+            f"{count} photographs of {folder} were taken at the very moment of others "
+            f"({second.name} at that of {first.name}, for example): if they are edited versions, move one of the two "
+            "away, or metrics of held-out photographs are too good."
+        )
 
 
 def _excerpt(path: Path, size: int) -> bytes:

@@ -505,6 +505,35 @@ def test_copies_of_a_photograph_are_left_out_and_told(tmp_path, caplog):
     assert "IMG_1 copy.jpg is IMG_1.jpg" in caplog.text
 
 
+def test_smaller_copies_of_photographs_are_left_out_and_told(tmp_path, caplog):
+    """As those in nerfstudio's images_2 and images_4; other photographs of the same names are no copies."""
+    for k in range(3):
+        for scale, name in {1: "images", 2: "images_2", 4: "images_4", 3: "others"}.items():
+            (tmp_path / name).mkdir(exist_ok=True)
+            shown = photograph(40, 30, seed=k if name != "others" else k + 9).resize((641, 480))
+            shown.resize((641 // scale, 480 // scale)).save(tmp_path / name / f"{k}.jpg")
+    (tmp_path / "images_2" / "0.jpg").write_bytes(b"damaged")
+    found = [*(f"images/{k}.jpg" for k in range(3)), "images_2/0.jpg", *(f"others/{k}.jpg" for k in range(3))]
+    assert list(find_photographs(tmp_path)) == found
+    assert "5 photographs of" in caplog.text
+    assert "(images_2/1.jpg is images/1.jpg, for example)" in caplog.text
+
+
+@pytest.mark.parametrize(("fraction", "told"), [("123", True), ("00", False), (None, False)])
+def test_photographs_of_one_moment_are_told(tmp_path, caplog, fraction, told):
+    """An iPhone's IMG_E0001 is IMG_0001 as it was edited there; without fractions of seconds, they may be a burst."""
+    for k, name in enumerate(("IMG_0001.jpg", "IMG_E0001.jpg", "IMG_0002.jpg")):
+        exif = Image.Exif()
+        tags = exif.get_ifd(ExifTags.IFD.Exif)
+        tags[ExifTags.Base.DateTimeOriginal] = f"2026:05:01 12:00:0{k // 2}"
+        if fraction:
+            tags[ExifTags.Base.SubsecTimeOriginal] = fraction
+        photograph(seed=k).save(tmp_path / name, exif=exif)
+    assert len(find_photographs(tmp_path)) == 3
+    assert ("1 photographs of" in caplog.text) == told
+    assert ("(IMG_E0001.jpg at that of IMG_0001.jpg, for example)" in caplog.text) == told
+
+
 def test_two_formats_of_one_name_are_kept_and_told(tmp_path, caplog):
     for k, name in enumerate(("IMG_1.jpg", "IMG_1.PNG", "IMG_2.jpg")):
         photograph(seed=k).save(tmp_path / name)
