@@ -19,7 +19,7 @@ from rich.progress import Progress
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from shellgs_method.errors import SceneError, notice
-from shellgs_method.files.transfer import HDR, Transfer, tone_mapped
+from shellgs_method.files.transfer import HDR, Transfer, narrowed, tone_mapped
 
 FRAMES_PER_SECOND = 5
 """Maximum rate. At walking pace this is a frame every 25 cm: closer ones add work and no parallax."""
@@ -254,6 +254,7 @@ def _upright(
         # FFmpeg takes what does not say so for BT.601, where players take HD for BT.709.
         untagged = frame.colorspace == _UNTAGGED
         image = frame.to_image(src_colorspace="ITU709" if hd and untagged else None)
+        image = Image.fromarray(narrowed(np.asarray(image), frame.color_primaries))
     else:
         image = Image.fromarray(tone_mapped(frame.to_ndarray(format="rgb48le"), transfer))
     if frame.interlaced_frame and _is_combed(pixels := np.asarray(image)):

@@ -22,6 +22,11 @@ _LUMINANCE = np.array([0.2627, 0.6780, 0.0593], np.float32)  # of BT.2020's prim
 _BT709_FROM_BT2020 = np.array(  # ITU-R BT.2087
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
 )
+_BT709_FROM_P3 = np.array(  # SMPTE EG 432-1, whose white is that of BT.709
+    [[1.2249, -0.2249, 0.0], [-0.0421, 1.0421, 0.0], [-0.0196, -0.0786, 1.0983]], np.float32
+)
+_WIDE = {9: _BT709_FROM_BT2020, 12: _BT709_FROM_P3}
+"""Matrices from wider primaries, by their codes in files (colour primaries of ITU-T H.273)."""
 _KNEE = 0.5  # of diffuse white: darker colours are kept, brighter ones leave room for highlights
 
 
@@ -40,6 +45,14 @@ def tone_mapped(rgb: UInt16[np.ndarray, "H W 3"], transfer: Transfer) -> UInt8[n
     room = 1 - _KNEE
     mapped = np.where(brightest < _KNEE, brightest, 1 - room * np.exp((_KNEE - brightest) / room))
     linear = (light * (mapped / np.maximum(brightest, 1e-9))) @ _BT709_FROM_BT2020.T
+    return np.rint(255 * srgb(linear.clip(0, 1))).astype(np.uint8)
+
+
+def narrowed(rgb: UInt8[np.ndarray, "H W 3"], primaries: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours of wider primaries, by their code in files, as sRGB has them, clipped; those of others as they are."""
+    if (matrix := _WIDE.get(primaries)) is None:
+        return rgb
+    linear = linear_of(np.linspace(0, 1, 256)).astype(np.float32)[rgb] @ matrix.T
     return np.rint(255 * srgb(linear.clip(0, 1))).astype(np.uint8)
 
 

@@ -250,6 +250,39 @@ def test_hd_video_that_does_not_say_its_colours_is_of_bt_709(tmp_path):
             np.testing.assert_allclose(np.asarray(shown).mean(axis=(0, 1)), colour, atol=4)
 
 
+def to_xyz(primaries: list[tuple[float, float]]) -> np.ndarray:
+    """From linear RGB of primaries, by their chromaticities, to XYZ, whose white is D65 (SMPTE RP 177)."""
+    columns = np.array([[x / y, 1, (1 - x - y) / y] for x, y in primaries]).T
+    white = np.array([0.3127 / 0.3290, 1, (1 - 0.3127 - 0.3290) / 0.3290])
+    return columns * np.linalg.solve(columns, white)
+
+
+BT709 = to_xyz([(0.64, 0.33), (0.30, 0.60), (0.15, 0.06)])
+WIDER = {
+    1: BT709,
+    9: to_xyz([(0.708, 0.292), (0.170, 0.797), (0.131, 0.046)]),  # BT.2020
+    12: to_xyz([(0.68, 0.32), (0.265, 0.69), (0.15, 0.06)]),  # P3 of displays and phones
+}
+
+
+@pytest.mark.parametrize("primaries", WIDER)
+def test_colours_of_a_video_of_wider_primaries_are_converted(tmp_path, primaries):
+    """As screen recordings and some phones have them, without being HDR."""
+    shown = np.array([200, 90, 60])
+    wide = srgb(np.linalg.solve(WIDER[primaries], BT709 @ linear_of(shown / 255)))
+    with av.open(str(tmp_path / "walk.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=5, options={"crf": "4"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.color_primaries = primaries
+        stored = av.VideoFrame.from_image(Image.new("RGB", (64, 48), tuple(np.rint(255 * wide).astype(int))))
+        for frame in [*[stored] * 5, None]:
+            container.mux(stream.encode(frame))
+    (tmp_path / "frames").mkdir()
+    extract_frames(tmp_path / "walk.mp4", tmp_path / "frames", 3, QUIET)
+    with Image.open(next((tmp_path / "frames").iterdir())) as frame:
+        np.testing.assert_allclose(np.asarray(frame).mean(axis=(0, 1)), shown, atol=4)
+
+
 def add_streams(path: Path, *streams: tuple[tuple[int, int], int, dict[str, object]]) -> None:
     """A file of several video streams: size, number of frames and properties of each; blue but for the last, red."""
     with av.open(str(path), "w") as container:
