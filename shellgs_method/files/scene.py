@@ -170,7 +170,7 @@ class SceneLayout(ScenePaths):
             raise FileNotFoundError(
                 f"{self.data} holds no cameras: neither transforms.json nor a COLMAP model in "
                 f"{', '.join(map(str, looked_in))}, or in numbered folders there; `shellgs capture` makes a scene of "
-                "photographs"
+                "photographs, `ns-process-data` of exports of Metashape, RealityScan, OpenDroneMap, Polycam or Record3D"
             )
         return folder
 
