@@ -35,6 +35,8 @@ _PACE = 0.2  # seconds between the frames that motion is measured between: pixel
 _UNTAGGED = 2  # a colour space that is not said (H.273)
 _SQUARE = 0.01  # by which a pixel's sides may differ: programs round them
 _PAUSE = 10.0  # seconds between two frames that are no step, but a break, as where files were joined
+_TIMED = ("mov", "avi")  # formats that say how long a stream is
+_WHOLE = 0.9  # of that time, is as good as all
 _BLACK = 32  # levels that compressed black reaches
 _BY_TIME = 0.2  # share of the frames that are spread over time: motion towards the building moves no picture aside
 
@@ -53,7 +55,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
         is_around = round(stream.width * aspect) == 2 * stream.height
         task = progress.add_task("looking for sharp frames", total=stream.frames or None)
         usual = 1 / float(stream.average_rate or 30)
-        sharpnesses, times, marks, shifts, before, last = [], [], [], [], None, None
+        sharpnesses, times, marks, shifts, before, last, end = [], [], [], [], None, None, 0.0
         brightest: UInt8[np.ndarray, "H W"] | None = None
         for frame in _frames(container, stream):
             half = frame.reformat(frame.width // 2, frame.height // 2, format="gray").to_ndarray()
@@ -65,7 +67,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
             step = usual if frame.time is None or last is None else frame.time - last
             # Times begin anew where files were joined, and jump after a break.
             times.append(times[-1] + (step if 0 < step < _PAUSE else usual) if times else 0.0)
-            last = frame.time
+            last, end = frame.time, max(end, frame.time or 0.0)
             if not marks or times[-1] >= marks[-1] + _PACE:
                 height = max(1, round(_SMALL * frame.height / frame.width))
                 small = frame.reformat(_SMALL, height, format="gray", interpolation="AREA").to_ndarray()
@@ -75,6 +77,7 @@ def extract_frames(video: Path, folder: Path, count: int, progress: Progress) ->
             progress.update(task, completed=len(times))
         if brightest is None:
             raise SceneError(f"{video} holds no frames: is it a complete video?")
+        _tell_of_a_cut(video, stream, end + usual)
     since = np.array(times)
     moved = np.interp(since, marks, travelled(np.array(shifts)))
     if is_around:  # the picture of a panorama moves to all sides at once
@@ -194,6 +197,17 @@ def _frames(container: av.container.InputContainer, stream: VideoStream) -> Iter
         notice(
             f"{damaged / packets:.1%} of the video {container.name} is damaged, and is left out: copy it again if you "
             "have it whole."
+        )
+
+
+def _tell_of_a_cut(video: Path, stream: VideoStream, end: float) -> None:
+    """Tell the user of a video that ends before the time that its header says, of formats that say it."""
+    start, whole = (float((each or 0) * (stream.time_base or 0)) for each in (stream.start_time, stream.duration))
+    seconds = end - start
+    if stream.container.format.name.startswith(_TIMED) and seconds < _WHOLE * whole:
+        notice(
+            f"{video} ends after {seconds:.1f} of its {whole:.1f} seconds, as a copy that was cut off: copy it again "
+            "if you have it whole."
         )
 
 
