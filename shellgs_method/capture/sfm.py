@@ -38,6 +38,7 @@ _FOCAL = 0.8  # widths, as of phones: calibration finds less from COLMAP's 1.2
 _CREDIBLE = 0.3, 10.0  # widths that EXIF may say, 11 to 360 mm on 35 mm film; 4 times the true one does no harm
 _NEAR = 10  # photographs, within which they are neighbours along a walk
 _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length and a coefficient of distortion
+_LEAST_POINTS = 10  # of a photograph with a camera: 17 and more of right ones, incremental mapping places none by 30
 _POINTS = 80  # of a photograph, by which its own focal length is found
 # F, and deviation of focal lengths, at which photographs have not one camera. Right models have 7 and less, but one of
 # 30 at a deviation of 0.01; videos with frames cropped by a tenth, a zoom or two lenses 39 and 0.07 and more.
@@ -286,7 +287,8 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
         models = []
         if is_global:
             options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
-            models = pycolmap.global_mapping(_calibrated(database, folder), photographs, folder, options).values()
+            mapped = pycolmap.global_mapping(_calibrated(database, folder), photographs, folder, options)
+            models = [_placed(model) for model in mapped.values()]
         if fitting(models) < (count, CONFIRMED):
             options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, min_model_size=3)
             options.constant_cameras, options.constant_rigs = known, rigs
@@ -313,6 +315,15 @@ def reconstruct(database: str, photographs: str, output: str, has_parallax: bool
     ]
 
 
+def _placed(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A model without the photographs that show hardly a point of it, which global mapping leaves anywhere."""
+    for number in list(model.reg_frame_ids()):
+        images = [model.image(data.id) for data in model.frame(number).image_ids]
+        if sum(image.num_points3D for image in images) < _LEAST_POINTS:
+            model.deregister_frame(number)
+    return model
+
+
 def _zoomed(model: pycolmap.Reconstruction) -> list | None:
     """How much the focal length changes between photographs of a camera, as a share of it, and the names of two.
 
@@ -330,7 +341,8 @@ def _zoomed(model: pycolmap.Reconstruction) -> list | None:
     off = {i: np.log(focal[i]) - np.median(logs[model.image(i).camera_id]) for i in known}
     least_f, least_deviation = _ZOOMED
     is_better = (together - apart) * max(1, freedom) > least_f * apart * (len(images) - len(used))
-    if not is_better or not 1.48 * np.median(np.abs(list(off.values()))) > least_deviation:
+    deviation = np.subtract(*np.quantile(list(off.values()), [0.84, 0.16])) / 2
+    if not is_better or not deviation > least_deviation:
         return None
     ranked = sorted(known, key=off.__getitem__)
     short, long = ranked[len(ranked) // 20], ranked[-1 - len(ranked) // 20]

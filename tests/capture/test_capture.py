@@ -1167,7 +1167,7 @@ model = pycolmap.synthesize_dataset(options)
 pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model)
 found = [sfm._zoomed(model)]
 images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
-for image in images[6:]:
+for image in images[8:]:
     camera = model.camera(image.camera_id)
     for point in image.points2D:
         ray = camera.cam_from_img(point.xy)
@@ -1178,14 +1178,37 @@ print(json.dumps([found, [image.name for image in images]]))
 
 
 def test_a_zoom_among_photographs_of_one_camera_is_noticed():
-    """Half of them are enlarged by 1.3."""
+    """A third of them are enlarged by 1.3."""
     command = [sys.executable, "-c", _ZOOM, Path(stages.__file__).parent]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     (plain, (change, short, long)), names = json.loads(printed.splitlines()[-1])
     assert plain is None
     assert change == pytest.approx(0.3, abs=0.03)
-    assert short in names[:6]
-    assert long in names[6:]
+    assert short in names[:8]
+    assert long in names[8:]
+
+
+_STRAY = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+import sfm  # first: it imports what must come before pycolmap
+import pycolmap
+
+model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=5, num_points3D=50))
+first = model.reg_image_ids()[0]
+seen = [k for k, point in enumerate(model.image(first).points2D) if point.has_point3D()]
+for k in seen[int(sys.argv[2]) :]:
+    model.delete_observation(first, k)
+print(json.dumps([model.num_reg_images(), first in sfm._placed(model).reg_image_ids(), model.num_reg_images()]))
+"""
+
+
+@pytest.mark.parametrize(("points", "placed"), [(9, False), (10, True)])
+def test_a_photograph_of_a_few_points_has_no_camera(points, placed):
+    """Global mapping leaves it anywhere."""
+    command = [sys.executable, "-c", _STRAY, Path(stages.__file__).parent, str(points)]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert json.loads(printed.splitlines()[-1]) == [5, placed, 4 + placed]
 
 
 def test_a_zoom_is_told(tmp_path, monkeypatch, caplog):
