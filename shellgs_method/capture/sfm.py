@@ -41,7 +41,7 @@ _MIN_CALIBRATED = 10  # photographs needed to calibrate more than a focal length
 _LEAST_POINTS = 10  # of a photograph with a camera: 17 and more of right ones, incremental mapping places none by 30
 _POINTS = 80  # of a photograph, by which its own focal length is found
 # F, and deviation of focal lengths, at which photographs have not one camera. Right models have 7 and less, but one of
-# 30 at a deviation of 0.01; videos with frames cropped by a tenth, a zoom or two lenses 39 and 0.07 and more.
+# 30 at a deviation of 0.02; videos with frames cropped by a tenth, a zoom or two lenses 39 and 0.07 and more.
 _ZOOMED = 20.0, 0.03
 
 
